@@ -1,1 +1,1 @@
-"""The command line: one file for the commands of each subject, put together in `flows.cli.app`."""
+"""The command line: one module per group of commands, assembled in `flows.cli.app`."""

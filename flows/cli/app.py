@@ -1,4 +1,4 @@
-"""The command line, put together. Heavy libraries load inside the commands that use them."""
+"""The assembled command line. Heavy libraries are imported inside the commands that use them."""
 
 from __future__ import annotations
 

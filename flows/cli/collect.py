@@ -25,12 +25,12 @@ app = typer.Typer()
 def plan(
     protocol: ProtocolArgument,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="A rig file or name, for bytes.")
+        Path | None, typer.Option("--rig", help="A rig file or name, to estimate bytes.")
     ] = None,
     enable: EnableOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the trials in the order they will be taken, with hours and (given a rig) bytes."""
+    """Print the trials in the order of collection, with the time and (given a rig) bytes needed."""
     from sliplab.flows.planning import plan_view
     from sliplab.protocols.plan import load_plan
 
@@ -58,7 +58,7 @@ def check(
     enable: EnableOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check everything that can be known before anything moves."""
+    """Check everything that can be checked before anything moves."""
     from sliplab.flows.planning import preflight
 
     found = preflight.check(protocol, rig, store, tuple(enable or ()))
@@ -79,13 +79,11 @@ def collect(
     enable: EnableOption = None,
     trials: Annotated[
         int | None,
-        typer.Option(
-            "--trials", min=1, max=1_000_000, help="Take so many of the missing, no more."
-        ),
+        typer.Option("--trials", min=1, max=1_000_000, help="Collect at most this many trials."),
     ] = None,
     campaign: Annotated[
         str | None,
-        typer.Option("--campaign", help="Name of the campaign; the protocol's by default."),
+        typer.Option("--campaign", help="Campaign name; default: the protocol's name."),
     ] = None,
     operator: Annotated[
         str, typer.Option("--operator", help="Name of the operator at the rig.")
@@ -100,7 +98,7 @@ def collect(
     note: Annotated[str, typer.Option("--note", help="A note to store with the session.")] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
+    """Collect the missing trials. Ctrl-C stops the arm; run the same command to resume."""
     from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
     from sliplab.flows.running import orchestration
     from sliplab.storage.trials.store import Store

@@ -17,17 +17,21 @@ PlaceArgument = Annotated[
 ]
 DaskOption = Annotated[
     str | None,
-    typer.Option("--dask", help="HOST:PORT of a Dask scheduler whose workers take the trials."),
+    typer.Option("--dask", help="HOST:PORT of a Dask scheduler whose workers process the trials."),
 ]
 RigOption = Annotated[
-    Path, typer.Option("--rig", help="A rig file (YAML), or the name of one that ships: mock.")
+    Path,
+    typer.Option("--rig", help="A rig file (YAML), or the name of a built-in rig such as mock."),
 ]
-StoreOption = Annotated[Path, typer.Option("--store", help="The store's folder; made if missing.")]
+StoreOption = Annotated[
+    Path, typer.Option("--store", help="The store's folder; created if missing.")
+]
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="One JSON object on standard output, the rest on error.")
+    bool, typer.Option("--json", help="Print one JSON object to stdout, everything else to stderr.")
 ]
 EnableOption = Annotated[
-    list[str] | None, typer.Option("--enable", help="Switch an optional level on: factor=level.")
+    list[str] | None,
+    typer.Option("--enable", help="Enable an optional level: factor=level. Repeatable."),
 ]
 CampaignOption = Annotated[
     list[str] | None, typer.Option("--campaign", help="Only this campaign. Repeatable.")
@@ -45,7 +49,7 @@ def located(place: str) -> Path:
 
     if not is_url(place):
         return Path(place)
-    with console.bar(f"look at {place} (trials)", 0) as bar:
+    with console.bar(f"read {place} (trials)", 0) as bar:
 
         def seen(name: str) -> None:
             bar.extend(1)
@@ -53,8 +57,8 @@ def located(place: str) -> Path:
 
         store, done = open_mirror(place, seen)
     for problem in done.problems:
-        console.say(f"left out: {problem}")
-    console.say(f"working on {store.folder}; events and videos come when they are read")
+        console.say(f"skipped: {problem}")
+    console.say(f"working on {store.folder}; events and videos are downloaded when first read")
     return store.folder
 
 

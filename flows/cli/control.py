@@ -1,4 +1,4 @@
-"""`sliplab pause`, `resume`, `stop`, `skip`, `again`, `serve`: control from elsewhere.
+"""`sliplab pause`, `resume`, `stop`, `skip`, `again`, `serve`: control from another process.
 
 Those before `serve` are for another terminal: each keeps in STORE/control/ who asked for what,
 when and why. `serve` offers one rig's deployments on Prefect's page, with schedules.
@@ -21,18 +21,22 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-TrialsArgument = Annotated[list[str], typer.Argument(help="Ids of trials, as in `sliplab plan`.")]
-WhyOption = Annotated[str, typer.Option("--why", help="The reason, kept with the request.")]
-NeededWhyOption = Annotated[
-    str, typer.Option("--why", help="The reason, kept with the trial.", show_default=False)
+TrialsArgument = Annotated[
+    list[str], typer.Argument(help="Trial ids, as listed by `sliplab plan --json`.")
 ]
-WhoOption = Annotated[str, typer.Option("--who", help="Your name; the user's name by default.")]
+WhyOption = Annotated[str, typer.Option("--why", help="The reason, stored with the request.")]
+NeededWhyOption = Annotated[
+    str, typer.Option("--why", help="The reason, stored with the trial.", show_default=False)
+]
+WhoOption = Annotated[str, typer.Option("--who", help="Your name; default: the login name.")]
 WaitOption = Annotated[
     float,
-    typer.Option("--wait", min=0, max=86400, help="How long to wait until it is carried out, s."),
+    typer.Option(
+        "--wait", min=0, max=86400, help="Maximum wait until the request is carried out, s."
+    ),
 ]
 CampaignOption = Annotated[
-    str | None, typer.Option("--campaign", help="The campaign, if several have the trials.")
+    str | None, typer.Option("--campaign", help="The campaign, if several contain the trials.")
 ]
 
 
@@ -41,7 +45,7 @@ def pause(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 600.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Pause after the trial that runs; returns when the collection is paused."""
+    """Pause after the current trial; returns once the collection is paused."""
     outcome = _request(store, "pause", who, why, wait)
     _finish([outcome], as_json, _pause_words(store, outcome))
 
@@ -51,7 +55,7 @@ def resume(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Resume after a pause."""
+    """Resume a paused collection."""
     outcome = _request(store, "resume", who, why, wait)
     running = outcome.answer is not None and outcome.answer["did"].get("running")
     words = f"{store} is no longer paused" + ("; the collection continues" if running else "")
@@ -63,7 +67,7 @@ def stop(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Stop a running collection now, the arm first, as Ctrl-C in its terminal would."""
+    """Stop a running collection at once, arm first, like Ctrl-C in its terminal."""
     from sliplab.flows.collecting.requests import halt
     from sliplab.storage.trials.store import Store
 
@@ -82,7 +86,7 @@ def skip(
     campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Skip trials: no collection takes them until `sliplab again` asks for them."""
+    """Skip trials: they are not collected until `sliplab again` requests them."""
     _decide(store, "skip", trials, campaign, who, why, wait, as_json)
 
 
@@ -92,7 +96,7 @@ def again(
     campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Take trials again: what is committed is moved to quarantine, never deleted."""
+    """Retake trials: the committed recording is moved to quarantine, never deleted."""
     _decide(store, "again", trials, campaign, who, why, wait, as_json)
 
 
@@ -136,7 +140,7 @@ def _pause_words(store: Path, outcome: Outcome) -> str:
 
 
 def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
-    """Print the outcomes; exit 1 while a request is open."""
+    """Print the outcomes; exit 1 if a request is still open."""
     done = all(outcome.answer is not None for outcome in outcomes)
     if as_json:
         found = [outcome.as_json() for outcome in outcomes]
@@ -160,20 +164,24 @@ def serve(
         Path | None, typer.Argument(help="A file of schedules (YAML): nights, weekends.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--name", help="Name of the deployments; the rig's by default.")
+        str | None, typer.Option("--name", help="Name of the deployments; default: the rig's name.")
     ] = None,
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Of the embedded server's page; 0: any.")
+        int,
+        typer.Option(
+            "--port", min=0, max=65535, help="Port of the embedded server's page; 0: any free port."
+        ),
     ] = 4200,
     poll: Annotated[
-        float, typer.Option("--poll", min=0.2, max=60, help="Period of looking for new runs, s.")
+        float, typer.Option("--poll", min=0.2, max=60, help="Polling period for new runs, s.")
     ] = 3.0,
     check: Annotated[
-        bool, typer.Option("--check", help="Read the file, print what would run when, and end.")
+        bool,
+        typer.Option("--check", help="Validate the schedules, print the upcoming runs, and exit."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Serve collect, label, train, evaluate, report, study and chain; Ctrl-C ends, arm first."""
+    """Serve the flows of one rig as Prefect deployments. Ctrl-C stops the arm, then all runs."""
     from sliplab.flows.server.schedules import load_schedules
     from sliplab.rigs.rig_file import load_rig_file
     from sliplab.rigs.rig_inheritance import rig_path

@@ -18,42 +18,56 @@ def detect(
     rig: RigOption,
     model: Annotated[Path, typer.Option("--model", help="A trained network: models/seed0.pt.")],
     protocol: Annotated[
-        Path | None, typer.Option("--protocol", help="Make a trial's motion; else only listen.")
+        Path | None,
+        typer.Option("--protocol", help="Run a trial of this protocol; default: only listen."),
     ] = None,
     trial: Annotated[
-        str | None, typer.Option("--trial", help="Its condition: depth=2.4mm,direction=0deg.")
+        str | None,
+        typer.Option("--trial", help="Condition of the trial: depth=2.4mm,direction=0deg."),
     ] = None,
     enable: EnableOption = None,
     reflex: Annotated[
         str | None,
-        typer.Option("--reflex", help="At incipient slip: stop, or press:MM. Needs --protocol."),
+        typer.Option(
+            "--reflex", help="Reaction to incipient slip: stop, or press:MM. Needs --protocol."
+        ),
     ] = None,
     hold: Annotated[
-        float, typer.Option("--hold", min=0, max=60, help="Stand and watch after a reflex, s.")
+        float,
+        typer.Option("--hold", min=0, max=60, help="Keep still and observe after a reflex, s."),
     ] = 1.0,
     seconds: Annotated[
         float | None,
-        typer.Option("--seconds", min=0.1, max=1_000_000, help="Listen so long; else to Ctrl-C."),
+        typer.Option(
+            "--seconds", min=0.1, max=1_000_000, help="Listen this long; default: until Ctrl-C."
+        ),
     ] = None,
     stride: Annotated[
         float | None,
-        typer.Option("--stride", min=0, max=1000, help="From window to window, ms; their length."),
+        typer.Option(
+            "--stride",
+            min=0,
+            max=1000,
+            help="Time between windows, ms; default: the window length.",
+        ),
     ] = None,
     margin: Annotated[
-        float | None, typer.Option("--margin", min=0, max=1e6, help="Spikes a winner must lead by.")
+        float | None,
+        typer.Option("--margin", min=0, max=1e6, help="Spikes by which the winner must lead."),
     ] = None,
     smoothing: Annotated[
-        int | None, typer.Option("--smoothing", min=1, max=1000, help="Windows to average over.")
+        int | None,
+        typer.Option("--smoothing", min=1, max=1000, help="Number of windows to average."),
     ] = None,
     poll: Annotated[
-        float, typer.Option("--poll", min=1, max=200, help="Period of reading the streams, ms.")
+        float, typer.Option("--poll", min=1, max=200, help="Polling period of the streams, ms.")
     ] = 5.0,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Decisions as JSON lines, while it runs.")
+        Path | None, typer.Option("--out", help="Write decisions as JSON lines while it runs.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print what happens at the sensor while it happens. Ctrl-C stops the arm at once."""
+    """Detect slip live on a rig's event stream. Ctrl-C stops the arm at once."""
     from sliplab.flows.detect import detect as run
     from sliplab.flows.detect import make_detect_request
 

@@ -1,8 +1,8 @@
-"""Ends a command that failed: its message for people, its error object for programs, its exit code.
+"""Error reporting of a failed command: message, JSON error object and exit code.
 
-Without ``--json`` an error is one message on standard error. With it, standard output has one
-object as well, unless the command has printed its own before it failed:
-``{"error": {"file", "key", "value", "message", "exit_code"}}``, null where nothing is known.
+Without ``--json`` an error is one message on standard error. With it, one object goes to standard
+output as well, unless the command had already printed its result before it failed:
+``{"error": {"file", "key", "value", "message", "exit_code"}}``, null where unknown.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError, disk_error, disk_fault
 
-INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
+INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _EXPECTED = {
     "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
     "OutputLost", "WorkerKilled",
 }  # fmt: skip
-"""Errors that need no traceback, by name: their modules take long to load."""
+"""Errors that need no traceback, by name: their modules are slow to import."""
 _OPTION = re.compile(r"--[a-z-]+|FOLDER|KIND|TRIAL|URL")
-"""An `InputError` about an option or an argument has its name where others have a file."""
+"""Names of options and arguments: an `InputError` about one has it in place of a file."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Failure:
     Attributes:
         file: the file, folder or URL that is wrong; None where there is none.
         key: the key inside it, or the option or argument.
-        value: what stood there, as written.
-        trace: where the program failed, if the fault is the program's own.
+        value: the offending value, as written.
+        trace: the traceback, if the error is a bug in the program.
     """
 
     message: str
@@ -53,7 +53,7 @@ class Failure:
     trace: str = ""
 
     def report(self) -> int:
-        """Say it to people, and to programs if they asked; returns the exit code."""
+        """Print the message, and with ``--json`` the error object; return the exit code."""
         if self.trace:
             console.say(self.trace)
         if self.message:
@@ -65,22 +65,22 @@ class Failure:
 
     @property
     def interrupted(self) -> bool:
-        """True if nothing failed: somebody stopped the program."""
+        """True if the user stopped the program and nothing failed."""
         return self.exit_code == console.INTERRUPTED
 
 
 def interruption() -> Failure:
-    """Return the failure of a program that somebody stopped."""
+    """Return the failure of a program that the user stopped."""
     return Failure(INTERRUPTED, console.INTERRUPTED)
 
 
 def is_arm_fault(error: Exception) -> bool:
-    """Return whether an arm failed, or could not be stopped: Ctrl-C must not hide that."""
-    return type(error).__name__ == "ArmFault"  # its module takes long to load
+    """Return whether an arm failed or could not be stopped, which Ctrl-C must not hide."""
+    return type(error).__name__ == "ArmFault"  # its module is slow to import
 
 
 def failure(error: Exception) -> Failure:
-    """Return message, subject and exit code of an error."""
+    """Return the message, location and exit code of an error."""
     if isinstance(error, typer.Exit):
         return Failure("", error.exit_code)
     if isinstance(error, typer.Abort):

@@ -24,11 +24,11 @@ def import_(
     store: StoreOption = ...,  # type: ignore[assignment]  # typer's word for: must be given
     name: Annotated[str, typer.Option("--name", help="Name of the new campaign.")] = ...,  # type: ignore[assignment]  # as above
     simulated: Annotated[
-        bool, typer.Option("--simulated", help="The files are of a simulation.")
+        bool, typer.Option("--simulated", help="Mark the trials as simulated.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Import trials of other programs into a campaign of their own; unknown values are marked.
+    """Import recordings of other programs into a new campaign; unknown values are marked.
 
     KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; by default the files' content decides.
     """
@@ -63,15 +63,18 @@ def import_(
 @app.command()
 def export(
     store: StoreArgument,
-    what: Annotated[str, typer.Argument(help="A campaign, or a trial of one.")],
+    what: Annotated[str, typer.Argument(help="A campaign name or a trial id.")],
     output: Annotated[
-        Path, typer.Option("--output", help="A folder; with --labels a .csv, .parquet or .json.")
+        Path,
+        typer.Option(
+            "--output", help="Output folder; with --labels a .csv, .parquet or .json file."
+        ),
     ],
-    form: Annotated[str, typer.Option("--format", help="aedat4 or dsec.")] = "aedat4",
-    labels: Annotated[bool, typer.Option("--labels", help="The labels as a table.")] = False,
+    form: Annotated[str, typer.Option("--format", help="File format: aedat4 or dsec.")] = "aedat4",
+    labels: Annotated[bool, typer.Option("--labels", help="Export the labels as a table.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write trials as files that other programs read, or their labels as a table."""
+    """Export trials in formats of other programs, or their labels as a table."""
     from sliplab.storage.formats.export_trials import SUFFIXES, export_trials, label_table
     from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import write_table
@@ -112,10 +115,12 @@ def export(
 @app.command("export-model")
 def export_model(
     model: Annotated[Path, typer.Argument(help="A trained network: STORE/models/seed0.pt.")],
-    out: Annotated[Path, typer.Option("--out", help="A folder; made if missing.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder; created if missing.")],
     store: Annotated[
         Path | None,
-        typer.Option("--store", help="Whose windows it is checked on; the model's own by default."),
+        typer.Option(
+            "--store", help="Store that provides the test windows; default: the model's own."
+        ),
     ] = None,
     campaign: CampaignOption = None,
     onnx: Annotated[
@@ -124,12 +129,12 @@ def export_model(
     windows: Annotated[
         int,
         typer.Option(
-            "--windows", min=1, max=1_000_000, help="Windows that the ONNX file is checked on."
+            "--windows", min=1, max=1_000_000, help="Number of windows to check the ONNX file on."
         ),
     ] = 256,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a network as ONNX, what it takes on a Speck chip, and its model card."""
+    """Export a network as ONNX, with its resource use on a Speck chip and a model card."""
     from sliplab.flows.detect import load_model
     from sliplab.storage.remote.mirror import open_store
 

@@ -1,4 +1,4 @@
-"""`sliplab review` and `sliplab view`: labels gone through by a person, a trial looked at."""
+"""`sliplab review` and `sliplab view`: manual label review, and one trial in Rerun."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ app = typer.Typer()
 def review(
     store: StoreArgument,
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Of the page; a free one by default.")
+        int, typer.Option("--port", min=0, max=65535, help="Port of the page; default: a free one.")
     ] = 0,
     campaign: CampaignOption = None,
     who: Annotated[
-        str, typer.Option("--who", help="Who reviews; the user's name by default.")
+        str, typer.Option("--who", help="Reviewer's name; default: the login name.")
     ] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Go through the labels in a browser on this computer; Ctrl-C ends it.
+    """Review the labels in a browser on this computer; Ctrl-C ends it.
 
     Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
     """
@@ -53,14 +53,15 @@ def view(
     store: StoreArgument,
     trial: Annotated[str, typer.Argument(help="A trial's id, as in `sliplab trials`.")],
     save: Annotated[
-        Path | None, typer.Option("--save", help="Write an .rrd file instead of opening it.")
+        Path | None,
+        typer.Option("--save", help="Write an .rrd file instead of opening the viewer."),
     ] = None,
     campaign: Annotated[
-        str | None, typer.Option("--campaign", help="Whose trial, where several have it.")
+        str | None, typer.Option("--campaign", help="The campaign, if several contain the trial.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
+    """Show a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
     from sliplab.flows.ui import view as looking
     from sliplab.storage.remote.mirror import open_store
 

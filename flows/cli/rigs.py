@@ -1,4 +1,4 @@
-"""`sliplab rigs`, `teach`, `calibrate`: rig files, their devices, what is measured on a rig."""
+"""`sliplab rigs`, `teach`, `calibrate`: rig files, their devices and their calibration."""
 
 from __future__ import annotations
 
@@ -19,34 +19,46 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
-teach_app = typer.Typer(help="Teach a rig where its plate and its tip are.", **_SETTINGS)  # type: ignore[arg-type]
+teach_app = typer.Typer(
+    help="Teach the contact plane, depth zero and tool centre point.", **_SETTINGS
+)  # type: ignore[arg-type]
 calibrate_app = typer.Typer(help="Calibrate a rig's cameras.", **_SETTINGS)  # type: ignore[arg-type]
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")
 
 OutOption = Annotated[
     Path | None,
-    typer.Option("--out", help="Write to this new file; by default to the rig file itself."),
+    typer.Option("--out", help="Write to this new file; default: the rig file itself."),
 ]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")]
 DryOption = Annotated[
-    bool, typer.Option("--dry-run", help="Print what would move where, and move nothing.")
+    bool, typer.Option("--dry-run", help="Print the planned motions without moving anything.")
 ]
 SpeedOption = Annotated[
-    float, typer.Option("--speed", min=0.01, max=1.0, help="Creeping speed, mm/s.")
+    float, typer.Option("--speed", min=0.01, max=1.0, help="Approach speed near contact, mm/s.")
 ]
 SearchOption = Annotated[
     float,
-    typer.Option("--search", min=0.1, max=50, help="Hard limit beyond the assumed plane, mm."),
+    typer.Option(
+        "--search", min=0.1, max=50, help="Hard limit of travel beyond the assumed plane, mm."
+    ),
 ]
 ClearanceOption = Annotated[
-    float, typer.Option("--clearance", min=0.5, max=50, help="Where creeping begins, mm before it.")
+    float,
+    typer.Option(
+        "--clearance",
+        min=0.5,
+        max=50,
+        help="Distance before the plane at which the slow approach begins, mm.",
+    ),
 ]
 SquareOption = Annotated[
-    float, typer.Option("--square", min=0.5, max=50, help="Side of a printed square, mm: measure.")
+    float, typer.Option("--square", min=0.5, max=50, help="Measured side of a printed square, mm.")
 ]
-ColumnsOption = Annotated[int, typer.Option("--columns", min=0, max=1000, help="Squares across.")]
-RowsOption = Annotated[int, typer.Option("--rows", min=0, max=1000, help="Squares down.")]
+ColumnsOption = Annotated[
+    int, typer.Option("--columns", min=0, max=1000, help="Board squares across.")
+]
+RowsOption = Annotated[int, typer.Option("--rows", min=0, max=1000, help="Board squares down.")]
 
 
 COLUMNS = {"name": "name", "driver": "driver", "arm": "arm", "cameras": "cameras", "answer": "says"}
@@ -56,14 +68,14 @@ COLUMNS = {"name": "name", "driver": "driver", "arm": "arm", "cameras": "cameras
 def rigs(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Rig files (YAML); those that ship are listed without."),
+        typer.Argument(help="Rig files (YAML); default: the built-in ones."),
     ] = None,
     ask: Annotated[
-        bool, typer.Option("--ask", help="See whether each device answers; nothing moves.")
+        bool, typer.Option("--ask", help="Check whether each device responds; nothing moves.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """List rig files: what each names, and with --ask whether it answers."""
+    """List rig files and their devices; with --ask check whether each device responds."""
     from sliplab.rigs.rig_inheritance import shipped_rigs
 
     found = [_about(path, ask) for path in (files or shipped_rigs().values())]
@@ -103,7 +115,7 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
 
 
 def _ask(file: RigFile) -> dict[str, str | None]:
-    """Return by device why it does not answer, None if it does; a rig in use is not disturbed."""
+    """Return for each device why it does not respond, None if it does; skip a rig in use."""
     from sliplab.rigs.core.capabilities import RigError
     from sliplab.rigs.discovery import ping_devices
     from sliplab.rigs.rig_lock import held
@@ -141,7 +153,7 @@ def _cameras(file: RigFile) -> str:
 
 
 class By(StrEnum):
-    """Method to detect a touch."""
+    """Ways to detect a touch."""
 
     EVENTS = "events"
     HAND = "hand"
@@ -157,12 +169,18 @@ class ZeroBy(StrEnum):
 @teach_app.command("plane")
 def teach_plane(
     rig: RigOption,
-    by: Annotated[By, typer.Option("--by", help="Touch off, or jog by hand.")] = By.EVENTS,
+    by: Annotated[
+        By, typer.Option("--by", help="Touch off by event rate, or jog by hand.")
+    ] = By.EVENTS,
     span: Annotated[
         float,
-        typer.Option("--span", min=0, max=1000, help="From the centre to each other point, mm."),
+        typer.Option(
+            "--span", min=0, max=1000, help="Distance of the other points from the centre, mm."
+        ),
     ] = 12.0,
-    repeats: Annotated[int, typer.Option("--repeats", min=1, max=20, help="Touches a point.")] = 2,
+    repeats: Annotated[
+        int, typer.Option("--repeats", min=1, max=20, help="Touches per point.")
+    ] = 2,
     speed: SpeedOption = 0.5,
     search: SearchOption = 2.0,
     clearance: ClearanceOption = 3.0,
@@ -171,7 +189,7 @@ def teach_plane(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the contact plane: touch at the centre, to the right, above, and check by a fourth."""
+    """Find the contact plane from three touches, and check it with a fourth."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
@@ -194,7 +212,9 @@ def teach_zero(
     by: Annotated[ZeroBy, typer.Option("--by", help="Events and markers, or events alone.")] = (
         ZeroBy.BOTH
     ),
-    repeats: Annotated[int, typer.Option("--repeats", min=1, max=50, help="Touches.")] = 3,
+    repeats: Annotated[
+        int, typer.Option("--repeats", min=1, max=50, help="Number of touches.")
+    ] = 3,
     speed: SpeedOption = 0.5,
     search: SearchOption = 2.0,
     clearance: ClearanceOption = 3.0,
@@ -203,7 +223,7 @@ def teach_zero(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find depth zero: touch at the centre, seen by both cameras."""
+    """Find depth zero from touches at the centre, observed by both cameras."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
@@ -220,11 +240,11 @@ def teach_zero(
 @teach_app.command("tool")
 def teach_tool(
     rig: RigOption,
-    poses: Annotated[int, typer.Option("--poses", min=4, max=50, help="How many.")] = 8,
+    poses: Annotated[int, typer.Option("--poses", min=4, max=50, help="Number of poses.")] = 8,
     tool: Annotated[
         str | None,
         typer.Option(
-            "--tool", help="Tool that the controller has now, x,y,z in mm and rotation vector in "
+            "--tool", help="Current tool of the controller, x,y,z in mm and rotation vector in "
             "degrees, from the flange; the rig file's if left out."
         ),
     ] = None,
@@ -233,7 +253,7 @@ def teach_tool(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Find the tool centre point: a person brings the tip onto one point, leaning differently."""
+    """Find the tool centre point by jogging the tip onto one point at different tilts."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
     from sliplab.rigs.build import tool_of
@@ -250,10 +270,12 @@ def teach_tool(
 @calibrate_app.command("lens")
 def calibrate_lens(
     rig: RigOption,
-    views: Annotated[int, typer.Option("--views", min=4, max=60, help="Pictures to take.")] = 8,
+    views: Annotated[int, typer.Option("--views", min=4, max=60, help="Images to take.")] = 8,
     images: Annotated[
         Path | None,
-        typer.Option("--images", help="A folder of pictures instead; the first one is flat."),
+        typer.Option(
+            "--images", help="Use the images of this folder; the first shows the board flat."
+        ),
     ] = None,
     square: SquareOption = 6.0,
     columns: ColumnsOption = 11,
@@ -262,7 +284,7 @@ def calibrate_lens(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate lens and scale of the outside camera by a ChArUco board. Nothing moves."""
+    """Calibrate lens and scale of the outside camera with a ChArUco board. Nothing moves."""
     from sliplab.flows.calibrating import calibrate as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
@@ -282,16 +304,18 @@ def calibrate_lens(
 @calibrate_app.command("crop")
 def calibrate_crop(
     rig: RigOption,
-    depth: Annotated[float, typer.Option("--depth", min=0.2, max=20, help="How deep, mm.")] = 2.4,
+    depth: Annotated[
+        float, typer.Option("--depth", min=0.2, max=20, help="Press depth, mm.")
+    ] = 2.4,
     radius: Annotated[
-        float, typer.Option("--radius", min=0.1, max=3, help="Of the circle, mm.")
+        float, typer.Option("--radius", min=0.1, max=3, help="Radius of the circle, mm.")
     ] = 1.0,
     out: OutOption = None,
     yes: YesOption = False,
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the skin in the event camera's image: press, and move in a circle."""
+    """Locate the skin in the event camera's image by pressing and moving in a circle."""
     from sliplab.flows.calibrating import calibrate as steps
     from sliplab.flows.calibrating.measurement import Measurement, PlannedMove
 
@@ -309,7 +333,7 @@ def calibrate_crop(
 
 @calibrate_app.command("board")
 def calibrate_board(
-    out: Annotated[Path, typer.Option("--out", help="A .pdf or .png file.")] = Path(
+    out: Annotated[Path, typer.Option("--out", help="Output file, .pdf or .png.")] = Path(
         "sliplab-board.pdf"
     ),
     square: SquareOption = 6.0,
@@ -317,7 +341,7 @@ def calibrate_board(
     rows: RowsOption = 7,
     as_json: JsonOption = False,
 ) -> None:
-    """Make the board to print, with its true size on it."""
+    """Write the calibration board to print, with a ruler to check its size."""
     from sliplab.flows.calibrating.calibrate import print_board
 
     board = _board(columns, rows, square)

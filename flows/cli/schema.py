@@ -21,10 +21,8 @@ KINDS = ("protocol", "rig", "trial", "label", "evaluation", "summary")
 
 @app.command()
 def schema(
-    kind: Annotated[str, typer.Argument(help=f"Of which file: {', '.join(KINDS)}.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Write it into this file instead.")
-    ] = None,
+    kind: Annotated[str, typer.Argument(help=f"Kind of file: {', '.join(KINDS)}.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the JSON Schema of a protocol, a rig file or a document in a store."""

@@ -1,4 +1,4 @@
-"""`sliplab sync`, `label`, `train`, `evaluate`, `report`: a step on what is stored."""
+"""`sliplab sync`, `label`, `train`, `evaluate`, `report`: one analysis step on stored data."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Engine(StrEnum):
 
 
 ReviewedOption = Annotated[
-    bool, typer.Option("--reviewed", help="Use what people decided in `sliplab review`.")
+    bool, typer.Option("--reviewed", help="Apply the decisions made in `sliplab review`.")
 ]
 
 
@@ -43,7 +43,7 @@ def sync(
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit the clocks of every trial again and write report/sync.html about them."""
+    """Refit the clocks of every trial and write report/sync.html."""
     result = run_step(located(store), campaign, "sync", dask)
     if as_json:
         console.print_json(result)
@@ -67,7 +67,7 @@ def label(
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the true onsets of every trial from its video, or from the tracks in its place."""
+    """Find the ground-truth onsets of every trial from its video or marker tracks."""
     step(store, campaign, as_json, "label", dask=dask)
 
 
@@ -88,36 +88,39 @@ def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
     margin: Annotated[
-        float | None, typer.Option("--margin", min=0, max=1e6, help="Spikes a winner must lead by.")
+        float | None,
+        typer.Option("--margin", min=0, max=1e6, help="Spikes by which the winner must lead."),
     ] = None,
     smoothing: Annotated[
-        int | None, typer.Option("--smoothing", min=1, max=1000, help="Windows to average over.")
+        int | None,
+        typer.Option("--smoothing", min=1, max=1000, help="Number of windows to average."),
     ] = None,
     reviewed: ReviewedOption = False,
     baselines: Annotated[
-        bool, typer.Option("--baselines", help="Also train other methods to compare (minutes).")
+        bool,
+        typer.Option("--baselines", help="Also train baseline methods for comparison (minutes)."),
     ] = False,
     checks: Annotated[
-        bool, typer.Option("--checks", help="Fail if permuted or shuffled labels show a fault.")
+        bool, typer.Option("--checks", help="Fail if permuted or shuffled labels reveal a fault.")
     ] = False,
     model: Annotated[
         Path | None,
         typer.Option(
             "--model",
-            help="Score this in place of the store's: a model file, or a Sinabs state_dict with "
-            "its description.",
+            help="Score this model instead of the store's: a model file or a Sinabs state_dict "
+            "with its description.",
         ),
     ] = None,
     engine: Annotated[
         Engine | None,
         typer.Option(
-            "--engine", help="Of --model: fast by default where it counts as Sinabs does."
+            "--engine", help="Engine for --model; default: fast where its counts equal Sinabs'."
         ),
     ] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Score the network on trials it has never seen."""
+    """Score the network on the test trials."""
     options: dict[str, Any] = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
     if model is None and engine is not None:
         raise InputError("--engine", "", engine.value, "belongs to --model")
@@ -178,7 +181,7 @@ def report(
     campaign: CampaignOption = None,
     against: Annotated[
         Path | None,
-        typer.Option("--against", help="Another store or its summary.json: what changed."),
+        typer.Option("--against", help="Another store or its summary.json to compare with."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`sliplab trials`, `verify`, `migrate`, `push` and `pull`: a store, here and on shared storage."""
+"""`sliplab trials`, `verify`, `migrate`, `push` and `pull`: local and remote stores."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SHOWN = (
 def trials(
     store: PlaceArgument,
     where: Annotated[
-        str | None, typer.Option("--where", help="Only rows for which this holds.")
+        str | None, typer.Option("--where", help="Filter rows by an expression: depth_mm == 3.")
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", help="Write a .csv, .parquet or .json file instead.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the catalogue of committed trials, and the trials that were set aside, with causes."""
+    """List committed trials, and quarantined or skipped ones with their causes."""
     from sliplab.flows.planning.campaign_trials import all_excluded, print_excluded
     from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import catalogue, query
@@ -89,11 +89,11 @@ def verify(
     store: PlaceArgument,
     quarantine: Annotated[
         bool,
-        typer.Option("--quarantine", help="Move damaged trials to quarantine, to be taken again."),
+        typer.Option("--quarantine", help="Move damaged trials to quarantine, to be retaken."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check every checksum, count and clock of a store; changes nothing without --quarantine."""
+    """Check every checksum, count and clock of a store; read-only unless --quarantine."""
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
     from sliplab.storage.trials.verify import quarantine_damaged, trial_folders
@@ -137,7 +137,7 @@ def verify(
 
 @app.command()
 def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
-    """Bring a store of an older version to this one's format; copies of what changes are kept.
+    """Migrate an older store to the current format; changed files are backed up first.
 
     `collect` does the same before it begins.
     """
@@ -163,10 +163,10 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
 
 
 UrlArgument = Annotated[
-    str, typer.Argument(help="Where pushed stores are: s3://bucket/folder, file:///shared/folder.")
+    str, typer.Argument(help="URL of the remote store: s3://bucket/folder, file:///shared/folder.")
 ]
 QuarantineOption = Annotated[
-    bool, typer.Option("--quarantine", help="Also the quarantine, with its causes.")
+    bool, typer.Option("--quarantine", help="Include quarantined trials and their causes.")
 ]
 FOLLOW_S = 30.0
 """Period of `push --follow`, s."""
@@ -179,20 +179,23 @@ def push(
     campaign: CampaignOption = None,
     quarantine: QuarantineOption = False,
     follow: Annotated[
-        bool, typer.Option("--follow", help="Go on until the collection that runs has ended.")
+        bool, typer.Option("--follow", help="Keep pushing until the running collection has ended.")
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Read what is there, and send damaged files again.")
+        bool, typer.Option("--check", help="Read the remote files back and resend damaged ones.")
     ] = False,
     sizes_only: Annotated[
-        bool, typer.Option("--sizes-only", help="Do not read back what was sent.")
+        bool, typer.Option("--sizes-only", help="Check sizes only; do not read sent files back.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Also trials of which there is another store's take.")
+        bool,
+        typer.Option(
+            "--replace", help="Replace trials of the same name pushed from another store."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Send committed trials to shared or object storage; run it again to send what is new.
+    """Upload committed trials to shared or object storage; rerun to upload new ones.
 
     It may run while trials are taken. Keys and addresses of servers come from the environment.
     """
@@ -229,12 +232,12 @@ def push(
 @app.command()
 def pull(
     url: UrlArgument,
-    store: Annotated[Path, typer.Argument(help="The store's folder; made if missing.")],
+    store: Annotated[Path, typer.Argument(help="The store's folder; created if missing.")],
     campaign: CampaignOption = None,
     quarantine: QuarantineOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Download pushed trials into a store, each checked; run it again to get new ones."""
+    """Download pushed trials into a store and check each one; rerun to get new ones."""
     from sliplab.storage.remote.objects import Remote
     from sliplab.storage.remote.pull import pull as pull_trials
 
@@ -252,7 +255,7 @@ def pull(
 
 
 def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
-    """Verify what was pushed to a URL; everything there is read.
+    """Verify a pushed store at a URL by reading all of it.
 
     Raises:
         InputError: `quarantine` was given; a URL has none.

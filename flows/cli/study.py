@@ -1,4 +1,4 @@
-"""`sliplab study` and `demo`: the whole chain from a rig to the report."""
+"""`sliplab study` and `demo`: the whole pipeline from a rig to the report."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ app = typer.Typer()
 
 @app.command()
 def study(
-    folder: Annotated[Path, typer.Argument(help="The study's store; made if missing.")],
+    folder: Annotated[Path, typer.Argument(help="The study's store; created if missing.")],
     rig: RigOption = Path("rehearsal"),
-    pilot: Annotated[bool, typer.Option("--pilot", help="The small protocols.")] = False,
+    pilot: Annotated[bool, typer.Option("--pilot", help="Use the small pilot protocols.")] = False,
     protocol: Annotated[
         list[Path] | None,
-        typer.Option(help="Your own protocols in place of those that ship; may be repeated."),
+        typer.Option(help="Your own protocol instead of the built-in ones. Repeatable."),
     ] = None,
     extra: Annotated[
-        bool, typer.Option(help="Also the disturbance of 125 % that the paper left out.")
+        bool, typer.Option(help="Include the 125 % disturbance that the paper left out.")
     ] = True,
     check_labels: Annotated[
         int,
         typer.Option(
             min=0,
             max=1_000_000,
-            help="Trials to take again with video, to check labels of tracks by.",
+            help="Trials to repeat with video, to check the labels from marker tracks.",
         ),
     ] = LABELS_CHECKED,
     holdout: Annotated[
@@ -41,7 +41,7 @@ def study(
         typer.Option(
             min=0,
             max=1_000_000,
-            help="Trials of another simulated skin that choose nothing, judged once a version; "
+            help="Trials of the hold-out campaign, evaluated once per version; default: "
             "144 with the protocols that ship, else 0.",
         ),
     ] = None,
@@ -49,15 +49,15 @@ def study(
         bool,
         typer.Option(
             "--searches",
-            help="Also other methods, the scene's guesses, speed against error; takes hours.",
+            help="Also run baselines, generalisation, sensitivity and trade-off sweeps (hours).",
         ),
     ] = False,
     status: Annotated[
-        bool, typer.Option("--status", help="Only print its progress, from any terminal.")
+        bool, typer.Option("--status", help="Print the study's progress and exit.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the whole chain: collect, sync, label, train, evaluate, report. Run again to resume."""
+    """Run the whole pipeline: collect, sync, label, train, evaluate, report. Rerun to resume."""
     if status:
         _status(folder, as_json)
         return
@@ -83,11 +83,13 @@ def _status(folder: Path, as_json: bool) -> None:
 
 @app.command()
 def demo(
-    folder: Annotated[Path, typer.Argument(help="Where its store goes.")] = Path("sliplab-demo"),
+    folder: Annotated[Path, typer.Argument(help="Folder for the demo's store.")] = Path(
+        "sliplab-demo"
+    ),
     rig: RigOption = Path("rehearsal"),
     as_json: JsonOption = False,
 ) -> None:
-    """Run the pilot study on the simulated rig and say where the report is."""
+    """Run the pilot study on the simulated rig and print the report's path."""
     if rig == Path("rehearsal"):
         console.say(
             "The demo's outside camera hands over simulated tracks of the markers, no video; "
@@ -105,7 +107,7 @@ def _chain(
     more: bool = False,
     holdout: int = 0,
 ) -> None:
-    """Run the whole chain and print its results."""
+    """Run the whole pipeline and print its results."""
     from sliplab.flows.planning.run_request import check_disk, make_request
 
     run_requests = [make_request(file, rig, folder, enable=on) for file, on in protocols.items()]

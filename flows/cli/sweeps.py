@@ -35,13 +35,14 @@ def tradeoff(
         Path | None, typer.Option("--scene", help="The protocol whose scene is simulated (YAML).")
     ] = None,
     detector: Annotated[
-        str | None, typer.Option("--detector", help="A labelled store whose detector is varied.")
+        str | None,
+        typer.Option("--detector", help="A labelled store whose detector settings are varied."),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help=f"Folder for page and numbers; {SCENE_OUT} or the store's report/ by default.",
+            help=f"Output folder; default: {SCENE_OUT} or the store's report/.",
         ),
     ] = None,
     trials: Annotated[
@@ -50,14 +51,14 @@ def tradeoff(
             "--trials",
             min=1,
             max=1_000_000,
-            help="Trials to simulate (4); or validation and test trials to judge by (60 each).",
+            help="Scene: trials to simulate (4). Detector: validation and test trials (60 each).",
         ),
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="Scene: a rig file or name; mock by default.")
+        Path | None, typer.Option("--rig", help="Scene: a rig file or name; default: mock.")
     ] = None,
     sensitivity: Annotated[
-        bool, typer.Option("--sensitivity", help="Scene: also what each guessed number changes.")
+        bool, typer.Option("--sensitivity", help="Scene: also vary each assumed parameter.")
     ] = False,
     dask: DaskOption = None,
     samples: Annotated[
@@ -66,19 +67,20 @@ def tradeoff(
             "--samples",
             min=3,
             max=1_000_000_000,
-            help="Detector: windows of each training (12000).",
+            help="Detector: windows per training (12000).",
         ),
     ] = None,
     epochs: Annotated[
         int | None,
-        typer.Option("--epochs", min=1, max=10_000, help="Detector: of each training (4)."),
+        typer.Option("--epochs", min=1, max=10_000, help="Detector: epochs per training (4)."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", min=1, max=1000, help="Detector: of each setting (3).")
+        int | None,
+        typer.Option("--seeds", min=1, max=1000, help="Detector: seeds per setting (3)."),
     ] = None,
     stride: Annotated[
         int | None,
-        typer.Option("--stride", min=1, max=1000, help="Detector: the finest stride, ms (10)."),
+        typer.Option("--stride", min=1, max=1000, help="Detector: the smallest stride, ms (10)."),
     ] = None,
     length: Annotated[
         list[int] | None,
@@ -86,29 +88,25 @@ def tradeoff(
             "--length",
             min=0,
             max=10_000,
-            help="Detector: a window length in milliseconds. Repeatable.",
+            help="Detector: window length, ms. Repeatable.",
         ),
     ] = None,
     step: Annotated[
         list[int] | None,
-        typer.Option(
-            "--step", min=0, max=10_000, help="Detector: a step in milliseconds. Repeatable."
-        ),
+        typer.Option("--step", min=0, max=10_000, help="Detector: time step, ms. Repeatable."),
     ] = None,
     pool: Annotated[
         list[int] | None,
-        typer.Option(
-            "--pool", min=0, max=10_000, help="Detector: a cell's side in pixels. Repeatable."
-        ),
+        typer.Option("--pool", min=0, max=10_000, help="Detector: cell size, pixels. Repeatable."),
     ] = None,
     width: Annotated[
         list[float] | None,
         typer.Option(
-            "--width", min=0, max=1000, help="Detector: a factor on channels. Repeatable."
+            "--width", min=0, max=1000, help="Detector: width multiplier of the layers. Repeatable."
         ),
     ] = None,
     full: Annotated[
-        bool, typer.Option("--full", help="Detector: every value with every other.")
+        bool, typer.Option("--full", help="Detector: run the full grid of values.")
     ] = False,
     minutes: Annotated[
         float | None,
@@ -116,17 +114,18 @@ def tradeoff(
             "--minutes",
             min=0,
             max=100_000,
-            help="Detector: begin no training after so many; 0: only the page.",
+            help="Detector: start no training after this many minutes; 0: only write the page.",
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Detector: only say what is to do and how long.")
+        bool,
+        typer.Option("--dry-run", help="Detector: only print the pending runs and their duration."),
     ] = False,
     campaign: CampaignOption = None,
     reviewed: ReviewedOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure what accuracy costs: of simulating a scene, or of the detector on a store."""
+    """Measure the cost of accuracy: of a simulated scene, or of the detector on a store."""
     if (scene is None) == (detector is None):
         raise InputError(
             "--scene", "", None, "give exactly one of --scene PROTOCOL and --detector STORE"
@@ -223,26 +222,29 @@ def generalise(
     ] = None,
     level: Annotated[
         list[str] | None,
-        typer.Option("--level", help="Leave out this level, such as '0 deg'. Repeatable."),
+        typer.Option("--level", help="Leave this level out, such as '0 deg'. Repeatable."),
     ] = None,
     every: Annotated[
-        bool, typer.Option("--all", help="Leave out each level in turn; else each factor's lowest.")
+        bool,
+        typer.Option("--all", help="Leave out every level in turn; default: each factor's lowest."),
     ] = False,
     skins: Annotated[
         int | None,
-        typer.Option("--skins", min=0, max=1000, help="Other skins of a simulated rig (5)."),
+        typer.Option("--skins", min=0, max=1000, help="Number of other simulated skins (5)."),
     ] = None,
     trials: Annotated[
-        int, typer.Option("--trials", min=1, max=1_000_000, help="On each other skin.")
+        int, typer.Option("--trials", min=1, max=1_000_000, help="Trials per other skin.")
     ] = 36,
     epochs: Annotated[
         int | None,
-        typer.Option("--epochs", min=1, max=10_000, help="Of each training; the protocol's."),
+        typer.Option(
+            "--epochs", min=1, max=10_000, help="Epochs per training; default: the protocol's."
+        ),
     ] = None,
     campaign: CampaignOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Train without a level and test on it; test the network on other simulated skins."""
+    """Test the network on levels left out of training and on other simulated skins."""
     store, campaigns = _opened(folder, campaign)
     from sliplab.analysis.sweeps.generalisation import COLUMNS, row_cells
     from sliplab.flows.generalise import measure_generalisation
@@ -264,15 +266,15 @@ def guesses(
     folder: StoreArgument,
     guess: Annotated[
         list[str] | None,
-        typer.Option("--guess", help="Only this parameter of the scene. Repeatable."),
+        typer.Option("--guess", help="Only this assumed parameter of the scene. Repeatable."),
     ] = None,
     trials: Annotated[
-        int, typer.Option("--trials", min=2, max=1_000_000, help="Test trials of each campaign.")
+        int, typer.Option("--trials", min=2, max=1_000_000, help="Test trials per campaign.")
     ] = 20,
     campaign: CampaignOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Repeat some test trials with each assumed parameter 20 % lower and higher, and evaluate."""
+    """Evaluate some test trials again with each assumed scene parameter 20 % lower and higher."""
     store, campaigns = _opened(folder, campaign)
     from sliplab.analysis.sweeps.sensitivity import FIGURES, UNITS
     from sliplab.flows.guesses import GUESSES, measure_guesses
@@ -303,16 +305,19 @@ def guesses(
 def holdout(
     folder: StoreArgument,
     trials: Annotated[
-        int, typer.Option("--trials", min=2, max=1_000_000, help="Spread over the conditions.")
+        int,
+        typer.Option(
+            "--trials", min=2, max=1_000_000, help="Number of trials, spread over the conditions."
+        ),
     ] = HELD_OUT,
     again: Annotated[
         bool,
-        typer.Option("--again", help="Also where this version of SlipLab judged it already."),
+        typer.Option("--again", help="Evaluate even if this version of SlipLab already has."),
     ] = False,
     campaign: CampaignOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Judge the network once on another simulated skin and seed, which choose nothing."""
+    """Evaluate the network once on a hold-out campaign: another simulated skin and seed."""
     store, campaigns = _opened(folder, campaign)
     from sliplab.analysis.report.holdout import COLUMNS, holdout_part, holdout_rows
     from sliplab.flows.holdout import measure_holdout
@@ -327,7 +332,7 @@ def holdout(
 
 
 def _opened(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:
-    """Return a store and its campaigns; what imports Prefect comes after."""
+    """Return a store and its campaigns, before anything imports Prefect."""
     from sliplab.analysis.campaigns import collected
     from sliplab.storage.remote.mirror import open_store
 
