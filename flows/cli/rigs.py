@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
-teach_app = typer.Typer(
-    help="Teach the contact plane, depth zero and tool centre point.", **_SETTINGS
-)  # type: ignore[arg-type]
+teach_app = typer.Typer(help="Teach plane, depth zero and tool of a rig.", **_SETTINGS)  # type: ignore[arg-type]
 calibrate_app = typer.Typer(help="Calibrate a rig's cameras.", **_SETTINGS)  # type: ignore[arg-type]
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")
