@@ -8,7 +8,7 @@ later (docs/decisions/0002). All times are int64.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -106,6 +106,36 @@ class FrameChunk:
 
 
 @dataclass(frozen=True)
+class WrenchChunk:
+    """Forces and torques of one sensor in its own axes, n of them; a chunk of a named stream."""
+
+    KIND: ClassVar[str] = "wrench"
+
+    t_ns: I64
+    """Sensor's clock, nanoseconds, shape (n,)."""
+    host_ns: I64
+    """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
+    force_n: F64
+    """Force along the sensor's axes, newtons, shape (n, 3)."""
+    torque_nm: F64
+    """Torque about the sensor's axes, newton metres, shape (n, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @staticmethod
+    def empty() -> WrenchChunk:
+        """A chunk without rows."""
+        none = np.empty(0, np.int64)
+        return WrenchChunk(none, none, np.empty((0, 3)), np.empty((0, 3)))
+
+
+StreamChunk = WrenchChunk
+"""Chunks that a named stream may be made of; `storage.trials.hdf5_writer.STREAMS` has the columns
+of each."""
+
+
+@dataclass(frozen=True)
 class StepTimes:
     """Start and end of one step of the motion program, on the arm's controller clock."""
 
@@ -160,6 +190,9 @@ class Sink(Protocol):
     def add_frames(self, chunk: FrameChunk) -> None:
         """Append frames."""
 
+    def add_stream(self, name: str, chunk: StreamChunk) -> None:
+        """Append to the stream of this name, which keeps the kind of its first chunk."""
+
 
 class NullSink:
     """A sink that drops every stream; a subclass takes some of them."""
@@ -169,6 +202,9 @@ class NullSink:
 
     add_events = add_event_pulses = add_arm_pulses = add_sync_pulses = _drop
     add_exposures = add_box_reads = add_frame_camera_reads = add_poses = add_frames = _drop
+
+    def add_stream(self, name: str, chunk: Any) -> None:
+        """Drop a chunk of a named stream."""
 
 
 Json = dict[str, Any]

@@ -154,11 +154,13 @@ class Clocks(Part):
     """Reasons why devices have no clock, by device."""
     pieces: dict[str, list[DeviceRecord | str]] = Field(default_factory=dict)
     """Of a device that restarted within the trial: each piece, or why it was not fitted."""
+    streams: dict[str, DeviceRecord] = Field(default_factory=dict)
+    """Clocks of the named streams; written only where there are any."""
 
     def devices(self) -> dict[str, DeviceRecord]:
-        """The clocks that are known, by device."""
+        """The clocks that are known, by device; named streams after the devices."""
         found = ((name, getattr(self, name)) for name in DEVICES)
-        return {name: known for name, known in found if known is not None}
+        return {name: clock for name, clock in found if clock is not None} | self.streams
 
     def against_events_ns(self, device: str) -> float | None:
         """Return the uncertainty of events against a device, ns; None where it is unknown.
@@ -212,6 +214,17 @@ class Imported(Part):
     warnings: tuple[str, ...] = ()
 
 
+class StreamRecord(Part):
+    """A named stream of the trial."""
+
+    kind: str
+    """Its kind: `wrench`."""
+    rows: Int
+    to_plate: tuple[tuple[Number, Number, Number], ...] | None = None
+    """Of a wrench: rows of the matrix from its axes to those of the plate (x right, y up, z into
+    the plate), such that the product is the force on the plate; null where it is unknown."""
+
+
 class TrialRecord(Document):
     """The record of one attempt at a trial."""
 
@@ -244,6 +257,8 @@ class TrialRecord(Document):
     simulation_truth: dict[str, Any] | None = None
     """Of a simulated trial: its true onsets and clocks."""
     imported: Imported | None = None
+    streams: dict[str, StreamRecord] = Field(default_factory=dict)
+    """Named streams besides those counted, by name; written only where there are any."""
 
     @classmethod
     def parse(cls, data: Json, path: Path) -> TrialRecord:

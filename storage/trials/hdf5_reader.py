@@ -22,20 +22,28 @@ from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
     PoseChunk,
+    WrenchChunk,
 )
 from sliplab.storage.trials.hdf5_writer import (
     COLUMNS,
     INDEX,
     INDEX_CUT_FORMAT,
+    KIND_ATTRIBUTE,
     OFFSET,
+    STREAM_GROUP,
+    STREAM_NAME,
+    STREAMS,
     TIMES,
     TIMING,
     TRACKS,
     Array,
 )
 
+MOST_STREAMS = 64
+"""Named streams that are read of one trial; a file with more is none of ours."""
 _BLOCK = 1 << 15
 _FEW = 16
+_MOST_KIND = 64
 _CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
 """Cache of unpacked chunks, a column. A chunk of events fits; with more than the processor's own
 cache holds, every chunk would go through main memory."""
@@ -84,6 +92,48 @@ class RowFile:
         values = np.empty(found.shape, found.dtype)
         found.read(values)
         return [int(value) for value in values]
+
+    def streams(self) -> dict[str, str]:
+        """Return the kind of every named stream, by name; it is ``""`` where it is unknown.
+
+        Raises:
+            ValueError: a stream points out of the file, has a wrong name, or there are too many.
+        """
+        group = STREAM_GROUP.encode()
+        if not self._file.links.exists(group):
+            return {}
+        found = self._group(STREAM_GROUP)
+        if found.get_num_objs() > MOST_STREAMS:
+            raise ValueError(f"{self.path}: has more than {MOST_STREAMS} named streams")
+        names = sorted(name.decode("utf-8", "replace") for name in found)
+        for name in names:
+            if not STREAM_NAME.fullmatch(name):
+                raise ValueError(f"{self.path}: a stream has the name {name!r}")
+        return {name: self._kind(self._group(f"{STREAM_GROUP}/{name}")) for name in names}
+
+    def _group(self, name: str) -> Any:
+        at = b""
+        for part in name.encode().split(b"/"):
+            at += b"/" + part
+            if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
+                raise ValueError(f"{self.path}: {name} points out of the file")
+        found = h5py.h5o.open(self._file, at)
+        if not isinstance(found, h5py.h5g.GroupID):
+            raise ValueError(f"{self.path}: {name} is no group")
+        return found
+
+    @staticmethod
+    def _kind(group: Any) -> str:
+        """Return a stream's kind; ``""`` where it says none that is known."""
+        if not h5py.h5a.exists(group, KIND_ATTRIBUTE.encode()):
+            return ""
+        found = h5py.h5a.open(group, KIND_ATTRIBUTE.encode())
+        if found.dtype.kind != "S" or found.shape != () or found.dtype.itemsize > _MOST_KIND:
+            return ""
+        value = np.empty((), found.dtype)
+        found.read(value)
+        kind = bytes(value.item()).decode("ascii", "replace")
+        return kind if kind in STREAMS else ""
 
     def has(self, name: str) -> bool:
         """Return whether there is a column of this name."""
@@ -262,6 +312,31 @@ class StreamReader:
         """Return all arm poses."""
         return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
 
+    def streams(self) -> dict[str, str]:
+        """Return the kind of every named stream, by name; ``""`` for one that is unknown.
+
+        Raises:
+            ValueError: what is there is no stream of ours.
+        """
+        return self._file.streams()
+
+    def wrenches(self, name: str) -> WrenchChunk:
+        """Return all forces and torques of a named stream; empty where the trial has none.
+
+        Raises:
+            ValueError: the stream is of another kind.
+        """
+        kind = self._file.streams().get(name)
+        if kind is None:
+            return WrenchChunk.empty()
+        if kind != WrenchChunk.KIND:
+            raise ValueError(f"{self._file.path}: stream '{name}' is of kind '{kind}', no wrench")
+        columns = STREAMS[kind]
+        return WrenchChunk(**{
+            field: self.column(f"{STREAM_GROUP}/{name}/{part}")
+            for part, (field, _) in columns.items()
+        })  # fmt: skip
+
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""
         values = self._file.rows(name).read()
@@ -276,4 +351,18 @@ class StreamReader:
         return {
             name: len(self._file.rows(name)) if self.has(name) else 0
             for name in (*COLUMNS, *TRACKS, *TIMING)
+        }
+
+    def stream_counts(self) -> dict[str, dict[str, int]]:
+        """Count the rows of every column of the named streams, by stream and column.
+
+        Raises:
+            KeyError: a column is missing.
+        """
+        return {
+            name: {
+                part: len(self._file.rows(f"{STREAM_GROUP}/{name}/{part}"))
+                for part in STREAMS.get(kind, {})
+            }
+            for name, kind in self._file.streams().items()
         }

@@ -18,6 +18,7 @@ index that ends before the last event (docs/decisions/0067).
 from __future__ import annotations
 
 import os
+import re
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -32,6 +33,7 @@ from sliplab.storage.streams import (
     I64,
     EventChunk,
     FrameChunk,
+    StreamChunk,
 )
 
 Array = npt.NDArray[Any]
@@ -79,6 +81,18 @@ TIMING: dict[str, Kind] = {
     "triggers/t": ("int64", (), "ns of the event camera's clock"),
     "triggers/kind": ("uint8", (), "what the event camera noted, as AEDAT4 numbers it"),
 }
+STREAMS: dict[str, dict[str, tuple[str, Kind]]] = {
+    "wrench": {
+        "t": ("t_ns", ("int64", (), "ns of the sensor's clock")),
+        "host": ("host_ns", ("int64", (), "ns of the host's monotonic clock")),
+        "force": ("force_n", ("float64", (3,), "N along the sensor's axes")),
+        "torque": ("torque_nm", ("float64", (3,), "N m about the sensor's axes")),
+    },
+}
+"""By kind of a named stream: its columns, each with the field of its chunks. A stream is the group
+``streams/NAME`` with its kind as an attribute, only there once something came."""
+STREAM_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+STREAM_GROUP, KIND_ATTRIBUTE = "streams", "kind"
 TIMES = "events/t"
 WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
 """The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
@@ -201,6 +215,7 @@ class StreamFile:
         self._last_us: int | None = None
         self._next_ms = 0
         self._wide = False
+        self._kinds: dict[str, str] = {}
         self._columns = {name: Column(self._file, name) for name in (*COLUMNS, INDEX)}
 
     @property
@@ -260,6 +275,28 @@ class StreamFile:
             if name not in self._columns:
                 self._create(name, TIMING[name])
             self._columns[name].append(values)
+
+    def add_stream(self, name: str, chunk: StreamChunk) -> None:
+        """Append rows to a named stream, which is made when its first row comes.
+
+        Raises:
+            ValueError: the name is no small identifier, or the stream is of another kind.
+        """
+        if not STREAM_NAME.fullmatch(name):
+            raise ValueError(f"stream '{name}': a name must match {STREAM_NAME.pattern}")
+        kind, columns = chunk.KIND, STREAMS[chunk.KIND]
+        known = self._kinds.setdefault(name, kind)
+        if known != kind:
+            raise ValueError(f"stream '{name}': is of kind '{known}', not '{kind}'")
+        if not len(chunk):
+            return
+        group = f"{STREAM_GROUP}/{name}"
+        if f"{group}/t" not in self._columns:
+            for part, (_, column) in columns.items():
+                self._create(f"{group}/{part}", column)
+            self._file[group].attrs[KIND_ATTRIBUTE] = np.bytes_(kind)
+        for part, (field, _) in columns.items():
+            self._columns[f"{group}/{part}"].append(getattr(chunk, field))
 
     def add_tracks(self, chunk: FrameChunk) -> None:
         """Append the marker positions that a camera returns instead of its frames.

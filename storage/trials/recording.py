@@ -14,7 +14,7 @@ from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.trial import Clocks, SyncResult, TrialRecord
-from sliplab.storage.streams import F64, I64, U8, EventChunk
+from sliplab.storage.streams import F64, I64, U8, EventChunk, WrenchChunk
 from sliplab.storage.trials.checksums import (
     DATA,
     FRAMES,
@@ -260,6 +260,22 @@ class Recording:
         ]
         with self.open() as reader:
             return reader.events(*bounds)
+
+    def wrenches(self, name: str = "force") -> WrenchChunk:
+        """Forces and torques of a named stream, on the sensor's own clock and in its own axes.
+
+        Raises:
+            StoreError: the trial has no such stream; the message lists those that it has.
+        """
+        streams = self.record.streams
+        known = [key for key, stream in streams.items() if stream.kind == WrenchChunk.KIND]
+        if name not in known:
+            raise StoreError(
+                f"{self.folder}: the trial has no wrenches '{name}'; it has: "
+                f"{', '.join(sorted(known)) or 'none'}"
+            )
+        with self.open() as reader:
+            return reader.wrenches(name)
 
     def frame_times(self) -> I64:
         """Middle of exposure of every frame on the time line, ns."""

@@ -26,7 +26,7 @@ from sliplab.storage.trials.checksums import (
     to_fetch,
 )
 from sliplab.storage.trials.hdf5_reader import StreamReader
-from sliplab.storage.trials.hdf5_writer import TIMING, TRACKS
+from sliplab.storage.trials.hdf5_writer import STREAM_GROUP, TIMING, TRACKS
 from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
 from sliplab.storage.trials.video import count_frames
 
@@ -202,6 +202,7 @@ def _contents(folder: Path) -> Found:
         for name in ("events/t", "event_pulses/t", "sync_pulses/t", "poses/t", "frames/t", *made):
             if np.any(np.diff(reader.column(name)) < 0):
                 problems.append((folder / DATA, f"{name} runs backwards"))
+        problems += _stream_problems(folder, reader, record)
     found = {
         "events": counts["events/t"],
         "frames": counts["frames/t"],
@@ -215,6 +216,31 @@ def _contents(folder: Path) -> Found:
     problems += _frame_problems(folder, tracks, counts)
     if not record.quality.passed:
         problems.append((folder / RECORD, "was committed although a gate failed"))
+    return problems
+
+
+def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) -> Found:
+    """Check the named streams: those that the record counts, whole, and in order of time."""
+    kinds, counts = reader.streams(), reader.stream_counts()
+    problems: Found = []
+    for name in sorted(kinds.keys() | record.streams.keys()):
+        path = f"{STREAM_GROUP}/{name}"
+        said = record.streams.get(name)
+        if said is None or name not in kinds:
+            where = "the record" if said is None else "the file"
+            problems.append((folder / DATA, f"{path} is not in {where}"))
+            continue
+        if kinds[name] != said.kind:
+            what = f"{path} is of kind '{kinds[name]}', the record says '{said.kind}'"
+            problems.append((folder / DATA, what))
+            continue
+        problems += [
+            (folder / DATA, f"{count} rows of {path}/{part}, the record says {said.rows}")
+            for part, count in counts[name].items()
+            if count != said.rows
+        ]
+        if np.any(np.diff(reader.column(f"{path}/t")) < 0):
+            problems.append((folder / DATA, f"{path}/t runs backwards"))
     return problems
 
 

@@ -29,6 +29,7 @@ from sliplab.storage.streams import (
     Json,
     PoseChunk,
     PulseChunk,
+    StreamChunk,
 )
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
@@ -141,6 +142,10 @@ class TrialWriter:
             if self._video is None:
                 self._video = VideoWriter(self.folder / FRAMES, *self._frame_px, self._rate_hz)
             self._video.write(chunk.images)
+
+    def add_stream(self, name: str, chunk: StreamChunk) -> None:
+        """Append to a named stream. Raises ValueError for another kind than it began with."""
+        self._streams.add_stream(name, chunk)
 
     def seal(self) -> Path:
         """Finish data and video files, so that they can be read before the commit.

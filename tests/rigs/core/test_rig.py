@@ -15,7 +15,14 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.storage.streams import (
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    PoseChunk,
+    PulseChunk,
+    StreamChunk,
+)
 from tests.conftest import ROOT, SMALL
 
 RIG: dict[str, Any] = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
@@ -67,6 +74,10 @@ class Memory:
         self._keep("frame numbers", chunk.number)
         self._keep("frame times", chunk.t_ns)
         self._keep("frames", chunk.images)
+
+    def add_stream(self, name: str, chunk: StreamChunk) -> None:
+        self._keep(f"{name} times", chunk.t_ns)
+        self._keep(f"{name} forces", chunk.force_n)
 
     def all(self, name: str) -> np.ndarray:
         return np.concatenate(self.parts[name])
