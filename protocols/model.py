@@ -78,6 +78,13 @@ class Collection(StrictModel):
         self._check_motion()
         return self
 
+    def bindings(self) -> list[tuple[str, FactorRef]]:
+        """Each ``$name`` of motion and plate, with the key that it stands at."""
+        return [
+            *_references_in(self.motion, "collection.motion"),
+            *_references_in(self.plate, "collection.plate"),
+        ]
+
     def _check_references(self) -> None:
         if self.references is None:
             if self.gates.reference is not None:
@@ -136,21 +143,19 @@ class Collection(StrictModel):
             fail("cannot hold before the approach")
         if ("plate" in names) != (self.plate is not None):
             fail("phases 'plate' and the section 'plate' belong together")
-        references = [
-            *_references_in(self.motion, "collection.motion"),
-            *_references_in(self.plate, "collection.plate"),
-        ]
+        references = self.bindings()
         used = {str(ref) for _, ref in references}
         for key, ref in references:
             if ref.factor not in self.factors:
                 raise KeyedError(key, ref, unknown_factor(str(ref), self.factors))
-        for _, each in references:
+        for key, each in references:
             unit = self.factors[each.factor].unit
             if unit is not None and unit != each.unit:
                 raise KeyedError(
                     f"collection.factors.{each.factor}.unit",
                     unit,
-                    f"must be {each.unit or 'left out, with words as levels'} where {each} stands",
+                    f"must be {each.unit or 'left out, with words as levels'} where {each} stands "
+                    f"({key})",
                 )
         for name in self.factors:
             if f"${name}" not in used:

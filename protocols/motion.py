@@ -25,7 +25,7 @@ from sliplab.protocols.phases import (
     Slide,
 )
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
-from sliplab.protocols.quantity import FactorRef, canonical
+from sliplab.protocols.quantity import FactorRef, canonical, check_least
 from sliplab.protocols.yaml_file import KeyedError
 
 Condition = Mapping[str, Level]
@@ -52,7 +52,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
     acting = next(i for i, phase in enumerate(motion) if isinstance(phase, (Slide, Retract)))
     holds = [i for i, phase in enumerate(motion) if isinstance(phase, Hold) and i < acting]
     approach = next(phase for phase in motion if isinstance(phase, Approach))
-    home = Position(0.0, 0.0, -float(approach.clearance))
+    home = Position(0.0, 0.0, -_value(approach.clearance, condition))
     start_xy = (0.0, 0.0)
     if isinstance(motion[acting], Slide):
         half = _half_slide(motion[acting], condition)
@@ -62,15 +62,16 @@ def build_program(collection: Collection, condition: Condition) -> Program:
     for index, phase in enumerate(motion):
         recorded = holds[-1] <= index <= acting
         if isinstance(phase, Approach):
-            at = Position(*start_xy, -float(phase.clearance))
-            steps.append(Move("approach", at, float(phase.speed)))
+            at = Position(*start_xy, -_value(phase.clearance, condition))
+            steps.append(Move("approach", at, _value(phase.speed, condition)))
         elif isinstance(phase, Press):
             at = Position(at.x_mm, at.y_mm, _value(phase.depth, condition))
-            steps.append(Move("press", at, float(phase.speed)))
+            steps.append(Move("press", at, _value(phase.speed, condition)))
         elif isinstance(phase, Hold):
-            if phase.settle:
-                steps.append(Dwell("settle", float(phase.settle)))
-            steps.append(Dwell("hold", float(phase.duration), recorded))
+            settle = _value(phase.settle, condition)
+            if settle:
+                steps.append(Dwell("settle", settle))
+            steps.append(Dwell("hold", _value(phase.duration, condition), recorded))
         elif isinstance(phase, Slide):
             half = _half_slide(phase, condition)
             at = Position(at.x_mm + 2 * half[0], at.y_mm + 2 * half[1], at.depth_mm)
@@ -81,13 +82,15 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             at = Position(at.x_mm + share * distance, at.y_mm, at.depth_mm - distance)
             steps.append(Move("retract", at, speed * math.hypot(1.0, share), recorded))
         elif isinstance(phase, PlateMotion):
-            steps.append(PlateStep("plate", phase.action, float(phase.duration), recorded))
+            steps.append(
+                PlateStep("plate", phase.action, _value(phase.duration, condition), recorded)
+            )
         elif isinstance(phase, Release):
-            at = Position(at.x_mm, at.y_mm, -float(phase.clearance))
-            steps.append(Move("release", at, float(phase.speed)))
+            at = Position(at.x_mm, at.y_mm, -_value(phase.clearance, condition))
+            steps.append(Move("release", at, _value(phase.speed, condition)))
         elif isinstance(phase, Return):
             at = Position(0.0, 0.0, home.depth_mm)
-            steps.append(Move("return", at, float(phase.speed)))
+            steps.append(Move("return", at, _value(phase.speed, condition)))
     return Program(home, tuple(steps))
 
 
@@ -153,17 +156,14 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
 
     def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> None:
         for value, where in levels(field, key):
-            if isinstance(value, str):
-                raise KeyedError(where, value, f"is a word where a number in {unit} belongs")
             if value > limit:
                 raise KeyedError(
                     where,
                     f"{canonical(value)} {unit}",
                     f"is over collection.limits.{name} = {canonical(limit)} {unit}",
                 )
-            if value <= 0:
-                raise KeyedError(where, f"{canonical(value)} {unit}", "must be more than 0")
 
+    _check_levels(collection, written)
     for index, phase in enumerate(collection.motion):
         base = f"collection.motion[{index}]"
         if isinstance(phase, (Approach, Press, Slide, Retract, Release, Return)):
@@ -191,6 +191,19 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
         at_most(collection.plate.mass, "collection.plate.mass", Decimal(5), "mass (fixed)", "kg")
 
 
+def _check_levels(collection: Collection, written: Mapping[str, list[tuple[Level, str]]]) -> None:
+    """Hold every level against the fields that it stands in: a number, and in their range."""
+    for key, ref in collection.bindings():
+        for level, where in written[ref.factor] if ref.unit is not None else ():
+            if isinstance(level, str):
+                raise KeyedError(where, level, f"is a word where a number in {ref.unit} belongs")
+            try:
+                check_least(level, str(ref.unit), ref.low, ref.strict)
+            except ValueError as error:
+                value = f"{canonical(level)} {ref.unit}"
+                raise KeyedError(where, value, f"{error} in {key}") from None
+
+
 Levels = Callable[[Any, str], Iterator[tuple[Any, str]]]
 
 
@@ -208,9 +221,7 @@ def _check_slide(phase: Slide, base: str, levels: Levels, limits: Any) -> None:
     pairs = product(
         levels(phase.distance, f"{base}.distance"), levels(phase.direction, f"{base}.direction")
     )
-    for (distance, where), (direction, from_key) in pairs:
-        if isinstance(direction, str):
-            raise KeyedError(from_key, direction, "is a word where a number in deg belongs")
+    for (distance, where), (direction, _) in pairs:
         probe = Slide.model_construct(
             phase="slide", distance=distance, speed=phase.speed, direction=direction
         )

@@ -1,4 +1,7 @@
-"""The phases that a trial's motion is made of, and nothing about their order."""
+"""The phases that a trial's motion is made of, and nothing about their order.
+
+Every number in a phase may be a factor: ``$name``, whose level in the trial at hand stands there.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,8 @@ from sliplab.protocols.quantity import (
     FactorRef,
     MillimetresOrRef,
     PercentOrRef,
-    PositiveMillimetres,
-    PositiveSeconds,
-    PositiveSpeed,
-    Seconds,
+    PositiveSecondsOrRef,
+    SecondsOrRef,
     SpeedOrRef,
 )
 from sliplab.protocols.yaml_file import StrictModel, register_tags
@@ -26,8 +27,8 @@ class Approach(StrictModel):
     """Travel, clear of the plate, to above the place where the trial begins."""
 
     phase: Literal["approach"]
-    clearance: PositiveMillimetres
-    speed: PositiveSpeed
+    clearance: MillimetresOrRef
+    speed: SpeedOrRef
 
 
 class Press(StrictModel):
@@ -35,15 +36,15 @@ class Press(StrictModel):
 
     phase: Literal["press"]
     depth: MillimetresOrRef
-    speed: PositiveSpeed
+    speed: SpeedOrRef
 
 
 class Hold(StrictModel):
     """Standing still: `settle` passes first, then `duration`, which may be recorded."""
 
     phase: Literal["hold"]
-    duration: PositiveSeconds
-    settle: Seconds = Decimal(0)
+    duration: PositiveSecondsOrRef
+    settle: SecondsOrRef = Decimal(0)
 
 
 class Slide(StrictModel):
@@ -90,22 +91,22 @@ class PlateMotion(StrictModel):
 
     phase: Literal["plate"]
     action: Literal["raise", "release", "catch"]
-    duration: Seconds = Decimal(0)
+    duration: SecondsOrRef = Decimal(0)
 
 
 class Release(StrictModel):
     """Out along the normal until clear of the plate."""
 
     phase: Literal["release"]
-    clearance: PositiveMillimetres
-    speed: PositiveSpeed
+    clearance: MillimetresOrRef
+    speed: SpeedOrRef
 
 
 class Return(StrictModel):
     """Back to above the plate's centre."""
 
     phase: Literal["return"]
-    speed: PositiveSpeed
+    speed: SpeedOrRef
 
 
 _PHASES = ("approach", "press", "hold", "slide", "retract", "plate", "release", "return")

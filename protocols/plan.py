@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from decimal import Decimal
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -22,7 +23,7 @@ from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits
 from sliplab.protocols.program import Dwell, Program
-from sliplab.protocols.quantity import FILE_UNITS, canonical, to_decimal
+from sliplab.protocols.quantity import FILE_UNITS, FactorRef, canonical, to_decimal
 from sliplab.protocols.shipped import protocol_path
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.yaml_file import KeyedError, load
@@ -145,13 +146,20 @@ class Plan:
         factors = self.protocol.collection.factors
         return {name: factors[name].text(level) for name, level in trial.condition}
 
+    def level_texts(self, field: Decimal | FactorRef, unit: str) -> tuple[str, ...]:
+        """A phase's field in words (``2.8 mm``): its one value, or the levels of its factor."""
+        if not isinstance(field, FactorRef):
+            return (f"{field} {unit}",)
+        factor = self.protocol.collection.factors[field.factor]
+        return tuple(factor.text(level) for level in self.enabled[field.factor])
+
     def mass_kg(self, trial: Trial) -> float | None:
         """Mass of the sliding plate in this trial; None where there is none."""
         plate = self.protocol.collection.plate
         if plate is None:
             return None
-        level = plate.mass
-        return float(dict(trial.condition)[level.factor] if hasattr(level, "factor") else level)
+        mass = plate.mass
+        return float(dict(trial.condition)[mass.factor] if isinstance(mass, FactorRef) else mass)
 
     def tasks_before(self, trial: Trial) -> tuple[Task, ...]:
         """List the tasks before `trial`, in order, in an undisturbed campaign."""
@@ -201,10 +209,11 @@ class Plan:
             f"analysis.{each.key}: {here} goes before the {each.value} of the preset"
             for each, here in (self.protocol.analysis.overrides if preset else ())
         ]
-        program = self.program(self.trials[0])
-        hold = sum(
-            step.seconds for step in program.steps if isinstance(step, Dwell) and step.recorded
-        )
+        hold = min(
+            sum(step.seconds for step in self.program(trial).steps
+                if isinstance(step, Dwell) and step.recorded)
+            for trial in self.trials
+        )  # fmt: skip
         if hold < need:
             found.append(
                 f"collection.motion: the recorded hold of {hold:g} s is shorter than "

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
@@ -142,16 +142,31 @@ def check_size(value: Decimal, unit: str) -> None:
         raise ValueError(f"must be from -{size:f} to {size:f} {unit}")
 
 
+def check_least(value: Decimal, unit: str, low: Decimal | None, strict: bool) -> None:
+    """Hold a value in a canonical unit against the least that a field takes.
+
+    Raises:
+        ValueError: it is less, or equal to `low` where it must be more (`strict`).
+    """
+    if low is not None and (value < low or (strict and value == low)):
+        words = "more than" if strict else "at least"
+        raise ValueError(f"must be {words} {canonical(low)} {unit}")
+
+
 @dataclass(frozen=True)
 class FactorRef:
     """``$depth`` in a motion phase: the level of that factor in the trial at hand.
 
     Attributes:
         unit: what its levels must be in, canonical; None for words.
+        low: the least that the field takes, in that unit; None if it takes any number.
+        strict: true if a level must be more than `low`.
     """
 
     factor: str
     unit: str | None = None
+    low: Decimal | None = None
+    strict: bool = False
 
     def __str__(self) -> str:
         return f"${self.factor}"
@@ -204,11 +219,9 @@ def _checked(
 ) -> Callable[[object], Any]:
     def read(raw: object) -> Any:
         value = reader(raw, unit)
-        if isinstance(value, Decimal) and low is not None:
-            if strict and value <= low:
-                raise ValueError(f"must be more than {canonical(low)} {unit}")
-            if value < low:
-                raise ValueError(f"must be at least {canonical(low)} {unit}")
+        if isinstance(value, FactorRef):
+            return replace(value, low=low, strict=strict)
+        check_least(value, unit, low, strict)
         return value
 
     return read
@@ -245,6 +258,8 @@ PositivePercent: Any = _quantity("percent", "0", True, ref=False)
 # The same, or a factor's name after a dollar sign.
 MillimetresOrRef: Any = _quantity("mm", "0", True, ref=True)
 SpeedOrRef: Any = _quantity("mm/s", "0", True, ref=True)
+SecondsOrRef: Any = _quantity("s", "0", False, ref=True)
+PositiveSecondsOrRef: Any = _quantity("s", "0", True, ref=True)
 DegreesOrRef: Any = _quantity("deg", None, False, ref=True)
 KilogramsOrRef: Any = _quantity("kg", "0", True, ref=True)
 PercentOrRef: Any = _quantity("percent", "0", False, ref=True)

@@ -134,11 +134,12 @@ def _plain(rules: Mapping[str, Detection]) -> dict[str, Json]:
 def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
     """Find in which settings this differs from the paper, and which of them it does not say."""
     depths = {
-        f"{phase.depth} mm"
+        text
         for item in campaigns
         if item.experiment != "kinematic"
         for phase in item.plan.protocol.collection.motion
         if isinstance(phase, Press)
+        for text in item.plan.level_texts(phase.depth, "mm")
     }
     differences = tuple(
         Difference(
