@@ -11,11 +11,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Code
-from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
+from sliplab.storage.streams import (
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    PoseChunk,
+    PulseChunk,
+    Sink,
+    WrenchChunk,
+)
 
 UNKNOWN = "unknown"
 """Value in `DeviceHealth` of what a device does not report."""
@@ -230,6 +238,51 @@ class SyncBox(Protocol):
 
     def stop(self) -> None:
         """Stop the ticks; the clock goes on."""
+
+    def close(self) -> None:
+        """Give the device back."""
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How a force sensor's axes, and the direction of its load, follow from the plate's."""
+
+    axes: Literal["plate", "base"] = "plate"
+    """The frame that `rotvec_deg` turns to: the plate's axes (x right, y up, z into the plate),
+    along which the tool stands, or the arm's base."""
+    rotvec_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector from the sensor's axes to that frame."""
+    feels: Literal["plate", "arm"] = "plate"
+    """The body whose load it reports: the plate, or the arm, which feels the plate's reaction."""
+
+
+@runtime_checkable
+class ForceSensor(Protocol):
+    """A sensor of force and torque with a clock of its own, or that of the arm."""
+
+    mounting: Mounting
+    zeroing: Literal["trial", "session", "never"]
+    """When the rig, or the sensor itself, takes the present load for zero: before each trial while
+    the arm is clear of the plate, once when it connects, or never."""
+
+    def connect(self) -> None:
+        """Open the connection; bounded. Raises RigError."""
+
+    def start(self) -> None:
+        """Begin to stream; what came before is dropped."""
+
+    def read(self) -> WrenchChunk:
+        """Forces and torques since the last call, sensor's axes and clock.
+
+        Raises:
+            RigError: it fell silent, began anew, or says that its readings are not to be trusted.
+        """
+
+    def zero(self) -> None:
+        """Take the present load for zero from now on."""
+
+    def stop(self) -> None:
+        """Stop streaming; what has come can still be read."""
 
     def close(self) -> None:
         """Give the device back."""

@@ -16,9 +16,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from sliplab.protocols.program import Position
-from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.capabilities import Mounting, Pose
 
 Vector = npt.NDArray[np.float64]
+Rows = tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -76,3 +77,15 @@ class PlateFrame:
         """The place in plate coordinates of a tool centre point in the base frame."""
         x, y, z = self.axes @ (np.asarray(xyz_mm, dtype=np.float64) - self.origin)
         return Position(float(x), float(y), float(z) - self.zero_mm)
+
+    def force_matrix(self, mounting: Mounting) -> Rows:
+        """Return the rows of the matrix from a sensor's reading to the force on the plate.
+
+        The product is in plate coordinates: x right, y up, z into the plate.
+        """
+        turn: Vector = Rotation.from_rotvec(np.radians(mounting.rotvec_deg)).as_matrix()
+        if mounting.axes == "base":
+            turn = self.axes @ turn
+        signed = turn if mounting.feels == "plate" else -turn
+        rows = (signed + 0.0).tolist()  # no negative zeros
+        return tuple((float(a), float(b), float(c)) for a, b, c in rows)

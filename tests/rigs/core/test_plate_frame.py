@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sliplab.protocols.program import Position
+from sliplab.rigs.core.capabilities import Mounting
 from sliplab.rigs.core.plate_frame import PlateFrame
 
 angles = st.floats(-3.0, 3.0)
@@ -44,3 +45,28 @@ def test_depth_goes_into_the_plate_from_its_found_zero() -> None:
 def test_points_that_teach_no_plane(points: list[tuple[float, ...]], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         PlateFrame.taught(points)
+
+
+@pytest.mark.parametrize(
+    ("mounting", "reading"),
+    [
+        (Mounting(), (0.1, 0.2, 3.0)),
+        (Mounting(feels="arm"), (-0.1, -0.2, -3.0)),
+        # the sensor's x is the plate's y
+        (Mounting(rotvec_deg=(0.0, 0.0, 90.0)), (0.2, -0.1, 3.0)),
+    ],
+)
+def test_a_reading_becomes_the_force_on_the_plate(
+    mounting: Mounting, reading: tuple[float, float, float]
+) -> None:
+    frame = PlateFrame.taught([(400, 0, 300), (400, 60, 300), (401, 0, 360)])
+    found = np.array(frame.force_matrix(mounting)) @ reading
+    assert found == pytest.approx([0.1, 0.2, 3.0])
+
+
+def test_a_reading_in_the_arms_base_becomes_the_force_on_the_plate() -> None:
+    frame = PlateFrame.taught([(400, 0, 300), (400, 60, 300), (401, 0, 360)])
+    arm = Mounting(axes="base", feels="arm")
+    reaction = -3.0 * frame.axes[2] + 0.5 * frame.axes[0]
+    found = np.array(frame.force_matrix(arm)) @ reaction
+    assert found == pytest.approx([-0.5, 0.0, 3.0], abs=1e-12)

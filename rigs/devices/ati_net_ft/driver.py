@@ -1,0 +1,373 @@
+"""Driver of ATI Net F/T sensors.
+
+A thread takes every record with the host's time of its arrival. The sensor's clock is its sample
+counter, `ft_sequence`, in nanoseconds at its nominal rate: it goes on whether or not records are
+lost. A record that comes after a later one is counted and dropped, so that times never fall back.
+Every wait is bounded by the settings; what goes wrong is a `RigError` in the next call.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import socket
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplab.rigs.core.capabilities import DeviceHealth, Mounting, RigError
+from sliplab.rigs.devices.ati_net_ft import rdt
+from sliplab.rigs.devices.ati_net_ft.settings import FILTER_NUMBERS, AtiNetFtSettings
+from sliplab.storage.streams import Json, WrenchChunk
+
+DEVICE = "force sensor"
+TRIES = 3
+"""Requests for a first record before the sensor is taken for absent."""
+LOOK_S = 0.05
+"""The listening thread looks this often whether it shall end."""
+JOIN_S = 1.0
+BACKLOG = 1 << 20
+"""Records kept for a reader, two minutes at most; older ones are dropped, and counted."""
+RECEIVE_BYTES = 1 << 20
+"""Kernel's buffer: a host that is busy for some seconds loses nothing."""
+_WRAP, _HALF = 1 << 32, 1 << 31
+
+
+@dataclass
+class Counts:
+    """Records of one stream, and what became of others."""
+
+    received: int = 0
+    lost: int = 0
+    """Missing by their numbers, and not come late either."""
+    late: int = 0
+    """Came after a later one, or twice; dropped."""
+    malformed: int = 0
+    dropped: int = 0
+    """Nobody read them in time."""
+
+
+class AtiNetFt:
+    """An ATI Net F/T sensor; a `ForceSensor` of `rigs.core.capabilities`."""
+
+    def __init__(self, settings: AtiNetFtSettings) -> None:
+        self._settings = settings
+        self.mounting = Mounting(
+            "plate", settings.mounting_rotvec_deg, "plate" if settings.mounted == "plate" else "arm"
+        )
+        self.zeroing = settings.bias
+        self._socket: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._ending = threading.Event()
+        self._lock = threading.Lock()
+        self._waiting: deque[tuple[bytes, int]] = deque(maxlen=BACKLOG)
+        self._page: rdt.Page | None = None
+        self._scale = (1.0, 1.0)
+        self._fault: str | None = None
+        self._ticks: int | None = None
+        """Sample counter of the last record, unwrapped."""
+        self._number: int | None = None
+        self.counts = Counts()
+
+    def connect(self) -> None:
+        """Read and write the sensor's settings, and see that a record comes.
+
+        Takes at most `TRIES` + 5 times `answer_s`.
+
+        Raises:
+            RigError: no answer, no calibration, a setting that was not taken, or an error status.
+        """
+        self.close()
+        settings = self._settings
+        self._fault = self._ticks = None
+        if settings.reads_page:
+            self._page = self._configure()
+        page = self._page
+        self._scale = (
+            settings.counts_per_n or (page.counts_per_n if page else 1.0),
+            settings.counts_per_nm or (page.counts_per_nm if page else 1.0),
+        )
+        try:
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
+            self._socket.connect((settings.host, settings.port))
+            self._socket.settimeout(LOOK_S)
+            self._greet()
+        except OSError as error:
+            self.close()
+            raise self._absent(error) from None
+        except BaseException:
+            self.close()
+            raise
+        if self.zeroing == "session":
+            self.zero()
+
+    def start(self) -> None:
+        """Begin to stream; what came before is dropped.
+
+        Raises:
+            RigError: it is not connected, or cannot be sent to.
+        """
+        self._halt()
+        with self._lock:
+            self._waiting.clear()
+            self.counts, self._fault = Counts(), None
+            self._number = self._ticks = None
+        self._drain()
+        self._send(rdt.STREAM)
+        self._ending.clear()
+        self._thread = threading.Thread(target=self._listen, name="net ft", daemon=True)
+        self._thread.start()
+
+    def read(self) -> WrenchChunk:
+        """Forces and torques since the last call, newtons and newton metres.
+
+        Raises:
+            RigError: the sensor fell silent, began anew, or says that it cannot be trusted.
+        """
+        with self._lock:
+            taken = list(self._waiting)
+            self._waiting.clear()
+            fault = self._fault
+        if fault is not None:
+            raise RigError(DEVICE, fault)
+        if not taken:
+            return WrenchChunk.empty()
+        found = rdt.records(b"".join(data for data, _ in taken))
+        ticks = self._unwrap(found["ft"].astype(np.int64))
+        return WrenchChunk(
+            ticks * 1_000_000_000 // self._settings.tick_hz,
+            np.array([host_ns for _, host_ns in taken], np.int64),
+            found["force"] / self._scale[0],
+            found["torque"] / self._scale[1],
+        )
+
+    def zero(self) -> None:
+        """Take the present load for zero from now on (the sensor's own bias)."""
+        self._send(rdt.SET_BIAS)
+
+    def stop(self) -> None:
+        """Stop streaming; what has come can still be read."""
+        self._halt()
+
+    def close(self) -> None:
+        """Stop, and give the port back; safe to call more than once."""
+        with contextlib.suppress(RigError):
+            self._halt()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def health(self) -> DeviceHealth:
+        """Return what the sensor's page says of it.
+
+        Raises:
+            RigError: the page does not answer.
+        """
+        page = self._page or self._read_page()
+        return DeviceHealth(
+            device=DEVICE,
+            model=page.product or "unknown",
+            serial=page.serial or "unknown",
+            firmware=page.firmware or "unknown",
+            temperature_c=None,
+            clock=f"its sample counter, {self._settings.tick_hz} a second",
+            notes=(f"{page.rate_hz or 'unknown'} records a second",),
+        )
+
+    def describe(self) -> Json:
+        """Return calibration, settings and losses of the stream that was read last."""
+        page = self._page
+        return {
+            "counts": vars(self.counts).copy(),
+            "counts_per_n": self._scale[0],
+            "counts_per_nm": self._scale[1],
+            "rate_hz": page.rate_hz if page else self._settings.rate_hz,
+            "filter_number": page.filter_number if page else None,
+            "tick_hz": self._settings.tick_hz,
+            "bias": self._settings.bias,
+            "serial": page.serial if page else "",
+        }
+
+    # -- the web page ----------------------------------------------------------------------
+
+    def _configure(self) -> rdt.Page:
+        """Write rate and filter, and read the page, which must say what was written."""
+        settings = self._settings
+        if settings.rate_hz is not None:
+            self._get(f"{rdt.RATE_PAGE}{settings.rate_hz}")
+        number = None if settings.filter_hz is None else FILTER_NUMBERS[settings.filter_hz]
+        if number is not None:
+            self._get(f"{rdt.FILTER_PAGE}{number}")
+        page = self._read_page()
+        for name, key, asked, found in (
+            ("rate_hz", "comrdtrate", settings.rate_hz, page.rate_hz),
+            ("filter_hz", "setuserfilter", number, page.filter_number),
+        ):
+            if asked is not None and found != asked:
+                raise RigError(
+                    DEVICE,
+                    f"{name}: {getattr(settings, name)} was not taken, its page says {key} = "
+                    f"{found} instead of {asked}; give a value that it has",
+                )
+        return page
+
+    def _read_page(self) -> rdt.Page:
+        text = self._get(rdt.PAGE)
+        try:
+            return rdt.Page.parse(text)
+        except ValueError as error:
+            raise RigError(
+                DEVICE, f"http://{self._settings.host}:{self._settings.web_port}/{rdt.PAGE} {error}"
+            ) from None
+
+    def _get(self, path: str) -> bytes:
+        settings = self._settings
+        link = http.client.HTTPConnection(
+            settings.host, settings.web_port, timeout=settings.answer_s
+        )
+        try:
+            link.request("GET", f"/{path}")
+            answer = link.getresponse()
+            body = answer.read(1 << 20)
+            if answer.status >= 400:
+                raise OSError(f"status {answer.status} for /{path}")
+        except (OSError, http.client.HTTPException) as error:
+            raise RigError(
+                DEVICE,
+                f"no answer from its page on {settings.host}:{settings.web_port}: {error}; check "
+                "its power, its network and its address, or give counts_per_n and counts_per_nm",
+            ) from None
+        finally:
+            link.close()
+        return body
+
+    # -- the stream ------------------------------------------------------------------------
+
+    def _send(self, command: int, count: int = 0) -> None:
+        if self._socket is None:
+            raise RigError(DEVICE, "is not connected; connect it first")
+        try:
+            self._socket.send(rdt.request(command, count))
+        except OSError as error:
+            raise self._absent(error) from None
+
+    def _absent(self, error: OSError | str) -> RigError:
+        return RigError(
+            DEVICE,
+            f"no record from {self._settings.host}:{self._settings.port}: {error}; check its "
+            "power, its network and its address, and that no other program reads it",
+        )
+
+    def _greet(self) -> None:
+        """See that one record comes, whose status is no error."""
+        assert self._socket is not None
+        self._send(rdt.STOP)
+        for _ in range(TRIES):
+            self._send(rdt.STREAM, 1)
+            end = time.monotonic() + self._settings.answer_s
+            while time.monotonic() < end:
+                try:
+                    data = self._socket.recv(2048)
+                except TimeoutError:
+                    continue
+                if len(data) == rdt.RECORD.itemsize:
+                    problem = rdt.status_problem(rdt.SEQUENCES.unpack_from(data)[2])
+                    if problem is not None:
+                        raise RigError(DEVICE, f"{problem}; take the load off, or see to it")
+                    return
+        raise self._absent(f"none within {TRIES * self._settings.answer_s:g} s")
+
+    def _drain(self) -> None:
+        """Forget what came before the stream."""
+        if self._socket is None:
+            return
+        self._socket.setblocking(False)
+        with contextlib.suppress(OSError):
+            while True:
+                self._socket.recv(2048)
+        self._socket.settimeout(LOOK_S)
+
+    def _halt(self) -> None:
+        """End the stream and the thread."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            if self._socket is None:
+                return
+        else:
+            self._ending.set()
+            thread.join(JOIN_S)
+        self._send(rdt.STOP)
+
+    def _listen(self) -> None:
+        """The thread: every record, until the stream ends or cannot be believed."""
+        link, silent_s = self._socket, 0.0
+        assert link is not None
+        last: int | None = None
+        try:
+            while not self._ending.is_set():
+                try:
+                    data = link.recv(2048)
+                except TimeoutError:
+                    silent_s += LOOK_S  # a host that stood still itself is no silence
+                    if silent_s >= self._settings.silence_s:
+                        self._fail(
+                            f"nothing came for {self._settings.silence_s:g} s; check its power "
+                            "and its cable, and that no other program reads it"
+                        )
+                        return
+                    continue
+                host_ns, silent_s = time.monotonic_ns(), 0.0
+                with self._lock:
+                    last = self._take(data, host_ns, last)
+        except Exception as error:  # a thread that dies must not look like a silent sensor
+            self._fail(f"its stream ended: {error}")
+
+    def _take(self, data: bytes, host_ns: int, last: int | None) -> int | None:
+        """Take one datagram; returns the sample counter of the newest record."""
+        if len(data) != rdt.RECORD.itemsize:
+            self.counts.malformed += 1
+            return last
+        number, ticks, status = rdt.SEQUENCES.unpack_from(data)
+        problem = rdt.status_problem(status)
+        if problem is not None:
+            self._fault = self._fault or f"{problem}; take the load off, or see to it"
+            return last
+        step = 1 if self._number is None else _signed(number - self._number)
+        gone = 1 if last is None else _signed(ticks - last)
+        if step <= 0 and gone <= 0:
+            self.counts.late += 1
+            self.counts.lost = max(self.counts.lost - (step < 0), 0)
+            return last
+        if gone <= 0:
+            self._fault = self._fault or (
+                "its sample counter stands still or fell back: it began anew; start the trial again"
+            )
+            return last
+        self.counts.lost += max(step - 1, 0)
+        self.counts.received += 1
+        self.counts.dropped += len(self._waiting) == BACKLOG
+        self._number = number
+        self._waiting.append((data, host_ns))
+        return ticks
+
+    def _fail(self, fault: str) -> None:
+        with self._lock:
+            self._fault = self._fault or fault
+
+    def _unwrap(self, ticks: np.ndarray) -> np.ndarray:
+        """Return counter readings (n,) as numbers that go on where 32 bits begin anew."""
+        first = int(ticks[0]) if self._ticks is None else self._ticks
+        steps = np.diff(ticks, prepend=first % _WRAP)
+        steps = (steps + _HALF) % _WRAP - _HALF
+        found = first + np.cumsum(steps)
+        self._ticks = int(found[-1])
+        return found
+
+
+def _signed(difference: int) -> int:
+    """Return a difference of two 32-bit counters as a number of either sign."""
+    return (difference + _HALF) % _WRAP - _HALF
