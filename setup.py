@@ -1,4 +1,4 @@
-"""Which folders are which packages; everything else stands in pyproject.toml.
+"""Mapping of folders to packages; everything else is in pyproject.toml.
 
 The five packages stand at the root of the repository and are installed below ``sliplab``, so that
 no other name can be taken from, or by, anybody else's code.

@@ -1,4 +1,4 @@
-"""What the parts of this project cost, measured beside the ways they replace.
+"""Benchmarks of this project's parts, measured beside the alternatives they replace.
 
 `python -m benchmarks NAME` runs one, `python -m benchmarks` runs all and writes RESULTS.md.
 """

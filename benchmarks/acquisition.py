@@ -52,9 +52,9 @@ PACKET_US = 10_000
 POLL_S = 0.01
 FREE_RUN = BaslerSettings(px_per_mm=20.0, trigger="free run", rate_hz=EMULATED_HZ)
 BURSTS = (1, 2, 5, 17)
-"""How many frames in a row the stand-in drops on purpose."""
+"""Number of consecutive frames that the fake camera drops on purpose."""
 TAIL_S = 10.0
-"""How long it waits for what was sent and is not there yet."""
+"""Time to wait for data that was sent and has not arrived yet."""
 
 
 def measure(
@@ -160,7 +160,7 @@ def _loop(
 
 
 def _tail(trial: TrialWriter, events: DvxplorerCamera, wanted: int, pulses: int) -> None:
-    """What was under way when the server had said its last."""
+    """Drain the events still in flight after the server has sent its last message."""
     end = time.perf_counter() + TAIL_S
     idle = threading.Event()
     while time.perf_counter() < end:

@@ -36,7 +36,7 @@ DAY_NS = 86_400 * 10**9
 WRONG_US = 100.0
 """A map that is wrong by more than this must not have been accepted."""
 DRIFT_PPM = 400.0
-"""What two crystals may differ by."""
+"""Largest frequency difference of two crystals."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What checks of labels against the truth come to: figures, and the tables of docs/labels.md."""
+"""Summary of label checks against the truth: figures, and the tables of docs/labels.md."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def summary(trials: Sequence[Checked]) -> Figures:
 
 
 def verdicts(trials: Sequence[Checked]) -> dict[str, dict[str, int]]:
-    """How many onsets were right, wrong or doubted, by rule and kind."""
+    """Count right, wrong and doubted onsets by rule and kind."""
     result: dict[str, dict[str, int]] = {}
     for trial in trials:
         for name, verdict in trial.wrong.items():

@@ -52,7 +52,7 @@ def rate(name: str, amount: float, seconds: Seconds) -> Figures:
 
 
 def ratio(name: str, slow: Seconds, fast: Seconds) -> Figures:
-    """How many times faster the second is, from the pairs of each round; see `spread`."""
+    """Return the speed-up of `fast` over `slow` from the pairs of each round; see `spread`."""
     return spread(name, [a / b for a, b in zip(slow, fast, strict=True)])
 
 

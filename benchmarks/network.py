@@ -238,7 +238,7 @@ def _inference(
 
 
 def _floor(x: U8, net: nn.Sequential, settings: Windows) -> Figures:
-    """What a window costs at the least: its synaptic operations, at the rate of a matrix product.
+    """Return a lower bound on a window's time: its synaptic operations at matrix-product rate.
 
     ``infer_floor_us`` is that for the operations that there are, ``dense_floor_us`` for all of the
     dense layers: below the second no dense implementation gets, below the first none at all.

@@ -1,4 +1,4 @@
-"""What Prefect costs a collection a trial, beside a bare loop and Bluesky; catalogue and start-up.
+"""Prefect's overhead per trial, compared with a bare loop and Bluesky; catalogue and start-up.
 
 864 empty trials go through the task of `flows.collect`, 25 a task as on a mock rig
 (`batched_ms`) and one a task as on a real one (`per_trial_ms`). Both are milliseconds a trial over
@@ -160,7 +160,7 @@ def _bluesky(trials: int) -> Any:
 
 
 def _memory(long: int) -> Figures:
-    """What is held after all trials more than after a tenth of them."""
+    """Return the memory growth, MB, between a tenth of the trials and all of them."""
     from benchmarks.measure import resident_mb
 
     server = embedded()
@@ -182,7 +182,7 @@ def _memory(long: int) -> Figures:
 
 
 def _server_cpu_s() -> float:
-    """What the server has used of processors so far, s; 0 where the system does not tell."""
+    """Return the server's processor time so far, s; 0 if the system does not report it."""
     try:
         fields = Path(f"/proc/{embedded().pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -1,4 +1,4 @@
-"""What a trial of the kinematic grid weighs, and what each step takes of it, for docs/scale.md.
+"""Size of a kinematic trial and processing time of each step, for docs/scale.md.
 
 Bytes with a video (`video_`) and with tracks in its place (`tracks_`); milliseconds a trial by
 step, each on one core, but for `counts_ms`, where the network uses all; pushing to a folder and to

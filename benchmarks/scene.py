@@ -1,4 +1,4 @@
-"""What simulating costs, and how exact it is: whole trials, contact, events and pictures.
+"""Cost and accuracy of the simulation: whole trials, contact, events and images.
 
 `tracks_x_realtime` (one core) and `video_x_realtime` (two cores) take whole trials of the kinematic
 grid from the first motion to the commit, quality gates included; a trial's time is that of its
@@ -247,7 +247,7 @@ def _joined(parts: list[Events]) -> tuple[EventChunk, I64]:
 
 
 def _apart_us(a: tuple[EventChunk, I64], b: tuple[EventChunk, I64]) -> tuple[F64, float]:
-    """How far partners are apart, and the share of all events that have one."""
+    """Return the time between matched events, and the share of events that have a match."""
     pairs = match_events(a[0], b[0])
     apart: F64 = np.abs(a[1][pairs.first] - b[1][pairs.second]) * 1e-3
     return apart, 1.0 - (pairs.unmatched or 0.0)

@@ -48,7 +48,7 @@ def loads_of_slide(
 def hold_and_slide(
     devices: MockDevices, length_mm: float, events: bool = True, speed_mm_s: float = SPEED_MM_S
 ) -> EventChunk:
-    """What is recorded of a trial: two seconds of hold, and the slide."""
+    """The recorded part of a trial: two seconds of hold, and the slide."""
     parts: list[EventChunk] = []
     if events:
         devices.events.start()

@@ -27,7 +27,7 @@ PART = 2048
 
 
 def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int | bool]:
-    """How many of the first `most` windows differ."""
+    """Return how many of the first `most` windows differ."""
     # waiting for each other, Sinabs' threads take longer beside other work
     torch.set_num_threads(1)
     fitted = model_file.load(model)

@@ -57,7 +57,7 @@ def _models_in(part: Schema, path: str, models: dict[str, Schema]) -> Iterator[t
 
 
 def _tag(model: Schema) -> str:
-    """What a file writes to say that it means this one: ``slide``, ``basler``."""
+    """The value that selects this model in a file: ``slide``, ``basler``."""
     return next(str(field["const"]) for field in model["properties"].values() if "const" in field)
 
 

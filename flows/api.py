@@ -66,7 +66,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Onsets:
-    """When slip begins in a trial, on its time line."""
+    """Onsets of incipient and gross slip in a trial, on its time line."""
 
     incipient_ns: int | None
     """First slip of any marker, nanoseconds; None when none slipped, or when it is in doubt."""

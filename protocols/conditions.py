@@ -82,7 +82,7 @@ class ReferenceGate(StrictModel):
 
 
 class Gates(StrictModel):
-    """When a trial is not good enough and is taken again."""
+    """Quality gates: limits beyond which a trial is rejected and retaken."""
 
     sync_uncertainty: SyncGates = SyncGates()
     """95 % uncertainty of events against frames and poses, by grade."""

@@ -52,7 +52,7 @@ def here(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[st
 
 
 def answer(*arguments: object) -> dict[str, Any]:
-    """What a command that succeeded in this process says as JSON."""
+    """Run a command in this process, expect success and return its JSON object."""
     done = here(*arguments, "--json")
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)

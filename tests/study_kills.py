@@ -32,7 +32,7 @@ DATED = ("provenance.json",)
 
 
 def command(store: Path, arguments: list[str]) -> list[str]:
-    """What runs a study in `store`."""
+    """Return the command line that runs a study in `store`."""
     return [sys.executable, "-m", "sliplab", "study", str(store), "--json", *arguments]
 
 
@@ -55,7 +55,7 @@ def live(store: Path, arguments: list[str], log: Path, kill_s: float | None = No
 
 
 def figures(store: Path) -> dict[str, Any]:
-    """What a finished study says: hashes of its trials and models, and its summary."""
+    """Return a finished study's result: hashes of its trials and models, and its summary."""
     summary = json.loads((store / "report" / "summary.json").read_text())
     del summary["quality"]["interrupted"]  # what the kills broke off
     data = [*store.glob("campaigns/*/trials/**/*"), *store.glob("models/*.pt")]
@@ -70,7 +70,7 @@ def figures(store: Path) -> dict[str, Any]:
 
 
 def differences(calm: Any, killed: Any, place: str = "") -> list[str]:
-    """Where two of these differ, as paths into them."""
+    """Return the paths at which two results differ."""
     if isinstance(calm, dict) and isinstance(killed, dict):
         return [
             found

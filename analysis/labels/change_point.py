@@ -1,4 +1,4 @@
-"""When a papilla began to slip: the change point of its track, with a 95 % interval.
+"""Change-point estimate of a papilla's slip onset from its track, with a 95 % interval.
 
 The paper's rule dates a slip by the frame in which a marker has gone 2 pixels, which at 0.6 mm/s is
 a sixth of a second after it let go. Here the whole track about that moment is used. Before the slip
@@ -83,7 +83,7 @@ def departure(away: Floats, sigma: Floats, first: int) -> int | None:
 def change_point(
     frame_ns: Ints, away: Floats, sigma: Floats, departed: int, exposure_ns: int
 ) -> ChangePoint | None:
-    """When the slip began that `departure` found.
+    """Locate the onset of the slip that `departure` found.
 
     Args:
         frame_ns: (n,) int64. away: (n, 2) px. sigma: (n,) px.

@@ -1,4 +1,4 @@
-"""When every papilla of a trial began to slip, by the change points of their tracks."""
+"""Slip onset of every papilla of a trial, from the change points of their tracks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WIDEST_NS = 40_000_000
 
 @dataclass(frozen=True)
 class SlipTimes:
-    """When m papillae began to slip: medians and central 95 %, ns, -1 for none.
+    """Slip onsets of m papillae: medians and central 95 % intervals, ns, -1 for none.
 
     A slip that was not seen from near (the marker was hidden) has an onset, its first frame away
     from rest, and an interval from the last frame at rest to that one.

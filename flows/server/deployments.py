@@ -94,7 +94,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
 
 
 def until_of(wanted: OnRig, run: Any) -> float | None:
-    """When the rig must be free again, seconds since 1970.
+    """Return the time by which the rig must be free again, seconds since 1970.
 
     Raises:
         WindowOver: that was before the run began.

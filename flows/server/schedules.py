@@ -192,7 +192,7 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
 
 
 class Timing(StrictModel):
-    """When something is started: on days from an hour on, or by a cron line."""
+    """Start times of a flow: days and an hour, or a cron line."""
 
     model_config = ConfigDict(populate_by_name=True)
 

@@ -274,7 +274,7 @@ class TrialRecord(Document):
 
 
 class Provenance(Document):
-    """When, where and with what a trial was taken."""
+    """Provenance of a trial: time, place and software of its collection."""
 
     started: str | None = None
     """UTC, ISO 8601."""
@@ -289,7 +289,7 @@ class Provenance(Document):
     disk_free: Int | None = None
     """Bytes."""
     imported: str | None = None
-    """When it was imported; UTC, ISO 8601."""
+    """Time of the import; UTC, ISO 8601."""
     source: str | None = Field(default=None, alias="from")
     """Name of the file that it was imported from."""
 

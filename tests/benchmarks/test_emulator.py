@@ -1,4 +1,4 @@
-"""How v2e's class is found and fed: by a package of the same names that does what it says."""
+"""Loading and driving v2e's emulator class, tested with a fake package of the same names."""
 
 import sys
 from collections.abc import Iterator
@@ -64,7 +64,7 @@ def circling(px_per_s: float, milliseconds: int) -> tuple[np.ndarray, np.ndarray
 
 @pytest.mark.usefixtures("checkout")
 def test_v2e_gets_our_frames_and_thresholds() -> None:
-    """What comes back are our events, each at the end of its frame."""
+    """The emulator returns our events, each at the end of its frame."""
     optics = replace(OPTICS, refractory_us=0.0)
     loads, t_ns = circling(40.0, 400)
     sensor = MarkerSensor(optics, LAYOUT, 3)

@@ -17,7 +17,7 @@ from tests.conftest import ROOT, SMALL
 
 NAME = "crash"
 BY_TIME = {"provenance.json"}
-"""When and where: the only file of a trial that differs from one run to the next."""
+"""Time and place: the only file of a trial that differs between runs."""
 
 
 def protocol(trials: int, video: bool = False) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def hashes(store: Path) -> dict[str, dict[str, str]]:
 
 
 def wrong(store: Path, whole: dict[str, dict[str, str]]) -> list[str]:
-    """What is not as it must be in a store that was just killed: nothing, one hopes.
+    """Return the faults of a store right after a kill; empty if it is consistent.
 
     A trial that is there is byte for byte the undisturbed one, and `verify` finds nothing that is
     damaged, only what the next collection clears up.
@@ -90,7 +90,7 @@ def wrong(store: Path, whole: dict[str, dict[str, str]]) -> list[str]:
 def wrong_at_the_end(
     store: Path, whole: dict[str, dict[str, str]], also: str = "interrupted"
 ) -> list[str]:
-    """What is not as it must be once the campaign went to its end.
+    """Return the faults of a store after the campaign has finished; empty if there are none.
 
     Args:
         also: how another cause may begin for which something is in quarantine.

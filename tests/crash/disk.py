@@ -126,15 +126,15 @@ class Disk:
         self._moves = waiting
 
     def seen(self) -> Tree:
-        """What a program sees now, and so what a killed one leaves."""
+        """Return the state that a program sees now, which a killed one leaves behind."""
         return _tree(self._top, safe=False)
 
     def left(self) -> Tree:
-        """What a power cut leaves that loses everything that was not flushed."""
+        """Return the state after a power cut that loses everything not flushed."""
         return _tree(self._top, safe=True)
 
     def torn(self, rng: random.Random) -> Tree:
-        """What a power cut leaves that loses some of it, and parts of writes."""
+        """Return the state after a power cut that loses some unflushed data and tears writes."""
         other = copy.deepcopy(self)
         for move in other._moves:
             if rng.random() < 0.5:

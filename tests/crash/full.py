@@ -37,7 +37,7 @@ def size(store: Path) -> int:
 
 
 def wrong_message(end: End, says: str) -> list[str]:
-    """What is wrong with how a collection ended: exit 1 and one message is right."""
+    """Return the faults in how a collection ended; exit code 1 and one message is correct."""
     found = [] if end.code == 1 and not end.killed else [f"exit code {end.code}"]
     lines = [line for line in end.said.splitlines() if line.strip()]
     if len(lines) != 1 or not lines[0].startswith("error: ") or says not in lines[0]:

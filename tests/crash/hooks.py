@@ -84,7 +84,7 @@ class Call:
 
     @staticmethod
     def fail(number: int) -> int:
-        """What a call returns that the system refuses with error `number`."""
+        """Return the result of a system call that fails with error `number`."""
         ctypes.set_errno(number)
         return -1
 

@@ -1,4 +1,4 @@
-"""What the hooks do with the calls of a process: kill it, fill its disk, watch it."""
+"""Policies for intercepted calls: kill the process, fill its disk, record the calls."""
 
 from __future__ import annotations
 

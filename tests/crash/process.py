@@ -18,7 +18,7 @@ LIMIT_S = 300.0
 
 @dataclass(frozen=True)
 class End:
-    """How a life ended.
+    """The end of a child process.
 
     Attributes:
         killed: by SIGKILL; otherwise it ended by itself with `code`.

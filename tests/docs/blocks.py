@@ -1,4 +1,4 @@
-"""What the documentation prints: its fenced blocks, and every command of ours in them or in prose.
+"""Fenced blocks of the documentation, and every SlipLab command in them or in prose.
 
 A synopsis is spelled out: ``pause / resume STORE`` is two commands, ``[--rig RIG]`` with and
 without, ``TRIAL...`` one trial.

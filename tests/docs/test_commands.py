@@ -1,6 +1,6 @@
-"""Every command that the documentation prints is one that there is, with its options and arguments.
+"""Every command printed in the documentation exists, with its options and arguments.
 
-Commands in blocks have to be whole. In prose a command may be named without what it works on.
+Commands in blocks must be complete. In prose a command may be named without its arguments.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.docs.blocks import PAGES, Command, blocks, commands
 
 ROOT_COMMAND: Any = typer.main.get_command(app)
 NUMBERS = {"N": "1", "P": "8000", "S": "1", "MS": "1"}
-"""What stands for a number in a synopsis."""
+"""Placeholders of numbers in a synopsis, and values to substitute."""
 MAKEFILES = {"docs/sync-box.md": "rigs/firmware/Makefile"}
 
 

@@ -23,7 +23,7 @@ ORDER = (
     "plan", "schema", "rigs", "check", "trials", "verify", "migrate", "sync", "teach", "calibrate",
     "export", "import", "push", "pull", "skip", "again",
 )  # fmt: skip
-"""What is cheap, in an order in which each finds what it needs."""
+"""Cheap pages, in an order in which each finds its inputs."""
 ELSEWHERE = ("--rig loopback", "--dask", "s3://", "--follow", "KIND", "lab-pickles", "--help")
 """Needs a rig in real time, other machines or a running campaign, or stands for a word."""
 

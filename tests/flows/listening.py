@@ -1,4 +1,4 @@
-"""Where a process and its children listen, from the kernel's own tables (Linux)."""
+"""Listening sockets of a process and its children, from the kernel's tables (Linux)."""
 
 from __future__ import annotations
 

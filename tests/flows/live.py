@@ -1,4 +1,4 @@
-"""What tests of a loopback rig share: a short trial, a rig file, sessions on its fakes."""
+"""Fixtures for tests on a loopback rig: a short trial, a rig file, sessions on its fakes."""
 
 from __future__ import annotations
 

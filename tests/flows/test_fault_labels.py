@@ -48,7 +48,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[Label, Recording]:
 
 
 def first_slip_s(sound: tuple[Label, Recording]) -> float:
-    """When the first marker slips, seconds into the recording."""
+    """Return the first marker's slip time, seconds into the recording."""
     assert sound[0].onsets.incipient_ns is not None
     return sound[0].onsets.incipient_ns / 1e9
 

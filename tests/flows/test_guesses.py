@@ -1,4 +1,4 @@
-"""What guesses decide: nothing changed gives the study's own figures, and each change is kept."""
+"""Sensitivity to assumed parameters: the unchanged scene gives the study's own figures."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ OUTSIDE = """() => [...document.querySelectorAll('body *')].filter((e) => {
   const box = e.getBoundingClientRect();
   return box.width && box.right > window.innerWidth + 1 && !e.closest('.scroll');
 }).map((e) => e.tagName + ' ' + e.textContent.slice(0, 60))"""
-"""What reaches beyond the window, unless it stands in a box that scrolls by itself."""
+"""Elements that overflow the window, except those inside a scrolling box."""
 
 EMPTY = """() => [...document.querySelectorAll('figure')].filter((e) => {
   const svg = e.querySelector('svg'), box = svg && svg.getBoundingClientRect();

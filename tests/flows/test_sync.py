@@ -59,7 +59,7 @@ def sliplab(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 
 def results(store: Store) -> list[dict[str, Any]]:
-    """What the step kept of every trial."""
+    """Return the stored clock fit of every trial."""
     kept = Derived.of(store, "sync", "tiny")
     return [kept.read(recording.folder.name) for recording in recordings(store)]
 

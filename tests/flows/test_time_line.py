@@ -60,13 +60,13 @@ def slides() -> dict[str, Any]:
 
 
 def truth(recording: Recording, device: str) -> ClockMap:
-    """What a device's clock and the box's really showed."""
+    """Return the true readings of a device's clock and of the box's."""
     pairs = recording.record.simulation_truth["clocks"][DEVICES[device]]
     return ClockMap.through(*zip(*pairs, strict=True))
 
 
 def apart_ns(recording: Recording, device: str, fitted: ClockMap) -> int:
-    """How far a map is from the truth anywhere in the recording, ns."""
+    """Return the largest error of a clock map over the recording, ns."""
     pairs = np.array(recording.record.simulation_truth["clocks"][DEVICES[device]])
     return int(np.abs(fitted.to_reference(pairs[:, 0]) - pairs[:, 1]).max())
 

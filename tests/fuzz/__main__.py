@@ -41,7 +41,7 @@ class Job:
 
 @dataclass
 class Tally:
-    """What became of the files."""
+    """Counts of the outcomes of all files."""
 
     outcomes: dict[str, Counter[str]] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)

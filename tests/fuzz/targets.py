@@ -1,4 +1,4 @@
-"""What is damaged and who reads it: each target has files to begin with, and the real readers."""
+"""Fuzzing targets: seed files to damage, and the real readers that parse them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is written by the project's own hand is what the standard library would write."""
+"""The project's own JSON writer produces the same text as the standard library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the skin is in the event camera's picture."""
+"""Locating the skin in the event camera's image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every detector must do: look back only, and cope with trials that are hardly there."""
+"""Requirements on every detector: causality, and robustness to very short trials."""
 
 from collections.abc import Callable
 

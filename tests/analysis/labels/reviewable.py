@@ -27,11 +27,11 @@ NAME = "kinematic"
 FRAMES, STEP_NS, START_NS = 60, 10_000_000, 5_000_000
 SIZE = 120
 HOLD_NS = 200_000_000
-"""Where the slide begins."""
+"""The start of the slide."""
 PER_S = 40.0
 """Pixels a second that a marker moves once it slips."""
 MOVES_NS = np.array([400, 260, 280, 300, 320, 340, 360], np.int64) * 1_000_000
-"""When each marker begins to move; the centre is the first of them and the last to move."""
+"""Slip time of each marker; index 0 is the centre, which slips last."""
 SKIN_MM = [[0.0, 0.0], *([5.6 * np.cos(a), 5.6 * np.sin(a)] for a in np.arange(6) * np.pi / 3)]
 EVENTS = 3000
 DOUBTFUL = 700
@@ -84,7 +84,7 @@ def events() -> EventChunk:
 
 
 def record(trial: str, condition: dict[str, str]) -> dict[str, Any]:
-    """What a session would say of such a trial."""
+    """Return the record that a session would store for such a trial."""
     clock = {
         "map": {"device_ns": [0], "reference_ns": [0], "drift": [0]},
         "uncertainty_ns": 1000.0, "grade": "trigger input",

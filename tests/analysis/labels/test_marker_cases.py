@@ -1,4 +1,4 @@
-"""What becomes of a marker in each hard case, and whether what is said of its error is true."""
+"""Marker tracking in hard cases, and the accuracy of the stated standard deviation."""
 
 from __future__ import annotations
 

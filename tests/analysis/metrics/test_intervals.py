@@ -41,7 +41,7 @@ def coverage(
 
 
 def as_said(found: float) -> bool:
-    """Whether a measured coverage can be one of 93 to 97 %."""
+    """Return whether a measured coverage is compatible with 93 to 97 %."""
     return 0.93 - NOISE <= found <= 0.97 + NOISE
 
 

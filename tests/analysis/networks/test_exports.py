@@ -1,4 +1,4 @@
-"""What others are given: the ONNX graph, the chip's layout and arithmetic, the model card."""
+"""Model exports: the ONNX graph, the chip's layout and arithmetic, the model card."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ def test_changes_are_counted() -> None:
 
 
 def layer_outputs(net: nn.Sequential, x: np.ndarray) -> dict[str, torch.Tensor]:
-    """What each of Sinabs' layers gives, (n * steps, ...)."""
+    """Return the output of each of Sinabs' layers, (n * steps, ...)."""
     reset_states(net)
     found, at = {}, torch.from_numpy(x.astype(np.float32)).flatten(0, 1)
     with torch.no_grad():

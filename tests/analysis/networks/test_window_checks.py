@@ -92,7 +92,7 @@ def test_permuted_outputs_change_no_figure(fitted: Fitted) -> None:
 
 
 def test_an_argmax_that_favours_class_0_is_found_out() -> None:
-    """What the first version of many evaluations does with a silent network."""
+    """A common mistake in evaluations: scoring a silent network as class 0."""
 
     def naive(counts: np.ndarray, labels: np.ndarray) -> Classification:
         votes = np.eye(3, dtype=int)[counts.argmax(axis=1)]

@@ -1,4 +1,4 @@
-"""How far two runs of a trial are from each other, on cases small enough to reckon by hand."""
+"""Differences between two runs of a trial, on cases small enough to compute by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where samples are taken: every window inside its phase, never two on one another."""
+"""Sampling of windows: each lies inside its phase, and no two overlap."""
 
 from __future__ import annotations
 

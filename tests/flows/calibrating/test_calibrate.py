@@ -64,7 +64,7 @@ def taught(finding: measurement.Finding) -> PlateFrame:
 
 
 def error_of(frame: PlateFrame) -> tuple[float, float]:
-    """How far a plane is from the true one: mm over 12 mm round the centre, and degrees."""
+    """Return a plane's error: mm within 12 mm of the centre, and degrees."""
     far = [
         TRUE_PLANE.position(frame.pose(Position(x, y, 0.0)).xyz_mm).depth_mm
         for x, y in ((0.0, 0.0), (12.0, 0.0), (0.0, 12.0), (-12.0, 0.0), (0.0, -12.0))

@@ -1,4 +1,4 @@
-"""What works without any extra, and how a command says which one it lacks."""
+"""Commands without any extra installed, and the message that names the missing one."""
 
 from __future__ import annotations
 

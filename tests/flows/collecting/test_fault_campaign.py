@@ -59,7 +59,7 @@ FAULTS: list[dict[str, Any]] = [
 
 @dataclass(frozen=True)
 class Row:
-    """What came of a fault, in the words of docs/faults.md."""
+    """Return the outcome of a fault, in the terms of docs/faults.md."""
 
     fault: str
     arm: str
@@ -78,7 +78,7 @@ def _numbers_aside(text: str) -> str:
 
 
 def _arm(rig: Rig) -> str:
-    """What the arm did when its trial ended early."""
+    """Return the arm's action when its trial ended early."""
     try:
         clear = rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm < CLEAR_MM
         ready = rig.arm.state() is ArmState.READY

@@ -31,7 +31,7 @@ from tests.rigs.waiting import own_address
 pytestmark = pytest.mark.realtime
 
 LABELS_AGREE_MS = 20.0
-"""How far the onsets of the same trial may lie apart, through real drivers and in the mock."""
+"""Tolerance between the onsets of one trial through real drivers and in the mock rig."""
 
 
 @dataclass(frozen=True)

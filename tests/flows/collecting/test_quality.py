@@ -1,4 +1,4 @@
-"""What the gates count, against the plain way to count it."""
+"""Counts of the quality gates, against a straightforward reference count."""
 
 from __future__ import annotations
 

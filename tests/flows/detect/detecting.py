@@ -1,4 +1,4 @@
-"""What tests of live detection share: a model file, a short trial, networks that obey."""
+"""Fixtures for tests of live detection: a model file, a short trial, scripted networks."""
 
 from __future__ import annotations
 
@@ -73,5 +73,5 @@ def keeping(rigs: list[Rig]) -> Callable[[RigFile], Rig]:
 
 
 def stands_clear(rig: Rig) -> bool:
-    """Whether the arm stands still off the plate."""
+    """Return whether the arm is at rest clear of the plate."""
     return rig.arm.progress().done and rig.position().depth_mm < 0

@@ -1,4 +1,4 @@
-"""How a live detection ends, and what it refuses to begin."""
+"""Ends of a live detection, and the requests that it rejects."""
 
 from __future__ import annotations
 

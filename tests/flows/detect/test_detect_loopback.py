@@ -17,7 +17,7 @@ from tests.flows.live import rig_yaml, stage_of
 pytestmark = pytest.mark.realtime
 
 BEHIND_MS = 500.0
-"""How late a decision may be on a busy machine before something is wrong."""
+"""Largest acceptable latency of a decision on a busy machine."""
 
 
 def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Where there is no terminal a bar says now and then how far it is, and nothing in between."""
+"""Without a terminal a progress bar prints a line at intervals and nothing in between."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Clock:
 
 
 def lines(monkeypatch: pytest.MonkeyPatch, *, terminal: bool, left: str | None) -> list[str]:
-    """What a bar of six steps of 25 s writes."""
+    """Return the output of a progress bar of six steps of 25 s."""
     out, clock = io.StringIO(), Clock()
     to = Console(file=out, force_terminal=terminal, soft_wrap=True, highlight=False)
     monkeypatch.setattr(console, "messages", to)

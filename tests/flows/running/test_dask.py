@@ -50,7 +50,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """What the steps make of it without a cluster, and in this process alone."""
+    """The results of the steps without a cluster, in this process alone."""
     folder = tmp_path_factory.mktemp("here") / "store"
     shutil.copytree(taken, folder)
     with pytest.MonkeyPatch.context() as patch:
@@ -60,7 +60,7 @@ def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
 
 @pytest.fixture(scope="module")
 def workers_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the workers keep what they fetch: not where this process does."""
+    """The workers' download cache, separate from this process's."""
     return tmp_path_factory.mktemp("cache")
 
 

@@ -1,4 +1,4 @@
-"""What the embedded server is told of quick tasks, and where its tables come from."""
+"""Reports of quick tasks to the embedded server, and the origin of its tables."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class Collection:
         return self.process.wait(limit_s)
 
     def lines(self) -> list[str]:
-        """What it said of the server."""
+        """Return the messages about the server."""
         return [line for line in self.log.read_text().splitlines() if LOST in line]
 
     def label(self) -> str:

@@ -27,7 +27,7 @@ FINAL = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
 
 
 def until(what: str, found: Callable[[], Any], limit_s: float = LIMIT_S) -> Any:
-    """What `found` returns, as soon as that is true."""
+    """Return the result of `found` as soon as it is truthy."""
     end = time.monotonic() + limit_s
     pause = threading.Event()
     while not (answer := found()):
@@ -47,7 +47,7 @@ def access(url: str, password: str) -> dict[str, str]:
 
 
 class Page:
-    """What a person does on Prefect's page."""
+    """A user's actions on Prefect's page."""
 
     def __init__(self, url: str, password: str, name: str, log: Path = Path()) -> None:
         self.url, self.password, self._name, self.log = url, password, name, log

@@ -1,4 +1,4 @@
-"""Who may reach the server of `sliplab serve`: no foreign web page, nobody without the password."""
+"""Access to the server of `sliplab serve`: no foreign web page, nobody without the password."""
 
 from __future__ import annotations
 

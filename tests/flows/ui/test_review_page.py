@@ -90,7 +90,7 @@ class Tab:
         box.press("Escape")
 
     def at(self, time_s: float) -> float:
-        """Where a time stands in the plot of displacements, pixels from the window's left."""
+        """Return a time's x position in the displacement plot, pixels from the window's left."""
         found = self.page.evaluate(
             """() => { for (const view of Bokeh.index.query((v) => v.model.type == "Figure")) {
               const m = view.model, r = view.el.getBoundingClientRect();

@@ -198,7 +198,7 @@ def test_nothing_is_sent_home(
 
 
 def gone(group: int) -> bool:
-    """Whether no process of a group is left, within 20 s."""
+    """Return whether all processes of a group end within 20 s."""
     end = time.monotonic() + 20
     while time.monotonic() < end:
         try:

@@ -1,4 +1,4 @@
-"""What the tests of foreign files share."""
+"""Fixtures for the tests of foreign file formats."""
 
 import pytest
 

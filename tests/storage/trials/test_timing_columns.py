@@ -1,4 +1,4 @@
-"""What a rig without wires stores besides: exposures and reads of clocks, only where there are."""
+"""Extra columns of a rig without trigger wiring: exposures and clock reads, only if present."""
 
 from pathlib import Path
 
