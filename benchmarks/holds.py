@@ -85,7 +85,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial) -> Json:
     built.connect()
     try:
         for task in plan.changeovers(None, trial):
-            built.operator.ask(task.kind, task.prompt, task.expected)
+            built.operator.ask(task.request, task.prompt, task.expected)
         seed = hash_integer(trial.seed, 0)
         truth = built.run_trial(plan.program(trial), NullSink(), seed, None, 100).truth
     finally:

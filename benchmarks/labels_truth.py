@@ -144,7 +144,7 @@ def _run(
     try:
         size = rig.frame_px(plan)
         for task in plan.changeovers(None, trial):
-            built.operator.ask(task.kind, task.prompt, task.expected)
+            built.operator.ask(task.request, task.prompt, task.expected)
         eye = _Eye(layout, plan.protocol.collection.plate is not None, jitter)
         rate_hz = plan.protocol.collection.recording.sync_rate
         done = built.run_trial(

@@ -316,7 +316,9 @@ def _move(request: DetectRequest, rig: Rig, sink: DetectSink) -> Reaction | None
     for task in plan.changeovers(None, trial):
         mass = plan.mass_kg(trial)
         mounted = mass is None or rig.plate is None or abs(rig.plate.mass_kg() - mass) < 1e-3
-        if not mounted and not rig.operator.ask(task.kind, task.prompt, task.expected):
+        if task.mounts_plate and mounted:
+            continue
+        if not rig.operator.ask(task.request, task.prompt, task.expected):
             raise RigError("operator", f"'{task.prompt}' was not confirmed")
     collection = plan.protocol.collection
     rezero = collection.maintenance.rezero

@@ -90,7 +90,9 @@ class Generalisation:
 
     def factors(self) -> list[str]:
         """Return all factors of two levels or more."""
-        names = (name for item in self.campaigns for name in item.plan.protocol.collection.factors)
+        names = (
+            name for item in self.campaigns for name in item.plan.protocol.collection.all_factors
+        )
         return [name for name in dict.fromkeys(names) if len(self.levels(name)) > 1]
 
     def without(self, factor: str, level: str) -> Task:

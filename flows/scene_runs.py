@@ -138,7 +138,7 @@ def _ready(rig: RigFile, plan: Plan, trial: Trial) -> Rig:
     built.connect()
     built.frames.set_region(_SMALL_PX, _SMALL_PX)  # it is asked for frames and takes none
     for task in plan.changeovers(None, trial):
-        built.operator.ask(task.kind, task.prompt, task.expected)
+        built.operator.ask(task.request, task.prompt, task.expected)
     return built
 
 

@@ -202,7 +202,7 @@ def searches(run_requests: list[RunRequest]) -> list[Search]:
         windows = training_windows(slides)
         found.append(Search("baselines", "methods", BASELINE_S * windows, window_baselines))
         protocol = slides[0].plan.protocol
-        epochs, factors = protocol.analysis.training.epochs, len(protocol.collection.factors)
+        epochs, factors = protocol.analysis.training.epochs, len(protocol.collection.all_factors)
         seconds = LEVEL_S * windows * epochs * factors + SKIN_S * SKINS
         found.append(Search("generalisation", "results", seconds, _generalisation))
     if simulated:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from sliplab.protocols.factors import MAX_TRIALS, LevelField
+from sliplab.protocols.factors import MAX_TRIALS, ContextLevel
 from sliplab.protocols.quantity import (
     KilogramsOrRef,
     Millimetres,
@@ -109,7 +109,7 @@ class References(StrictModel):
     """One condition taken again and again, to see the skin wear and the rig drift."""
 
     every: Annotated[int, Field(ge=1, le=MAX_TRIALS)]
-    condition: dict[str, LevelField]
+    condition: dict[str, ContextLevel]
 
 
 class WarmUp(StrictModel):

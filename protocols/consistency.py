@@ -29,8 +29,8 @@ def check_consistency(protocol: Protocol) -> None:
     Raises:
         KeyedError: the first rule that is broken.
     """
-    _check_strata(protocol.analysis.split, protocol.collection.factors)
-    _check_held_out(check_split(protocol.analysis.split, protocol.collection.factors))
+    _check_strata(protocol.analysis.split, protocol.collection.all_factors)
+    _check_held_out(check_split(protocol.analysis.split, protocol.collection.all_factors))
     _check_directions(protocol.collection)
     _check_plate(protocol.collection)
     _check_references(protocol.collection)
@@ -83,7 +83,7 @@ def _check_references(collection: Collection) -> None:
     """Reference trials obey the limits as all others do."""
     given = {} if collection.references is None else collection.references.condition
     for name, level in given.items():
-        unit = collection.factors[name].unit
+        unit = collection.all_factors[name].unit
         if unit is not None and not isinstance(level, str):
             try:
                 check_size(level, unit)

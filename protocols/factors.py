@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from decimal import Decimal
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -24,6 +24,7 @@ from sliplab.protocols.yaml_file import KeyedError, StrictModel
 MAX_TRIALS = 1_000_000
 _UNITS = sorted({kind for kind, _ in UNITS.values()})
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 Level = Decimal | str
 
@@ -101,12 +102,36 @@ LevelField = Annotated[
 ]
 
 
+def _named(raw: object) -> Level:
+    """A level of context: a number, or text that names a thing, also one of digits (``"0042"``)."""
+    if isinstance(raw, str):
+        if not _NAME.fullmatch(raw):
+            raise ValueError(
+                "must be a number (the unit stands once, in 'unit') or a text of letters, digits, "
+                "'_', '-' and '.', 32 characters at most"
+            )
+        return raw
+    return to_decimal(raw)
+
+
+ContextLevel = Annotated[
+    Level,
+    BeforeValidator(_named),
+    PlainSerializer(_write_level),
+    WithJsonSchema(
+        {"anyOf": [{"type": "number"}, {"type": "string", "pattern": f"^{_NAME.pattern}$"}]}
+    ),
+]
+
+
 class Factor(StrictModel):
     """One factor of the factorial: its unit and its levels, as a list or a range."""
 
     model_config = ConfigDict(
         json_schema_extra={"oneOf": [{"required": ["values"]}, {"required": ["range"]}]}
     )
+
+    _HINT: ClassVar[str] = ""
 
     unit: str | None = Field(default=None, json_schema_extra={"enum": [*_UNITS, None]})
     """Of all its levels; words have none."""
@@ -140,6 +165,7 @@ class Factor(StrictModel):
                 if isinstance(level, str) == (self.unit is not None):
                     raise ValueError(
                         f"has the level {_write_level(level)}: numbers need a unit, words have none"
+                        f"{self._HINT}"
                     )
                 continue
             try:
@@ -165,6 +191,20 @@ class Factor(StrictModel):
     def text(self, level: Level) -> str:
         """A level with its unit: ``2.4 mm``, ``left``."""
         return level if isinstance(level, str) else f"{canonical(level)} {self.unit}"
+
+
+class Context(Factor):
+    """One thing that is known of a trial and moves nothing: skin, temperature, serial number.
+
+    Its levels belong to conditions, ids, tables and splits as those of a factor do. Text may be
+    any name, also one of digits only where it stands in quotes.
+    """
+
+    _HINT: ClassVar[str] = " (quote a number that is a name)"
+
+    values: tuple[ContextLevel, ...] | None = None
+    optional: tuple[ContextLevel, ...] = ()
+    """Levels that the protocol knows but does not take unless they are switched on."""
 
 
 def unknown_factor(name: str, factors: Iterable[str]) -> str:

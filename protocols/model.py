@@ -8,6 +8,7 @@ mean (that is `protocols.settings`). Quantities are decimals in the canonical un
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -20,13 +21,32 @@ from sliplab.protocols.conditions import (
     Recording,
     References,
 )
-from sliplab.protocols.factors import MAX_TRIALS, Factor, unknown_factor
+from sliplab.protocols.factors import MAX_TRIALS, Context, Factor, unknown_factor
 from sliplab.protocols.phases import Phase
 from sliplab.protocols.quantity import FactorRef
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+
+
+COLUMNS = (
+    "campaign", "trial", "experiment", "role", "repetition", "block", "attempt", "simulated",
+    "recorded_s", "events", "frames", "frame_source", "sync_uncertainty_us", "passed", "split",
+    "motion_s",
+)  # fmt: skip
+"""Columns that tables of trials have beside the conditions."""
+
+
+def _check_names(factors: Iterable[str], section: str) -> None:
+    for name in factors:
+        if not _NAME.fullmatch(name) or name == "r":
+            raise KeyedError(
+                f"collection.{section}.{name}",
+                name,
+                "a factor's name is a small letter, then small letters, digits and '_' "
+                "('r' stands for the repetition)",
+            )
 
 
 class Collection(StrictModel):
@@ -38,6 +58,11 @@ class Collection(StrictModel):
         json_schema_extra={"minProperties": 1, "propertyNames": {"pattern": f"^{_NAME.pattern}$"}}
     )
     """Factors that are varied; every combination of their levels is a condition."""
+    context: dict[str, Context] = Field(
+        default_factory=dict, json_schema_extra={"propertyNames": {"pattern": f"^{_NAME.pattern}$"}}
+    )
+    """What is known of a trial and moves nothing: skin, temperature, serial number, operator. It
+    is part of every condition, id, table and split."""
     repetitions: Annotated[int, Field(ge=1, le=100_000)]
     order: Literal["shuffled", "listed"] = "shuffled"
     references: References | None = None
@@ -53,24 +78,40 @@ class Collection(StrictModel):
     def _named(cls, factors: dict[str, Factor]) -> dict[str, Factor]:
         if not factors:
             raise ValueError("is empty; give at least one factor")
-        for name in factors:
-            if not _NAME.fullmatch(name) or name == "r":
-                raise KeyedError(
-                    f"collection.factors.{name}",
-                    name,
-                    "a factor's name is a small letter, then small letters, digits and '_' "
-                    "('r' stands for the repetition)",
-                )
+        _check_names(factors, "factors")
         return factors
+
+    @field_validator("context")
+    @classmethod
+    def _context_named(cls, context: dict[str, Context]) -> dict[str, Context]:
+        _check_names(context, "context")
+        for name in context:
+            if name in COLUMNS:
+                raise KeyedError(
+                    f"collection.context.{name}", name, "is a column of every table; choose another"
+                )
+        return context
+
+    @property
+    def all_factors(self) -> dict[str, Factor]:
+        """Factors and context by name, in the order in which a condition has them."""
+        return {**self.factors, **self.context}
+
+    def key_of(self, name: str) -> str:
+        """The key of a factor or of context: ``collection.context.skin``."""
+        return f"collection.{'context' if name in self.context else 'factors'}.{name}"
 
     @model_validator(mode="after")
     def _consistent(self) -> Collection:
+        for name in self.context:
+            if name in self.factors:
+                raise KeyedError(f"collection.context.{name}", name, "is a factor already")
         count = self.repetitions
-        for name, factor in self.factors.items():
+        for name, factor in self.all_factors.items():
             count *= len(factor.levels())
             if count > MAX_TRIALS:
                 raise KeyedError(
-                    f"collection.factors.{name}",
+                    self.key_of(name),
                     f"{count:,} trials",
                     f"the factorial has more than {MAX_TRIALS:,} trials",
                 )
@@ -95,7 +136,7 @@ class Collection(StrictModel):
                 )
             return
         given = self.references.condition
-        for name, factor in self.factors.items():
+        for name, factor in self.all_factors.items():
             key = f"collection.references.condition.{name}"
             if name not in given:
                 raise KeyedError(key, None, "is missing: a reference trial has every factor")
@@ -108,11 +149,11 @@ class Collection(StrictModel):
                     "a reference trial cannot ask for a changeover; leave references out",
                 )
         for name in given:
-            if name not in self.factors:
+            if name not in self.all_factors:
                 raise KeyedError(
                     f"collection.references.condition.{name}",
                     given[name],
-                    unknown_factor(name, self.factors),
+                    unknown_factor(name, self.all_factors),
                 )
 
     def _check_motion(self) -> None:
@@ -146,6 +187,9 @@ class Collection(StrictModel):
         references = self.bindings()
         used = {str(ref) for _, ref in references}
         for key, ref in references:
+            if ref.factor in self.context:
+                text = "is context, which moves nothing; put it below collection.factors"
+                raise KeyedError(key, ref, text)
             if ref.factor not in self.factors:
                 raise KeyedError(key, ref, unknown_factor(str(ref), self.factors))
         for key, each in references:
@@ -162,7 +206,8 @@ class Collection(StrictModel):
                 raise KeyedError(
                     f"collection.factors.{name}",
                     name,
-                    f"is used by no phase; write ${name} where it belongs",
+                    f"is used by no phase; write ${name} where it belongs, or put it below "
+                    "collection.context if it moves nothing",
                 )
 
 

@@ -127,9 +127,9 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
     factors = protocol.collection.factors
     written = {
         name: [
-            (level, f"collection.factors.{name}.{factors[name].place(level)}") for level in levels
+            (level, f"collection.factors.{name}.{factor.place(level)}") for level in enabled[name]
         ]
-        for name, levels in enabled.items()
+        for name, factor in factors.items()
     }
     _check_written(protocol.collection, written)
 

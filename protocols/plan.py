@@ -63,6 +63,13 @@ class Task:
     expected: str
     slot: int
     """Number of the occurrence; with the rig's seed it decides a simulated rezero."""
+    mounts_plate: bool = False
+    """It is the change to another plate, which a rig can weigh."""
+
+    @property
+    def request(self) -> str:
+        """Name of the task to a rig's operator: a `condition` is a changeover of no plate."""
+        return "condition" if self.kind == "changeover" and not self.mounts_plate else self.kind
 
 
 def condition_columns(condition: Mapping[str, str]) -> dict[str, float | str]:
@@ -143,14 +150,14 @@ class Plan:
 
     def describe(self, trial: Trial) -> dict[str, str]:
         """The trial's condition as text with units, by factor."""
-        factors = self.protocol.collection.factors
+        factors = self.protocol.collection.all_factors
         return {name: factors[name].text(level) for name, level in trial.condition}
 
     def level_texts(self, field: Decimal | FactorRef, unit: str) -> tuple[str, ...]:
         """A phase's field in words (``2.8 mm``): its one value, or the levels of its factor."""
         if not isinstance(field, FactorRef):
             return (f"{field} {unit}",)
-        factor = self.protocol.collection.factors[field.factor]
+        factor = self.protocol.collection.all_factors[field.factor]
         return tuple(factor.text(level) for level in self.enabled[field.factor])
 
     def mass_kg(self, trial: Trial) -> float | None:
@@ -185,12 +192,15 @@ class Plan:
     def changeovers(self, before: Trial | None, trial: Trial) -> tuple[Task, ...]:
         """List the changes that a person must make between two trials (or before the first)."""
         past = dict(before.condition) if before is not None else {}
+        plate = self.protocol.collection.plate
+        mass = plate.mass if plate is not None else None
         tasks = []
         for name, level in trial.condition:
-            factor = self.protocol.collection.factors[name]
+            factor = self.protocol.collection.all_factors[name]
             if factor.changeover == "person" and past.get(name) != level:
                 text = factor.text(level)
-                tasks.append(Task("changeover", True, f"set {name} to {text}", text, trial.block))
+                prompt, mounts = f"set {name} to {text}", str(mass) == f"${name}"
+                tasks.append(Task("changeover", True, prompt, text, trial.block, mounts))
         return tuple(tasks)
 
     def stretches(self) -> list[tuple[int, int]]:
@@ -219,6 +229,12 @@ class Plan:
                 f"collection.motion: the recorded hold of {hold:g} s is shorter than "
                 f"{samples.per_class} no-slip windows of {windows.length_ms} ms ({need:g} s)"
             )
+        for name, factor in self.protocol.collection.context.items():
+            if factor.changeover == "none" and len(self.enabled[name]) > 1:
+                found.append(
+                    f"collection.context.{name}: has {len(self.enabled[name])} levels and nobody "
+                    "is asked to change it; write changeover: person if somebody does"
+                )
         return found
 
     @cached_property
@@ -228,7 +244,7 @@ class Plan:
         Levels, repetitions and reference trials only add trials; the ids say which.
         """
         data = self.collection_data
-        for factor in data["factors"].values():
+        for factor in (*data["factors"].values(), *data.get("context", {}).values()):
             for key in ("values", "range", "optional"):
                 factor.pop(key)
         for key in ("repetitions", "references"):
@@ -239,6 +255,8 @@ class Plan:
     def collection_data(self) -> dict[str, Any]:
         """The `collection:` section as JSON data, defaults written out."""
         data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
+        if not data["context"]:  # as in protocols from before it came
+            data.pop("context")
         gates = self.protocol.collection.gates
         for name in ("reference", "hold_slip"):
             if getattr(gates, name) is None:  # hashes of protocols from before it came stay
@@ -279,7 +297,7 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
     levels = _enabled(protocol, enable)
     try:
         check_limits(protocol, levels)
-        split = check_split(protocol.analysis.split, protocol.collection.factors)
+        split = check_split(protocol.analysis.split, protocol.collection.all_factors)
     except KeyedError as error:
         raise InputError(file, error.key, error.value, str(error)) from None
     analysis = protocol.analysis.model_copy(update={"split": split})
@@ -307,7 +325,7 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
 
 
 def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level, ...]]:
-    factors = protocol.collection.factors
+    factors = protocol.collection.all_factors
     levels = {name: factor.levels() for name, factor in factors.items()}
     for text in enable:
         name, _, raw = text.partition("=")
@@ -332,7 +350,7 @@ def condition_id(protocol: Protocol, condition: Mapping[str, Level]) -> str:
     """``depth=2.4mm,direction=45deg``: factors by name, levels as decimal text with unit."""
     parts = []
     for name in sorted(condition):
-        level, unit = condition[name], protocol.collection.factors[name].unit
+        level, unit = condition[name], protocol.collection.all_factors[name].unit
         text = level if isinstance(level, str) else canonical(level)
         parts.append(f"{name}={text}{FILE_UNITS.get(unit or '', unit or '')}")
     return ",".join(parts)
@@ -340,7 +358,7 @@ def condition_id(protocol: Protocol, condition: Mapping[str, Level]) -> str:
 
 def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iterator[Trial]:
     collection = protocol.collection
-    factors = collection.factors
+    factors = collection.all_factors
     outer = [name for name in factors if factors[name].changeover == "person"]
     inner = [name for name in factors if name not in outer]
     repetitions = range(1, collection.repetitions + 1)

@@ -40,6 +40,7 @@ UNITS: dict[str, tuple[str, Decimal]] = {
     "kHz": ("Hz", Decimal(1000)),
     "ppm": ("ppm", Decimal(1)),
     "N": ("N", Decimal(1)),
+    "degC": ("degC", Decimal(1)),
 }
 # how a canonical unit is written where a slash or a percent sign cannot stand (file names)
 FILE_UNITS = {"mm/s": "mmps", "percent": "pct"}

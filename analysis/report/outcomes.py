@@ -119,7 +119,7 @@ class Conditions:
         self.factors: dict[str, list[str]] = {}
         names = {item.name for item in campaigns if item.experiment == experiment}
         for item in campaigns:
-            factors = item.plan.protocol.collection.factors
+            factors = item.plan.protocol.collection.all_factors
             for name, levels in item.plan.enabled.items() if item.name in names else ():
                 there = self.factors.setdefault(name, [])
                 there += [t for t in map(factors[name].text, levels) if t not in there]

@@ -215,7 +215,9 @@ class Session:
 
     def _change_over(self, trial: Trial) -> None:
         for task in self.plan.changeovers(self._previous, trial):
-            if not self._mounted(trial):
+            if not task.mounts_plate:
+                self._ask(task)
+            elif not self._mounted(trial):
                 self._ask(task)
                 if not self._mounted(trial):
                     raise RigError("plate", f"{task.prompt}: the rig finds another mass mounted")
@@ -247,7 +249,7 @@ class Session:
         return mass is None or self.rig.plate is None or abs(self.rig.plate.mass_kg() - mass) < 1e-3
 
     def _ask(self, task: Task) -> None:
-        if not self.rig.operator.ask(task.kind, task.prompt, task.expected):
+        if not self.rig.operator.ask(task.request, task.prompt, task.expected):
             raise RigError("operator", f"'{task.prompt}' was not confirmed")
 
     def _take(self, trial: Trial) -> None:

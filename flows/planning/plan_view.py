@@ -86,7 +86,7 @@ def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str,
 
 def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
     """Print the plan as tables."""
-    factors = list(found.protocol.collection.factors)
+    factors = list(found.protocol.collection.all_factors)
     table = []
     for trial in found:
         known = found.describe(trial)
@@ -105,7 +105,7 @@ def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
                 before,
             ]
         )
-    units = {name: factor.unit for name, factor in found.protocol.collection.factors.items()}
+    units = {name: factor.unit for name, factor in found.protocol.collection.all_factors.items()}
     named = [f"{name} ({units[name]})" if units[name] else name for name in factors]
     columns = ["#", "block", *named, "rep.", "split", "motion (s)", "before it"]
     console.print_table(f"{found.file}: {found.protocol.title}", columns, table, limit=40)

@@ -152,7 +152,8 @@ def _changed(run_request: RunRequest, campaign: Campaign) -> str:
         return ""
     old, new = begun.collection_data, run_request.plan.collection_data
     for data, enabled in ((old, begun.enabled), (new, run_request.plan.enabled)):
-        for name, factor in data["factors"].items():  # however they were written
+        # however they were written
+        for name, factor in (*data["factors"].items(), *data.get("context", {}).items()):
             for key in ("values", "range", "optional"):
                 factor.pop(key)
             factor["levels"] = [str(level) for level in enabled[name]]

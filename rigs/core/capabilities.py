@@ -304,7 +304,11 @@ class Operator(Protocol):
     """The person at the rig."""
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """Ask for something to be done (`task`: changeover, clean, ...); True once confirmed."""
+        """Ask for something to be done; True once confirmed.
+
+        Args:
+            task: changeover (another plate), condition (another skin, ...), clean, jog, ...
+        """
 
 
 @runtime_checkable

@@ -15,7 +15,7 @@ from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.lens import VIEWS
 from sliplab.rigs.scene.randomness import generator
 
-_TRACELESS = {"clean", "warm_up", "rezero"}
+_TRACELESS = {"clean", "condition", "warm_up", "rezero"}
 _LONGEST_S = 3600.0
 
 
@@ -72,7 +72,8 @@ class Asked:
 class SimulatedOperator:
     """A simulated person, who does at once what is asked and says so.
 
-    `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
+    `changeover` mounts the mass that `expected` names (``0.205 kg``), and a `condition` (another
+    skin, a temperature) is only confirmed: the scene stays; `protective_stop` clears a
     stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before
     the camera (`rigs.mock.operator`). What leaves no trace in the simulation is only confirmed.
     """
