@@ -349,6 +349,16 @@ def load(model: type[ModelT], path: Path, what: str) -> ModelT:
 
 
 def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -> InputError:
+    fault = first_fault(model, error)
+    return InputError(path, fault.key, fault.value, str(fault))
+
+
+def first_fault(model: type[BaseModel], error: ValidationError) -> KeyedError:
+    """Return the fault of `error` that is said to a person: its key, the value and what is right.
+
+    A model that is chosen by what stands in it (a device by its driver) is validated by itself, and
+    its fault goes on from the key where it stands: `KeyedError` with a ``.`` before the key.
+    """
     # An unknown key is most often the cause of a missing one beside it: say it first.
     first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
     loc = first["loc"]
@@ -359,7 +369,7 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
         keyed = context["error"]
         below = keyed.key == "" or keyed.key[0] in ".["
         whole = (key + keyed.key).lstrip(".") if below else keyed.key
-        return InputError(path, whole, keyed.value, str(keyed))
+        return KeyedError(whole, keyed.value, str(keyed))
     if kind == "extra_forbidden":
         names = _fields_at(model, loc[:-1])
         close = difflib.get_close_matches(str(loc[-1]), names, n=1)
@@ -367,30 +377,30 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
         known = f" (known here: {', '.join(names)})" if names else ""
         foreign = foreign_character(str(loc[-1]))
         hint = (f" (holds {foreign})" if foreign else "") + hint
-        return InputError(path, key, value, f"unknown key{hint}{known}")
+        return KeyedError(key, value, f"unknown key{hint}{known}")
     if kind == "missing":
-        return InputError(path, key, None, "is missing")
+        return KeyedError(key, None, "is missing")
     if kind == "value_error":
-        return InputError(path, key, value, str(context["error"]))
+        return KeyedError(key, value, str(context["error"]))
     if kind in {"union_tag_invalid", "union_tag_not_found"}:
         tags = str(context.get("expected_tags", "")).replace("'", "")
         tag = str(context.get("discriminator", "'kind'")).strip("'")
         found = value.get(tag) if isinstance(value, dict) else value
-        return InputError(path, f"{key}.{tag}", found, f"must be one of {tags}")
+        return KeyedError(f"{key}.{tag}", found, f"must be one of {tags}")
     message = re.sub("^Input should", "must", first["msg"])
     expected = _EXPECTED.get(kind, message[0].lower() + message[1:])
     if value is None:
-        return InputError(path, key, None, f"is empty; {expected}")
+        return KeyedError(key, None, f"is empty; {expected}")
     if kind in _EXPECTED:
         if isinstance(value, str) and (meant := number_meant(value)):
-            return InputError(path, key, value, meant)
+            return KeyedError(key, value, meant)
         if kind == "string_type" and not isinstance(value, list | tuple | dict):
             reads = "a switch" if isinstance(value, bool) else "a day"
             reads = "a number" if isinstance(value, int | Decimal) and reads == "a day" else reads
             expected += f" and reads as {reads}: quote it"
     if context.get("pattern") == NAME_PATTERN:
         expected = f"must be {NAME_WORDS} (pattern {NAME_PATTERN})"
-    return InputError(path, key, value, expected)
+    return KeyedError(key, value, expected)
 
 
 NAME_PATTERN = "^[a-z][a-z0-9_-]{0,47}$"

@@ -1,28 +1,23 @@
-"""From a rig file to a rig that can be run: the one place that knows which driver is which."""
+"""From a rig file to a rig that can be run, by the drivers that the file names."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from sliplab.rigs.core.arm_settings import PlaneSettings
+from sliplab.rigs.core.arm_settings import BaseArmSettings, PlaneSettings
 from sliplab.rigs.core.capabilities import (
-    Arm,
-    EventCamera,
     FrameCamera,
     Operator,
     Plate,
     Pose,
     RigError,
-    Simulation,
 )
 from sliplab.rigs.core.host_clock import HostClock
 from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.devices.basler.settings import BaslerSettings
-from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.settings import ArmSettings, DeviceSettings
+from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.discovery import need_libraries
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.rig_file import RigFile
@@ -109,7 +104,7 @@ def tool_of(file: RigFile) -> Pose:
     return Pose(tool.tcp_mm if taught is None else taught.offset, tool.tcp_rotvec_deg)
 
 
-def calibrated_arm(file: RigFile, devices: DeviceSettings) -> ArmSettings:
+def calibrated_arm(file: RigFile, devices: DeviceSettings) -> BaseArmSettings:
     """The arm's settings: tool as taught, limits that follow the taught plane unless they say."""
     arm = devices.arm
     limits, plane = arm.limits, file.calibration.contact_plane
@@ -123,7 +118,7 @@ def calibrated_arm(file: RigFile, devices: DeviceSettings) -> ArmSettings:
 def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     console = ConsoleOperator()
     person = PersonAtPlate(console, devices.plate.mass_kg) if devices.plate else None
-    return _driven_rig(file, devices, person or console, person, None, None, ())
+    return _driven_rig(file, devices, person or console, person, None)
 
 
 def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
@@ -131,7 +126,7 @@ def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     from sliplab.rigs.loopback.client import Loopback
 
     with ExitStack() as undo:
-        stage = Loopback(file.scene, file.timing, devices.arm)
+        stage = Loopback(file.scene, file.timing, devices)
         undo.callback(stage.close)
         rig = loopback_rig(file, stage)
         rig.ending = (stage.close,)
@@ -148,12 +143,8 @@ def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
     Raises:
         RigError: a fake is not there.
     """
-    from sliplab.rigs.devices.basler.fake_live import LiveBasler
-
     assert file.devices is not None
-    exposure_ns = file.scene.frame_camera.exposure_us * 1000
-    camera = LiveBasler(stage, exposure_ns // 2, file.devices.frame_camera.sync_line or 1)
-    return _driven_rig(file, stage.reached_by(file.devices), stage, stage, stage, camera, ())
+    return _driven_rig(file, stage.reached_by(file.devices), stage, stage, stage)
 
 
 def _driven_rig(
@@ -161,33 +152,27 @@ def _driven_rig(
     devices: DeviceSettings,
     operator: Operator,
     plate: Plate | None,
-    simulation: Simulation | None,
-    camera: Any,
-    ending: tuple[Any, ...],
+    shown: Loopback | None,
 ) -> Rig:
     """A rig of drivers; whatever was opened is closed again if one of them fails.
 
     Args:
-        camera: the device behind the frame camera's driver, None to search for it.
-        ending: called when the rig is closed, last.
+        shown: the simulated scene behind the fakes; None on a real rig.
     """
-    from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
-
     assert devices.sync_box is not None
-    scale = {"px_per_mm": file.frame_camera.scale_px_per_mm}
     with ExitStack() as undo:
-        frames = build_frame_camera(devices.frame_camera.model_copy(update=scale), camera)
+        frames = _frame_camera(file, devices, shown)
         undo.callback(frames.close)
         _check_grade(file, frames)
-        events = build_event_camera(devices.event_camera)
+        events = devices.event_camera_driver.build(devices.event_camera)
         undo.callback(events.close)
         rig = Rig(
             name=file.name,
             clock=HostClock(),
-            arm=build_arm(calibrated_arm(file, devices)),
+            arm=devices.arm_driver.build(calibrated_arm(file, devices)),
             events=events,
             frames=frames,
-            sync=SerialSyncBox(devices.sync_box),
+            sync=devices.sync_box_driver.build(devices.sync_box),
             operator=operator,
             plate_frame=taught_frame(file),
             poll_s=float(file.poll),
@@ -195,11 +180,19 @@ def _driven_rig(
             touch_mm=file.calibration.touch_depth,
             tail_s=DRIVEN_TAIL_S,
             plate=plate,
-            simulation=simulation,
-            ending=ending,
+            simulation=shown,
         )
         undo.pop_all()
     return rig
+
+
+def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None) -> FrameCamera:
+    driver, settings = devices.frame_camera_driver, devices.frame_camera
+    px_per_mm = file.frame_camera.scale_px_per_mm
+    if shown is None:
+        return driver.build(settings, px_per_mm)
+    assert driver.fake is not None  # the rig file was held against it
+    return driver.fake(settings, px_per_mm, shown, file.scene.frame_camera.exposure_us * 500)
 
 
 def _check_grade(file: RigFile, frames: FrameCamera) -> None:
@@ -216,39 +209,3 @@ def _check_grade(file: RigFile, frames: FrameCamera) -> None:
             f"says timing.frames: {file.timing.frames}; wire and set it so, or write "
             f"timing.frames: {stamping.grade}",
         )
-
-
-def build_arm(settings: ArmSettings) -> Arm:
-    """The arm that `settings` describe, not connected yet.
-
-    A driver is imported here only, with its maker's library.
-    """
-    if settings.driver == "ur":
-        from sliplab.rigs.devices.ur.driver import UrArm
-
-        return UrArm(settings)
-    if settings.driver == "abb":
-        from sliplab.rigs.devices.abb.driver import AbbArm
-
-        return AbbArm(settings)
-    from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
-
-    return AbbSocketArm(settings)
-
-
-def build_frame_camera(settings: BaslerSettings, device: Any = None) -> FrameCamera:
-    """The frame camera that `settings` describe, open and not grabbing yet. Raises RigError.
-
-    Args:
-        device: pylon's camera behind the driver; searched for where None.
-    """
-    from sliplab.rigs.devices.basler.driver import BaslerCamera
-
-    return BaslerCamera(settings, device)
-
-
-def build_event_camera(settings: DvxplorerSettings) -> EventCamera:
-    """The event camera that `settings` describe, open and not streaming yet. Raises RigError."""
-    from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
-
-    return DvxplorerCamera(settings)

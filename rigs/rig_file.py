@@ -14,7 +14,7 @@ from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move
 from sliplab.protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
-from sliplab.protocols.shown import MASK
+from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import Timing
 from sliplab.protocols.yaml_file import (
     NAME_PATTERN,
@@ -154,6 +154,17 @@ class RigFile(StrictModel):
         ):
             if value != right:
                 raise KeyedError(key, value, f"must be {right}: that is what stand-ins show")
+        fakes = {
+            "arm": self.devices.arm_driver.fake,
+            "event_camera": self.devices.event_camera_driver.reach,
+            "frame_camera": self.devices.frame_camera_driver.fake,
+            "sync_box": self.devices.sync_box_driver.reach,
+        }
+        for name, fake in fakes.items():
+            if fake is None:
+                found = getattr(self.devices, name).driver
+                text = "has no fake for a loopback rig: write driver: devices"
+                raise KeyedError(f"devices.{name}.driver", found, text)
         return self
 
     @model_validator(mode="after")
@@ -247,7 +258,7 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
         if rig.devices is not None and not stored:
             try:
                 check_units(rig.devices.arm)
-                _check_password(rig)
+                _check_secrets(rig)
             except KeyedError as error:
                 raise InputError(found.path, error.key, error.value, str(error)) from None
         return rig, found.text
@@ -255,11 +266,15 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
         raise error.in_file(found.blame(error.key)) from None
 
 
-def _check_password(rig: RigFile) -> None:
-    arm = None if rig.devices is None else rig.devices.arm
-    if not rig.simulated and getattr(arm, "password", None) == MASK:
-        text = "is masked in a store's copy of a rig file: write the rig's own"
-        raise KeyedError("devices.arm.password", MASK, text)
+def _check_secrets(rig: RigFile) -> None:
+    if rig.simulated or rig.devices is None:
+        return
+    for driver, settings in rig.devices.drivers():
+        for name in driver.settings.model_fields:
+            if is_secret(name) and getattr(settings, name) == MASK:
+                key = f"devices.{driver.kind.replace(' ', '_')}.{name}"
+                text = "is masked in a store's copy of a rig file: write the rig's own"
+                raise KeyedError(key, MASK, text)
 
 
 def rig_hash(text: str) -> str:

@@ -1,4 +1,4 @@
-"""One program at a time at a real rig: an OS lock for its arm, and one for its sync box.
+"""One program at a time at a real rig: an OS lock for each device that must not be shared.
 
 The locks are the machine's, whoever runs the program and from whatever session: two programs that
 drive one arm are dangerous whoever their users are. So they stand in one folder for everybody and
@@ -32,12 +32,11 @@ def lock_names(file: RigFile) -> dict[str, str]:
     """
     if file.simulated or file.devices is None:
         return {}
-    host = file.devices.arm.host.lower()
-    found = {f"arm-{_plain(host)}.lock": f"the arm at {host} (rig {file.name})"}
-    if file.devices.sync_box is not None:
-        port = os.path.realpath(file.devices.sync_box.port)  # by-id links and plain names are one
-        found[f"sync-{_plain(port)}.lock"] = f"the sync box at {port} (rig {file.name})"
-    return found
+    return {
+        f"{_plain(name)}.lock": f"{what} (rig {file.name})"
+        for driver, settings in file.devices.drivers()
+        for name, what in driver.locks(settings).items()
+    }
 
 
 @contextmanager

@@ -71,11 +71,17 @@ def rigs(
     ask: Annotated[
         bool, typer.Option("--ask", help="Check whether each device responds; nothing moves.")
     ] = False,
+    drivers: Annotated[
+        bool, typer.Option("--drivers", help="List the installed drivers of devices instead.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List rig files and their devices; with --ask check whether each device responds."""
     from sliplab.rigs.rig_inheritance import shipped_rigs
 
+    if drivers:
+        _list_drivers(as_json)
+        return
     found = [_about(path, ask) for path in (files or shipped_rigs().values())]
     if as_json:
         console.print_json({"rigs": found})
@@ -83,6 +89,36 @@ def rigs(
         rows = [[str(item[name]) for name in COLUMNS] for item in found]
         console.print_table("rigs", [*COLUMNS.values()], rows)
     if any(item["wrong"] for item in found):
+        raise typer.Exit(console.FAILED)
+
+
+DRIVER_COLUMNS = {"name": "driver", "kind": "kind", "title": "device", "package": "package"}
+
+
+def _list_drivers(as_json: bool) -> None:
+    """Print every installed driver, and in a line each what is wrong with one."""
+    from sliplab.rigs.core.registry import DriverError, listed, load_driver, taken
+
+    found, wrong = [], taken()
+    for item in listed().values():
+        try:
+            driver = load_driver(item)
+        except DriverError as error:
+            wrong.append(str(error))
+            continue
+        found.append({
+            "name": item.name, "kind": driver.kind, "title": driver.title, "package": item.package,
+            "simulated_on_loopback": getattr(driver, "fake", None) is not None
+            or getattr(driver, "reach", None) is not None,
+        })  # fmt: skip
+    if as_json:
+        console.print_json({"drivers": found, "wrong": wrong})
+    else:
+        rows = [[str(item[name]) for name in DRIVER_COLUMNS] for item in found]
+        console.print_table("drivers", [*DRIVER_COLUMNS.values()], rows)
+        for line in wrong:
+            console.say(line)
+    if wrong:
         raise typer.Exit(console.FAILED)
 
 
@@ -138,16 +174,16 @@ def _answer(file: RigFile, ask: bool, silent: dict[str, str]) -> str:
 def _arm(file: RigFile) -> str:
     if file.devices is None:
         return "simulated"
-    arm = file.devices.arm
-    kind = {"ur": "Universal Robots", "abb": "ABB, motion programs", "abb_socket": "ABB, RAPID"}
-    return f"{kind[arm.driver]}, {'stand-in' if file.simulated else arm.host}"
+    driver, arm = file.devices.arm_driver, file.devices.arm
+    return f"{driver.title}, {'fake' if file.simulated else driver.address(arm)}"
 
 
 def _cameras(file: RigFile) -> str:
     if file.devices is None:
         return f"simulated, {file.frame_source}"
-    suffix = " (stand-ins)" if file.simulated else ""
-    return f"DVXplorer, Basler{suffix}"
+    suffix = " (fakes)" if file.simulated else ""
+    cameras = file.devices.event_camera_driver, file.devices.frame_camera_driver
+    return f"{', '.join(camera.title for camera in cameras)}{suffix}"
 
 
 class By(StrEnum):

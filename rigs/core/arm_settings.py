@@ -7,12 +7,13 @@ belong to the rig, not to the protocol.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from sliplab.protocols.yaml_file import KeyedError, StrictModel
 from sliplab.rigs.core.address import Host
+from sliplab.rigs.core.device_settings import DriverSettings
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -50,9 +51,7 @@ class Limits(StrictModel):
     def _makes_sense(self) -> Limits:
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:
-                raise KeyedError(
-                    "devices.arm.limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm"
-                )
+                raise KeyedError(".low_mm", list(self.low_mm), f"{axis} is not below high_mm")
         return self
 
 
@@ -66,9 +65,11 @@ class ToolSettings(StrictModel):
     centre_of_mass_mm: Triple = (0.0, 0.0, 0.0)
 
 
-class BaseArmSettings(StrictModel):
+class BaseArmSettings(DriverSettings):
     """Settings that every arm has, whatever its make."""
 
+    host_clock: ClassVar[bool] = False
+    """The controller has no clock to read: poses are stamped by this computer's."""
     host: Host
     tool: ToolSettings = ToolSettings()
     limits: Limits

@@ -1,25 +1,75 @@
 """The devices of a real rig as its rig file names them: which driver, and how to reach it.
 
-Cheap to import: `sliplab plan` reads rig files, and no maker's library is needed for that.
+The driver that a device names has the rest of its keys (`rigs.core.registry`). Cheap to import:
+`sliplab plan` reads rig files, and no maker's library is needed for that.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Literal, Union
 
-from pydantic import Field
+from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
-from sliplab.protocols.yaml_file import StrictModel, register_tags_of
-from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
-from sliplab.rigs.devices.basler.settings import BaslerSettings
-from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
-from sliplab.rigs.devices.ur.settings import UrSettings
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, first_fault, register_tags_of
+from sliplab.rigs.core.arm_settings import BaseArmSettings
+from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
+from sliplab.rigs.core.driver import (
+    ArmDriver,
+    Driver,
+    EventCameraDriver,
+    FrameCameraDriver,
+    SyncBoxDriver,
+)
+from sliplab.rigs.core.registry import DriverError, drivers, find_driver
 
-ArmSettings = UrSettings | AbbSettings | AbbSocketSettings
-
-register_tags_of("arm", "ur", "abb", "abb_socket")
 register_tags_of("source", "usb", "network")
+
+
+class _OfKind:
+    """Settings of any installed driver of a kind: `driver` says which model checks the others."""
+
+    def __init__(self, kind: str, default: str | None = None) -> None:
+        self._kind, self._default = kind, default
+
+    def read(self, value: Any) -> DriverSettings:
+        """Return the settings in `value`, checked by the driver that it names."""
+        if isinstance(value, DriverSettings):
+            return value
+        if not isinstance(value, dict):
+            raise ValueError("must be a mapping (key: value)")
+        name = value.get("driver", self._default)
+        try:
+            driver = find_driver(str(name), self._kind)
+        except DriverError as error:
+            raise KeyedError(".driver", name, str(error)) from None
+        try:
+            return driver.settings.model_validate(value)
+        except ValidationError as error:
+            fault = first_fault(driver.settings, error)
+        raise KeyedError(f".{fault.key}" if fault.key else "", fault.value, str(fault))
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: Callable[[Any], CoreSchema]
+    ) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self.read,
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda settings: settings.model_dump(mode="json")
+            ),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """One choice a driver, of those that are installed."""
+        models = tuple(driver.settings for driver in drivers(self._kind))
+        if len(models) == 1:
+            return handler(TypeAdapter(models[0]).core_schema)
+        choice: Any = Annotated[Union[models], Field(discriminator="driver")]  # noqa: UP007
+        return handler(TypeAdapter(choice).core_schema)
 
 
 class OperatedPlate(StrictModel):
@@ -33,10 +83,48 @@ class OperatedPlate(StrictModel):
 class DeviceSettings(StrictModel):
     """The `devices:` section of a rig file."""
 
-    arm: Annotated[ArmSettings, Field(discriminator="driver")]
-    event_camera: DvxplorerSettings = DvxplorerSettings()
-    frame_camera: BaslerSettings
-    sync_box: SyncBoxSettings | None = None
-    """Needed by a real rig; a rig of stand-ins brings its own."""
+    arm: Annotated[BaseArmSettings, _OfKind("arm")]
+    event_camera: Annotated[DriverSettings, _OfKind("event camera", "dvxplorer")] = Field(
+        default={"driver": "dvxplorer"}, validate_default=True
+    )
+    frame_camera: Annotated[FrameCameraSettings, _OfKind("frame camera", "basler")]
+    sync_box: Annotated[DriverSettings, _OfKind("sync box", "sync_box")] | None = None
+    """Needed by a real rig; a loopback rig brings its own."""
     plate: OperatedPlate | None = None
     """Left out, the rig has no sliding plate, and takes kinematic protocols only."""
+
+    def drivers(self) -> Iterator[tuple[Driver[Any], DriverSettings]]:
+        """The driver of every device, with its settings, the arm first."""
+        for kind in ("arm", "event camera", "frame camera", "sync box"):
+            settings = getattr(self, kind.replace(" ", "_"))
+            if settings is not None:
+                yield find_driver(settings.driver, kind), settings
+
+    @property
+    def arm_driver(self) -> ArmDriver[Any]:
+        """The driver of the arm."""
+        found = find_driver(self.arm.driver, "arm")
+        assert isinstance(found, ArmDriver)
+        return found
+
+    @property
+    def event_camera_driver(self) -> EventCameraDriver[Any]:
+        """The driver of the event camera."""
+        found = find_driver(self.event_camera.driver, "event camera")
+        assert isinstance(found, EventCameraDriver)
+        return found
+
+    @property
+    def frame_camera_driver(self) -> FrameCameraDriver[Any]:
+        """The driver of the frame camera."""
+        found = find_driver(self.frame_camera.driver, "frame camera")
+        assert isinstance(found, FrameCameraDriver)
+        return found
+
+    @property
+    def sync_box_driver(self) -> SyncBoxDriver[Any]:
+        """The driver of the sync box."""
+        name = "sync_box" if self.sync_box is None else self.sync_box.driver
+        found = find_driver(name, "sync box")
+        assert isinstance(found, SyncBoxDriver)
+        return found

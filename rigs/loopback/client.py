@@ -21,9 +21,7 @@ from typing import Any
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.devices.dvxplorer.settings import NetworkStream
-from sliplab.rigs.devices.settings import ArmSettings, DeviceSettings
-from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
+from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.streams import FrameChunk, Sink
 
@@ -46,26 +44,26 @@ class Loopback:
 
     Attributes:
         sync_port: name of the sync box's serial port.
-        event_ports: the event camera's two network ports: events and triggers.
+        event_address: where the event camera's driver finds its fake.
 
     Raises:
         RigError: they do not begin.
     """
 
-    def __init__(self, settings: MockSettings, timing: Timing, arm: ArmSettings) -> None:
+    def __init__(self, settings: MockSettings, timing: Timing, devices: DeviceSettings) -> None:
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._frames, their_frames = context.Pipe(duplex=False)
         self._asking = threading.Lock()
         self.on_frames: Callable[[FrameChunk], None] = _forget
         self._process = context.Process(
-            target=_serve, args=(theirs, their_frames, settings, timing, arm), name="stand-ins"
+            target=_serve, args=(theirs, their_frames, settings, timing, devices), name="stand-ins"
         )
         self._process.start()
         theirs.close()
         their_frames.close()
         try:
-            self.sync_port, self.event_ports = self._answer(READY_S)
+            self.sync_port, self.event_address = self._answer(READY_S)
         except BaseException:
             self.close()
             raise
@@ -83,13 +81,13 @@ class Loopback:
 
     def reached_by(self, devices: DeviceSettings) -> DeviceSettings:
         """Settings of drivers that reach these fakes."""
-        events, triggers = self.event_ports
-        source = NetworkStream(events_port=events, triggers_port=triggers)
-        box = devices.sync_box or SyncBoxSettings(port=self.sync_port)
+        camera, box = devices.event_camera_driver.reach, devices.sync_box_driver.reach
+        assert camera is not None  # the rig file was held against it
+        assert box is not None
         return devices.model_copy(
             update={
-                "event_camera": devices.event_camera.model_copy(update={"source": source}),
-                "sync_box": box.model_copy(update={"port": self.sync_port}),
+                "event_camera": camera(devices.event_camera, self.event_address),
+                "sync_box": box(devices.sync_box, self.sync_port),
             }
         )
 
@@ -142,7 +140,7 @@ class Loopback:
 
     def restore(self, device: str) -> None:
         """A person puts it right; see `SimulationServer.restore`. Drivers have to be built anew."""
-        self.sync_port, self.event_ports = self._ask("restore", device)
+        self.sync_port, self.event_address = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
         """Return where the sensor truly is: right and up on the plate, and depth into it, mm."""
@@ -199,7 +197,7 @@ def _serve(
     frames: Connection,
     settings: MockSettings,
     timing: Timing,
-    arm: ArmSettings,
+    devices: DeviceSettings,
 ) -> None:
     """The process: it ends with its parent, and never waits for a library to be taken down."""
     from sliplab.rigs.loopback.simulation_server import SimulationServer
@@ -207,8 +205,8 @@ def _serve(
     sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes
     status, server = 1, None
     try:
-        server = SimulationServer(settings, timing, arm, frames.send)
-        pipe.send((True, (server.sync_box.port, server.camera.ports)))
+        server = SimulationServer(settings, timing, devices, frames.send)
+        pipe.send((True, (server.sync_box.port, server.camera.address)))
         while True:
             if pipe.poll(TURN_S):
                 what, arguments = pipe.recv()

@@ -20,13 +20,12 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
-from sliplab.rigs.core.fakes import FakeController, Kind
+from sliplab.rigs.core.driver import ArmScene
+from sliplab.rigs.core.fake_motion import ControllerClock
+from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
-from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
-from sliplab.rigs.devices.settings import ArmSettings
+from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.devices.sync_box.fake import FakeSyncBox, Train
-from sliplab.rigs.devices.ur.settings import UrSettings
 from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.devices import build_mock
@@ -64,7 +63,7 @@ class SimulationServer:
     Args:
         settings: the simulated scene and devices, with their faults.
         timing: which signals reach which device; frames by hardware trigger.
-        arm: settings of the arm's driver: a fake of its kind listens where it will look.
+        devices: the rig's drivers: fakes of their kinds listen where they will look.
         on_frames: is given the frames of each turn.
     """
 
@@ -72,7 +71,7 @@ class SimulationServer:
         self,
         settings: MockSettings,
         timing: Timing,
-        arm: ArmSettings,
+        devices: DeviceSettings,
         on_frames: Callable[[FrameChunk], None],
     ) -> None:
         _rehearse(settings, timing)
@@ -80,7 +79,7 @@ class SimulationServer:
         clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
         plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self._arm_clock = clocks.arm
-        self._arm_by_host = arm.driver == "abb_socket"
+        self._arm_by_host = devices.arm.host_clock
         self._path = FakeArmPath(plane, start_pose(settings), clocks.arm)
         self.world = World(settings, self._path, run_on=True)
         self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
@@ -97,10 +96,16 @@ class SimulationServer:
         self._stamps_us: list[I64] = []
         self._size = settings.event_camera.width, settings.event_camera.height
         self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
-        self.camera = LiveDvxplorer(self._size)
-        self.arm: FakeController = fake_arm(
-            arm, self._path.motion, self._arm_now_s, self._arm_input
+        fake_arm, fake_camera = devices.arm_driver.fake, devices.event_camera_driver.fake
+        assert fake_arm is not None  # the rig file was held against it
+        assert fake_camera is not None
+        self._make_camera = partial(fake_camera, self._size)
+        self.camera = self._make_camera()
+        scene = ArmScene(
+            self._path.motion, ControllerClock(self._arm_now_s), self._arm_input, REACH_MM
         )
+        self.arm = fake_arm(devices.arm, scene)
+        self.arm.start()
         self._events.start()
 
     def close(self) -> None:
@@ -284,13 +289,13 @@ class SimulationServer:
             raise RigError(device, f"no stand-in can show '{kind}' of it") from None
         what()
 
-    def restore(self, device: str) -> tuple[str, tuple[int, int]]:
+    def restore(self, device: str) -> tuple[str, Any]:
         """A person puts right whatever is wrong with a device.
 
         A stopped arm is unlocked and moved clear of the plate; the others are plugged in again.
 
         Returns:
-            The sync box's port and the event camera's ports, which may be new ones.
+            The sync box's port and the event camera's address, which may be new ones.
 
         Raises:
             RigError: no such device.
@@ -307,10 +312,10 @@ class SimulationServer:
             self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
         elif device == "event_camera":
             self.camera.close()
-            self.camera = LiveDvxplorer(self._size)
+            self.camera = self._make_camera()
         else:
             raise RigError(device, "is no device of a stand-in")
-        return self.sync_box.port, self.camera.ports
+        return self.sync_box.port, self.camera.address
 
 
 class SyncLevel:
@@ -346,55 +351,6 @@ class SyncLevel:
             return False
         bit = bool(self._bits.upto(tick + 1)[tick])
         return bit and passed - tick * period < min(PULSE_NS, period / 2)
-
-
-def fake_arm(
-    settings: ArmSettings,
-    motion: StraightMotion,
-    now_s: Callable[[], float],
-    sync: Callable[[float], bool],
-) -> FakeController:
-    """A fake for the arm that `settings` describe, started.
-
-    Args:
-        motion: where its tool centre point is.
-        now_s: its controller's clock, s.
-        sync: level of the sync line at a time of that clock.
-
-    Raises:
-        OSError: a port is taken.
-    """
-    arm: FakeController
-    clock = ControllerClock(now_s)
-    if isinstance(settings, UrSettings):
-        from sliplab.rigs.devices.ur.fake import FakeUr
-
-        bit = 1 << settings.sync_input
-        arm = FakeUr(
-            settings.host,
-            motion,
-            cycle_hz=settings.frequency_hz,
-            digital_inputs=lambda t_s: bit if sync(t_s) else 0,
-            reach_mm=REACH_MM,
-            clock=clock,
-        )
-    elif settings.driver == "abb":
-        from sliplab.rigs.devices.abb.fake import FakeAbb
-
-        arm = FakeAbb(
-            settings.host,
-            settings.rws_port,
-            ("127.0.0.1", settings.egm_port),
-            motion,
-            egm_point=settings.egm_point,
-            clock=clock,
-        )
-    else:
-        from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
-
-        arm = FakeRapidServer(settings.host, settings.port, motion=motion, clock=clock)
-    arm.start()
-    return arm
 
 
 def _rehearse(settings: MockSettings, timing: Timing) -> None:

@@ -1,1 +1,65 @@
 """ABB arms on an IRC5 controller: motion programs with EGM poses, or a RAPID socket server."""
+
+from __future__ import annotations
+
+from sliplab.rigs.core.capabilities import Arm
+from sliplab.rigs.core.driver import ArmDriver, ArmScene
+from sliplab.rigs.core.fakes import FakeController
+from sliplab.rigs.core.network import answers, arm_lock
+from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
+
+
+def _build(settings: AbbSettings) -> Arm:
+    from sliplab.rigs.devices.abb.driver import AbbArm
+
+    return AbbArm(settings)
+
+
+def _fake(settings: AbbSettings, scene: ArmScene) -> FakeController:
+    from sliplab.rigs.devices.abb.fake import FakeAbb
+
+    return FakeAbb(
+        settings.host,
+        settings.rws_port,
+        ("127.0.0.1", settings.egm_port),
+        scene.motion,
+        egm_point=settings.egm_point,
+        clock=scene.clock,
+    )
+
+
+def _build_socket(settings: AbbSocketSettings) -> Arm:
+    from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
+
+    return AbbSocketArm(settings)
+
+
+def _fake_socket(settings: AbbSocketSettings, scene: ArmScene) -> FakeController:
+    from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
+
+    return FakeRapidServer(settings.host, settings.port, motion=scene.motion, clock=scene.clock)
+
+
+LIBRARIES = ("abb_motion_program_exec", "abb_robot_client")
+
+DRIVER = ArmDriver(
+    name="abb",
+    title="ABB, motion programs",
+    settings=AbbSettings,
+    libraries=LIBRARIES,
+    ping=lambda settings: answers(settings.host, settings.rws_port),
+    address=lambda settings: settings.host,
+    locks=arm_lock,
+    build=_build,
+    fake=_fake,
+)
+SOCKET_DRIVER = ArmDriver(
+    name="abb_socket",
+    title="ABB, RAPID",
+    settings=AbbSocketSettings,
+    ping=lambda settings: answers(settings.host, settings.port),
+    address=lambda settings: settings.host,
+    locks=arm_lock,
+    build=_build_socket,
+    fake=_fake_socket,
+)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -34,6 +34,7 @@ class AbbSettings(BaseArmSettings):
 class AbbSocketSettings(BaseArmSettings):
     """An ABB arm behind the small RAPID socket server that some labs run (option b)."""
 
+    host_clock: ClassVar[bool] = True
     driver: Literal["abb_socket"] = "abb_socket"
     port: Port = 5000
     segment_s: Annotated[float, Field(gt=0, le=2)] = 0.25

@@ -1,1 +1,41 @@
 """Basler cameras through pylon. `frame_time` says how the time of a frame is known."""
+
+from __future__ import annotations
+
+from sliplab.rigs.core.capabilities import FrameCamera
+from sliplab.rigs.core.driver import FrameCameraDriver, SceneFrames
+from sliplab.rigs.devices.basler.settings import BaslerSettings
+
+
+def _build(settings: BaslerSettings, px_per_mm: float) -> FrameCamera:
+    from sliplab.rigs.devices.basler.driver import BaslerCamera
+
+    return BaslerCamera(settings.model_copy(update={"px_per_mm": px_per_mm}))
+
+
+def _ping(settings: BaslerSettings) -> str | None:
+    from sliplab.rigs.devices.basler.driver import look_for_camera
+
+    look_for_camera(settings.serial)
+    return None
+
+
+def _fake(
+    settings: BaslerSettings, px_per_mm: float, scene: SceneFrames, mid_exposure_ns: int
+) -> FrameCamera:
+    from sliplab.rigs.devices.basler.driver import BaslerCamera
+    from sliplab.rigs.devices.basler.fake_live import LiveBasler
+
+    device = LiveBasler(scene, mid_exposure_ns, settings.sync_line or 1)
+    return BaslerCamera(settings.model_copy(update={"px_per_mm": px_per_mm}), device)
+
+
+DRIVER = FrameCameraDriver(
+    name="basler",
+    title="Basler",
+    settings=BaslerSettings,
+    libraries=("pypylon",),
+    ping=_ping,
+    build=_build,
+    fake=_fake,
+)

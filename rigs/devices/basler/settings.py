@@ -6,12 +6,13 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError
+from sliplab.rigs.core.device_settings import FrameCameraSettings
 
 FrameTrigger = Literal["hardware", "software", "free run"]
 
 
-class BaslerSettings(StrictModel):
+class BaslerSettings(FrameCameraSettings):
     """The camera that looks through the plate."""
 
     driver: Literal["basler"] = "basler"

@@ -1,1 +1,48 @@
 """The DVXplorer event camera through dv-processing."""
+
+from __future__ import annotations
+
+from sliplab.rigs.core.capabilities import EventCamera
+from sliplab.rigs.core.driver import EventCameraDriver, FakeEventCamera
+from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
+
+
+def _build(settings: DvxplorerSettings) -> EventCamera:
+    from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
+
+    return DvxplorerCamera(settings)
+
+
+def _ping(settings: DvxplorerSettings) -> str | None:
+    from sliplab.rigs.devices.dvxplorer.source import find_camera, greet
+
+    source = settings.source
+    if isinstance(source, NetworkStream):
+        greet(source.host, source.events_port)
+        greet(source.host, source.triggers_port)
+    else:
+        find_camera(source.serial)
+    return None
+
+
+def _fake(size: tuple[int, int]) -> FakeEventCamera:
+    from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
+
+    return LiveDvxplorer(size)
+
+
+def _reach(settings: DvxplorerSettings, address: tuple[int, int]) -> DvxplorerSettings:
+    source = NetworkStream(events_port=address[0], triggers_port=address[1])
+    return settings.model_copy(update={"source": source})
+
+
+DRIVER = EventCameraDriver(
+    name="dvxplorer",
+    title="DVXplorer",
+    settings=DvxplorerSettings,
+    libraries=("dv_processing",),
+    ping=_ping,
+    build=_build,
+    fake=_fake,
+    reach=_reach,
+)

@@ -211,6 +211,11 @@ class LiveDvxplorer:
         self.ports = self._events.port, self._triggers.port
         self._silent = False
 
+    @property
+    def address(self) -> tuple[int, int]:
+        """The ports, for `reach` of the driver."""
+        return self.ports
+
     def send(self, chunk: EventChunk, pulses: PulseChunk) -> None:
         """Send events, and rising edges of its input; nothing while it is stalled."""
         if self._silent:

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from sliplab.protocols.yaml_file import StrictModel
 from sliplab.rigs.core.address import Host
+from sliplab.rigs.core.device_settings import DriverSettings
 
 Readout = Literal[
     "constant 100", "constant 200", "constant 500", "constant 1000",
@@ -40,7 +41,7 @@ class NetworkStream(StrictModel):
     triggers_port: int = Field(ge=1, le=65_535)
 
 
-class DvxplorerSettings(StrictModel):
+class DvxplorerSettings(DriverSettings):
     """The event camera inside the sensor."""
 
     driver: Literal["dvxplorer"] = "dvxplorer"

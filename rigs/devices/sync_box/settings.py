@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import StrictModel
+from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.devices.sync_box.line import BAUD
 
 
-class SyncBoxSettings(StrictModel):
+class SyncBoxSettings(DriverSettings):
     """Settings that reach a sync box; the defaults fit the firmware that ships."""
 
+    driver: Literal["sync_box"] = "sync_box"
     port: str = Field(min_length=1)
     """The serial port's name, best one that stays: /dev/serial/by-id/..."""
     baud: int = Field(default=BAUD, ge=9600, le=2_000_000)

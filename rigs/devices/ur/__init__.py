@@ -1,1 +1,44 @@
 """Universal Robots arms: RTDE, dashboard, script port, and ur_rtde in a process of its own."""
+
+from __future__ import annotations
+
+from sliplab.rigs.core.capabilities import Arm
+from sliplab.rigs.core.driver import ArmDriver, ArmScene
+from sliplab.rigs.core.fakes import FakeController
+from sliplab.rigs.core.network import answers, arm_lock
+from sliplab.rigs.devices.ur.settings import UrSettings
+
+RTDE_PORT = 30004
+
+
+def _build(settings: UrSettings) -> Arm:
+    from sliplab.rigs.devices.ur.driver import UrArm
+
+    return UrArm(settings)
+
+
+def _fake(settings: UrSettings, scene: ArmScene) -> FakeController:
+    from sliplab.rigs.devices.ur.fake import FakeUr
+
+    bit = 1 << settings.sync_input
+    return FakeUr(
+        settings.host,
+        scene.motion,
+        cycle_hz=settings.frequency_hz,
+        digital_inputs=lambda t_s: bit if scene.sync(t_s) else 0,
+        reach_mm=scene.reach_mm,
+        clock=scene.clock,
+    )
+
+
+DRIVER = ArmDriver(
+    name="ur",
+    title="Universal Robots",
+    settings=UrSettings,
+    libraries=("rtde_control",),
+    ping=lambda settings: answers(settings.host, RTDE_PORT),
+    address=lambda settings: settings.host,
+    locks=arm_lock,
+    build=_build,
+    fake=_fake,
+)

@@ -12,8 +12,8 @@ import dv_processing as dv
 import numpy as np
 import pytest
 
-from sliplab.rigs.build import build_event_camera, build_frame_camera
 from sliplab.rigs.core.capabilities import DeviceHealth, EventCamera, FrameCamera, RigError
+from sliplab.rigs.devices import basler, dvxplorer
 from sliplab.rigs.devices.basler.fake import unplug
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer, arrays
@@ -27,7 +27,7 @@ FREE = BaslerSettings(px_per_mm=20.0, trigger="free run", exposure_line="Line2")
 
 @pytest.mark.usefixtures("pylon_emulation")
 def test_a_frame_camera_says_what_it_is_grabbing_or_not() -> None:
-    camera: Any = build_frame_camera(FREE)
+    camera: Any = basler.DRIVER.build(FREE, 20.0)
     try:
         assert isinstance(camera, FrameCamera)
         camera.set_region(64, 48)
@@ -55,7 +55,7 @@ def test_an_event_camera_says_what_it_is_and_when_it_is_gone() -> None:
     empty = np.empty(0, np.uint16)
     nothing = EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))
     with DvxplorerServer(partial(arrays, nothing, np.empty(0, np.int64), 1000)) as server:
-        camera: Any = build_event_camera(server.settings)
+        camera: Any = dvxplorer.DRIVER.build(server.settings)
         try:
             assert isinstance(camera, EventCamera)
             health: DeviceHealth = camera.health()
@@ -99,7 +99,7 @@ def test_a_camera_on_usb_is_asked_by_names_that_the_library_has() -> None:
 
 @pytest.mark.usefixtures("pylon_emulation")
 def test_a_thermometer_is_read_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera: Any = build_frame_camera(FREE)
+    camera: Any = basler.DRIVER.build(FREE, 20.0)
     try:
         answers = {"DeviceTemperature": 41.5, "BslUSBSpeedMode": "SuperSpeed"}
         peek = camera._nodes.peek

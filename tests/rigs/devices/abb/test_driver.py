@@ -9,11 +9,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import WorkspaceError
 from sliplab.rigs.core.pose import distance_mm
+from sliplab.rigs.devices import abb
 from sliplab.rigs.devices.abb import driver
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.rws import REQUEST_S, START_REQUESTS
@@ -57,7 +57,7 @@ def test_a_slide_is_straight_and_at_its_speed(abb_pair: MakeAbb, speed: float) -
 
 def test_it_is_an_arm_that_sets_its_tool(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
-    assert isinstance(build_arm(abb_settings("127.0.0.1")), Arm)
+    assert isinstance(abb.DRIVER.build(abb_settings("127.0.0.1")), Arm)
     assert arm.state() is ArmState.READY
     assert distance_mm(arm.pose(), HOME) < 1e-3
     assert robot.tool.xyz_mm == pytest.approx((0, 0, 120))

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
+from sliplab.rigs.devices import abb
 from sliplab.rigs.devices.abb import socket_driver as driver
 from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket
@@ -90,7 +90,7 @@ def test_a_slide_in_pieces_is_at_its_speed_where_they_run_into_each_other(
 
 def test_it_is_an_arm_that_sets_its_tool(pair: MakePair) -> None:
     arm, robot = pair()
-    assert isinstance(build_arm(settings("127.0.0.1")), Arm)
+    assert isinstance(abb.SOCKET_DRIVER.build(settings("127.0.0.1")), Arm)
     assert arm.state() is ArmState.READY
     assert distance_mm(arm.pose(), HOME) < 1e-3
     assert robot.tool.xyz_mm == (0, 0, 120)

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SingularityError, SpeedError, WorkspaceError
+from sliplab.rigs.devices import ur
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.storage.streams import PoseChunk
 from tests.rigs.devices.conftest import MakeArm, MakeRobot, ur_settings
@@ -92,7 +92,7 @@ def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(
     robot = robot_of()
     tool = {"tcp_mm": (0, 0, 120), "tcp_rotvec_deg": (0, 0, 90), "mass_kg": 0.4}
     arm = arm_on(robot, tool=tool)
-    assert isinstance(build_arm(ur_settings("127.0.0.1")), Arm)
+    assert isinstance(ur.DRIVER.build(ur_settings("127.0.0.1")), Arm)
     assert arm.pose() == HOME
     assert robot.program.tcp == pytest.approx([0, 0, 0.12, 0, 0, np.pi / 2])
     assert robot.program.payload_kg == 0.4

@@ -1,0 +1,23 @@
+"""Settings that every device of a kind has in a rig file, whatever its make; cheap to import."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from sliplab.protocols.yaml_file import StrictModel
+
+
+class DriverSettings(StrictModel):
+    """A device in a rig file. A driver's own settings fix `driver` to the driver's name."""
+
+    driver: str
+    """Name of the driver, as `sliplab rigs --drivers` lists it."""
+
+
+class FrameCameraSettings(DriverSettings):
+    """Settings that every frame camera has."""
+
+    exposure_us: Annotated[float, Field(ge=1, le=1_000_000)] = 2000.0
+    """Exposure, microseconds."""

@@ -1,0 +1,145 @@
+"""Driver: all that SlipLab knows of a kind of device, as the device's own folder declares it.
+
+One declaration a device: which settings a rig file gives it, how it is made and looked for, what
+only one program may use at a time, and the fake that stands in for it on a loopback rig. Nothing
+outside the device's folder knows it by name (`rigs.core.registry` finds it). Declarations are cheap
+to import: a maker's library is loaded when a device is made, not when a rig file is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+from sliplab.rigs.core.arm_settings import BaseArmSettings
+from sliplab.rigs.core.capabilities import Arm, EventCamera, FrameCamera, SyncBox
+from sliplab.rigs.core.device_settings import DriverSettings
+from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+from sliplab.rigs.core.fakes import FakeController
+from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk
+
+SettingsT = TypeVar("SettingsT", bound=DriverSettings)
+ArmSettingsT = TypeVar("ArmSettingsT", bound=BaseArmSettings)
+
+
+def _no_locks(settings: Any) -> dict[str, str]:
+    return {}
+
+
+def _no_address(settings: Any) -> str:
+    return ""
+
+
+@dataclass(frozen=True)
+class Driver(Generic[SettingsT]):
+    """The declaration of one kind of device. `name` is what a rig file writes as `driver:`."""
+
+    kind: ClassVar[str]
+    """``arm``, ``event camera``, ``frame camera`` or ``sync box``."""
+    name: str
+    title: str
+    """Make and model for people, such as ``Universal Robots``."""
+    settings: type[SettingsT]
+    """Keys that a rig file may write; field `driver` is a `Literal` of `name`."""
+    ping: Callable[[SettingsT], str | None]
+    """Look whether the device can be reached, within seconds and without taking control of it.
+
+    Returns None if it can, else why not and what to check. May raise RigError.
+    """
+    libraries: tuple[str, ...] = ()
+    """Modules of the maker's library, for the message where they are not installed."""
+    address: Callable[[SettingsT], str] = _no_address
+    """Address for people, such as a host name; empty where there is none to show."""
+    locks: Callable[[SettingsT], dict[str, str]] = field(default=_no_locks)
+    """What one program at a time may use: a name for it (``arm-192.168.0.9``), and in words."""
+
+
+@dataclass(frozen=True)
+class ArmScene:
+    """What the fake of an arm shows on a loopback rig."""
+
+    motion: StraightMotion
+    """Where the tool centre point is."""
+    clock: ControllerClock
+    sync: Callable[[float], bool]
+    """Level of the sync line at a time of the controller's clock, s."""
+    reach_mm: float
+    """How far from its base the fake moves: the rig file's limits are the driver's to hold."""
+
+
+@dataclass(frozen=True)
+class ArmDriver(Driver[ArmSettingsT]):
+    """A kind of arm."""
+
+    kind = "arm"
+    build: Callable[[ArmSettingsT], Arm] = field(kw_only=True)
+    """Make the device, not connected yet."""
+    fake: Callable[[ArmSettingsT, ArmScene], FakeController] | None = None
+    """Make a fake controller, not started yet; None: no loopback rig can have this arm."""
+
+
+class FakeEventCamera(Protocol):
+    """An event camera on a wire, that sends what a simulated scene shows."""
+
+    @property
+    def address(self) -> Any:
+        """Where the driver finds it, for `EventCameraDriver.reach`; it can be pickled."""
+
+    def send(self, chunk: EventChunk, pulses: PulseChunk) -> None:
+        """Send events, and rising edges of its input; nothing while it is stalled."""
+
+    def stall(self) -> None:
+        """Send nothing from now on; the connection stays."""
+
+    def close(self) -> None:
+        """Unplug it: connections break. Any number of times."""
+
+
+@dataclass(frozen=True)
+class EventCameraDriver(Driver[SettingsT]):
+    """A kind of event camera."""
+
+    kind = "event camera"
+    build: Callable[[SettingsT], EventCamera] = field(kw_only=True)
+    """Open the device, not streaming yet. Raises RigError."""
+    fake: Callable[[tuple[int, int]], FakeEventCamera] | None = None
+    """Make a fake of so many columns and rows."""
+    reach: Callable[[SettingsT, Any], SettingsT] | None = None
+    """Return settings that reach a fake at an address."""
+
+
+class SceneFrames(Protocol):
+    """The frames of a simulated scene that runs elsewhere."""
+
+    on_frames: Callable[[FrameChunk], None]
+    """Is given every chunk of frames, in a thread."""
+
+    def grab(self, width_px: int, height_px: int) -> None:
+        """Begin to expose a centred region."""
+
+    def stop_grabbing(self) -> None:
+        """Stop; an empty chunk ends the frames."""
+
+
+@dataclass(frozen=True)
+class FrameCameraDriver(Driver[SettingsT]):
+    """A kind of frame camera."""
+
+    kind = "frame camera"
+    build: Callable[[SettingsT, float], FrameCamera] = field(kw_only=True)
+    """Open the device, not grabbing yet; of so many pixels a millimetre. Raises RigError."""
+    fake: Callable[[SettingsT, float, SceneFrames, int], FrameCamera] | None = None
+    """Open the driver on frames of a scene: settings, px per mm, frames, half the exposure (ns)."""
+
+
+@dataclass(frozen=True)
+class SyncBoxDriver(Driver[SettingsT]):
+    """A kind of sync box."""
+
+    kind = "sync box"
+    build: Callable[[SettingsT], SyncBox] = field(kw_only=True)
+    """Make the device, not connected yet."""
+    reach: Callable[[SettingsT | None, str], SettingsT] | None = None
+    """Return settings that reach the fake box of a loopback rig, which speaks the firmware's
+    protocol at a serial port; the rest from a rig file's settings where it has some."""
