@@ -19,6 +19,7 @@ from sliplab.flows.running import console
 from tests.command_line import here
 from tests.docs.blocks import Block, blocks, steps
 
+_OFFLINE = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation")
 WIDTH = 100
 """Columns of the terminal that the pages show."""
 
@@ -37,6 +38,8 @@ def run(line: str, folder: Path) -> Done:
     words = shlex.split(line)
     if words[0] == "sliplab":
         return _sliplab(words, folder)
+    if words[:2] == ["pip", "install"]:  # beside the page's files, and without the network
+        words = ["python", "-m", *words, *_OFFLINE, "--target", str(folder)]
     words[0] = sys.executable if words[0] == "python" else words[0]
     ended = subprocess.run(
         words, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,

@@ -82,7 +82,9 @@ CASES: dict[str, tuple[Change, str, str]] = {
         _set("devices", "arm", "driver", to="kuka"), "devices.arm.driver", "one of ur, abb",
     ),
     "a setting of another make": (
-        _set("devices", "arm", "egm_port", to=6510), "devices.arm.egm_port", "known here: driver, host",
+        _set("devices", "arm", "egm_port", to=6510),
+        "devices.arm.egm_port",
+        "known here: driver, host",
     ),
     "an arm without limits": (
         _without("devices", "arm", "limits"), "devices.arm.limits", "is missing",

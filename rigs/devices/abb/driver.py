@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Sequence
 
-from sliplab.rigs.core.arm_driver import ArmDriver, Run, SegmentWatch, has_left, is_at
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -25,6 +24,7 @@ from sliplab.rigs.core.capabilities import (
 )
 from sliplab.rigs.core.pose import compose, distance_mm
 from sliplab.rigs.core.pose_stream import Sample
+from sliplab.rigs.core.threaded_arm import Run, SegmentWatch, ThreadedArm, has_left, is_at
 from sliplab.rigs.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
 from sliplab.rigs.devices.abb.program import PAUSE_S, motion_program
 from sliplab.rigs.devices.abb.rws import (
@@ -65,7 +65,7 @@ AGREE_MM = 0.5
 """Largest difference between the positions of EGM and the web services, mm."""
 
 
-class AbbArm(ArmDriver):
+class AbbArm(ThreadedArm):
     """An ABB arm by motion programs; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: AbbSettings) -> None:

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from sliplab.rigs.core.arm_driver import ArmDriver, Run
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -27,6 +26,7 @@ from sliplab.rigs.core.capabilities import (
 )
 from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
 from sliplab.rigs.core.pose_stream import Sample
+from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket, socket_health
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
 from sliplab.storage.streams import PoseChunk
@@ -48,7 +48,7 @@ ARRIVED_MM = 0.1
 """A segment that ends further than this from its target was stopped by somebody."""
 
 
-class AbbSocketArm(ArmDriver):
+class AbbSocketArm(ThreadedArm):
     """An ABB arm by the RAPID socket server; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: AbbSocketSettings) -> None:

@@ -19,7 +19,6 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sliplab.rigs.core.arm_driver import ArmDriver, Run
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -30,6 +29,7 @@ from sliplab.rigs.core.capabilities import (
 )
 from sliplab.rigs.core.pose import MM_PER_M, distance_mm, to_ur
 from sliplab.rigs.core.pose_stream import Sample
+from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.ur import ports
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
 from sliplab.rigs.devices.ur.rtde import OUTPUTS, Packet, RtdeError, RtdeReader, UrStatus, status_of
@@ -66,7 +66,7 @@ _FULL_SPEED = 0.999
 """The speed slider is up when it stands at least here."""
 
 
-class UrArm(ArmDriver):
+class UrArm(ThreadedArm):
     """A Universal Robots arm; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: UrSettings) -> None:

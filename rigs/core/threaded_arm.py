@@ -58,7 +58,7 @@ class Run:
             self.thread.join(within_s)
 
 
-class ArmDriver(ABC):
+class ThreadedArm(ABC):
     """A base for drivers of arms that follow a path in a thread of their own.
 
     A subclass has `state`, and follows a path in `_follow_path` and gives one up in

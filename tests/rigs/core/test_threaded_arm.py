@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sliplab.rigs.core.arm_driver import SegmentWatch
 from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.core.fake_motion import StraightMotion
+from sliplab.rigs.core.threaded_arm import SegmentWatch
 
 A = Pose((0.0, 0.0, 0.0), (180.0, 0.0, 0.0))
 PERIOD_S = 0.004
