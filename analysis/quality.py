@@ -9,7 +9,7 @@ still reports it as done.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from sliplab.analysis.labels.rest import offsets
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
-from sliplab.storage.schema.trial import Clocks, Counts, Gate
+from sliplab.storage.schema.trial import Clocks, Counts, Gate, StreamRecord
 from sliplab.storage.streams import F64, I64, PathSegment
 from sliplab.storage.trials.checksums import DATA
 from sliplab.storage.trials.hdf5_reader import StreamReader
@@ -62,11 +62,12 @@ class Motion:
 
 @dataclass(frozen=True)
 class Assessment:
-    """Clock maps, gates and counts of one attempt."""
+    """Clock maps, gates and counts of one attempt; `streams` has the named ones."""
 
     clocks: Clocks
     gates: dict[str, Gate]
     counts: Counts
+    streams: dict[str, StreamRecord] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -112,8 +113,12 @@ def assess(
         event_us = reader.event_times()
         pose_mm = reader.column("poses/xyz")
         tracks = [reader.column(name) for name in TRACKS if reader.has(name)]
+        named = {
+            name: StreamRecord(kind=kind, rows=reader.stream_counts()[name]["t"])
+            for name, kind in reader.streams().items()
+        }
     sync = synchronise(streams, timing, rate_hz)
-    results = _sync_gates(sync, gates, motion.recorded_ns, mid_exposure_ns is not None)
+    results = _sync_gates(sync, gates, timing, motion.recorded_ns, mid_exposure_ns is not None)
     if mid_exposure_ns is not None:
         lost = _frames_lost(streams.frame_number, motion.recorded_ns, rate_hz)
         results["frames_lost"] = _gate(lost, gates.frames_lost)
@@ -134,7 +139,7 @@ def assess(
         poses=len(streams.pose_ns),
         pulses=len(streams.sync_pulses),
     )
-    return Assessment(sync.record(), results, counts)
+    return Assessment(sync.record(), results, counts, named)
 
 
 def hold_rate(recording: Recording) -> float:
@@ -144,18 +149,19 @@ def hold_rate(recording: Recording) -> float:
 
 
 def _sync_gates(
-    sync: TrialSync, gates: Gates, recorded_ns: tuple[int, int], video: bool
+    sync: TrialSync, gates: Gates, timing: Timing, recorded_ns: tuple[int, int], video: bool
 ) -> dict[str, Gate]:
     """Check that every device has a clock map, good for its grade and all of the recording."""
     limits = gates.sync_uncertainty
     results: dict[str, Gate] = {}
-    for device in ("events", "arm", "frames")[: 3 if video else 2]:
+    for device in (*("events", "arm", "frames")[: 3 if video else 2], *sorted(sync.streams)):
         name = f"sync_uncertainty_{device}_s"
         known = sync.devices.get(device)
         if known is None:
             results[name] = Gate(value=sync.refused[device], limit=None, passed=False)
             continue
         grade = "digital input" if device == "events" else known.grade
+        grade = timing.arm if grade == "arm clock" else grade
         # a latency is a difference: both maps count
         both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
         value = (known.uncertainty_ns if both is None else both) / 1e9

@@ -19,6 +19,7 @@ Code = Literal["lfsr", "irregular", "regular"]
 """Pulses of the box: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""
 FrameGrade = Literal["hardware trigger", "exposure line", "device time stamps", "host arrival"]
 ArmGrade = Literal["digital input", "host time"]
+ForceGrade = Literal["host time", "arm clock"]
 WIRED: tuple[str, ...] = ("hardware trigger", "exposure line", "digital input", "trigger input")
 """Grades by which a device's time is known from a wire; the others go through the host."""
 
@@ -54,6 +55,17 @@ class Delay(StrictModel):
         return self
 
 
+class ForceTiming(DeviceClock):
+    """The clock of a force sensor."""
+
+    grade: ForceGrade = "host time"
+    """`host time`: a sample was taken between two delays before it arrived. `arm clock`: the arm's
+    controller stamps it with its own clock, as a Universal Robots arm does with its wrench."""
+    delay: Delay = Delay(shortest_us=0, longest_us=5_000)
+    """From the load to the host that has the sample, the delay of the sensor's own filter in it;
+    where the grade is `host time`."""
+
+
 class Timing(StrictModel):
     """The `timing:` section of a rig file."""
 
@@ -73,6 +85,9 @@ class Timing(StrictModel):
     frame_delay: Delay = Delay(shortest_us=0, longest_us=50_000)
     """From the end of a frame's exposure to the host, where `frames` is `host arrival`."""
 
+    force: ForceTiming | None = None
+    """Of a force sensor; left out, the rig has none, or it is `host time` with its defaults."""
+
     def start_marker_ns(self, rate_hz: float) -> float | None:
         """From a regular train's first pulse to its second, ns; None where there is a code."""
         return MARKER_TICKS * 1e9 / rate_hz if self.code == "regular" else None
@@ -80,7 +95,8 @@ class Timing(StrictModel):
     @property
     def reads_clocks(self) -> bool:
         """True if the host has to read clocks, because some device has no wire."""
-        return self.frames not in WIRED or self.arm not in WIRED
+        grades = {self.frames, self.arm, self.force.grade if self.force else "arm clock"}
+        return not grades <= {*WIRED, "arm clock"}
 
 
 class SyncGates(StrictModel):

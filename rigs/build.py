@@ -84,6 +84,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         touch_mm=file.calibration.touch_depth,
         centre_px=file.calibration.centre_px,
         plate=devices.plate,
+        force=devices.force,
         simulation=_MockSimulation(devices),
     )
 

@@ -8,7 +8,8 @@ was timed is its grade, and it goes wherever the result goes (docs/clocks.md).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,13 @@ from sliplab.analysis.clocks.clocks import (
     fit_numbered,
 )
 from sliplab.analysis.clocks.counters import split_at_restarts
-from sliplab.protocols.timing import DeviceClock, Timing
+from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.trial import Clocks, DeviceRecord
+from sliplab.storage.streams import WrenchChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 from sliplab.storage.trials.recording import Recording
 
 I64 = npt.NDArray[np.int64]
@@ -64,6 +67,7 @@ class SyncStreams:
         pose_ns, pose_host_ns: controller's and host's time of every pose.
         box_reads, frame_camera_reads: clocks read by the host.
         mid_exposure_ns: from the start of an exposure to its middle; None without frames.
+        wrenches: of every force sensor by its name: its own and the host's time of each sample.
     """
 
     sync_pulses: I64
@@ -78,6 +82,7 @@ class SyncStreams:
     box_reads: ClockReadings
     frame_camera_reads: ClockReadings
     mid_exposure_ns: int | None
+    wrenches: dict[str, tuple[I64, I64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,7 @@ class DeviceSync:
         map: device ns to the box's ns.
         uncertainty_ns: how far the map may be off within the trial: 95 % where `fit` is there,
             a hard bound otherwise.
+        kind: the meaning of the uncertainty, where the clock is that of another device.
     """
 
     grade: str
@@ -96,11 +102,14 @@ class DeviceSync:
     uncertainty_ns: float
     fit: ClockFit | None = None
     bounds: BoundedClock | None = None
+    kind: str | None = None
 
     def record(self) -> DeviceRecord:
         """Return the part of the trial's record."""
         known: dict[str, Any] = {"grade": self.grade}
-        if self.fit is not None:
+        if self.kind is not None:
+            known["kind"] = self.kind
+        elif self.fit is not None:
             known |= {"kind": "95 %", **self.fit.to_json()}
         elif self.bounds is not None:
             known |= {
@@ -117,21 +126,26 @@ class TrialSync:
     """The clocks of one trial.
 
     Attributes:
-        devices: what is known of ``events``, ``arm`` and ``frames``.
+        devices: what is known of ``events``, ``arm`` and ``frames``, and of ``streams``.
         refused: why a device has no clock.
         pieces: of a device whose clock began anew within the trial, each piece by itself, or why
             it could not be fitted; such a device is refused all the same.
+        streams: names of the devices that are named streams, as a force sensor is.
     """
 
     code: str
     devices: dict[str, DeviceSync]
     refused: dict[str, str]
     pieces: dict[str, list[DeviceSync | str]]
+    streams: frozenset[str] = frozenset()
 
     def record(self) -> Clocks:
         """Return the part of the trial's record."""
         known: dict[str, Any] = {"reference": "sync box", "code": self.code}
-        known |= {name: device.record() for name, device in self.devices.items()}
+        records = {name: device.record() for name, device in self.devices.items()}
+        known |= {name: part for name, part in records.items() if name not in self.streams}
+        if streams := {name: part for name, part in records.items() if name in self.streams}:
+            known["streams"] = streams
         if self.refused:
             known["refused"] = self.refused
         if self.pieces:
@@ -170,6 +184,11 @@ def streams_of(reader: StreamReader, mid_exposure_ns: int | None) -> SyncStreams
         box_reads=reads("box_reads"),
         frame_camera_reads=reads("frame_camera_reads"),
         mid_exposure_ns=mid_exposure_ns,
+        wrenches={
+            name: (column(f"{STREAM_GROUP}/{name}/t"), column(f"{STREAM_GROUP}/{name}/host"))
+            for name, kind in reader.streams().items()
+            if kind == WrenchChunk.KIND
+        },
     )
 
 
@@ -193,8 +212,8 @@ def synchronise(streams: SyncStreams, timing: Timing, rate_hz: float) -> TrialSy
     Args:
         rate_hz: ticks of the box a second.
     """
-    found = TrialSync(timing.code, {}, {}, {})
-    events, arm, camera = timing.event_camera, timing.arm_controller, timing.frame_camera
+    found = TrialSync(timing.code, {}, {}, {}, frozenset(streams.wrenches))
+    events, arm = timing.event_camera, timing.arm_controller
     pulses = _Pulses(streams.sync_pulses, timing, rate_hz, found)
     _try(
         found, "events", lambda: pulses.fit("events", streams.event_pulses, events, "trigger input")
@@ -203,9 +222,19 @@ def synchronise(streams: SyncStreams, timing: Timing, rate_hz: float) -> TrialSy
         _try(found, "arm", lambda: pulses.fit("arm", streams.arm_pulses, arm, timing.arm))
     else:
         _try(found, "arm", lambda: _arm_by_host(streams, timing))
-    if streams.mid_exposure_ns is None:
-        return found
-    begins = streams.frame_ns - streams.mid_exposure_ns
+    if streams.mid_exposure_ns is not None:
+        _synchronise_frames(found, pulses, streams, streams.mid_exposure_ns)
+    for name in streams.wrenches:
+        _try(found, name, partial(_force, found, name, streams, timing))
+    return found
+
+
+def _synchronise_frames(
+    found: TrialSync, pulses: _Pulses, streams: SyncStreams, mid_exposure_ns: int
+) -> None:
+    """Fit the clock of the frame camera."""
+    timing, camera = pulses.timing, pulses.timing.frame_camera
+    begins = streams.frame_ns - mid_exposure_ns
     if timing.frames == "hardware trigger":
         coded = begins[streams.frame_sync > 0]
         _try(found, "frames", lambda: pulses.fit("frames", coded, camera, timing.frames))
@@ -215,7 +244,6 @@ def synchronise(streams: SyncStreams, timing: Timing, rate_hz: float) -> TrialSy
         _try(found, "frames", lambda: _frames_by_reads(streams, timing))
     else:
         _try(found, "frames", lambda: _frames_by_arrival(streams, timing))
-    return found
 
 
 def _try(found: TrialSync, name: str, fit: Callable[[], DeviceSync]) -> None:
@@ -287,20 +315,40 @@ def _by_exposures(begins: I64, streams: SyncStreams, timing: Timing) -> DeviceSy
 
 def _arm_by_host(streams: SyncStreams, timing: Timing) -> DeviceSync:
     """Bound a pose's time: it was sent before it arrived, at most by its transmission time."""
-    delay = timing.pose_delay
     # bounds of some thousand poses say as much as those of all
     some = slice(None, None, max(1, streams.pose_ns.size // 4000))
-    arrived = streams.pose_host_ns[some]
     bounded = _bounded(
-        ClockReadings(
-            streams.pose_ns[some],
-            arrived - round(delay.longest_us * 1000),
-            arrived - round(delay.shortest_us * 1000),
-        ),
+        _sent(streams.pose_ns[some], streams.pose_host_ns[some], timing.pose_delay),
         timing.arm_controller.drift_ppm + HOST_PPM,
         "poses",
     )
     return _through_host(bounded, streams, timing, timing.arm)
+
+
+def _force(found: TrialSync, name: str, streams: SyncStreams, timing: Timing) -> DeviceSync:
+    """The clock of a force sensor: the arm's, or bounded by the arrivals of its samples."""
+    how = timing.force or ForceTiming()
+    if how.grade == "arm clock":
+        if "arm" not in found.devices:
+            raise BoundsContradictError("the arm's clock stamps it, and that one was refused")
+        arm = found.devices["arm"]
+        kind = "hard bound" if arm.fit is None else "95 %"
+        return DeviceSync(how.grade, arm.map, arm.uncertainty_ns, kind=kind)
+    device, host = streams.wrenches[name]
+    if np.any(np.diff(device) < 0):
+        raise ClockRefused("residuals", f"its clock fell back during the trial; {UNDISTURBED}")
+    some = slice(None, None, max(1, device.size // 4000))
+    bounded = _bounded(_sent(device[some], host[some], how.delay), how.drift_ppm + HOST_PPM, name)
+    return _through_host(bounded, streams, timing, how.grade)
+
+
+def _sent(device_ns: I64, arrived_ns: I64, delay: Delay) -> ClockReadings:
+    """Bounds of messages' times by the host's clock: they arrived after their delay."""
+    return ClockReadings(
+        device_ns,
+        arrived_ns - round(delay.longest_us * 1000),
+        arrived_ns - round(delay.shortest_us * 1000),
+    )
 
 
 def _frames_by_reads(streams: SyncStreams, timing: Timing) -> DeviceSync:

@@ -32,7 +32,7 @@ from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.rig import Rig, StopRequested, TrialRun
+from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
@@ -43,6 +43,7 @@ from sliplab.storage.schema.trial import (
     Quality,
     RecordedTiming,
     Step,
+    StreamRecord,
     TrialRecord,
 )
 from sliplab.storage.streams import Json
@@ -335,6 +336,8 @@ class Session:
             given["devices"] = described
         if run.truth is not None:
             given["simulation_truth"] = run.truth
+        if found.streams:
+            given["streams"] = self._streams(found)
         return TrialRecord(
             format=TrialRecord.FORMAT,
             trial=trial.id,
@@ -366,6 +369,14 @@ class Session:
             geometry=self._geometry(frame_px),
             **given,
         )
+
+    def _streams(self, found: Assessment) -> dict[str, StreamRecord]:
+        """Return the named streams, that of the force sensor with its axes."""
+        streams, force = dict(found.streams), self.rig.force
+        if force is not None and FORCE in streams:
+            rows = self.rig.plate_frame.force_matrix(force.mounting)
+            streams[FORCE] = StreamRecord(**{**dict(streams[FORCE]), "to_plate": rows})
+        return streams
 
     def _geometry(self, frame_px: tuple[int, int] | None) -> Geometry:
         given: dict[str, Any] = {}

@@ -21,6 +21,7 @@ from sliplab.rigs.core.capabilities import (
     Clock,
     DeviceHealth,
     EventCamera,
+    ForceSensor,
     FrameCamera,
     Operator,
     Plate,
@@ -37,6 +38,8 @@ from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """Time for which cameras are read after the last pulse, unless a rig says otherwise."""
+FORCE = "force"
+"""Name of the force sensor's stream."""
 _MOVE_GRACE_S = 10.0
 _STOP_RETRIES = 10
 """Retries of a stop that was interrupted."""
@@ -75,6 +78,7 @@ class Rig:
         centre_px: where the event camera sees that papilla; by default in its picture's centre.
         tail_s: how long cameras are read after the last pulse: they send in blocks, and a busy
             host is late to read them.
+        force: a sensor of force and torque; None costs nothing.
         simulation: the world behind a simulated rig, None on a real one.
         ending: called last when the rig is closed.
     """
@@ -93,6 +97,7 @@ class Rig:
     centre_px: tuple[float, float] | None = None
     tail_s: float = TAIL_S
     plate: Plate | None = None
+    force: ForceSensor | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     ending: tuple[Callable[[], None], ...] = ()
@@ -102,9 +107,15 @@ class Rig:
     """The plate was let go and not caught: it hangs on the sensor, or falls."""
 
     def connect(self) -> None:
-        """Connect sync box and arm; cameras connect when they are built. Raises RigError."""
+        """Connect sync box, arm and force sensor; cameras connect when they are built.
+
+        Raises:
+            RigError: one of them does not answer.
+        """
         self.sync.connect()
         self.arm.connect()
+        if self.force is not None:
+            self.force.connect()
 
     def close(self) -> None:
         """Give every device back, the arm stopped first; safe to call more than once.
@@ -119,9 +130,10 @@ class Rig:
         try:
             fault = self._stop_arm()
         finally:
-            for device in (self.arm, self.events, self.frames, self.sync):
+            for device in (self.arm, self.events, self.frames, self.sync, self.force):
                 with suppress(Exception):
-                    device.close()
+                    if device is not None:
+                        device.close()
             for end in self.ending:
                 end()
         before = sys.exception()
@@ -135,15 +147,15 @@ class Rig:
         Raises:
             RigError: one does not answer.
         """
-        devices = (self.arm, self.events, self.frames, self.sync)
-        return [device.health() for device in devices if hasattr(device, "health")]
+        devices = (self.arm, self.events, self.frames, self.sync, self.force)
+        return [device.health() for device in devices if device and hasattr(device, "health")]
 
     def describe(self) -> dict[str, Json]:
         """Return settings, counts and losses of the trial that just ran, by device."""
         described = {}
         cameras = ("event_camera", self.events), ("frame_camera", self.frames)
-        for name, device in (("arm", self.arm), *cameras):
-            if hasattr(device, "describe"):
+        for name, device in (("arm", self.arm), *cameras, ("force_sensor", self.force)):
+            if device is not None and hasattr(device, "describe"):
                 described[name] = device.describe()
         losses = getattr(self.sync, "losses", None)
         if losses is not None:
@@ -239,6 +251,8 @@ class Rig:
         with ExitStack() as stopping:
             stopping.callback(self.events.stop)
             stopping.callback(self.sync.stop)
+            if self.force is not None:
+                stopping.callback(self.force.stop)
             self.start_streams(0, rate_hz, False)
             self.wait(seconds, sink)
             self.stop_streams(sink, False)
@@ -331,6 +345,8 @@ class Rig:
         self.arm.read_poses()
         self.arm.read_pulses()
         self.events.start()
+        if self.force is not None:
+            self.force.start()
         by_itself = with_frames and self.timing.frames == "exposure line"
         if with_frames and not by_itself:
             self.frames.start()
@@ -350,6 +366,9 @@ class Rig:
         self.wait(self.tail_s, sink)
         self.events.stop()
         sink.add_event_pulses(self.events.read_pulses())
+        if self.force is not None:
+            self.force.stop()
+            sink.add_stream(FORCE, self.force.read())
         if with_frames:
             self.frames.stop()
             sink.add_frames(self.frames.read())
@@ -367,12 +386,19 @@ class Rig:
             sink.add_box_reads(self.sync.read_clock())
         if self.timing.frames == "device time stamps":
             sink.add_frame_camera_reads(self.frames.read_clock())
+        if self.force is not None:
+            sink.add_stream(FORCE, self.force.read())
 
     def begin_trial(self, home: Position, seed: int) -> None:
-        """Move to the start position, then let a simulation draw its random values."""
+        """Move to the start position, then let a simulation draw its random values.
+
+        There the sensor is clear of the plate, and a force sensor takes its load for zero.
+        """
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
+        if self.force is not None and self.force.zeroing == "trial":
+            self.force.zero()
 
     def _segment(
         self, times: StepTimes, begin: Position, end: Position, speed: float
@@ -399,9 +425,10 @@ class Rig:
             try:
                 fault = self._stop_arm() or self._retract(clear)
             finally:
-                for device in (self.events, self.frames, self.sync):
+                for device in (self.events, self.frames, self.sync, self.force):
                     with suppress(Exception):
-                        device.stop()
+                        if device is not None:
+                            device.stop()
             self._reported = str(fault or "")
             if fault is not None and str(fault) != str(error):
                 if isinstance(error, RigError) and error.device == "arm":

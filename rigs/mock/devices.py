@@ -13,11 +13,12 @@ from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
 from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull
+from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator, VirtualClock
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.sync import ExposureLine, FreeRun, MockSyncBox
-from sliplab.rigs.mock.truth import clocks_of, truth_of
+from sliplab.rigs.mock.truth import clocks_of, readings_of, truth_of
 from sliplab.rigs.mock.world import World
 from sliplab.storage.streams import Sink
 
@@ -85,6 +86,7 @@ class MockDevices:
     operator: SimulatedOperator
     world: World
     timing: Timing
+    force: MockForceSensor | None = None
 
     def begin_trial(self, seed: int) -> None:
         """Make what follows depend on `seed` and the program alone; see `World.begin_trial`."""
@@ -106,9 +108,12 @@ class MockDevices:
             self.sync.started_ns,
             (self.world.now_ns if stopped_ns is None else stopped_ns),
         )
+        clocks = clocks_of(self.world, self.sync.clock, recorded_ns, self.timing.frames)
+        if self.force is not None:
+            clocks["force"] = readings_of(self.force.clock, self.sync.clock, recorded_ns)
         return {
             **truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px, hold_true_ns),
-            "clocks": clocks_of(self.world, self.sync.clock, recorded_ns, self.timing.frames),
+            "clocks": clocks,
         }
 
 
@@ -127,6 +132,9 @@ def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevi
     sync = MockSyncBox(world, line)
     arm = MockArm(world, sync, wired=timing.arm == "digital input")
     frames = MockFrameCamera(world, free_run or sync, timing.frames)
+    force = None
+    if settings.force is not None:
+        force = on_cable(MockForceSensor(world, settings.force), "force_sensor", world)
     return MockDevices(
         clock=VirtualClock(world),
         arm=on_cable(arm, "arm", world),
@@ -137,4 +145,5 @@ def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevi
         operator=SimulatedOperator(world),
         world=world,
         timing=timing,
+        force=force,
     )

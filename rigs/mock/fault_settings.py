@@ -15,7 +15,7 @@ from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Papilla = Annotated[int, Field(ge=0, le=10_000)]
-Device = Literal["arm", "event_camera", "frame_camera", "sync_box"]
+Device = Literal["arm", "event_camera", "frame_camera", "sync_box", "force_sensor"]
 RestartDevice = Literal["arm", "event_camera", "frame_camera"]
 PulseDevice = Literal["arm", "event_camera", "sync_box"]
 

@@ -43,6 +43,8 @@ class Physics:
         step_ns: the last row is never further behind the present than this.
         track: `rigs.scene.contact.record`'s rows since the trial began.
         loads: forces of every row since `keep_loads`, or None.
+        wrench: sum of the contact's forces on the plate, and their torque about its centre, of
+            every row since `keep_wrench`, (k, 6) in N and N m; or None, at no cost.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Physics:
         self.tips: Tips = new_tips(len(skin))
         self.track = History(track_width(len(skin)))
         self.loads: History | None = None
+        self.wrench: History | None = None
         self.plate_free = False
         self._plate_ramp: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
         self._plate_motion = np.zeros(2)
@@ -111,7 +114,10 @@ class Physics:
         count = len(t_ns) - 1
         sensor = np.ascontiguousarray(self._sensor_at(t_ns[1:]))
         track = self.track.grow(t_ns[1:])
-        load = np.empty((count, 0)) if self.loads is None else self.loads.grow(t_ns[1:])
+        if self.loads is not None:
+            load = self.loads.grow(t_ns[1:])
+        else:
+            load = np.empty((count, 0 if self.wrench is None else 3 * len(self.tips.state)))
         springs, state = self.springs, self.tips.state
         if not self.plate_free:
             height = np.empty(count + 1)
@@ -122,6 +128,7 @@ class Physics:
                 load,
             )  # fmt: skip
             self._plate_motion[:] = height[-1], 0.0
+            self._sum_up(t_ns[1:], track, load)
             return
         plate, mass_kg = self._settings.scene.plate, self._release[2]
         done, landed = advance_free(
@@ -129,11 +136,17 @@ class Physics:
             self._plate_motion, mass_kg, self._weight(t_ns), plate.stiction_n,
             -plate.stroke_mm, track, load,
         )  # fmt: skip
+        self._sum_up(t_ns[1:], track, load)
         if landed:
             self._hold_plate(-plate.stroke_mm)
-            for rows in (self.track, self.loads):
+            for rows in (self.track, self.loads, self.wrench):
                 if rows is not None:
                     rows.shrink(count - done, int(t_ns[done]))
+
+    def _sum_up(self, t_ns: I64, track: F64, load: F64) -> None:
+        """Keep the sum of the tips' forces, if somebody looks at it."""
+        if self.wrench is not None:
+            self.wrench.grow(t_ns)[:] = plate_wrench(track, load)
 
     # -- the plate -------------------------------------------------------------------------
 
@@ -180,6 +193,15 @@ class Physics:
         row[:] = np.column_stack([tips.force, tips.normal]).ravel()
         return self.loads
 
+    def keep_wrench(self, now_ns: int) -> History:
+        """Keep the sum of the forces of every row from the present on."""
+        self._catch_up(now_ns)
+        self.wrench = History(6)
+        last_ns = np.array([self.track.end_ns], np.int64)
+        load = np.column_stack([self.tips.force, self.tips.normal]).reshape(1, -1)
+        self.wrench.grow(last_ns)[:] = plate_wrench(self.track.at(last_ns), load)
+        return self.wrench
+
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
         """Places of the tips in the world and heights of the plate, mm: (k, n, 2) and (k,).
 
@@ -191,6 +213,23 @@ class Physics:
         height = here[:, 4 * n]
         tips[:, :, 1] += height[:, None]
         return tips, height
+
+
+def plate_wrench(track: F64, load: F64) -> F64:
+    """Return force on the plate and torque about its centre, (k, 6), N and N m.
+
+    Axes: x right, y up, z into the plate.
+
+    Args:
+        track: rows that begin with the tips' places on the plate, mm, (k, 2 n and more).
+        load: friction on the plate x, y and normal force of every tip, N, (k, 3 n).
+    """
+    n = load.shape[1] // 3
+    place = track[:, : 2 * n].reshape(-1, n, 2) * 1e-3
+    x, y = place[:, :, 0], place[:, :, 1]
+    along_x, along_y, normal = np.moveaxis(load.reshape(-1, n, 3), 2, 0)
+    parts = along_x, along_y, normal, y * normal, -x * normal, x * along_y - y * along_x
+    return np.stack([part.sum(axis=1) for part in parts], axis=1)
 
 
 def springs_of(settings: MockSettings, skin: Skin, seed: int) -> Springs:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sliplab.protocols.timing import Delay, Timing
+from sliplab.protocols.timing import Delay, ForceTiming, Timing
 from sliplab.protocols.yaml_file import KeyedError, StrictModel
 from sliplab.rigs.mock.fault_settings import Fault, check_papillae
 
@@ -279,6 +279,45 @@ class Arm(StrictModel):
     """Position of the arm when the rig is switched on; left out, 60 mm clear of the plate."""
 
 
+Row = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+
+class ForceSensor(StrictModel):
+    """A force/torque sensor behind the plate: the contact's true forces, and its own faults.
+
+    Axes: x right, y up, z into the plate; torques are about the plate's centre. The defaults are
+    those of a small six-axis transducer (a range of some 10 N), rounded; none was measured.
+    """
+
+    seed: Seed | None = None
+    """Fabrication: cross-talk and drift of the clock. Left out, the rig's seed."""
+    rate_hz: Annotated[int, Field(ge=10, le=7000)] = 1000
+    noise_n: NonNegative = 0.005
+    """Standard deviation of a sample's force along each axis."""
+    noise_nm: NonNegative = 0.0001
+    """The same of its torque about each axis."""
+    drift_n_per_min: NonNegative = 0.02
+    """Largest drift of zero along each axis; a trial has a random share of it, either way."""
+    drift_nm_per_min: NonNegative = 0.0004
+    cross_talk: tuple[Row, Row, Row, Row, Row, Row] | None = None
+    """What a reading shows of the load besides the load: the matrix C of (1 + C) load, of Fx, Fy,
+    Fz in N and Tx, Ty, Tz in N m. Left out, it is drawn from the seed."""
+    cross_talk_share: Share = 0.01
+    """Largest share of one axis that shows on another where the matrix is drawn."""
+    lever_m: Positive = 0.02
+    """Length that compares forces with torques where the matrix is drawn."""
+    range_n: Positive = 50.0
+    """Force along any axis beyond which readings are not to be trusted: a fault."""
+    clock_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
+    """Largest drift of its clock, either way; the seed draws it."""
+    latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 500
+    """From a sample to the host."""
+    arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 1000.0
+    """Delay besides; half-normal, four standard deviations wide."""
+    bias: Literal["trial", "session", "never"] = "trial"
+    """When the present reading becomes zero."""
+
+
 class Clocks(StrictModel):
     """Deviations of the devices' clocks from the truth. Drifts belong to the rig."""
 
@@ -321,6 +360,8 @@ class MockSettings(StrictModel):
     event_camera: EventCamera = EventCamera()
     frame_camera: FrameCamera = FrameCamera()
     arm: Arm = Arm()
+    force: ForceSensor | None = None
+    """Left out, the rig has no force sensor; `{}` is one with its defaults."""
     clocks: Clocks = Clocks()
     faults: tuple[Fault, ...] = ()
     """Faults to inject; docs/faults.md lists the kinds."""
@@ -370,11 +411,29 @@ def check_timing(mock: MockSettings, timing: Timing) -> None:
             "frame_camera", camera.latency_us, camera.arrival_jitter_us,
             "frame_delay", timing.frame_delay,
         )  # fmt: skip
+    if mock.force is not None:
+        _check_force(mock.force, timing)
     if timing.arm == "host time":
         _check_delay(
             "arm", mock.arm.latency_us, mock.arm.arrival_jitter_us,
             "pose_delay", timing.pose_delay,
         )  # fmt: skip
+
+
+def _check_force(force: ForceSensor, timing: Timing) -> None:
+    """Hold a simulated force sensor's clock and delay against `timing.force`."""
+    how = timing.force or ForceTiming()
+    if how.grade != "host time":
+        raise KeyedError(
+            "timing.force.grade", how.grade, "must be host time: the simulated sensor has a clock"
+        )
+    if force.clock_ppm > how.drift_ppm:
+        raise KeyedError(
+            "mock.force.clock_ppm",
+            force.clock_ppm,
+            f"must be at most timing.force.drift_ppm = {how.drift_ppm:g}",
+        )
+    _check_delay("force", force.latency_us, force.arrival_jitter_us, "force.delay", how.delay)
 
 
 def _jitters(stream: str, used: bool) -> tuple[str, ...]:

@@ -122,15 +122,17 @@ def clocks_of(
     Returns:
         For `arm`, `event_camera` and `frame_camera` pairs of that clock and the box's, ns.
     """
-    start_ns, end_ns = recorded_ns
-    times = [*range(start_ns, end_ns, 1_000_000_000), end_ns]
     clocks = world.clocks
     found = {"arm": clocks.arm, "event_camera": clocks.event_camera}
     found["frame_camera"] = IDENTITY if frames == "host arrival" else clocks.frame_camera
-    return {
-        name: [[clock.to_reference(t), box.to_reference(t)] for t in times]
-        for name, clock in found.items()
-    }
+    return {name: readings_of(clock, box, recorded_ns) for name, clock in found.items()}
+
+
+def readings_of(clock: ClockMap, box: ClockMap, recorded_ns: tuple[int, int]) -> list[list[int]]:
+    """Return pairs of one clock's reading and the box's, ns, as `clocks_of` has them."""
+    start_ns, end_ns = recorded_ns
+    times = [*range(start_ns, end_ns, 1_000_000_000), end_ns]
+    return [[clock.to_reference(t), box.to_reference(t)] for t in times]
 
 
 def _onsets(

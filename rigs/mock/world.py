@@ -180,6 +180,14 @@ class World:
         """Keep the forces of every row from the last one on, until `drop_loads`."""
         return self.physics.keep_loads(self.now_ns)
 
+    def keep_wrench(self) -> History:
+        """Keep the sum of the forces of every row from the last one on, until the trial ends."""
+        return self.physics.keep_wrench(self.now_ns)
+
+    def drop_wrench(self) -> None:
+        """Nobody looks at the sum of the forces any longer."""
+        self.physics.wrench = None
+
     def drop_loads(self) -> None:
         """Nobody looks at the forces any longer."""
         self.physics.loads = None

@@ -176,8 +176,10 @@ class Clocks(Part):
 class RecordedTiming(Part):
     """The timing of the rig, from which the clocks are fitted again."""
 
-    rig: Annotated[Timing, PlainSerializer(lambda timing: timing.model_dump(mode="json"))]
-    """The section `timing` of the rig file."""
+    rig: Annotated[
+        Timing, PlainSerializer(lambda timing: timing.model_dump(mode="json", exclude_none=True))
+    ]
+    """The section `timing` of the rig file, without the devices that the rig has not."""
     rate_hz: Number
     """Ticks of the sync box a second."""
     mid_exposure_ns: Int | None = None

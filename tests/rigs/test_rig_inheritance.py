@@ -140,7 +140,9 @@ def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.Monk
     assert rig_path(Path("some/mock")) == Path("some/mock")
     (tmp_path / "mine").write_text(MOCK)
     assert load_rig_file(Path("mine"))[0].name == "mock"
-    with pytest.raises(InputError, match=r"rehersal: .* ships: irb120, loopback, mock, mock_noisy"):
+    with pytest.raises(
+        InputError, match=r"rehersal: .* ships: irb120, loopback, mock, mock_force, mock_noisy"
+    ):
         rig_path(Path("rehersal"))
 
 

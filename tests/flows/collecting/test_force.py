@@ -1,0 +1,93 @@
+"""Trials of a rig with a force sensor: stored, counted, on the time line, and gated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.force import has_forces, plate_forces
+from sliplab.storage.errors import StoreError
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.flows.collecting.test_session import session, short, take_all
+
+TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
+TRACKS = {"level": "tracks"}
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """One slide to 0 degrees, with forces."""
+    folder = tmp_path_factory.mktemp("force")
+    work, campaign = session(folder / "a", short(), TIMING, force={}, frame_camera=TRACKS)
+    take_all(work)
+    assert verify(Store.open(folder / "a" / "store")) == []
+    return sorted(campaign.recordings(), key=lambda r: str(r.record.condition["direction"]))[0]
+
+
+def test_the_record_counts_and_times_the_forces(taken: Recording) -> None:
+    record = taken.record
+    stream = record.streams["force"]
+    assert stream.kind == "wrench"
+    assert stream.rows == len(taken.wrenches())
+    assert stream.rows == pytest.approx(record.recorded_s * 1000, rel=0.2)
+    assert stream.to_plate == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    clock = record.clocks.streams["force"]
+    assert (clock.grade, clock.kind) == ("host time", "hard bound")
+    gate = record.quality.gates["sync_uncertainty_force_s"]
+    assert gate.passed
+    assert gate.grade == "host time"
+    assert 0.001 < float(gate.value or 0) < 0.004
+    assert record.timing is not None
+    assert record.timing.rig.force is not None
+    truth = np.array((record.simulation_truth or {})["clocks"]["force"])
+    error = np.abs(np.asarray(clock.map.to_reference(truth[:, 0])) - truth[:, 1])
+    assert error.max() <= (clock.uncertainty_ns or 0)
+
+
+def test_forces_stand_on_the_plate_and_on_the_time_line(taken: Recording) -> None:
+    assert has_forces(taken)
+    found = plate_forces(taken)
+    assert found.simulated
+    start, end = taken.step("slide")
+    held, slid = found.between(*taken.step("hold")), found.between(start, end)
+    assert np.all(np.diff(found.t_ns) > 0)
+    assert len(slid.t_ns) == pytest.approx((end - start) / 1e6, abs=3)
+    assert held.normal_n.mean() > 1.0
+    # friction grows along the slide, below the edge of the cone
+    assert held.tangential_n.mean() < 0.3
+    assert slid.tangential_n[-50:].mean() > 0.5
+    assert np.all(slid.tangential_n < 1.1 * slid.normal_n)
+    assert 1e6 < found.uncertainty_ns < 4e6
+
+
+def test_a_rig_without_a_sensor_says_nothing_of_forces(tmp_path: Path) -> None:
+    work, campaign = session(tmp_path / "a", short(), frame_camera=TRACKS)
+    take_all(work)
+    recording = next(iter(campaign.recordings()))
+    text = (recording.folder / "record.json").read_text()
+    data = json.loads(text)
+    assert "streams" not in data
+    assert "streams" not in data["clocks"]
+    assert "force" not in data["timing"]["rig"]
+    assert "force" not in text
+    assert not has_forces(recording)
+    with pytest.raises(StoreError, match="no wrenches 'force'"):
+        plate_forces(recording)
+
+
+def test_a_clock_that_jumps_back_is_refused_and_the_trial_taken_again(tmp_path: Path) -> None:
+    fault = {
+        "kind": "clock_jump", "device": "force_sensor", "seconds": -2.0, "at_s": 0.5, "trial": 2,
+    }  # fmt: skip
+    work, campaign = session(
+        tmp_path / "a", short(), TIMING, force={}, frame_camera=TRACKS, faults=[fault]
+    )
+    take_all(work)
+    (failed,) = campaign.quarantined()
+    assert "sync_uncertainty_force_s: its clock fell back" in failed["cause"]
+    assert len(campaign.committed()) == 3
