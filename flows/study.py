@@ -19,12 +19,13 @@ from sliplab.analysis.labels.label_errors import CHECK
 from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
+from sliplab.analysis.sweeps.holdout import STEP
 from sliplab.analysis.sweeps.sensitivity import value_of
 from sliplab.flows.collect import collect
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.generalise import SKINS, measure_generalisation
 from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
-from sliplab.flows.holdout import STEP, measure_holdout
+from sliplab.flows.holdout import measure_holdout
 from sliplab.flows.label import check_labels, check_required, label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
@@ -123,7 +124,7 @@ def study(
     run("train", lambda: train(store, campaigns), "networks")
     run("evaluate", lambda: evaluate(store, campaigns), "evaluations")
     if holdout:
-        run(STEP, lambda: measure_holdout(store, campaigns, holdout), "evaluations")
+        run(STEP, lambda: measure_holdout(store, campaigns, holdout).to_json(), "evaluations")
     for search in more:
         run(search.name, partial(search.work, store, campaigns), search.unit)
     run("report", lambda: report(store, campaigns), "pages")
@@ -224,12 +225,12 @@ def searches(run_requests: list[RunRequest]) -> list[Search]:
 
 def _generalisation(store: Store, campaigns: list[Collected]) -> Json:
     result = measure_generalisation(store, campaigns)
-    return {"step": "generalisation", "done": result["made"]}
+    return {"step": "generalisation", "done": result.made}
 
 
 def _guesses(store: Store, campaigns: list[Collected], names: tuple[str, ...]) -> Json:
     result = measure_guesses(store, campaigns, names, TRIALS)
-    return {"step": "guesses", "done": result["measured"]}
+    return {"step": "guesses", "done": result.measured}
 
 
 def _scene(store: Store, campaigns: list[Collected]) -> Json:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.latency import (
     score_trial,
     summarise_latency,
@@ -16,15 +18,22 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.models import rules_of
 from sliplab.analysis.networks.quantised import Quantised, chip_run, quantised_net
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.analysis.windows.samples import strided_windows
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import ExperimentScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
+from sliplab.storage.schema.sweeps import HoldoutScores
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 
 def score_row(
@@ -117,3 +126,87 @@ def _summary(rows: dict[str, list[Any]]) -> Latency:
         experiment: {"trials": len(each), "latency_ms": summarise_latency(each).to_json()}
         for experiment, each in rows.items()
     }
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Outputs of a network and a rule on a store's test trials.
+
+    Attributes:
+        counts: spikes of each class in each sample, int64 (n, 3).
+        samples: of the kinematic test trials.
+        trials: a row of `score_row` for each, and its recording.
+    """
+
+    counts: npt.NDArray[np.int64]
+    samples: dataset.SampleSet
+    trials: list[tuple[TrialScore, Recording]]
+
+    @property
+    def rows(self) -> list[TrialScore]:
+        """Onsets, detections and latency of each trial."""
+        return [row for row, _ in self.trials]
+
+    def hits_by_trial(self, with_campaign: bool) -> dict[str, tuple[int, int]]:
+        """Return by trial its windows that were classified correctly, and all of its windows.
+
+        Args:
+            with_campaign: the campaign stands before the trial in its name.
+        """
+        trial, known = self.samples.trial, self.samples.trials
+        names = [f"{c}/{name}" if with_campaign else name for c, name in known]
+        hits = window_groups.strict_hits(self.counts, self.samples.y)
+        right = np.bincount(trial, hits, len(names))
+        count = np.bincount(trial, minlength=len(names))
+        return {name: (int(right[k]), int(count[k])) for k, name in enumerate(names)}
+
+    def window_scores(self, margin: float) -> HoldoutScores:
+        """Return all figures of the windows, with two accuracies over trials.
+
+        Args:
+            margin: spikes by which the winning class must lead.
+        """
+        counts, y, trial = self.counts, self.samples.y, self.samples.trial
+        return HoldoutScores(
+            **dict(metrics.score(counts, y, margin)),
+            strict=window_groups.share(window_groups.strict_hits(counts, y), trial),
+            argmax=window_groups.share(window_groups.credit(counts, y), trial),
+        )
+
+
+def judge(
+    fitted: Fitted,
+    detection: Mapping[str, Detection],
+    store: Store,
+    campaigns: list[Collected],
+) -> Judged:
+    """Judge the labelled test trials of a store by a network that another store trained.
+
+    Args:
+        detection: smoothing, margin and stride by campaign.
+    """
+    labels, rows = Labels(store), []
+    for item in campaigns:
+        settings = detection[item.name]
+        for trial, recording in item.of_split("test"):
+            counts, end_ns = _counts(recording, fitted, settings)
+            of_trial = labels.read(item, recording)
+            row = score_row(item, trial, of_trial, counts, end_ns, settings)
+            rows.append((row, recording))
+    samples = load_samples(labels, training_campaigns(campaigns), "test")
+    return Judged(training.predict_counts(fitted, samples.windows), samples, rows)
+
+
+def _counts(
+    recording: Recording, fitted: Fitted, settings: Detection
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return spikes of consecutive windows (n, 3), and where they end (n,), ns."""
+    windows = fitted.windows
+    if settings.stride_ms is None:
+        x, end_ns = dataset.trial_windows(recording, windows)
+    else:
+        length_ns = windows.length_ms * 1_000_000
+        span, stride_ns = dataset.recorded_span(recording), settings.stride_ms * 1_000_000
+        starts = strided_windows(*span, length_ns, stride_ns)
+        x, end_ns = dataset.cut_windows(recording, starts, windows), starts + length_ns
+    return training.predict_counts(fitted, x), end_ns

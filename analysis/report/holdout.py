@@ -4,40 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
 from sliplab.analysis.report.page import Content, Table, number, percent
-from sliplab.analysis.report.programs import shape_checked
-from sliplab.storage.schema.evaluation import LatencyByOnset, Share, TrialScore
-from sliplab.storage.schema.summary import Holdout, Kinematic, Span, TrialIntervals
-
-Json = dict[str, Any]
+from sliplab.storage.schema.evaluation import LatencyByOnset, Share
+from sliplab.storage.schema.summary import (
+    Holdout,
+    HoldoutWindows,
+    Kinematic,
+    Span,
+    TrialIntervals,
+)
+from sliplab.storage.schema.sweeps import HoldoutResult
 
 COLUMNS = ("figure", "hold-out", "n")
 _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
 
 
-def holdout_part(found: Json) -> Holdout:
-    """Return the part of the summary: all but single trials and dates, with intervals.
-
-    Args:
-        found: `sliplab holdout`'s results.
-
-    Raises:
-        StoreError: they are of another shape.
-    """
-    numbers = ("trials", "protocol_seed", "skin_seed", "model", "windows")
-    with shape_checked("holdout"):
-        return Holdout.model_validate({
-            **{name: found[name] for name in numbers},
-            "versions": [each["version"] for each in found["evaluations"]],
-            **found["kinematic"],
-            "intervals": trial_intervals(
-                [trial_outcome(TrialScore.model_validate(row)) for row in found["rows"]]
-            ),
-        })  # fmt: skip
+def holdout_part(found: HoldoutResult) -> Holdout:
+    """Return the part of the summary: all but single trials and dates, with intervals."""
+    return Holdout(
+        **dict(found.kinematic),
+        protocol_seed=found.protocol_seed,
+        skin_seed=found.skin_seed,
+        model=found.model,
+        versions=tuple(each.version for each in found.evaluations),
+        windows=HoldoutWindows.model_validate(found.windows.to_json()),
+        intervals=trial_intervals([trial_outcome(row) for row in found.rows]),
+    )
 
 
 def holdout_rows(holdout: Holdout) -> list[list[str]]:

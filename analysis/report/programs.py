@@ -11,7 +11,8 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -22,9 +23,12 @@ from sliplab.analysis.report.tradeoff_scene import SceneCost, scene_cost
 from sliplab.analysis.report.windows import share_data
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
+from sliplab.storage.schema.document import Document
+from sliplab.storage.schema.sweeps import GeneralisationResults, NotTrained
 from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
+DocumentT = TypeVar("DocumentT", bound=Document)
 
 FILES = {
     "generalisation": "derived/generalisation/results.json",
@@ -89,6 +93,16 @@ def shape_checked(name: str) -> Iterator[None]:
         ) from None
 
 
+def parse_program(name: str, kind: type[DocumentT], found: Json) -> DocumentT:
+    """Return the results of a program as a document.
+
+    Raises:
+        StoreError: they are of another shape.
+    """
+    with shape_checked(name):
+        return kind.parse(found, Path(FILES[name]))
+
+
 @dataclass(frozen=True)
 class SkinSection(Content):
     """The network on skins and levels that it never saw, or how to measure it."""
@@ -114,18 +128,17 @@ def skin_section(
         return SkinSection(command)
     groups: dict[str, list[Share]] = {}
     rows = []
-    with shape_checked("generalisation"):
-        results = found["results"].items()
-        for name, row in sorted(results, key=lambda each: each[0].startswith("skin ")):
-            if "left out" in row:
-                rows.append([name, row["left out"], "", "", "", ""])
-                continue
-            group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
-            item = Share(name, row["share"], row["low"], row["high"])
-            groups.setdefault(group, []).append(item)
-            span = "–" if item.low is None else f"{percent(item.low)} to {percent(item.high)}"
-            rows.append([name, str(row["trials"]), str(row["n"]), percent(item.value), span,
-                         percent(row.get("seen"))])  # fmt: skip
+    results = parse_program("generalisation", GeneralisationResults, found).results.items()
+    for name, row in sorted(results, key=lambda each: each[0].startswith("skin ")):
+        if isinstance(row, NotTrained):
+            rows.append([name, row.why, "", "", "", ""])
+            continue
+        group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
+        item = Share(name, row.share, row.low, row.high)
+        groups.setdefault(group, []).append(item)
+        span = "–" if item.low is None else f"{percent(item.low)} to {percent(item.high)}"
+        rows.append([name, str(row.trials), str(row.n), percent(item.value), span,
+                     percent(row.seen)])  # fmt: skip
     figure = None
     if groups:
         drawn = [item for of in groups.values() for item in of]

@@ -8,15 +8,10 @@ from typing import Any, ClassVar
 
 from sliplab.analysis.report.figures.intervals import Changed, ChangePanel, lowered_and_raised
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
-from sliplab.analysis.report.programs import shape_checked
-from sliplab.analysis.sweeps.sensitivity import (
-    AS_IT_IS,
-    FIGURES,
-    NAMES,
-    UNITS,
-    changes,
-    figures,
-)
+from sliplab.analysis.report.programs import parse_program, shape_checked
+from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, NAMES
+from sliplab.analysis.sweeps.study_sensitivity import FIGURES, UNITS, changes, figures
+from sliplab.storage.schema.sweeps import SensitivityResults
 
 Json = dict[str, Any]
 
@@ -53,26 +48,27 @@ def sensitivity_section(found: Json | None, command: str) -> SensitivitySection:
     """
     if found is None:
         return SensitivitySection(command)
+    results = parse_program("guesses", SensitivityResults, found)
     with shape_checked("guesses"):
-        return _made(found, command)
+        return _made(results, command)
 
 
-def _made(found: Json, command: str) -> SensitivitySection:
-    settings: dict[str, Json] = dict(found["settings"])
+def _made(found: SensitivityResults, command: str) -> SensitivitySection:
+    settings = dict(found.settings)
     base = settings.pop(AS_IT_IS)
     unchanged = figures(base)
     lower: dict[str, dict[str, Changed]] = {key: {} for key in FIGURES}
     higher: dict[str, dict[str, Changed]] = {key: {} for key in FIGURES}
     names: dict[str, None] = {}
     for setting in settings.values():
-        parameter = setting["parameter"]
+        parameter = setting.parameter or ""
         name = NAMES.get(parameter, parameter.split(".")[-1])
         names[name] = None
         values, spans = figures(setting), changes(base, setting)
-        side = lower if setting["factor"] < 1 else higher
+        side = lower if setting.factor < 1 else higher
         for key in FIGURES:
             side[key][name] = _changed(key, unchanged[key], values[key], spans[key])
-    share = 100 * found["change"]
+    share = 100 * found.change
     panels = [
         ChangePanel(
             f"{FIGURES[key]}\n({_change_unit(key)})", lower[key], higher[key],
@@ -91,7 +87,7 @@ def _made(found: Json, command: str) -> SensitivitySection:
     ]  # fmt: skip
     first = [AS_IT_IS, *(_value(key, unchanged[key], unit=False) for key in FIGURES)]
     return SensitivitySection(
-        command, share, len(base["trials"]),
+        command, share, len(base.trials),
         Figure(svg, name="guesses", data=_data(list(names), lower, higher)),
         Table(("guess", *(f"{text} ({UNITS[key]})" for key, text in FIGURES.items())),
               [first, *rows]),

@@ -11,6 +11,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.campaign import references_of
 from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
+from sliplab.analysis.report.programs import parse_program
 from sliplab.analysis.report.sources import Sources
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
@@ -28,6 +29,7 @@ from sliplab.storage.schema.summary import (
     Sync,
     TrialOutcome,
 )
+from sliplab.storage.schema.sweeps import HoldoutResult
 
 Json = dict[str, Any]
 
@@ -58,7 +60,10 @@ def make_summary(sources: Sources) -> Summary:
         "window_intervals": {} if spans is None else spans.to_json(),
         **judged["kinematic"],
     }
-    holdout = sources.programs.get("holdout")
+    holdout = None
+    if "holdout" in sources.programs:
+        kept = parse_program("holdout", HoldoutResult, sources.programs["holdout"])
+        holdout = holdout_part(kept)
     return Summary.model_validate({
         "simulated": sources.store.simulated,
         **judged,
@@ -78,7 +83,7 @@ def make_summary(sources: Sources) -> Summary:
         "detection": _plain(evaluation.detection),
         "choices": evaluation.choices,
         "detectors": evaluation.detectors,
-        "holdout": None if holdout is None else holdout_part(holdout),
+        "holdout": holdout,
         "sync": sync_part(campaigns),
         "quality": _quality(campaigns),
         "planned": {

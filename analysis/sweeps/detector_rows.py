@@ -28,12 +28,12 @@ from sliplab.analysis.metrics.pareto import front
 from sliplab.analysis.sweeps.detector_grid import PAPER, Setting, counted_stride, strides
 from sliplab.analysis.sweeps.detector_search import (
     PRECISIONS,
-    Arrays,
     DetectorSearch,
     LabelledTrial,
     trial_counts,
 )
-from sliplab.analysis.sweeps.runner import Json
+from sliplab.analysis.sweeps.runner import Arrays
+from sliplab.storage.streams import Json
 
 SMOOTHINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0, 30.0, 40.0)

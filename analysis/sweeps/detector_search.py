@@ -33,7 +33,7 @@ from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.networks.synaptic import count_net_work
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.analysis.sweeps.detector_grid import Grid, Setting, counted_stride
-from sliplab.analysis.sweeps.runner import Advance, Json, Sweep
+from sliplab.analysis.sweeps.runner import Advance, Arrays, Sweep
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.samples import strided_windows
@@ -43,6 +43,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Network, Samples, Training, Windows
 from sliplab.storage.files import make_folder, write_bytes
 from sliplab.storage.schema.label import TrialLabel
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import StoreError
@@ -54,8 +55,6 @@ SINGLE, BATCH, ROUNDS = 200, 512, 5
 """Windows measured one at a time; windows in a batch; how often the batch is measured."""
 PROBE_TRIALS, PROBE_WINDOWS = 6, 96
 """Training trials and windows of them that a run is tried with for an estimate."""
-
-Arrays = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy.typing as npt
+
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.storage.files import make_folder, read_json, write_json
+from sliplab.storage.schema.document import Document, Part
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.derived import load_document
 
-Json = dict[str, Any]
+Arrays = dict[str, npt.NDArray[Any]]
 Progress = Callable[[float, str], None]
 """Called with how much more is done, in the units of `Sweep.expected`, and a note."""
 Advance = Callable[[str, float, str], None]
@@ -45,51 +50,55 @@ class Results(Protocol):
     def fresh(self, name: str, key: str) -> bool:
         """Return whether the result `name` was made with `key`."""
 
-    def read(self, name: str) -> Json:
-        """Return a result."""
-
-    def write(self, name: str, key: str, data: Json, arrays: Json | None = None) -> None:
+    def write(self, name: str, key: str, data: Json | Part, arrays: Arrays | None = None) -> None:
         """Keep a result."""
 
 
+DocumentT = TypeVar("DocumentT", bound=Document)
+
+
 @dataclass(frozen=True)
-class ResultFile:
-    """The results of a whole sweep in one JSON file, by name, each with its key.
+class ResultFile(Generic[DocumentT]):
+    """The results of a whole sweep in one document, by name, each with its key.
 
     Attributes:
-        field: key of the file that holds the results.
-        head: other entries of the file.
+        kind: of the document.
+        field: key of the document that holds the results.
+        head: other entries of the document.
     """
 
     path: Path
+    kind: type[DocumentT]
     field: str
-    head: Mapping[str, Any]
+    head: Mapping[str, bool | float]
 
-    def all(self) -> dict[str, Json]:
-        """Return the results by name."""
+    def load(self) -> DocumentT:
+        """Read the document.
+
+        Raises:
+            FileNotFoundError: nothing was kept yet.
+            StoreError: it is damaged, or was written by a newer version.
+        """
+        return load_document(self.path, self.kind)
+
+    def fresh(self, name: str, key: str) -> bool:
+        """Return whether the result `name` was made with `key`."""
+        return self._kept().get(name, {}).get("key") == key
+
+    def write(self, name: str, key: str, data: Json | Part, arrays: Arrays | None = None) -> None:
+        """Store a result with the others; it has no arrays."""
+        make_folder(self.path.parent)
+        plain = data.to_json() if isinstance(data, Part) else data
+        found = {**self._kept(), name: {"key": key, **plain}}
+        write_json(self.path, {**self.head, self.field: found})
+
+    def _kept(self) -> dict[str, Json]:
+        """Return the results by name, unchecked: stale ones may have another version's shape."""
         try:
             found: dict[str, Json] = read_json(self.path)[self.field]
         except FileNotFoundError:
             return {}
         return found
-
-    def fresh(self, name: str, key: str) -> bool:
-        """Return whether the result `name` was made with `key`."""
-        return self.all().get(name, {}).get("key") == key
-
-    def read(self, name: str) -> Json:
-        """Return a result.
-
-        Raises:
-            KeyError: it was never made.
-        """
-        return self.all()[name]
-
-    def write(self, name: str, key: str, data: Json, arrays: Json | None = None) -> None:
-        """Store a result with the others; it has no arrays."""
-        make_folder(self.path.parent)
-        found = {**self.all(), name: {"key": key, **data}}
-        write_json(self.path, {**self.head, self.field: found})
 
 
 P = TypeVar("P", bound=Point)
@@ -107,7 +116,7 @@ class Sweep(Generic[P]):
 
     points: Sequence[P]
     results: Results
-    measure: Callable[[P, Advance], tuple[Json, Json | None]]
+    measure: Callable[[P, Advance], tuple[Json | Part, Arrays | None]]
     estimate: Callable[[P], Mapping[str, float]] = lambda point: {"": 1.0}
 
     def done(self, point: P) -> bool:
@@ -181,7 +190,7 @@ class Task:
 
     name: str
     key: str
-    work: Callable[[], Json]
+    work: Callable[[], Part]
 
     @property
     def title(self) -> str:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from sliplab.analysis.sweeps.runner import Json
 from sliplab.analysis.sweeps.scene_error import (
     Onsets,
     SceneError,
@@ -24,6 +23,7 @@ from sliplab.analysis.sweeps.scene_windows import SceneWindows, look, pooled
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Windows
+from sliplab.storage.streams import Json
 
 HIGHEST = 3
 """The highest level of physics."""

@@ -1,22 +1,20 @@
 """Sensitivity analysis: one assumed number of the simulated scene lower, then higher.
 
-None of these numbers was measured on a real skin. `outcome_change` says what a fifth of each does
-to onsets and event rates of the scene alone, and so which are worth measuring first. `figures` and
-`changes` say the same of a whole study: its test trials taken again and judged by its own network.
+None of these numbers was measured on a real skin. The change of onsets and event rates of the scene
+alone says which are worth measuring first; `study_sensitivity` says the same of a whole study.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.metrics.intervals import difference, share_difference
-from sliplab.analysis.sweeps.runner import Json
 from sliplab.analysis.sweeps.scene_windows import PHASES
+from sliplab.storage.streams import Json
 
 CHANGE = 0.2
 LARGEST_POISSON = 0.499
@@ -39,16 +37,6 @@ OTHER_SEED = "another seed"
 
 AS_IT_IS = "as it is"
 """The name of the setting that changes nothing."""
-FIGURES = {
-    "strict": "windows right",
-    "incipient_ms": "incipient latency",
-    "gross_ms": "gross latency",
-    "gravity_lead_ms": "gravity lead",
-    "disturbance_lead_ms": "disturbance lead",
-    "depth_zero_mm": "depth zero",
-}
-"""Compared figures of a study, and their titles. Depth zero is what the rig found by touching the
-plate: it detects contact by events, so a number of the camera moves it, and with it every depth."""
 NAMES = {
     "scene.friction.path_variation": "friction's variation on its path",
     "scene.friction.correlation_mm": "length of that variation",
@@ -65,8 +53,6 @@ NAMES = {
 }
 """Titles of the assumed numbers: the three families of decision 12 that decide accuracy, and
 whatever moves an onset or a rate by a tenth (its table)."""
-UNITS = {name: "%" if name == "strict" else name.rsplit("_", 1)[1] for name in FIGURES}
-_MEDIANS = ("incipient_ms", "gross_ms")
 
 
 @dataclass(frozen=True)
@@ -115,6 +101,15 @@ def value_of(simulated: Any, name: str) -> float | None:
     for part in name.split("."):
         value = getattr(value, part, None)
     return float(value) if isinstance(value, int | float) else None
+
+
+def in_all(names: Sequence[str], scenes: Sequence[Any]) -> list[str]:
+    """Return the parameters that are not zero in any of several rigs' simulated scenes.
+
+    Args:
+        scenes: settings of simulated rigs; None for a real one, which has no parameters.
+    """
+    return [name for name in names if all(value_of(scene, name) for scene in scenes)]
 
 
 @dataclass(frozen=True)
@@ -196,48 +191,3 @@ def _percent(part: float | None, whole: float | None) -> float | None:
 def _mean(values: npt.NDArray[np.float64]) -> float | None:
     there = values[np.isfinite(values)]
     return float(there.mean()) if len(there) else None
-
-
-def figures(setting: Json) -> dict[str, float | None]:
-    """Return the compared figures of one setting of a study, by the names of `FIGURES`."""
-    right, count = (sum(found[k] for found in setting["windows"].values()) for k in (0, 1))
-    summary: dict[str, float | None] = {"strict": right / count if count else None}
-    for name, found in _values(setting).items():
-        there = [value for value in found.values() if value is not None]
-        middle = np.median if name in _MEDIANS else np.mean
-        summary[name] = float(middle(there)) if there else None
-    return summary
-
-
-def changes(base: Json, other: Json) -> dict[str, tuple[float, float] | None]:
-    """Return the 95 % interval of each figure's change, over trials that both have."""
-    found: dict[str, tuple[float, float] | None] = {}
-    first, second = _values(other), _values(base)
-    for name in first:
-        both = sorted(first[name].keys() & second[name].keys())
-        pair = [np.array([of[name][t] for t in both], np.float64) for of in (first, second)]
-        statistic = "median" if name in _MEDIANS else "mean"
-        found[name] = difference(pair[0], pair[1], statistic, paired=True)
-    trials = sorted(other["windows"].keys() & base["windows"].keys())
-    hits = [np.array([of["windows"][t] for t in trials]).reshape(-1, 2).T for of in (other, base)]
-    found["strict"] = share_difference((hits[0][0], hits[0][1]), (hits[1][0], hits[1][1]))
-    return found
-
-
-def _values(setting: Json) -> dict[str, dict[str, float | None]]:
-    """Return latencies and leads by trial; None where a trial has none."""
-    found: dict[str, dict[str, float | None]] = {name: {} for name in FIGURES if name != "strict"}
-    for row in setting["trials"]:
-        latency = row["latency"] or {}
-        trial = f"{row['campaign']}/{row['trial']}"
-        found["depth_zero_mm"][trial] = row["depth_zero_mm"]
-        for name, key in _keys(row["experiment"]):
-            found[name][trial] = latency.get(key)
-    return found
-
-
-def _keys(experiment: str) -> Iterator[tuple[str, str]]:
-    if experiment == "kinematic":
-        yield from (("incipient_ms", "latency_incipient_ms"), ("gross_ms", "latency_gross_ms"))
-    else:
-        yield f"{experiment}_lead_ms", "lead_ms"

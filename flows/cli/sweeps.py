@@ -253,12 +253,12 @@ def generalise(
         store, campaigns, factor or (), level or (), every, skins, trials, epochs
     )
     if as_json:
-        console.print_json(result)
+        console.print_json(result.to_json())
         return
-    simulated = ", simulated" if result["simulated"] else ""
-    rows = [row_cells(name, row) for name, row in result["results"].items()]
+    simulated = ", simulated" if result.simulated else ""
+    rows = [row_cells(name, row) for name, row in result.results.items()]
     console.print_table(f"generalise{simulated}", COLUMNS, rows)
-    console.say(f"kept in {result['file']}; the next report shows it")
+    console.say(f"kept in {result.file}; the next report shows it")
 
 
 @app.command()
@@ -276,29 +276,20 @@ def guesses(
 ) -> None:
     """Evaluate some test trials again with each assumed scene parameter 20 % lower and higher."""
     store, campaigns = _opened(folder, campaign)
-    from sliplab.analysis.sweeps.sensitivity import FIGURES, UNITS
+    from sliplab.analysis.sweeps.study_sensitivity import FIGURES, UNITS, figure_cells
     from sliplab.flows.guesses import GUESSES, measure_guesses
 
     result = measure_guesses(store, campaigns, tuple(guess or GUESSES), trials)
     if as_json:
-        console.print_json(result)
+        console.print_json(result.to_json())
         return
     columns = [f"{FIGURES[name]} ({UNITS[name]})" for name in FIGURES]
-    rows = []
-    for name, found in result["settings"].items():
-        shown = [
-            "-"
-            if value is None
-            else f"{100 * value:.1f}"
-            if key == "strict"
-            else f"{value:.3f}"
-            if UNITS[key] == "mm"
-            else f"{value:.0f}"
-            for key, value in found.items()
-        ]
-        rows.append([name.removeprefix("scene.").removeprefix("event_camera."), *shown])
+    rows = [
+        [name.removeprefix("scene.").removeprefix("event_camera."), *figure_cells(found)]
+        for name, found in result.settings.items()
+    ]
     console.print_table("guesses, simulated", ["setting", *columns], rows)
-    console.say(f"kept in {result['file']}; the next report shows them")
+    console.say(f"kept in {result.file}; the next report shows them")
 
 
 @app.command()
@@ -324,11 +315,11 @@ def holdout(
 
     done = measure_holdout(store, campaigns, trials, again)
     if as_json:
-        console.print_json(done)
+        console.print_json(done.to_json())
         return
-    result = done["result"]
-    console.print_table("hold-out, simulated", COLUMNS, holdout_rows(holdout_part(result)))
-    console.say(f"kept in {done['file']}, with its ledger; the next report shows it")
+    rows = holdout_rows(holdout_part(done.result))
+    console.print_table("hold-out, simulated", COLUMNS, rows)
+    console.say(f"kept in {done.file}, with its ledger; the next report shows it")
 
 
 def _opened(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import inside, read_json, safe_name, write_bytes, write_json
-from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
+from sliplab.storage.schema.document import Document, DocumentError, NewerFormat, Part
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
@@ -28,6 +28,23 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 def make_key(step: str, version: int, inputs: Any, parameters: Any) -> str:
     """Return the key of a result."""
     return hash_data([step, version, inputs, parameters])
+
+
+def load_document(path: Path, kind: type[DocumentT]) -> DocumentT:
+    """Read a document that a step makes again where it lacks.
+
+    Raises:
+        FileNotFoundError: it was never made.
+        StoreError: it is damaged, or was written by a newer version.
+    """
+    try:
+        return kind.load(path)
+    except NewerFormat as error:
+        raise StoreError(str(error)) from None
+    except DocumentError as error:
+        raise StoreError(
+            f"{error}; it is damaged: delete it, and its step makes it again"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -55,7 +72,7 @@ class Derived:
         return self.key(name) == key
 
     def write(
-        self, name: str, key: str, data: Json | Document, arrays: dict[str, Any] | None = None
+        self, name: str, key: str, data: Json | Part, arrays: dict[str, Any] | None = None
     ) -> None:
         """Keep a result; the JSON with its key is written last and decides."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -63,7 +80,7 @@ class Derived:
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **arrays)
             write_bytes(self.arrays_path(name), buffer.getvalue())
-        plain = data.to_json() if isinstance(data, Document) else data
+        plain = data.to_json() if isinstance(data, Part) else data
         write_json(self.folder / f"{safe_name(name)}.json", {**plain, "key": key})
 
     def read(self, name: str) -> Json:
@@ -81,14 +98,7 @@ class Derived:
             FileNotFoundError: it was never made.
             StoreError: it is damaged, or was written by a newer version.
         """
-        try:
-            return kind.load(self.folder / f"{safe_name(name)}.json")
-        except NewerFormat as error:
-            raise StoreError(str(error)) from None
-        except DocumentError as error:
-            raise StoreError(
-                f"{error}; it is damaged: delete it, and its step makes it again"
-            ) from None
+        return load_document(self.folder / f"{safe_name(name)}.json", kind)
 
     def arrays_path(self, name: str) -> Path:
         """Return the path of a result's arrays."""

@@ -13,14 +13,15 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.sweeps import generalisation
-from sliplab.analysis.sweeps.generalisation import markdown
-from sliplab.analysis.sweeps.runner import Json, Task, task_sweep
-from sliplab.flows import generalise, other_rig
-from sliplab.flows.generalise import Generalisation, measure_generalisation
+from sliplab.analysis.sweeps.generalisation import Generalisation, markdown
+from sliplab.analysis.sweeps.runner import Task, task_sweep
+from sliplab.flows import other_rig
+from sliplab.flows.generalise import measure_generalisation, skin_task
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import read_json
+from sliplab.storage.files import json_text, read_json
+from sliplab.storage.schema.sweeps import GeneralisationResults, NotTrained, UnseenScores
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.conftest import shape_of
@@ -42,15 +43,18 @@ def test_a_level_is_tested_on_and_not_trained_on(store: Store) -> None:
     work = Generalisation(store, collected(store), 1)
     levels = work.levels("direction")
     assert levels == sorted(levels, key=lambda text: float(text.split()[0]))
-    row = work.results.read(f"direction {levels[0]}")
+    row = work.results.load().results[f"direction {levels[0]}"]
+    assert isinstance(row, UnseenScores)
+    assert row.trained_on is not None
+    assert row.share is not None
     where = [condition["direction"] for condition in work.trials.conditions]
-    assert row["trials"] == where.count(levels[0])
+    assert row.trials == where.count(levels[0])
     assert (
-        row["n"]
+        row.n
         == np.isin(work.trials.samples.trial, np.flatnonzero(np.array(where) == levels[0])).sum()
     )
-    assert 0 < row["trained_on"] < len(where) - row["trials"]
-    assert 0 <= row["share"] <= 1
+    assert 0 < row.trained_on < len(where) - row.trials
+    assert 0 <= row.share <= 1
     assert not list(work.folder.glob("*.state"))
 
 
@@ -69,24 +73,24 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
     )
     model = choose_model(wanted_models(store, collected(store)))
     with pytest.raises(StoreError, match="holds no campaign yet"):
-        Generalisation(store, collected(store), 1).skin(model, 102, 4).work()
+        skin_task(Generalisation(store, collected(store), 1), model, 102, 4).work()
     shutil.rmtree(folder / "skin102")
     assert seen == [102]
 
 
 def test_what_is_kept_is_not_measured_again(store: Store) -> None:
     asked = (store, collected(store), ("direction",))
-    assert measure_generalisation(*asked, skins=1, trials=4, epochs=1)["made"] == 0
+    assert measure_generalisation(*asked, skins=1, trials=4, epochs=1).made == 0
     other = Generalisation(store, collected(store), 2)
     made: list[str] = []
 
-    def work() -> Json:
+    def work() -> NotTrained:
         made.append("made")
-        return {"left out": "not tried"}
+        return NotTrained(why="not tried")
 
     before = store.folder / "derived" / "generalisation" / "results.json"
     text = before.read_text()
-    name = next(iter(other.results.all()))
+    name = next(iter(other.results.load().results))
     for _ in range(2):
         task_sweep([Task(name, "another key", work)], other.results).run()
     assert len(made) == 1
@@ -103,11 +107,10 @@ def test_what_is_not_there_is_refused(store: Store) -> None:
 
 def test_the_table_has_a_row_for_each_result() -> None:
     counts = np.array([[3, 0, 0], [0, 3, 0], [0, 0, 0], [0, 0, 5]])
-    row = generalisation.scored(counts, np.array([0, 1, 1, 2]), np.array([0, 0, 1, 1]))
-    assert (row["share"], row["trials"], row["n"]) == (0.75, 2, 4)
-    text = markdown(
-        {"depth 2 mm": {**row, "seen": 0.9}, "speed 1": {"left out": "no trials"}}, True
-    )
+    row = generalisation.score_windows(counts, np.array([0, 1, 1, 2]), np.array([0, 0, 1, 1]))
+    assert (row.share, row.trials, row.n) == (0.75, 2, 4)
+    seen = row.model_copy(update={"seen": 0.9})
+    text = markdown({"depth 2 mm": seen, "speed 1": NotTrained(why="no trials")}, True)
     assert "(simulated)" in text
     assert "| depth 2 mm | 2 | 4 | 75.0 | 0.0 to 100.0 | 83.3 | 90.0 |" in text
     assert "| speed 1 | no trials |" in text
@@ -140,15 +143,17 @@ EXAMPLE = """{
 
 
 def test_the_file_is_the_same_to_the_byte(tmp_path: Path) -> None:
-    results = generalise._Results(tmp_path / "results.json", "results", {"simulated": True})
+    results = generalisation._Results(
+        tmp_path / "results.json", GeneralisationResults, "results", {"simulated": True}
+    )
     counts = np.array([[3, 0, 0], [0, 3, 0], [0, 0, 0], [0, 0, 5]])
     y, trial = np.array([0, 1, 1, 2]), np.zeros(4, np.int64)
     tasks = [
-        Task("skin 101", "k1", lambda: generalisation.scored(counts, y, trial)),
-        Task("speed 1 mm/s", "k2", lambda: {"left out": "no train trials"}),
+        Task("skin 101", "k1", lambda: generalisation.score_windows(counts, y, trial)),
+        Task("speed 1 mm/s", "k2", lambda: NotTrained(why="no train trials")),
     ]
     assert task_sweep(tasks, results).run() == 2
-    assert results.path.read_text() == EXAMPLE
+    assert results.path.read_text() == EXAMPLE == json_text(results.load().to_json())
     assert "| speed 1 mm/s | no train trials |" in (tmp_path / "results.md").read_text()
 
 

@@ -11,13 +11,21 @@ import pytest
 
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.sensitivity import sensitivity_section
-from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, FIGURES, Setting, changes, figures
+from sliplab.analysis.sweeps import study_sensitivity
+from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, Setting
+from sliplab.analysis.sweeps.study_sensitivity import (
+    FIGURES,
+    StudySensitivity,
+    changes,
+    figures,
+)
 from sliplab.flows import guesses
-from sliplab.flows.guesses import Guesses, measure_guesses
+from sliplab.flows.guesses import TRIALS, guess_sweep, measure_guesses
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
-from sliplab.storage.files import read_json, write_json
+from sliplab.storage.files import json_text, read_json, write_json
+from sliplab.storage.schema.sweeps import SensitivityResults, SettingScores
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
@@ -42,6 +50,10 @@ def kept(store: Store) -> dict[str, Json]:
     return found
 
 
+def scores(store: Store) -> dict[str, SettingScores]:
+    return SensitivityResults.load(store.folder / "derived/guesses/results.json").settings
+
+
 def test_the_scene_as_it_is_gives_the_study_s_own_trials(store: Store) -> None:
     ours = Derived.of(store, "evaluation").read("evaluation")["trials"]
     again = [
@@ -64,9 +76,10 @@ def test_a_change_is_seen_and_compared_trial_by_trial(store: Store) -> None:
         same = [(a, b) for a, b in pairs if a["depth_zero_mm"] == b["depth_zero_mm"]]
         assert all(a["incipient_ns"] == b["incipient_ns"] for a, b in same)
         assert setting["windows"].keys() == base["windows"].keys()
-        assert set(figures(setting)) == set(FIGURES)
     assert lower["windows"] != higher["windows"]
-    none = changes(base, base)
+    typed = scores(store)
+    assert all(set(figures(setting)) == set(FIGURES) for setting in typed.values())
+    none = changes(typed[AS_IT_IS], typed[AS_IT_IS])
     assert none["strict"] == (0.0, 0.0)
     assert all(span in (None, (0.0, 0.0)) for span in none.values())
 
@@ -95,7 +108,9 @@ TRIAL = {
 
 
 def test_a_setting_has_these_keys(store: Store) -> None:
-    file = read_json(store.folder / "derived/guesses/results.json")
+    path = store.folder / "derived/guesses/results.json"
+    assert json_text(SensitivityResults.load(path).to_json()) == path.read_text()
+    file = read_json(path)
     assert list(file) == ["change", "settings", "simulated"]
     assert (file["change"], file["simulated"]) == (0.2, True)
     base, lower, _ = file["settings"].values()
@@ -121,7 +136,7 @@ def test_a_setting_has_these_keys(store: Store) -> None:
 
 def test_what_is_kept_is_not_measured_again_and_leaves_no_store(store: Store) -> None:
     again = measure_guesses(store, collected(store), (GUESS,), 20)
-    assert again["measured"] == 0
+    assert again.measured == 0
     folder = store.folder / "derived" / "guesses"
     assert [path.name for path in folder.iterdir()] == ["results.json"]
 
@@ -133,29 +148,29 @@ def test_stopped_between_two_settings_it_goes_on(
     other = Store.open(tmp_path / "store")
     file = other.folder / "derived/guesses/results.json"
     write_json(file, {"settings": {AS_IT_IS: kept(other)[AS_IT_IS]}})
-    first = Guesses.measure
+    first = guesses.measure_setting
 
-    def stopped(self: Guesses, setting: Setting, key: str) -> Json:
+    def stopped(work: StudySensitivity, setting: Setting, scenes: Any) -> SettingScores:
         if setting.factor > 1:
             raise KeyboardInterrupt
-        return first(self, setting, key)
+        return first(work, setting, scenes)
 
-    monkeypatch.setattr(Guesses, "measure", stopped)
+    monkeypatch.setattr(guesses, "measure_setting", stopped)
     with pytest.raises(KeyboardInterrupt):
         measure_guesses(other, collected(other), (GUESS,), 20)
     monkeypatch.undo()
     assert len(kept(other)) == 2
-    assert measure_guesses(other, collected(other), (GUESS,), 20)["measured"] == 1
+    assert measure_guesses(other, collected(other), (GUESS,), 20).measured == 1
     assert kept(other) == kept(store)
 
 
 def test_another_network_is_another_measurement(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work = Guesses(store, collected(store))
-    assert work.sweep((GUESS,)).pending == []
-    monkeypatch.setattr(guesses, "VERSION", 99)
-    assert len(work.sweep((GUESS,)).pending) == 3
+    work = StudySensitivity(store, collected(store), TRIALS)
+    assert guess_sweep(work, (GUESS,)).pending == []
+    monkeypatch.setattr(study_sensitivity, "VERSION", 99)
+    assert len(guess_sweep(work, (GUESS,)).pending) == 3
 
 
 def test_the_report_shows_them(store: Store) -> None:
@@ -179,7 +194,7 @@ def test_how_it_is_said_on_the_command_line(store: Store) -> None:
     told = json.loads(done.stdout)
     assert list(told) == ["simulated", "trials", "measured", "settings", "file"]
     assert told["settings"] == {
-        name: figures(setting) for name, setting in kept(store).items()
+        name: figures(setting) for name, setting in scores(store).items()
     }  # fmt: skip
     assert told["trials"] == {"tiny": 2, "tiny_gravity": 2}
     assert list(told["settings"]) == list(kept(store))

@@ -11,13 +11,22 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.report.holdout import holdout_part, holdout_rows
+from sliplab.analysis.report.programs import parse_program
+from sliplab.analysis.sweeps import holdout as figures
+from sliplab.analysis.sweeps.holdout import Holdout
 from sliplab.flows import generalise, holdout
-from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
+from sliplab.flows.holdout import (
+    PROTOCOL_SEED,
+    SKIN_SEED,
+    holdout_request,
+    measure_holdout,
+)
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
-from sliplab.storage.files import read_json, write_json
+from sliplab.storage.files import json_text, read_json, write_json
+from sliplab.storage.schema.sweeps import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import shape_of, summary_json
@@ -32,7 +41,7 @@ def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPa
     folder = tmp_path_factory.mktemp("holdout") / "store"
     shutil.copytree(ran[0][0].store, folder)
     found = Store.open(folder)
-    assert measure_holdout(found, collected(found), 4, seeds=SEEDS)["done"] == 1
+    assert measure_holdout(found, collected(found), 4, seeds=SEEDS).done == 1
     return found
 
 
@@ -54,7 +63,7 @@ def test_the_release_s_seeds_stand_nowhere_else() -> None:
 
 def test_its_trials_are_others_on_another_skin(store: Store) -> None:
     item = collected(store)[0]
-    run_request = Holdout(store, collected(store), 4, SEEDS).run_request()
+    run_request = holdout_request(Holdout(store, collected(store), 4, SEEDS))
     assert (
         run_request.plan.protocol.collection.seed == SEEDS[0] != item.plan.protocol.collection.seed
     )
@@ -74,28 +83,29 @@ def test_it_is_judged_once_a_version_and_written_down(
 ) -> None:
     campaigns = collected(store)
     first = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert first["done"] == 0
-    (line,) = first["result"]["evaluations"]
+    assert first.done == 0
+    (line,) = first.result.evaluations
     key = evaluation_of(store).key
     assert key is not None
-    assert line["model"] == first["result"]["model"]
-    assert line["strict"] == first["result"]["windows"]["accuracy"]["strict"]
+    assert line.model == first.result.model
+    assert line.strict == first.result.windows.accuracy.strict
     # other settings under the same version: kept as it was, and said
-    monkeypatch.setattr(holdout, "VERSION", 99)
+    monkeypatch.setattr(figures, "VERSION", 99)
     again = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert (again["done"], again["result"]) == (0, first["result"])
+    assert (again.done, again.result) == (0, first.result)
     assert "a second look" in capsys.readouterr().err
     # a new version of the program looks once more
-    monkeypatch.setattr(holdout, "version", lambda name: "99.0")
+    for module in (holdout, figures):
+        monkeypatch.setattr(module, "version", lambda name: "99.0")
     later = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert [each["version"] for each in later["result"]["evaluations"]] == [
-        line["version"], "99.0"
+    assert [each.version for each in later.result.evaluations] == [
+        line.version, "99.0"
     ]  # fmt: skip
     asked = measure_holdout(store, campaigns, 3, again=True, seeds=SEEDS)
-    assert len(asked["result"]["evaluations"]) == 3
-    figures = ("windows", "rows", "kinematic", "trials")
-    assert all(later["result"][name] == first["result"][name] for name in figures)
-    write_json(store.folder / "holdout/results.json", first["result"])
+    assert len(asked.result.evaluations) == 3
+    kept, now = first.result.to_json(), later.result.to_json()
+    assert all(now[name] == kept[name] for name in ("windows", "rows", "kinematic", "trials"))
+    write_json(store.folder / "holdout/results.json", kept)
 
 
 def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None:
@@ -110,7 +120,7 @@ def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None
     page = " ".join((store.folder / "report" / "index.html").read_text().split())
     assert "Another skin and seed, which chose nothing" in page
     assert "They were judged 1 time here" in page
-    rows = holdout_rows(holdout_part(kept))
+    rows = holdout_rows(holdout_part(HoldoutResult.model_validate(kept)))
     assert rows[0][0] == "windows right, strict"
     assert rows[0][2] == f"4 trials, {summary['windows']['strict']['n']} windows"
 
@@ -120,7 +130,9 @@ BY_CLASS = {"gross": "float", "incipient": "float", "no_slip": "float"}
 
 
 def test_the_file_has_these_keys(store: Store) -> None:
-    found = shape_of(read_json(store.folder / "holdout/results.json"))
+    path = store.folder / "holdout/results.json"
+    assert json_text(HoldoutResult.load(path).to_json()) == path.read_text()
+    found = shape_of(read_json(path))
     assert list(found) == [
         "evaluations", "key", "kinematic", "model", "protocol_seed", "rows", "simulated",
         "skin_seed", "trials", "windows",
@@ -145,7 +157,7 @@ def test_the_file_has_these_keys(store: Store) -> None:
 
 def test_a_file_of_another_shape_is_named(store: Store) -> None:
     with pytest.raises(StoreError, match=r"holdout/results\.json"):
-        holdout_part({"rows": []})
+        parse_program("holdout", HoldoutResult, {"rows": []})
 
 
 def test_real_slides_need_a_campaign_of_their_own(

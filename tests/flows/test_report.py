@@ -268,7 +268,8 @@ def detector() -> Json:
 def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) -> None:
     shutil.copytree(store.folder, tmp_path / "store")
     other = Store.open(tmp_path / "store")
-    skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81}
+    skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81,
+            "recall": {"no_slip": 0.8, "incipient": 0.8, "gross": None}}  # fmt: skip
     results = {"skin 101": skin, "depth 2.4 mm": {**skin, "seen": 0.9},
                "speed 1 mm/s": {"left out": "no train trials"}}  # fmt: skip
     found = {

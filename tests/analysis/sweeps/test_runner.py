@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.analysis.sweeps.runner import Advance, Json, ResultFile, Sweep, Task, task_sweep
+from sliplab.analysis.sweeps.runner import Advance, Arrays, ResultFile, Sweep, Task, task_sweep
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import write_json
+from sliplab.storage.schema.document import Document
 from sliplab.storage.trials.derived import Derived
 
 
@@ -36,13 +39,26 @@ class Square:
         return self.name
 
 
-def measure(point: Square, advance: Advance) -> tuple[Json, Json | None]:
+class Value(Document):
+    """A result of the tests."""
+
+    key: str = ""
+    value: int
+
+
+class Squares(Document):
+    """All results of the tests."""
+
+    squares: dict[str, Value]
+
+
+def measure(point: Square, advance: Advance) -> tuple[Value, Arrays | None]:
     """Do two parts, of which the first says that it is done half, then whole."""
     advance("train", 0.5, "half")
     advance("train", 0.5, "whole")
     if point.number == 13:
         raise KeyboardInterrupt
-    return {"value": point.number**2}, None
+    return Value(value=point.number**2), None
 
 
 def estimate(point: Square) -> Mapping[str, float]:
@@ -50,11 +66,16 @@ def estimate(point: Square) -> Mapping[str, float]:
     return {"train": 10.0, "count": float(point.number)}
 
 
-def results(folder: Path, kind: str) -> Derived | ResultFile:
+def results(folder: Path, kind: str) -> Derived | ResultFile[Squares]:
     """One of the two places for results."""
     if kind == "derived":
         return Derived(folder)
-    return ResultFile(folder / "results.json", "squares", {"simulated": True})
+    return ResultFile(folder / "results.json", Squares, "squares", {"simulated": True})
+
+
+def read(kept: Derived | ResultFile[Squares], name: str) -> Value:
+    """The result of that name."""
+    return kept.load(name, Value) if isinstance(kept, Derived) else kept.load().squares[name]
 
 
 @pytest.mark.parametrize("kind", ["derived", "file"])
@@ -68,11 +89,11 @@ def test_a_stopped_sweep_goes_on_and_grows(tmp_path: Path, kind: str) -> None:
     larger = Sweep([Square(2), Square(3), Square(4)], kept, measure)
     assert larger.run() == 2
     assert (larger.run(), larger.pending) == (0, [])
-    assert kept.read("square_4") == {"key": "4 1", "value": 16}
+    assert read(kept, "square_4").to_json() == {"key": "4 1", "value": 16}
     # another key is another result, in the same place
     other = Sweep([Square(2, version=2)], kept, measure)
     assert other.run() == 1
-    assert kept.read("square_2")["key"] == "2 2"
+    assert read(kept, "square_2").key == "2 2"
 
 
 def test_progress_adds_up_to_what_was_expected(tmp_path: Path) -> None:
@@ -104,10 +125,24 @@ def test_no_point_is_begun_when_the_time_is_over(tmp_path: Path) -> None:
 
 
 def test_a_file_of_results_keeps_its_head(tmp_path: Path) -> None:
-    kept = ResultFile(tmp_path / "results.json", "rows", {"change": 0.2})
-    assert (kept.all(), kept.fresh("a", "k")) == ({}, False)
-    task_sweep([Task(name, "k", lambda: {"x": 1}) for name in "ba"], kept).run()
-    task_sweep([Task("b", "other", lambda: {"x": 2})], kept).run()
+    kept = ResultFile(tmp_path / "results.json", Squares, "squares", {"change": 0.2})
+    assert not kept.fresh("a", "k")
+    with pytest.raises(FileNotFoundError):
+        kept.load()
+    task_sweep([Task(name, "k", lambda: Value(value=1)) for name in "ba"], kept).run()
+    task_sweep([Task("b", "other", lambda: Value(value=2))], kept).run()
     assert json.loads(kept.path.read_text()) == {
-        "change": 0.2, "rows": {"b": {"key": "other", "x": 2}, "a": {"key": "k", "x": 1}},
-    }  # fmt: skip
+        "change": 0.2,
+        "squares": {"b": {"key": "other", "value": 2}, "a": {"key": "k", "value": 1}},
+    }
+
+
+def test_a_stale_result_of_another_shape_is_made_again_and_a_damaged_one_is_named(
+    tmp_path: Path,
+) -> None:
+    kept = ResultFile(tmp_path / "results.json", Squares, "squares", {})
+    write_json(kept.path, {"squares": {"a": {"key": "old", "values": [1]}}})
+    with pytest.raises(StoreError, match=r"results\.json: squares\.a\.value: is missing.*delete"):
+        kept.load()
+    assert task_sweep([Task("a", "new", lambda: Value(value=3))], kept).run() == 1
+    assert kept.load().squares["a"].value == 3

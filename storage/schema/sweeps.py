@@ -1,0 +1,113 @@
+"""Results of a store's sweeps: levels left out, other skins, assumed parameters, the hold-out.
+
+Units are those of an evaluation. Every point has the key of what it was made of, so that only what
+is missing or stale is measured.
+"""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+from sliplab.storage.schema.evaluation import (
+    ByClass,
+    Classification,
+    Experiments,
+    ExperimentScores,
+    Share,
+    TrialScore,
+)
+
+
+class UnseenScores(Share):
+    """Strict accuracy on a level or a skin that the network was not trained on."""
+
+    key: str = ""
+    argmax: Number | None
+    recall: ByClass
+    seen: Number | None = None
+    """Strict accuracy on validation windows of the other levels; not written for a skin."""
+    trained_on: Int | None = None
+    """Trials of the training; not written for a skin."""
+
+
+class NotTrained(Part):
+    """A level that no network could be trained without."""
+
+    key: str = ""
+    why: str = Field(validation_alias="left out", serialization_alias="left out")
+
+
+class GeneralisationResults(Document):
+    """Results that `sliplab generalise` keeps."""
+
+    simulated: Bool
+    results: dict[str, UnseenScores | NotTrained]
+    """By factor and level, such as `speed 4 mm/s`, or by skin, such as `skin 101`."""
+
+
+class TrialAtSetting(TrialScore):
+    """One trial at a setting of the scene."""
+
+    depth_zero_mm: Number | None
+    """Where the rig found the plate."""
+
+
+class SettingScores(Part):
+    """A study's test trials, repeated with one assumed parameter of the scene changed."""
+
+    key: str = ""
+    parameter: str | None
+    """Its dotted name; null for the scene as it is."""
+    factor: Number
+    value: Number | None
+    windows: dict[str, tuple[Int, Int]]
+    """By trial, windows that were classified correctly, and all of its windows."""
+    trials: tuple[TrialAtSetting, ...]
+    experiments: Experiments
+
+
+class SensitivityResults(Document):
+    """Results that `sliplab guesses` keeps."""
+
+    simulated: Bool
+    change: Number
+    """Share by which each parameter is lowered and raised."""
+    settings: dict[str, SettingScores]
+    """By the setting's name."""
+
+
+class HoldoutScores(Classification):
+    """Windows of the hold-out campaign, with two accuracies over trials."""
+
+    strict: Share
+    argmax: Share
+
+
+class HoldoutLook(Part):
+    """One time that the hold-out campaign was judged."""
+
+    version: str
+    """Of the program."""
+    at: str
+    """UTC, ISO 8601."""
+    model: str
+    """Key of the network."""
+    strict: Number | None
+
+
+class HoldoutResult(Document):
+    """Results that `sliplab holdout` keeps."""
+
+    key: str = ""
+    simulated: Bool
+    trials: Int
+    protocol_seed: Int
+    skin_seed: Int
+    model: str
+    """Key of the network."""
+    windows: HoldoutScores
+    rows: tuple[TrialScore, ...]
+    kinematic: ExperimentScores
+    evaluations: tuple[HoldoutLook, ...]
+    """Every time that the campaign was judged; the others are of the last time."""
