@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sliplab.flows.running import console
 from sliplab.storage.files import read_json, write_json
@@ -73,20 +72,24 @@ class Ledger:
         return list(self._rows.values())
 
     @contextmanager
-    def step(self, name: str) -> Iterator[Callable[[str, bool], None]]:
-        """Time a step; yield a callback that takes its result in words, and whether it did work."""
+    def step(self, name: str, unit: str) -> Iterator[Callable[[int], None]]:
+        """Time a step; yield a callback that takes how much it did.
+
+        Args:
+            unit: noun in plural that its work is counted in, and what follows it.
+        """
         before, began = self._rows[name], self._clock()
         self._put(before, state=RUNNING)
         place = list(self._rows).index(name) + 1
-        reports: list[tuple[str, bool]] = []
+        counted: list[int] = []
         console.say(f"[{place}/{len(self._rows)}] {name}{self._times()}")
         state = STOPPED
         try:
-            yield lambda note, worked: reports.append((note, worked))
+            yield counted.append
             state = DONE
         finally:
-            note, worked = reports[-1] if reports else ("", True)
-            spent = self._clock() - began if worked else 0.0
+            note = _in_words(counted[-1], unit) if counted else ""
+            spent = 0.0 if counted and not counted[-1] else self._clock() - began
             self._put(before, state=state, seconds=before.seconds + spent, note=note)
 
     def left_s(self) -> float:
@@ -113,6 +116,15 @@ class Ledger:
         write_json(self._path, {"steps": [vars(each) for each in self._rows.values()]})
 
 
+def _in_words(done: int, unit: str) -> str:
+    if not done:
+        return "nothing to do"
+    noun, space, rest = unit.partition(" ")
+    if done == 1:
+        noun = noun.removesuffix("es" if noun.endswith("ches") else "s")
+    return f"{done} {noun}{space}{rest}"
+
+
 def read(folder: Path) -> list[Row]:
     """Return the steps of a study as last written; none where there is no study."""
     path = folder / FILE
@@ -124,7 +136,7 @@ def read(folder: Path) -> list[Row]:
 def print_rows(rows: list[Row]) -> None:
     """Print state, cost and result of each step as a table."""
     total = sum(row.seconds for row in rows)
-    shown: list[list[Any]] = [
+    shown: list[list[str]] = [
         [
             row.name,
             row.state,

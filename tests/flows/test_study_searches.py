@@ -16,7 +16,7 @@ from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.flows import study as chain
 from sliplab.flows.generalise import measure_generalisation
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome, expected, searches, study
+from sliplab.flows.study import Outcome, searches, study, study_plan
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store
 
@@ -43,7 +43,8 @@ def test_they_stand_before_the_report_with_their_own_time(
     ran: tuple[list[RunRequest], Outcome],
 ) -> None:
     run_requests, _ = ran
-    plain, more = expected(run_requests, 0), expected(run_requests, 0, searches(run_requests))
+    planned = study_plan(run_requests)
+    plain, more = planned.expected(0), planned.expected(0, searches(run_requests))
     assert list(more)[-7:] == ["evaluate", *NAMES, "report"]
     assert sum(more.values()) - sum(plain.values()) > 3600
 
@@ -79,6 +80,7 @@ def test_each_is_done_once_and_reported(
 
     again = study(run_requests, more=searches(run_requests))
     assert not any(step["done"] for step in again.steps)
+    assert {row.name: row.note for row in outcome.rows}["scene search"] == "1 search"
     notes = {row.name: (row.state, row.note) for row in again.rows}
     assert all(notes[name] == ("done", "nothing to do") for name in NAMES)
 

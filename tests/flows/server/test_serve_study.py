@@ -37,7 +37,7 @@ def test_a_served_study_asks_for_the_same_trials(
 
     def study(run_requests: list[Any], check: int) -> Outcome:
         asked.extend([run_requests, check])
-        return Outcome([{"taken": 3}], [{"step": "report", "done": 1}])
+        return Outcome([{"taken": 3}], [{"step": "report", "done": 1}], [])
 
     monkeypatch.setattr("sliplab.flows.study.study", study)
     monkeypatch.setattr(
