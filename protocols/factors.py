@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from decimal import Decimal
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -17,12 +17,12 @@ from pydantic import (
     model_validator,
 )
 
-from sliplab.protocols.quantity import UNITS, canonical, check_size, number_meant, to_decimal
+from sliplab.protocols.quantity import canonical, check_size, number_meant, to_decimal
 from sliplab.protocols.shown import foreign_character
+from sliplab.protocols.units import Unit, all_symbols, canonical_of, faults, find_unit
 from sliplab.protocols.yaml_file import KeyedError, StrictModel
 
 MAX_TRIALS = 1_000_000
-_UNITS = sorted({kind for kind, _ in UNITS.values()})
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
@@ -124,6 +124,41 @@ ContextLevel = Annotated[
 ]
 
 
+def _list_units(schema: dict[str, Any]) -> None:
+    schema["enum"] = [*all_symbols(), None]
+
+
+def _other_unit(symbol: object) -> Unit | None:
+    """The unit of a symbol that is not canonical; None for others, and for what is no unit."""
+    found = find_unit(symbol) if isinstance(symbol, str) else None
+    return None if found is None or canonical_of(found) == symbol else found
+
+
+def converted(level: Any, unit: Unit) -> Any:
+    """A level in a unit as a number in its canonical one; what is no number stays as it is."""
+    try:
+        return to_decimal(level) * unit.factor
+    except ValueError:
+        return level
+
+
+def in_canonical_units(condition: Any, *sections: Any) -> Any:
+    """A condition as a file gives it, its levels in the canonical units of their factors.
+
+    Args:
+        sections: `factors` and `context`, as the file gives them.
+    """
+    factors = {name: each for part in sections if isinstance(part, dict)
+               for name, each in part.items() if isinstance(each, dict)}  # fmt: skip
+    if not isinstance(condition, dict):
+        return condition
+    units = {name: _other_unit(factors.get(name, {}).get("unit")) for name in condition}
+    return {
+        name: level if (unit := units[name]) is None else converted(level, unit)
+        for name, level in condition.items()
+    }
+
+
 class Factor(StrictModel):
     """One factor of the factorial: its unit and its levels, as a list or a range."""
 
@@ -133,8 +168,9 @@ class Factor(StrictModel):
 
     _HINT: ClassVar[str] = ""
 
-    unit: str | None = Field(default=None, json_schema_extra={"enum": [*_UNITS, None]})
-    """Of all its levels; words have none."""
+    unit: str | None = Field(default=None, json_schema_extra=_list_units)
+    """Of all its levels, which are taken over in the canonical unit of its dimension; words have
+    none."""
     values: tuple[LevelField, ...] | None = None
     range: Range | None = None
     optional: tuple[LevelField, ...] = ()
@@ -145,9 +181,22 @@ class Factor(StrictModel):
     @field_validator("unit")
     @classmethod
     def _known(cls, unit: str | None) -> str | None:
-        if unit is not None and unit not in _UNITS:
-            raise ValueError(f"must be one of {', '.join(_UNITS)}")
+        if unit is not None and find_unit(unit) is None:
+            raise ValueError(f"must be one of {', '.join(all_symbols())}{faults()}")
         return unit
+
+    @model_validator(mode="before")
+    @classmethod
+    def _in_canonical_unit(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or (found := _other_unit(data.get("unit"))) is None:
+            return data
+        made = {**data, "unit": canonical_of(found)}
+        for key in ("values", "optional"):
+            if isinstance(data.get(key), list | tuple):
+                made[key] = [converted(level, found) for level in data[key]]
+        if isinstance(data.get("range"), dict):
+            made["range"] = {key: converted(end, found) for key, end in data["range"].items()}
+        return made
 
     @model_validator(mode="after")
     def _levels(self) -> Factor:

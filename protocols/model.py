@@ -21,7 +21,13 @@ from sliplab.protocols.conditions import (
     Recording,
     References,
 )
-from sliplab.protocols.factors import MAX_TRIALS, Context, Factor, unknown_factor
+from sliplab.protocols.factors import (
+    MAX_TRIALS,
+    Context,
+    Factor,
+    in_canonical_units,
+    unknown_factor,
+)
 from sliplab.protocols.phases import Phase
 from sliplab.protocols.quantity import FactorRef
 from sliplab.protocols.settings import AnalysisSettings
@@ -72,6 +78,17 @@ class Collection(StrictModel):
     limits: Limits
     gates: Gates = Gates()
     maintenance: Maintenance = Maintenance()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _references_in_canonical_units(cls, data: Any) -> Any:
+        references = data.get("references") if isinstance(data, dict) else None
+        if not isinstance(references, dict):
+            return data
+        condition = in_canonical_units(
+            references.get("condition"), data.get("factors"), data.get("context")
+        )
+        return {**data, "references": {**references, "condition": condition}}
 
     @field_validator("factors")
     @classmethod

@@ -7,6 +7,7 @@ that were there already.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -23,9 +24,10 @@ from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits
 from sliplab.protocols.program import Dwell, Program
-from sliplab.protocols.quantity import FILE_UNITS, FactorRef, canonical, to_decimal
+from sliplab.protocols.quantity import FactorRef, canonical, parse, to_decimal
 from sliplab.protocols.shipped import protocol_path
 from sliplab.protocols.split import assign, check_split
+from sliplab.protocols.units import file_text
 from sliplab.protocols.yaml_file import KeyedError, load
 
 if TYPE_CHECKING:
@@ -333,7 +335,7 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
             raise InputError("--enable", "", text, unknown_factor(name or text, factors))
         factor = factors[name]
         try:
-            level: Level = raw if factor.unit is None else to_decimal(raw.strip())
+            level: Level = raw if factor.unit is None else _number(raw.strip(), factor.unit)
         except ValueError as error:
             raise InputError("--enable", name, raw, str(error)) from None
         if level not in (*factor.levels(), *factor.optional):
@@ -346,13 +348,19 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
     return levels
 
 
+def _number(raw: str, unit: str) -> Decimal:
+    """A level as a number in a canonical unit, or with any unit of its dimension."""
+    with_unit = re.match(r"[+-]?[\d.].*[A-Za-z%]\d?$", raw) is not None
+    return parse(raw, unit) if with_unit else to_decimal(raw)
+
+
 def condition_id(protocol: Protocol, condition: Mapping[str, Level]) -> str:
     """``depth=2.4mm,direction=45deg``: factors by name, levels as decimal text with unit."""
     parts = []
     for name in sorted(condition):
         level, unit = condition[name], protocol.collection.all_factors[name].unit
         text = level if isinstance(level, str) else canonical(level)
-        parts.append(f"{name}={text}{FILE_UNITS.get(unit or '', unit or '')}")
+        parts.append(f"{name}={text}{file_text(unit)}")
     return ",".join(parts)
 
 

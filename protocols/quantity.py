@@ -14,40 +14,14 @@ from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
+from pydantic import BeforeValidator, PlainSerializer
 
 from sliplab.protocols.shown import foreign_character
-
-# unit -> (canonical unit of its kind, factor to it); all factors are exact decimals
-UNITS: dict[str, tuple[str, Decimal]] = {
-    "mm": ("mm", Decimal(1)),
-    "um": ("mm", Decimal("0.001")),
-    "cm": ("mm", Decimal(10)),
-    "m": ("mm", Decimal(1000)),
-    "mm/s": ("mm/s", Decimal(1)),
-    "cm/s": ("mm/s", Decimal(10)),
-    "m/s": ("mm/s", Decimal(1000)),
-    "deg": ("deg", Decimal(1)),
-    "s": ("s", Decimal(1)),
-    "ms": ("s", Decimal("0.001")),
-    "min": ("s", Decimal(60)),
-    "kg": ("kg", Decimal(1)),
-    "g": ("kg", Decimal("0.001")),
-    "percent": ("percent", Decimal(1)),
-    "%": ("percent", Decimal(1)),
-    "px": ("px", Decimal(1)),
-    "Hz": ("Hz", Decimal(1)),
-    "kHz": ("Hz", Decimal(1000)),
-    "ppm": ("ppm", Decimal(1)),
-    "N": ("N", Decimal(1)),
-    "degC": ("degC", Decimal(1)),
-}
-# how a canonical unit is written where a slash or a percent sign cannot stand (file names)
-FILE_UNITS = {"mm/s": "mmps", "percent": "pct"}
+from sliplab.protocols.units import canonical_of, faults, find_unit, symbols_of
 
 _DIGITS = r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
-_NUMBER = re.compile(rf"{_DIGITS}\s*([A-Za-z%/]+)?")
-_PATTERN = re.compile(rf"\s*{_DIGITS}\s*([A-Za-z%/]+)\s*")
+_NUMBER = re.compile(rf"{_DIGITS}\s*([A-Za-z%/][A-Za-z0-9%/]*)?")
+_PATTERN = re.compile(rf"\s*{_DIGITS}\s*([A-Za-z%/][A-Za-z0-9%/]*)\s*")
 _DASHES = "\u2010\u2011\u2012\u2013\u2014\u2212\ufe63"
 _PLAIN = str.maketrans(dict.fromkeys(_DASHES, "-") | {"\u03bc": "u"})
 _LARGEST = Decimal("1e9")
@@ -107,11 +81,11 @@ def parse(raw: object, unit: str) -> Decimal:
             raise ValueError(meant)
         raise ValueError(f"must be a finite number with a unit, such as '1.5 {unit}'")
     number, written = match.groups()
-    base, factor = UNITS.get(written, ("", Decimal(1)))
-    if base != unit:
-        allowed = ", ".join(name for name, (kind, _) in UNITS.items() if kind == unit)
-        raise ValueError(f"has the unit '{written}' where one of these belongs: {allowed}")
-    value = to_decimal(number) * factor
+    found = find_unit(written)
+    if found is None or canonical_of(found) != unit:
+        allowed, broken = ", ".join(symbols_of(unit)), faults() if found is None else ""
+        raise ValueError(f"has the unit '{written}' where one of these belongs: {allowed}{broken}")
+    value = to_decimal(number) * found.factor
     check_size(value, unit)
     return value
 
@@ -198,7 +172,7 @@ def quantity_schema(unit: str, *, negative: bool = True, zero: bool = True) -> d
     Args:
         negative: whether it may be below 0; zero: whether it may be 0.
     """
-    units = [name for name, (kind, _) in UNITS.items() if kind == unit]
+    units = symbols_of(unit)
     sign = "[+-]?" if negative else "[+]?"
     some = "" if zero else "(?=[^eE]*[1-9])"
     number = r"([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
@@ -235,16 +209,29 @@ def _writer(unit: str) -> Callable[[Any], str]:
     return write
 
 
+@dataclass(frozen=True)
+class _Schema:
+    """JSON Schema of a quantity, made when it is asked for: packages may have brought units."""
+
+    unit: str
+    negative: bool
+    zero: bool
+    ref: bool
+
+    def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
+        schema = quantity_schema(self.unit, negative=self.negative, zero=self.zero)
+        return {"anyOf": [schema, REF_SCHEMA]} if self.ref else schema
+
+
 def _quantity(unit: str, low: str | None, strict: bool, *, ref: bool) -> Any:
     bound = None if low is None else Decimal(low)
     kind: Any = (Decimal | FactorRef) if ref else Decimal
     reader = parse_or_ref if ref else parse
-    schema = quantity_schema(unit, negative=bound is None, zero=not strict)
     return Annotated[
         kind,
         BeforeValidator(_checked(unit, reader, bound, strict)),
         PlainSerializer(_writer(unit)),
-        WithJsonSchema({"anyOf": [schema, REF_SCHEMA]} if ref else schema),
+        _Schema(unit, negative=bound is None, zero=not strict, ref=ref),
     ]
 
 

@@ -19,6 +19,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
 from sliplab.protocols.model import Protocol
+from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
 from sliplab.storage.schema.document import Document
@@ -63,6 +64,7 @@ class _Described(GenerateJsonSchema):
 
 def file_schema(kind: Kind) -> Schema:
     """Return the JSON Schema (draft 7) of a file or document, as plain data."""
+    load_packages()  # their units, too
     if kind == "rig":
         return _rig_schema()
     if kind == "protocol":
