@@ -42,7 +42,7 @@ from sliplab.protocols.program import Move, Program
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import Clock, RigError
-from sliplab.rigs.core.reacting import ACTING, Reaction, Reflex, SlipSeen, run_watched
+from sliplab.rigs.core.reacting import ACTING, Reaction, Reflex, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.levels import with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
@@ -421,7 +421,7 @@ class DetectSink(NullSink):
         """Feed events to the detector.
 
         Raises:
-            SlipSeen: incipient slip is detected while `armed`; the rest of the read is reported.
+            SlipDetected: incipient slip was detected while `armed`; the whole read is reported.
             ClockFellBack: the camera's clock is another one.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
@@ -434,7 +434,7 @@ class DetectSink(NullSink):
         """Advance the detector to the camera's time, which pulses show without events.
 
         Raises:
-            SlipSeen: as `add_events`.
+            SlipDetected: as `add_events`.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
         if len(chunk):
@@ -470,7 +470,7 @@ class DetectSink(NullSink):
             self._on_decision(timed)
         if slip and self.armed:
             self.armed = False
-            raise SlipSeen
+            raise SlipDetected
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of events, windows, states and latencies, and the onsets."""

@@ -32,7 +32,7 @@ DRIVEN_TAIL_S = 0.3
 
 
 class _MockSimulation:
-    """The simulated world, asked on the arm controller's clock."""
+    """The simulated world, in the time of the arm controller's clock."""
 
     def __init__(self, devices: MockDevices) -> None:
         self._devices = devices
@@ -46,17 +46,17 @@ class _MockSimulation:
         return self._devices.sink(sink)
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """The truth of a trial after these moments."""
+        """Return the ground truth of a trial, counted from these times."""
         clock = self._devices.world.clocks.arm
         hold_ns = None if hold_arm_ns is None else int(clock.to_device(hold_arm_ns))
         return self._devices.truth(int(clock.to_device(reference_arm_ns)), hold_ns)
 
 
 def build_rig(file: RigFile) -> Rig:
-    """The rig that a rig file describes, its arm not connected yet.
+    """Build the rig that a rig file describes; its arm is not connected yet.
 
     Raises:
-        RigError: a device that has to be there before a rig is, such as a camera, is not.
+        RigError: a device that must be present at this stage, such as a camera, is missing.
         ModuleNotFoundError: a maker's library is not installed.
     """
     if file.driver == "mock":
@@ -69,7 +69,7 @@ def build_rig(file: RigFile) -> Rig:
 
 
 def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
-    """The rig that a rig file describes, on simulated devices that somebody else made."""
+    """Build the rig that a rig file describes on the given simulated devices."""
     return Rig(
         name=file.name,
         clock=devices.clock,
@@ -90,14 +90,14 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
 
 
 def taught_frame(file: RigFile) -> PlateFrame:
-    """The plate's frame as it was taught."""
+    """Return the plate's frame as taught."""
     plane = file.calibration.contact_plane
     taught = PlateFrame.taught((plane.centre, plane.right, plane.above))
     return taught.with_zero(file.calibration.zero_mm)
 
 
 def tool_of(file: RigFile) -> Pose:
-    """The tool set in the arm's controller, from the flange: as taught, else as given."""
+    """Return the controller's tool frame, from the flange: as taught, else as given."""
     taught = file.calibration.tool_centre_point
     if file.devices is None:
         return Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -106,7 +106,7 @@ def tool_of(file: RigFile) -> Pose:
 
 
 def calibrated_arm(file: RigFile, devices: DeviceSettings) -> BaseArmSettings:
-    """The arm's settings: tool as taught, limits that follow the taught plane unless they say."""
+    """Return the arm's settings with the taught tool, and limits that follow the taught plane."""
     arm = devices.arm
     limits, plane = arm.limits, file.calibration.contact_plane
     if limits.plate is None:
@@ -123,26 +123,26 @@ def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
 
 
 def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
-    """Real drivers; fakes in a process of their own show the simulated scene."""
+    """Build a rig of real drivers; fakes in a separate process show the simulated scene."""
     from sliplab.rigs.loopback.client import Loopback
 
     with ExitStack() as undo:
         stage = Loopback(file.scene, file.timing, devices)
         undo.callback(stage.close)
         rig = loopback_rig(file, stage)
-        rig.ending = (stage.close,)
+        rig.on_close = (stage.close,)
         undo.pop_all()
     return rig
 
 
 def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
-    """Real drivers on fakes that somebody else began, and ends.
+    """Build a rig of real drivers on running fakes, which stay the caller's to close.
 
     Args:
-        file: of the kind `loopback`, with the arm and the scene that `stage` shows.
+        file: a `loopback` rig file with the arm and the scene that `stage` simulates.
 
     Raises:
-        RigError: a fake is not there.
+        RigError: a fake cannot be reached.
     """
     assert file.devices is not None
     return _driven_rig(file, stage.reached_by(file.devices), stage, stage, stage)
@@ -155,7 +155,7 @@ def _driven_rig(
     plate: Plate | None,
     shown: Loopback | None,
 ) -> Rig:
-    """A rig of drivers; whatever was opened is closed again if one of them fails.
+    """Build a rig of drivers; if one fails, the others are closed again.
 
     Args:
         shown: the simulated scene behind the fakes; None on a real rig.
@@ -197,16 +197,16 @@ def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None
 
 
 def _check_grade(file: RigFile, frames: FrameCamera) -> None:
-    """The rig file must not promise a better grade than the camera can keep, nor another one.
+    """Check that the rig file states the grade of time stamps that the camera delivers.
 
     Raises:
-        RigError: it does.
+        RigError: it states another grade.
     """
     stamping = getattr(frames, "stamping", None)
     if stamping is not None and stamping.grade != file.timing.frames:
         raise RigError(
             "frame camera",
-            f"its times are of the grade '{stamping.grade}' ({stamping.means}), and the rig file "
-            f"says timing.frames: {file.timing.frames}; wire and set it so, or write "
-            f"timing.frames: {stamping.grade}",
+            f"its time stamps are of grade '{stamping.grade}' ({stamping.means}), but the rig file "
+            f"says timing.frames: {file.timing.frames}; wire and configure the camera for that, or "
+            f"write timing.frames: {stamping.grade}",
         )

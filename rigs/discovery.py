@@ -1,4 +1,4 @@
-"""Discovery: can a rig's devices be reached? None of them is taken control of."""
+"""Discovery: check that a rig's devices can be reached, without taking control of any."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from sliplab.rigs.devices.settings import DeviceSettings
 
 
 def need_libraries(devices: DeviceSettings) -> None:
-    """Look for the makers' libraries that the drivers of these devices use; none is loaded.
+    """Check that the vendor libraries of these devices' drivers are installed; none is imported.
 
     Raises:
-        ModuleNotFoundError: one is not installed.
+        ModuleNotFoundError: one of them is not installed.
     """
     for driver, _ in devices.drivers():
         for name in driver.libraries:
@@ -21,12 +21,12 @@ def need_libraries(devices: DeviceSettings) -> None:
 
 
 def ping_devices(devices: DeviceSettings) -> dict[str, str | None]:
-    """By device: None if it can be reached, else why not, and what to look at.
+    """Return for each device None if it can be reached, else the reason and what to check.
 
-    Nothing is opened for longer than it takes to see that somebody answers; takes some seconds.
+    Each connection is closed as soon as the device has answered; takes some seconds.
 
     Raises:
-        ModuleNotFoundError: a maker's library is not installed.
+        ModuleNotFoundError: a vendor library is not installed.
     """
     need_libraries(devices)
     found: dict[str, str | None] = {}
@@ -35,7 +35,7 @@ def ping_devices(devices: DeviceSettings) -> dict[str, str | None]:
             found[driver.kind] = driver.ping(settings)
         except RigError as error:
             found[driver.kind] = str(error).removeprefix(f"{error.device}: ")
-        except Exception as error:  # a maker's library may raise anything
+        except Exception as error:  # a vendor library may raise anything
             found[driver.kind] = str(error) or type(error).__name__
     if devices.sync_box is None:
         found["sync box"] = "no port is named"

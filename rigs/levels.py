@@ -1,8 +1,8 @@
-"""The level of physics that a plan needs in a simulated rig, and the slip to expect from it.
+"""The physics level that a plan needs in a simulated rig, and the slip to expect from it.
 
-A scene takes the lowest level whose onsets differ from the next level's by less than two seeds of
-the same scene differ. That is computed from onsets in closed form (`rigs.scene.onsets`), in
-milliseconds and without a simulation; `sliplab tradeoff --scene` measures the same by windows.
+A scene takes the lowest level whose onsets differ from the next level's by less than the onsets of
+two seeds differ. This is computed from onsets in closed form (`rigs.scene.onsets`), in milliseconds
+and without a simulation; `sliplab tradeoff --scene` measures the same on windows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HIGHEST = 3
 
 @dataclass(frozen=True)
 class Slide:
-    """Parameters that decide on the onsets of one slide."""
+    """Parameters that determine the onsets of one slide."""
 
     depth_mm: float
     speed_mm_s: float
@@ -38,19 +38,19 @@ class Slide:
 
 @dataclass(frozen=True)
 class Choice:
-    """A level, and why."""
+    """A level and the reason for it."""
 
     level: int
     reason: str
 
     @property
     def name(self) -> str:
-        """As rig files write it."""
+        """Name of the level in rig files."""
         return f"L{self.level}"
 
 
 def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
-    """The level of physics for a plan on a simulated rig; None on a real one."""
+    """Choose the physics level for a plan on a simulated rig; None on a real one."""
     if not rig.simulated:
         return None
     stated = rig.scene.scene.level
@@ -60,7 +60,7 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
     if not slides:
         return Choice(
             HIGHEST,
-            "onsets under a falling plate have no closed form at the higher levels, so nothing "
+            "onsets under a falling plate have no closed form at the higher levels, so no effect "
             "is left out",
         )
     onsets = {level: expected_onsets(rig.scene, slides, level) for level in (1, 2, 3)}
@@ -84,22 +84,22 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
 
 
 def with_level(rig: RigFile, plan: Plan) -> RigFile:
-    """The rig file with its scene's level decided for a plan."""
+    """Return the rig file with its scene at the level chosen for a plan."""
     choice = choose_level(rig, plan)
     return rig if choice is None else at_level(rig, choice.name)
 
 
 def at_level(rig: RigFile, name: str) -> RigFile:
-    """A simulated rig's file with the scene at the level `name`, such as L2."""
+    """Return a simulated rig's file with the scene at the level `name`, such as L2."""
     scene = rig.scene.scene.model_copy(update={"level": name})
     return rig.model_copy(update={"mock": rig.scene.model_copy(update={"scene": scene})})
 
 
 def slip_expected(rig: RigFile, plan: Plan) -> dict[str, Any] | None:
-    """First slip after the start of the slide and duration of incipient slip, over all slides.
+    """Return the range of the first slip and of the duration of incipient slip over all slides.
 
-    None for a real rig or a plan without slides. Friction is taken as even, markers' thresholds
-    are left out; closed forms at the highest level.
+    Times are from the start of the slide. None for a real rig or a plan without slides. Closed
+    forms at the highest level, with uniform friction and without the markers' thresholds.
     """
     slides = slides_of(plan)
     if not rig.simulated or not slides:
@@ -114,7 +114,7 @@ def slip_expected(rig: RigFile, plan: Plan) -> dict[str, Any] | None:
 
 
 def slides_of(plan: Plan) -> list[Slide]:
-    """The distinct slides of a plan, in the order they first come."""
+    """Return the distinct slides of a plan, in order of first appearance."""
     found: dict[Slide, None] = {}
     for trial in plan:
         slide = _slide(plan.program(trial))
@@ -138,7 +138,7 @@ def _slide(program: Program) -> Slide | None:
 def expected_onsets(
     mock: MockSettings, slides: list[Slide], level: int, grip: F64 | None = None
 ) -> F64:
-    """First slip of all and slip of the centre, s after the start of each slide, (k, 2)."""
+    """Return the first slip and the slip of the centre, s after the start of a slide, (k, 2)."""
     scene = mock.scene
     skin = skin_of(mock)
     material = Material(
@@ -154,7 +154,7 @@ def expected_onsets(
 
 
 def _seeds_differ(mock: MockSettings, slides: list[Slide]) -> F64:
-    """Mean difference of both onsets between two seeds: friction at each tip's start varies."""
+    """Mean difference of both onsets between two seeds, whose friction at the tips varies."""
     variation, count = mock.scene.friction.path_variation, sum(mock.scene.skin.ring_counts)
     onsets = []
     for seed in range(SEEDS):

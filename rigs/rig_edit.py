@@ -1,6 +1,6 @@
-"""Writing what was measured into a rig file: its comments stay, a copy of the old file is kept.
+"""Writes measurements into a rig file: comments are preserved, and a copy of the old file is kept.
 
-The new text is checked as a rig file before it takes the old one's place, in one rename.
+The new text is validated as a rig file before it replaces the old one atomically.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ from sliplab.rigs.rig_inheritance import KEY, read_rig, shipped_rigs
 from sliplab.storage.files import write_text
 
 _WIDEST = 1 << 20
-"""Lines are not folded."""
+"""Line width, so large that no line is folded."""
 
 
 @dataclass(frozen=True)
 class Written:
-    """The file that was written, and the kept copy of the one before."""
+    """The written file, and the copy of the previous one."""
 
     path: Path
     kept: Path | None
 
 
 def writable_target(rig: Path, out: Path | None) -> Path:
-    """The file that an entry is written to: `out`, or the rig file itself.
+    """Return the file to write an entry to: `out`, or the rig file itself.
 
     Raises:
-        InputError: that file ships with the package; or `out` is no YAML file, or in no folder.
+        InputError: that file ships with the package, `out` is not a YAML file, or its folder does
+            not exist.
     """
     target = out or rig
     if any(path.resolve() == target.resolve() for path in shipped_rigs().values()):
@@ -53,7 +54,7 @@ def writable_target(rig: Path, out: Path | None) -> Path:
     if not target.parent.is_dir():
         raise InputError("--out", "", str(target), "its folder does not exist")
     if target.exists() and target.resolve() != rig.resolve():
-        raise InputError("--out", "", str(target), "exists: give it as --rig, or another name")
+        raise InputError("--out", "", str(target), "exists: give it as --rig, or use another name")
     return target.resolve()
 
 
@@ -69,15 +70,15 @@ def write_entries(
     """Set keys of a rig file.
 
     Args:
-        rig: the file to begin with.
-        target: where the result goes; see `writable_target`.
-        changes: by path of a key, such as ``calibration.lens``; mappings replace what is there.
-        today: what a copy of an old file is named after.
-        remove: keys to take away, if they are there.
+        rig: the file to start from.
+        target: the file to write; see `writable_target`.
+        changes: values by dotted key, such as ``calibration.lens``; mappings replace the old ones.
+        today: the day in the name of the old file's copy.
+        remove: keys to remove where present.
         expected: the rig's content as it was read before measuring (`load_rig_file`).
 
     Raises:
-        InputError: the rig file has changed since, or the result would be none.
+        InputError: the rig file has changed since, or the result would not be a valid rig file.
     """
     source = read_rig(rig)
     if expected is not None and source.text != expected:
@@ -85,10 +86,10 @@ def write_entries(
     text = read_text(rig, "rig file")
     own, changes = parse_yaml(text, rig), dict(changes)
     for key in remove:
-        if _stands(source.data, key) and not _stands(own, key):
-            changes[key] = None  # it stands in a file that this one extends
+        if _has_key(source.data, key) and not _has_key(own, key):
+            changes[key] = None  # the key comes from a file that this one extends
     if rig.parent.resolve() != target.parent.resolve() and KEY in own:
-        text = source.text  # elsewhere, what it extends would not be found
+        text = source.text  # in another folder, `extends` would not find its file
     new = edited(text, changes, remove)
     _check(rig, target, new)
     kept = _keep(target, today) if target.exists() else None
@@ -97,9 +98,9 @@ def write_entries(
 
 
 def edited(text: str, changes: Mapping[str, Any], remove: Sequence[str] = ()) -> str:
-    """YAML text with some keys set or removed; comments and the rest stay as they are.
+    """Set or remove keys in YAML text; comments and everything else are preserved.
 
-    Lists of numbers and texts are written in one line.
+    Lists of numbers and strings are written on one line.
     """
     yaml = _yaml()
     data = yaml.load(text)
@@ -123,7 +124,7 @@ def edited(text: str, changes: Mapping[str, Any], remove: Sequence[str] = ()) ->
     return stream.getvalue()
 
 
-def _stands(data: Any, key: str) -> bool:
+def _has_key(data: Any, key: str) -> bool:
     for part in key.split("."):
         if not isinstance(data, dict) or data.get(part) is None:
             return False
@@ -132,10 +133,10 @@ def _stands(data: Any, key: str) -> bool:
 
 
 def _put(here: CommentedMap, key: str, value: Any) -> None:
-    """Set one key; a mapping that is there keeps its place and its comments.
+    """Set one key; an existing mapping keeps its position and its comments.
 
     A new key goes before the last one: a comment or an empty line after a mapping belongs to its
-    last key, and would stand in the middle.
+    last key, and would end up in the middle.
     """
     there = here.get(key)
     if isinstance(value, Mapping) and isinstance(there, CommentedMap):
@@ -165,21 +166,21 @@ def _plain(value: Any) -> Any:
 
 
 def _check(rig: Path, target: Path, text: str) -> None:
-    """Check that `text` at `target` would be a rig file."""
-    aside = target.with_name(f".{target.name}.new")
-    write_text(aside, text)
+    """Check that `text` would be a valid rig file at `target`."""
+    draft = target.with_name(f".{target.name}.new")
+    write_text(draft, text)
     try:
-        validate(RigFile, read_rig(aside).data, aside)
+        validate(RigFile, read_rig(draft).data, draft)
     except InputError as error:
         raise InputError(
-            target, error.key, error.value, f"{error.expected}; {rig} is as it was"
+            target, error.key, error.value, f"{error.expected}; {rig} is unchanged"
         ) from None
     finally:
-        aside.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
 
 
 def _keep(path: Path, today: date) -> Path:
-    """A copy of `path` beside it, named after the day."""
+    """Copy `path` to a file next to it that is named after the day."""
     number, text = 1, read_text(path, "rig file")
     while True:
         more = f"-{number}" if number > 1 else ""

@@ -1,4 +1,4 @@
-"""Rig files: which devices a rig has, where its plate is, and what it may do."""
+"""Rig files: a rig's devices, the position of its plate, and its limits."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RigLimits(StrictModel):
 
 
 class Skin(StrictModel):
-    """The sensor's papillae by ring, from the one in the centre outwards."""
+    """The sensor's papillae by ring, from the centre outwards."""
 
     serial: str = Field(min_length=1, max_length=40)
     made: date | None = None
@@ -68,22 +68,22 @@ class Skin(StrictModel):
 
 
 class Estimates(StrictModel):
-    """Measured sizes of this rig's streams, for the plan's estimate of disk space."""
+    """Measured data rates of this rig's streams, for the plan's estimate of disk space."""
 
     noise_events_per_s: float = Field(ge=0, le=1e9)
     signal_events_per_mm: float = Field(ge=0, le=1e9)
-    """Events of one millimetre of recorded motion in contact."""
+    """Events per millimetre of recorded motion in contact."""
     events_per_fall: float = Field(default=0.0, ge=0, le=1e9)
-    """Events of a plate that falls, besides."""
+    """Additional events of a falling plate."""
     bytes_per_event: float = Field(gt=0, le=1000)
     bytes_per_frame: float = Field(ge=0, le=1e9)
-    """Of one frame without the plate's marker: its papillae; the dark ground costs little."""
+    """Size of one frame without the plate's marker: the papillae on a dark background."""
     bytes_per_plate_frame: float = Field(ge=0, le=1e9)
-    """Of one frame with the plate's marker."""
+    """Size of one frame with the plate's marker."""
     bytes_per_tracked_frame: float = Field(ge=0, le=1e9)
-    """Of one frame that is kept as the places of its markers."""
+    """Size of one frame that is stored as marker positions only."""
     fixed_bytes: float = Field(ge=0, le=1e12)
-    """Of one trial: poses, pulses, record."""
+    """Size of a trial's other data: poses, pulses, record."""
 
 
 class FrameCameraSpec(StrictModel):
@@ -94,18 +94,18 @@ class FrameCameraSpec(StrictModel):
     height_px: int = Field(default=1200, ge=16, le=100_000)
     """Pixels of the whole sensor."""
     spool: bool = False
-    """Write raw frames first and encode after the trial, where encoding live is too slow."""
+    """Write raw frames and encode them after the trial, where live encoding is too slow."""
 
 
 class RigFile(StrictModel):
-    """A whole rig file."""
+    """A rig file."""
 
     rig: Literal[1]
     """Version of the file format."""
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
     driver: Literal["mock", "devices", "loopback"]
-    """`mock`: simulated devices in this program, as fast as it goes. `devices`: the real ones.
-    `loopback`: the real drivers in real time, with stand-ins that show the simulated scene."""
+    """`mock`: simulated devices in this process, in virtual time. `devices`: the real devices.
+    `loopback`: the real drivers in real time, on fakes that show the simulated scene."""
     poll: PositiveSeconds
     """Period at which streams are read and stop requests checked."""
     sensor: str = Field(min_length=1, max_length=40)
@@ -153,7 +153,7 @@ class RigFile(StrictModel):
             ("mock.frame_camera.level", self.mock.frame_camera.level, "video"),
         ):
             if value != right:
-                raise KeyedError(key, value, f"must be {right}: that is what stand-ins show")
+                raise KeyedError(key, value, f"must be {right}, which is what the fakes simulate")
         fakes = {
             "arm": self.devices.arm_driver.fake,
             "event_camera": self.devices.event_camera_driver.reach,
@@ -170,38 +170,38 @@ class RigFile(StrictModel):
     @model_validator(mode="after")
     def _poll_is_short(self) -> RigFile:
         if self.poll > 1:
-            raise KeyedError("poll", self.poll, "must be at most 1 s: a stop waits for it")
+            raise KeyedError("poll", self.poll, "must be at most 1 s: a stop waits that long")
         return self
 
     @model_validator(mode="after")
     def _scales_agree(self) -> RigFile:
-        """The simulated camera draws at the scale that the rig file promises, or has measured."""
+        """Check that the simulated camera renders at the scale that the rig file states."""
         if self.mock is None:
             return self
-        stated, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
-        if abs(stated - drawn) > SCALE_ERROR * drawn:
+        stated, rendered = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
+        if abs(stated - rendered) > SCALE_ERROR * rendered:
             raise KeyedError(
                 "frame_camera.scale_px_per_mm",
                 stated,
-                f"must be mock.frame_camera.px_per_mm = {drawn:g}",
+                f"must be mock.frame_camera.px_per_mm = {rendered:g}",
             )
         return self
 
     @model_validator(mode="after")
-    def _promises_are_kept(self) -> RigFile:
-        """The simulated clocks are no worse than `timing` says."""
+    def _clocks_meet_timing(self) -> RigFile:
+        """Check that the simulated clocks are no worse than `timing` states."""
         if self.mock is not None:
             check_timing(self.mock, self.timing)
         return self
 
     @property
     def simulated(self) -> bool:
-        """True if everything that comes from this rig is simulated."""
+        """True if all data of this rig are simulated."""
         return self.driver != "devices"
 
     @property
     def in_virtual_time(self) -> bool:
-        """True if its time runs as fast as it can, not with the wall clock."""
+        """True if the rig runs in virtual time, not in real time."""
         return self.driver == "mock"
 
     @property
@@ -222,7 +222,7 @@ class RigFile(StrictModel):
 
     @property
     def frame_source(self) -> str:
-        """``video`` or ``tracks``: what the outside camera hands over."""
+        """Output of the outside camera: ``video`` or ``tracks``."""
         return self.mock.frame_camera.level if self.mock is not None else "video"
 
     def frame_bytes(self, with_plate: bool) -> float:
@@ -233,7 +233,7 @@ class RigFile(StrictModel):
         return known.bytes_per_plate_frame if with_plate else known.bytes_per_frame
 
     def frame_px(self, plan: Plan) -> tuple[int, int] | None:
-        """(width, height) of the recorded region in pixels, multiples of 16; None without video."""
+        """Return width and height of the recorded region in px, multiples of 16; None: no video."""
         recording = plan.protocol.collection.recording
         if "frames" not in recording.streams:
             return None
@@ -243,14 +243,14 @@ class RigFile(StrictModel):
 
 
 def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
-    """A checked rig file and its text, what it extends merged in.
+    """Load and validate a rig file; return it and its text, with the files it extends merged in.
 
     Args:
         path: a file, or the name of a rig that ships with the package, such as ``mock``.
-        stored: it is a campaign's own copy, which is not held to rules that came after it.
+        stored: True for a campaign's own copy, to which newer rules do not apply.
 
     Raises:
-        InputError: anything wrong, with file, key, value and what would be right.
+        InputError: the file is invalid; names file, key, value and what would be right.
     """
     found = read_rig(rig_path(path))
     try:
@@ -273,20 +273,20 @@ def _check_secrets(rig: RigFile) -> None:
         for name in driver.settings.model_fields:
             if is_secret(name) and getattr(settings, name) == MASK:
                 key = f"devices.{driver.kind.replace(' ', '_')}.{name}"
-                text = "is masked in a store's copy of a rig file: write the rig's own"
+                text = "is masked, as in a store's copy of a rig file: write the rig's password"
                 raise KeyedError(key, MASK, text)
 
 
 def rig_hash(text: str) -> str:
-    """Hash of a rig file's content, as `load_rig_file` gives it, whatever its passwords are."""
+    """Hash a rig file's content, as `load_rig_file` returns it, with passwords masked."""
     return hash_text(mask_secrets(text))
 
 
 def same_rig(one: str, other: str) -> bool:
-    """Return whether two contents of rig files describe one rig.
+    """Return whether the contents of two rig files describe the same rig.
 
-    The faults of a simulated rig happen to it and are no part of it: a campaign that one of them
-    ended goes on without it. So does one whose plate was taught anew, or whose password is another.
+    The simulated faults are ignored: a campaign that a fault ended continues without it. The
+    plate's taught position and passwords are ignored too.
     """
     if one == other:
         return True
@@ -298,7 +298,7 @@ def same_rig(one: str, other: str) -> bool:
 
 
 def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
-    """Check that an exposure ends before the next tick, where every tick triggers a frame."""
+    """Check that exposures end before the next tick, where every tick triggers a frame."""
     rate = plan.protocol.collection.recording.sync_rate
     if rig.timing.frames != "hardware trigger":
         return
@@ -315,10 +315,10 @@ def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
-    """Hold every motion of a plan against the rig's own limits.
+    """Check every motion of a plan against the rig's limits.
 
     Raises:
-        InputError: the first move that the rig may not make.
+        InputError: the first move beyond a limit.
     """
     most_us = 1e6 / 4 / plan.protocol.collection.recording.sync_rate
     for name in ("event_camera", "frame_camera", "arm_controller"):
@@ -329,7 +329,7 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
                 f"timing.{name}.jitter_us",
                 f"{jitter_us:g}",
                 f"must be at most {most_us:g}, a quarter of a tick of {plan.file}'s sync_rate: "
-                "pulses could not be told apart",
+                "pulses could not be distinguished",
             )
     _check_exposure(rig, plan, file)
     frame_px = rig.frame_px(plan)

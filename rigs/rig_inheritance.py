@@ -1,7 +1,7 @@
-"""Rig files that build on one another: `extends: mock.yaml`, and the file's own keys on top.
+"""Inheritance of rig files: `extends: mock.yaml`, overridden by the file's own keys.
 
-A rehearsal differs from the rig it rehearses by a line or two; copies of whole files would drift
-apart. What is kept with the data is the merged content, which stands alone.
+A rehearsal's rig file differs from the real rig's by a line or two; full copies would diverge. The
+merged content, which is self-contained, is stored with the data.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _DEEPEST = 8
 
 @dataclass(frozen=True)
 class RigSource:
-    """A rig file as read, and everything that it extends."""
+    """A rig file as read, with the files that it extends."""
 
     path: Path
     data: dict[str, Any]
-    """Merged."""
+    """Merged content."""
     text: str
     """The file's own text if it extends nothing, else the merged content as YAML."""
     parts: tuple[tuple[Path, Document], ...]
     """Each file with its own keys, the one that was asked for first."""
 
     def blame(self, key: str) -> Path:
-        """The file that says what stands at `key`; the first one where none says it."""
+        """Return the file that sets `key`, the first one where none does."""
         path = re.findall(r"[^.\[\]]+", key)
         deepest = max(_depth(data, path) for _, data in self.parts)
         return next(file for file, data in self.parts if _depth(data, path) == deepest)
@@ -47,25 +47,25 @@ def shipped_rigs() -> dict[str, Path]:
 
 
 def rig_path(given: Path) -> Path:
-    """The file that a person means: a path, or the name of a shipped rig.
+    """Resolve a path, or the name of a shipped rig, to a file.
 
     Raises:
-        InputError: a bare name that is neither.
+        InputError: neither exists.
     """
     if (found := find_shipped(given, known := shipped_rigs())) is not None:
         return found
-    text = f"no such file, nor a rig that ships: {', '.join(known)}"
+    text = f"no such file, and not one of the shipped rigs: {', '.join(known)}"
     raise InputError("--rig", "", str(given), text)
 
 
 def read_rig(path: Path) -> RigSource:
-    """A rig file with everything that it extends, merged but not checked.
+    """Read a rig file and merge the files that it extends, without validation.
 
-    Mappings are merged key by key, everything else is replaced as a whole; so is a device's
+    Mappings are merged key by key; everything else is replaced as a whole, and so is a device's
     section that names another driver.
 
     Raises:
-        InputError: a file cannot be read, or extends itself, or goes on for more than 8 files.
+        InputError: a file cannot be read, extends itself, or has a chain of more than 8 files.
     """
     parts: list[tuple[Path, Document]] = []
     text, here = read_text(path, "rig file"), path
@@ -80,7 +80,7 @@ def read_rig(path: Path) -> RigSource:
             raise InputError(here, KEY, parent, "must be the path of a rig file")
         there = here.parent / parent
         if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:
-            raise InputError(here, KEY, parent, "leads in a circle, or through more than 8 files")
+            raise InputError(here, KEY, parent, "is circular, or a chain of more than 8 files")
         try:
             own = read_text(there, "rig file")
         except InputError as error:
@@ -97,7 +97,7 @@ def read_rig(path: Path) -> RigSource:
 
 
 def rig_yaml(data: dict[str, Any]) -> str:
-    """A rig file's content as it is written down."""
+    """Serialise a rig file's content as YAML."""
     text: str = yaml.dump(dict(data), Dumper=_Dumper, sort_keys=False)
     return text
 
@@ -111,7 +111,7 @@ def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     for key, value in above.items():
         known = merged.get(key)
         if isinstance(known, dict) and isinstance(value, dict):
-            # another driver has other settings
+            # a section for another driver has other settings
             other = "driver" in value and value["driver"] != known.get("driver")
             merged[key] = value if other else _merge(known, value)
         else:
@@ -120,7 +120,7 @@ def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 def _depth(data: Any, path: list[str]) -> int:
-    """Return the number of leading parts of a key that stand in `data`."""
+    """Return the number of leading parts of a key that exist in `data`."""
     for depth, part in enumerate(path):
         if isinstance(data, dict) and part in data:
             data = data[part]
@@ -132,7 +132,7 @@ def _depth(data: Any, path: list[str]) -> int:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Numbers with the digits they were written with."""
+    """A dumper that preserves the digits of numbers."""
 
 
 def _number(dumper: _Dumper, value: Decimal) -> Any:

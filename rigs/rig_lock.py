@@ -1,9 +1,9 @@
 """One program at a time at a real rig: an OS lock for each device that must not be shared.
 
-The locks are the machine's, whoever runs the program and from whatever session: two programs that
-drive one arm are dangerous whoever their users are. So they stand in one folder for everybody and
-not in each user's own. They die with their holder. Two machines that reach one arm are not kept
-apart by this; the arm's own controller must.
+The locks apply to the whole machine, across users and sessions, because two programs that drive one
+arm are dangerous whoever runs them. The lock files are therefore in one shared folder. A lock ends
+with its holder's process. It does not exclude another machine that can reach the same arm; the
+arm's controller must do that.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _FOLDER = Path("/tmp/sliplab-rigs")
 
 
 def lock_names(file: RigFile) -> dict[str, str]:
-    """Return what is locked, by the name of its lock file; nothing on simulated rigs.
+    """Return descriptions of the locked devices by lock file name; empty for simulated rigs.
 
-    Each simulated rig has devices, or fakes, of its own.
+    Each simulated rig has its own devices or fakes.
     """
     if file.simulated or file.devices is None:
         return {}
@@ -41,14 +41,14 @@ def lock_names(file: RigFile) -> dict[str, str]:
 
 @contextmanager
 def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
-    """Hold a rig for this program while the block runs.
+    """Lock a rig for this program while the block runs.
 
     Args:
-        store: where its data go, shown to whoever is refused.
+        store: the store that is written, shown to other programs that are refused.
 
     Raises:
-        Locked: another program has it; the message says which, whose and since when.
-        RigError: the lock files cannot be made.
+        Locked: another program has the lock; the message names it, its user and its start time.
+        RigError: the lock files cannot be created.
     """
     names = lock_names(file)
     with ExitStack() as locks:
@@ -61,8 +61,8 @@ def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
             except (OSError, NoLocks) as error:
                 raise RigError(
                     "rig",
-                    f"cannot be locked against other programs: {error}; name a folder that all "
-                    f"who use it may write to in {ENVIRONMENT}",
+                    f"cannot be locked against other programs: {error}; set {ENVIRONMENT} to a "
+                    "folder that all its users can write to",
                 ) from None
         yield
 
@@ -78,9 +78,9 @@ def _folder(locks: ExitStack) -> Path:
     locks.callback(os.close, handle)
     mode = os.fstat(handle).st_mode
     if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-        text = "every user may delete the locks in it (chmod +t takes that away)"
+        text = "every user may delete the locks in it (chmod +t prevents that)"
         raise OSError(errno.EPERM, text, str(folder))
-    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # keeps the system from tidying it up
+    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # keeps the system from cleaning it up
     return folder
 
 

@@ -19,14 +19,14 @@ from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import StopRequested
-from sliplab.rigs.core.teaching import look, stir
+from sliplab.rigs.core.teaching import grab_frames, press_in_circles
 
 if TYPE_CHECKING:
     from sliplab.analysis.calibration.charuco import Board
 
 MOST_LENS_PX = 0.5
 MOST_CROP_PX = 5.0
-STIR_MM_S = 1.0
+CIRCLE_MM_S = 1.0
 
 
 def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.uint8]]:
@@ -44,7 +44,7 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
         prompt = "lay the board flat on the plate" if number == 0 else how
         if not rig.operator.ask("board", f"{prompt} ({number + 1} of {views})", f"view {number}"):
             raise StopRequested
-        pictures.append(look(rig).images[-1])
+        pictures.append(grab_frames(rig).images[-1])
         if not pictures[-1].size:
             raise RigError(
                 "frame camera", "hands over tracks and no pictures: take a rig with `video`"
@@ -147,7 +147,7 @@ def calibrate_crop(session: CalibrationSession, depth_mm: float, radius_mm: floa
 
     rig = session.rig
     with console.bar(f"{session.simulated}rounds", 1) as bar:
-        counts = stir(rig, depth_mm, radius_mm, STIR_MM_S, 3000)
+        counts = press_in_circles(rig, depth_mm, radius_mm, CIRCLE_MM_S, 3000)
         bar.advance(1, f"{int(counts.sum())} events")
     try:
         crop = find_crop(counts)

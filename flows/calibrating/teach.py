@@ -18,7 +18,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
 from sliplab.rigs.core.capabilities import Pose, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.core.teaching import ASLANT, Creep, MarkerFinder, Touch, jogged, touch
+from sliplab.rigs.core.teaching import OBLIQUE_SLOPE, Creep, MarkerFinder, Touch, jog_poses, touch
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import FrameChunk
 
@@ -54,7 +54,7 @@ def planned_zero(creep: Creep, with_markers: bool) -> list[PlannedMove]:
     """Return the touches that find depth zero."""
     places = [("centre, straight in", (0.0, 0.0))]
     if with_markers:
-        places.append(("centre, aslant", (ASLANT * creep.search_mm, 0.0)))
+        places.append(("centre, aslant", (OBLIQUE_SLOPE * creep.search_mm, 0.0)))
     return planned_touches(places, creep)
 
 
@@ -119,7 +119,7 @@ def teach_plane_by_hand(session: CalibrationSession) -> Finding:
         (f"jog the arm until the centre papilla just touches {text}", f"touched {name}")
         for name, text in where.items()
     ]
-    poses = jogged(session.rig, prompts)
+    poses = jog_poses(session.rig, prompts)
     points = {name: pose.xyz_mm for name, pose in zip(where, poses, strict=True)}
     return _plane_found(session, points, 0.0, "jogged by hand and confirmed", None)
 
@@ -254,7 +254,7 @@ def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> Finding:
         )
         for number in range(1, poses + 1)
     ]
-    found = jogged(session.rig, prompts)
+    found = jog_poses(session.rig, prompts)
     turns = Rotation.from_rotvec(np.radians([pose.rotvec_deg for pose in found]))
     flange = turns * Rotation.from_rotvec(np.radians(tool.rotvec_deg)).inv()
     xyz = np.array([pose.xyz_mm for pose in found]) - flange.apply(np.array(tool.xyz_mm))

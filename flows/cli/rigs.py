@@ -360,7 +360,7 @@ def calibrate_crop(
         raise InputError("--depth", "", f"{depth:g} mm", text)
     moves = [
         PlannedMove("press", 0.0, 0.0, -5.0, depth, 2.0),
-        PlannedMove(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.STIR_MM_S),
+        PlannedMove(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.CIRCLE_MM_S),
     ]
     command.run(moves, yes, dry_run, lambda session: steps.calibrate_crop(session, depth, radius))
 

@@ -1,1 +1,1 @@
-"""The parts of a rig that know no device: capabilities, the rig, its safety and calibration."""
+"""Device-independent parts of a rig: capabilities, the rig itself, its safety and calibration."""

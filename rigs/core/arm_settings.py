@@ -1,7 +1,7 @@
-"""Settings that all real arms share, as a rig file gives them; cheap to import.
+"""Settings that all real arms share, as rig files give them; cheap to import.
 
-Units stand in the names: a rig file's numbers for one make of arm are the maker's own, and
-belong to the rig, not to the protocol.
+Names carry the unit: numbers for one make of arm follow its maker's conventions, and belong to the
+rig, not to the protocol.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class Limits(StrictModel):
     frame: Literal["base", "plate"] = "base"
     """Whose axes the box is in: the arm's base, or the plate (right, up, into the plate)."""
     plate: PlaneSettings | None = None
-    """Left out, the contact plane that the rig was taught."""
+    """The taught contact plane if left out."""
     speed_mm_s: Positive = 50.0
     depth_mm: Finite | None = None
     """Largest distance of the tool centre point beyond the taught plane; needs `plate`."""
     tilt_deg: Annotated[float, Field(gt=0, le=180)] = 180.0
     """Largest rotation of the tool in a move."""
     singular_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
-    """Least angle of wrist 2 (UR) or joint 5 (ABB) from the singularity."""
+    """Smallest allowed angle of wrist 2 (UR) or joint 5 (ABB) from the singularity."""
 
     @model_validator(mode="after")
     def _makes_sense(self) -> Limits:
@@ -66,7 +66,7 @@ class ToolSettings(StrictModel):
 
 
 class BaseArmSettings(DriverSettings):
-    """Settings that every arm has, whatever its make."""
+    """Settings that arms of every make have."""
 
     host_clock: ClassVar[bool] = False
     """The controller has no clock to read: poses are stamped by this computer's."""
@@ -76,17 +76,17 @@ class BaseArmSettings(DriverSettings):
 
 
 _SHORTEST_MM = 1.0
-"""A tool or a plate in metres is shorter, and no real one in millimetres is."""
+"""Shortest plausible tool or plate; one given in metres is shorter than this."""
 _SMALLEST_MM = 2.0
-"""Side of a box of limits; of one in metres all are shorter."""
+"""Shortest plausible longest side of the workspace box; in metres every side is shorter."""
 _RADIANS = 1e-3
 
 
 def check_units(arm: BaseArmSettings) -> None:
-    """Look for lengths that were written in metres and turns that were written in radians.
+    """Check that lengths were not written in metres, and rotations not in radians.
 
     Raises:
-        KeyedError: a value that no arm can have in the unit of its key.
+        KeyedError: a value is implausible in the unit of its key.
     """
     tool, limits, key = arm.tool, arm.limits, "devices.arm"
     for name, vector in (
@@ -100,7 +100,7 @@ def check_units(arm: BaseArmSettings) -> None:
         raise KeyedError(
             f"{key}.tool.tcp_rotvec_deg",
             tool.tcp_rotvec_deg,
-            f"is a turn in radians: write degrees, such as {_row(tool.tcp_rotvec_deg, 57.29578)}",
+            f"looks like radians: write degrees, such as {_row(tool.tcp_rotvec_deg, 57.29578)}",
         )
     sides = [high - low for low, high in zip(limits.low_mm, limits.high_mm, strict=True)]
     if max(sides) < _SMALLEST_MM:

@@ -1,7 +1,7 @@
-"""The `calibration:` section of a rig file: measurements on the rig, and how long each holds.
+"""The `calibration:` section of a rig file: measurements on the rig, and their validity.
 
 `sliplab teach` and `sliplab calibrate` write its entries, each with the day, the residual and the
-method; `sliplab check` refuses what is missing or too old (docs/calibration.md).
+method; `sliplab check` refuses missing and outdated entries (docs/calibration.md).
 """
 
 from __future__ import annotations
@@ -69,17 +69,17 @@ class ContactPlane(StrictModel):
 
     @model_validator(mode="after")
     def _spans(self) -> ContactPlane:
-        """Three points that are a plane; the frame itself is made by `rigs.core.plate_frame`."""
+        """Check that the points span a plane; `rigs.core.plate_frame` builds the frame."""
         right, above = (
             [b - a for a, b in zip(self.centre, point, strict=True)]
             for point in (self.right, self.above)
         )
         lengths = math.hypot(*right), math.hypot(*above)
         if min(lengths) < 5.0:
-            raise ValueError("needs points at least 5 mm from the centre")
+            raise ValueError("points must be at least 5 mm from the centre")
         cosine = sum(a * b for a, b in zip(right, above, strict=True)) / (lengths[0] * lengths[1])
         if abs(cosine) > 0.98:
-            raise ValueError("has its three points almost on one line")
+            raise ValueError("the three points lie almost on one line")
         return self
 
 
@@ -87,14 +87,14 @@ class DepthZero(StrictModel):
     """Depth at which the skin first touches, measured from the contact plane into the plate."""
 
     zero: Millimetre
-    """Depth zero with which the rig begins; a protocol's `rezero` finds it again."""
+    """Depth zero when the rig starts; a protocol's `rezero` measures it again."""
     by_events: Millimetre | None = None
     by_markers: Millimetre | None = None
     difference: Millimetre | None = None
     """By events minus by markers."""
     taught: date
     residual: Millimetre
-    """Half the range of repeated touches, or half the difference, whichever is more."""
+    """Half the range of repeated touches, or half the difference, whichever is larger."""
     method: Method
 
 
@@ -102,7 +102,7 @@ class ToolCentrePoint(StrictModel):
     """Place of the centre papilla's tip on the tool, by pivoting about a fixed point."""
 
     offset: Point
-    """From the flange, in the flange's axes: what the controller's tool has to be."""
+    """Offset from the flange, in the flange's axes: the value to set as the controller's tool."""
     pivot: Point
     """The fixed point, in the arm's base frame."""
     poses: int = Field(ge=4, le=10_000)
@@ -113,28 +113,28 @@ class ToolCentrePoint(StrictModel):
 
 
 class Lens(StrictModel):
-    """The outside camera: pinhole and Brown's distortion, as OpenCV writes them."""
+    """The outside camera: pinhole model with Brown distortion, in OpenCV's convention."""
 
     scale_px_per_mm: float = Field(gt=0, le=200)
-    """On the plate's plane, at the picture's centre."""
+    """Scale on the plate's plane, at the image centre."""
     focal: tuple[Pixel, Pixel]
     centre: tuple[Pixel, Pixel]
-    """Principal point: the optical axis in the picture."""
+    """Principal point: the optical axis in the image."""
     distortion: tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
     """k1, k2, p1, p2, k3."""
     tilt: Degree
-    """Between the plate and the picture."""
+    """Angle between the plate and the image plane."""
     size: tuple[Pixel, Pixel]
-    """Of the pictures that it was measured in: width, height."""
+    """Width and height of the images used."""
     views: int = Field(ge=1, le=10_000)
     measured: date
     residual: Pixel
-    """Root mean square distance of corners from where the model puts them."""
+    """Root mean square reprojection error of the corners."""
     method: Method
 
 
 class EventCrop(StrictModel):
-    """Place of the skin in the event camera's picture."""
+    """Position of the skin in the event camera's image."""
 
     centre: tuple[Pixel, Pixel]
     """Column, row."""
@@ -147,7 +147,7 @@ class EventCrop(StrictModel):
 
 
 class MaxAge(StrictModel):
-    """The age that each entry may have; null: it may be any age, and may be missing."""
+    """Maximum age of each entry; null: any age, and the entry may be missing."""
 
     contact_plane: Days | None = 30
     depth_zero: Days | None = 1
@@ -161,7 +161,7 @@ class Calibration(StrictModel):
 
     contact_plane: ContactPlane
     touch_depth: Millimetre = 0.0
-    """Depth of the centre papilla when touching off notices it, found once with a gauge."""
+    """Depth of the centre papilla when touching off detects it, measured once with a gauge."""
     depth_zero: DepthZero | None = None
     tool_centre_point: ToolCentrePoint | None = None
     lens: Lens | None = None
@@ -170,12 +170,12 @@ class Calibration(StrictModel):
 
     @property
     def zero_mm(self) -> float:
-        """Depth zero that a rig begins with."""
+        """Depth zero when a rig starts."""
         return 0.0 if self.depth_zero is None else self.depth_zero.zero
 
     @property
     def centre_px(self) -> tuple[float, float] | None:
-        """Return where the event camera sees the skin's centre; None: nobody has looked."""
+        """Return the skin's centre in the event camera's image; None if not measured."""
         return None if self.event_crop is None else self.event_crop.centre
 
 
@@ -186,19 +186,19 @@ COMMANDS = {
     "lens": "sliplab calibrate lens",
     "event_crop": "sliplab calibrate crop",
 }
-"""Commands by the entry that they calibrate."""
+"""The command that calibrates each entry."""
 _SAME_SCALE = 1e-3
 
 
 @dataclass(frozen=True)
 class CalibrationFault:
-    """An entry that cannot be relied on: its key, what stands there, and what would be right."""
+    """An invalid entry: its key, its value, and the value that would be right."""
 
     key: str
     value: str | None
     expected: str
     command: str
-    """Return the command that calibrates it, without ``--rig``."""
+    """Command that calibrates it, without ``--rig``."""
 
 
 def find_faults(
@@ -209,15 +209,15 @@ def find_faults(
     scale_px_per_mm: float,
     today: date,
 ) -> list[CalibrationFault]:
-    """Entries that are missing, too old, or contradict each other.
+    """Return the entries that are missing, too old, or contradict each other.
 
-    An age that the rig file itself gives under `max_age` counts for any rig, and its entry must be
-    there. The defaults count for real rigs only, and there for what is `needed`.
+    An age that the rig file itself states under `max_age` applies to any rig, and its entry must
+    exist. The defaults apply to real rigs only, and only to entries that are `needed`.
 
     Args:
-        needed: names of the entries that the plan at hand relies on.
-        scale_px_per_mm: of the frame camera as the rig file has it.
-        today: the day from which ages count.
+        needed: names of the entries that the plan relies on.
+        scale_px_per_mm: scale of the frame camera in the rig file.
+        today: the day on which ages are computed.
     """
     found = []
     for name in COMMANDS:
@@ -229,16 +229,16 @@ def find_faults(
         found += [fault] if fault else []
     zero, plane = calibration.depth_zero, calibration.contact_plane
     if zero is not None and zero.taught < plane.taught:
-        text = f"was found before the plane was taught anew on {plane.taught}"
-        found.append(_mend("depth_zero", "taught", str(zero.taught), text))
+        text = f"was found before the plane was taught again on {plane.taught}"
+        found.append(_fault("depth_zero", "taught", str(zero.taught), text))
     lens = calibration.lens
     if lens is not None and abs(scale_px_per_mm / lens.scale_px_per_mm - 1.0) > _SAME_SCALE:
         found.append(
             CalibrationFault(
                 "frame_camera.scale_px_per_mm",
                 f"{scale_px_per_mm:g}",
-                f"must be calibration.lens.scale_px_per_mm = {lens.scale_px_per_mm:g}, or the "
-                "lens is another",
+                f"must be calibration.lens.scale_px_per_mm = {lens.scale_px_per_mm:g}, unless the "
+                "lens was replaced",
                 COMMANDS["lens"],
             )
         )
@@ -246,7 +246,7 @@ def find_faults(
 
 
 def measured_on(calibration: Calibration, name: str) -> date | None:
-    """The day of an entry; None where there is none."""
+    """Return the day of an entry; None if there is none."""
     entry = getattr(calibration, name)
     day: date | None = getattr(entry, "taught", None) or getattr(entry, "measured", None)
     return day
@@ -260,21 +260,21 @@ def _too_old(name: str, entry: Any, limit: int, today: date) -> CalibrationFault
     age = (today - day).days
     if age > limit:
         text = f"is {age} d old, calibration.max_age.{name} allows {limit} d"
-        return _mend(name, key, str(day), text)
-    if age < -1:  # a day is not the same everywhere
-        return _mend(name, key, str(day), f"lies in the future, today is {today}")
+        return _fault(name, key, str(day), text)
+    if age < -1:  # time zones differ by up to a day
+        return _fault(name, key, str(day), f"is in the future; today is {today}")
     return None
 
 
-def _mend(name: str, key: str, value: str, text: str) -> CalibrationFault:
+def _fault(name: str, key: str, value: str, text: str) -> CalibrationFault:
     return CalibrationFault(f"calibration.{name}.{key}", value, text, COMMANDS[name])
 
 
 def without_taught(data: dict[str, Any]) -> dict[str, Any]:
-    """A rig file's data without where the plate was found to be, and without ages.
+    """Return a rig file's data without the plate's taught position and without ages.
 
-    Both are found again in the course of a campaign and make no other rig: coordinates are the
-    plate's. Scale and lens stay: what is measured in pictures depends on them.
+    Both are measured again during a campaign and do not make it another rig: coordinates are
+    relative to the plate. Scale and lens stay, because measurements in images depend on them.
     """
     calibration = data.get("calibration")
     if not isinstance(calibration, dict):

@@ -1,9 +1,8 @@
-"""Capabilities: everything that a device must be able to do to be part of a rig; no base classes.
+"""Capabilities: the interfaces that the devices of a rig implement, as protocols.
 
-A driver, a fake on the wire and a simulated device are all the same to the rig if they can
-do what is written here. Every call returns within a bounded time or raises a `RigError`; nothing
-here waits for a motion to end. Time passes only in `Clock.wait`, so a simulated rig runs as fast
-as it can while the code around it stays the same.
+A driver, a driver on a fake, and a simulated device are interchangeable if they implement these.
+Every call returns within a bounded time or raises a `RigError`; no call waits for a motion to end.
+Time passes only in `Clock.wait`, so a simulated rig runs faster than real time with the same code.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from sliplab.storage.streams import (
 )
 
 UNKNOWN = "unknown"
-"""Value in `DeviceHealth` of what a device does not report."""
+"""Value in `DeviceHealth` of a property that a device does not report."""
 
 
 class RigError(RuntimeError):
-    """An action of the rig that failed. `device` names the part; the text says what to do."""
+    """A failed action of the rig. `device` names the part; the text says what to do."""
 
     def __init__(self, device: str, message: str) -> None:
         super().__init__(f"{device}: {message}")
@@ -38,11 +37,11 @@ class RigError(RuntimeError):
 
 
 class ArmFault(RigError):
-    """The arm is not able to move: protective or emergency stop, or no connection."""
+    """The arm cannot move: protective or emergency stop, or no connection."""
 
 
 class ArmState(Enum):
-    """The state that an arm reports."""
+    """State that an arm reports."""
 
     READY = "ready"
     MOVING = "moving"
@@ -60,7 +59,7 @@ class ArmState(Enum):
 
     @property
     def advice(self) -> str:
-        """The action that a person must take; no rig unlocks or restarts anything by itself."""
+        """The action that the operator must take; SlipLab never unlocks or restarts an arm."""
         return {
             ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
             ArmState.EMERGENCY_STOP: (
@@ -69,7 +68,7 @@ class ArmState(Enum):
             ArmState.DISCONNECTED: "check power and network of the arm's controller",
             ArmState.REMOTE_CONTROL_OFF: "switch the pendant to remote control",
             ArmState.NOT_RUNNING: "switch the arm on at the pendant, then connect again",
-        }.get(self, "look at the arm")
+        }.get(self, "check the arm")
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class DeviceHealth:
-    """A device's own report, read without starting it; `unknown` where it does not say."""
+    """A device's status report, read without starting it; `unknown` where it reports nothing."""
 
     device: str
     """Its part in the rig, as `RigError` names it."""
@@ -107,9 +106,9 @@ class DeviceHealth:
     serial: str
     firmware: str
     temperature_c: float | None
-    """Degrees Celsius; None where it has no thermometer that can be read."""
+    """Degrees Celsius; None where the device has no readable temperature sensor."""
     clock: str
-    """Clock that stamps its data."""
+    """Clock of its time stamps."""
     notes: tuple[str, ...] = ()
     """Further details for people: region, buffers, speed of the link."""
 
@@ -142,10 +141,10 @@ class Arm(Protocol):
         """The controller's clock now."""
 
     def start(self, path: Sequence[Segment]) -> None:
-        """Begin to follow `path` and return at once. Raises ArmFault, or RigError if moving."""
+        """Start to follow `path` and return at once. Raises ArmFault, or RigError if moving."""
 
     def progress(self) -> Progress:
-        """Return how far the path begun last has come."""
+        """Return the progress of the path started last."""
 
     def read_poses(self) -> PoseChunk:
         """Poses since the last call."""
@@ -160,7 +159,7 @@ class Arm(Protocol):
         """Stop now; safe to call at any time and more than once; never unlocks anything."""
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
 
 
 @runtime_checkable
@@ -171,7 +170,7 @@ class EventCamera(Protocol):
     height: int
 
     def start(self) -> None:
-        """Begin to stream; what came before is dropped."""
+        """Start streaming; earlier data are discarded."""
 
     def read(self) -> EventChunk:
         """Events since the last call."""
@@ -192,19 +191,19 @@ class FrameCamera(Protocol):
 
     px_per_mm: float
     mid_exposure_ns: int
-    """From the start of the exposure to its middle, which is what a frame's time says."""
+    """Time from the start of an exposure to its middle, which is the time of a frame."""
 
     def set_region(self, width_px: int, height_px: int) -> None:
-        """Read out a centred region only."""
+        """Read out only a centred region."""
 
     def start(self) -> None:
-        """Begin to grab, on the sync box's ticks or freely; the frame counter restarts at 0."""
+        """Start grabbing, on the sync box's ticks or free-running; frames count from 0 again."""
 
     def read(self) -> FrameChunk:
         """Frames since the last call."""
 
     def read_clock(self) -> ClockReads:
-        """Read the camera's clock once: one row. Only asked of a camera that has one to read."""
+        """Read the camera's clock once: one row. Called only on cameras with a readable clock."""
 
     def stop(self) -> None:
         """Stop grabbing."""
@@ -215,13 +214,13 @@ class FrameCamera(Protocol):
 
 @runtime_checkable
 class SyncBox(Protocol):
-    """Ticks at a fixed rate: triggers frames, and sends a pulse on each tick with a code bit 1."""
+    """A box that triggers a frame on each tick, and sends a pulse on ticks with a code bit 1."""
 
     def connect(self) -> None:
-        """See that a box answers; anew after a fault. Raises RigError."""
+        """Check that a box answers; reconnects after a fault. Raises RigError."""
 
     def start(self, rate_hz: float, seed: int, code: Code) -> None:
-        """Begin ticks and a code of `rigs.core.pulse_code` from `seed`, which has 32 bits."""
+        """Start ticks and a code of `rigs.core.pulse_code` from `seed`, a 32-bit number."""
 
     def read_pulses(self) -> PulseChunk:
         """Pulses sent since the last call; the box's clock starts at 0 with `start`."""
@@ -229,15 +228,15 @@ class SyncBox(Protocol):
     def read_exposures(self) -> PulseChunk:
         """Starts of the frame camera's exposures since the last call, box clock.
 
-        Exposures are seen from `start` to `close`, also those whose frame is lost later; none
-        where the camera's output is not wired.
+        Exposures are recorded from `start` to `close`, also those whose frame is lost later; none
+        if the camera's output is not wired.
         """
 
     def read_clock(self) -> ClockReads:
         """Read the box's clock once: one row."""
 
     def stop(self) -> None:
-        """Stop the ticks; the clock goes on."""
+        """Stop the ticks; the clock keeps running."""
 
     def close(self) -> None:
         """Give the device back."""
@@ -269,7 +268,7 @@ class ForceSensor(Protocol):
         """Open the connection; bounded. Raises RigError."""
 
     def start(self) -> None:
-        """Begin to stream; what came before is dropped."""
+        """Start streaming; earlier data are discarded."""
 
     def read(self) -> WrenchChunk:
         """Forces and torques since the last call, sensor's axes and clock.
@@ -293,10 +292,10 @@ class Plate(Protocol):
     """The plate on its vertical slider (gravity and disturbance trials)."""
 
     def act(self, action: PlateAction, seconds: float) -> None:
-        """Raise and hold, release over `seconds`, or catch; returns at once."""
+        """Raise and hold the plate, release it over `seconds`, or catch it; returns at once."""
 
     def mass_kg(self) -> float:
-        """Mass mounted now, as far as the rig can tell (a scale, or a person's word)."""
+        """Mass mounted now, as the rig knows it (from a scale, or confirmed by the operator)."""
 
 
 @runtime_checkable
@@ -316,15 +315,15 @@ class Simulation(Protocol):
     """The world behind a simulated rig; a real rig has none."""
 
     def begin_trial(self, seed: int) -> None:
-        """Draw everything that varies by trial from `seed`, forgetting what ran before."""
+        """Reset the world, and draw everything that varies by trial from `seed`."""
 
     def sink(self, sink: Sink) -> Sink:
-        """`sink` as this world lets it be written: its disk may be full."""
+        """Wrap `sink` in this world's storage faults, such as a full disk."""
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """Return the truth of the trial that just ran (JSON), times in ns of the sync box.
+        """Return the ground truth of the trial that just ran (JSON), times in ns of the sync box.
 
         Args:
-            reference_arm_ns: arm controller time from which displacements are counted.
-            hold_arm_ns: when the recorded hold began, where they are wanted from there too.
+            reference_arm_ns: arm controller time from which displacements are measured.
+            hold_arm_ns: start of the recorded hold, to measure displacements from there too.
         """

@@ -1,7 +1,7 @@
-"""Motion of a fake's tool centre point: straight lines at constant speed, with real ramps.
+"""Motion of a fake's tool centre point: straight lines at constant speed, with speed ramps.
 
-A fake asks a `StraightMotion` and nothing else; a simulated scene listens to its lines (`on_line`)
-and sees the same moves.
+A fake reads its pose from a `StraightMotion` alone; a simulated scene subscribes to its lines
+(`on_line`) and so follows the same moves.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.pose import angle_deg, between, distance_mm, way
+from sliplab.rigs.core.pose import angle_deg, between, distance_mm, straight_path
 
 F64 = npt.NDArray[np.float64]
 _OFF_LINE_MM = 0.01
@@ -25,7 +25,7 @@ _OFF_LINE_MM = 0.01
 
 @dataclass(frozen=True)
 class Ramp:
-    """Speed up, go steadily, slow down: distance over time along one line, mm and s."""
+    """Trapezoidal speed profile: distance over time along one line, mm and s."""
 
     length: float
     speed: float
@@ -33,18 +33,18 @@ class Ramp:
 
     @property
     def peak(self) -> float:
-        """The highest speed reached: short ways never come to `speed`."""
+        """The highest speed reached; a short move never reaches `speed`."""
         return min(self.speed, math.sqrt(self.length * self.acceleration))
 
     @property
     def seconds(self) -> float:
-        """Return how long the whole way takes."""
+        """Duration of the whole move."""
         if self.length == 0:
             return 0.0
         return self.length / self.peak + self.peak / self.acceleration
 
     def at(self, t: float) -> tuple[float, float]:
-        """Distance gone and speed at `t` after the start."""
+        """Distance travelled and speed at `t` after the start."""
         if t <= 0 or self.length == 0:
             return 0.0, 0.0
         if t >= self.seconds:
@@ -58,7 +58,7 @@ class Ramp:
         return self.peak * (t - up / 2), self.peak
 
     def shares(self, t: F64) -> F64:
-        """Shares of the way gone at times after the start, (n,)."""
+        """Shares of the distance travelled at times after the start, (n,)."""
         if self.length == 0:
             return np.ones(len(t))
         up = self.peak / self.acceleration
@@ -72,12 +72,12 @@ class Ramp:
 
 
 STILL = Ramp(0.0, 1.0, 1.0)
-"""No way at all."""
+"""A move of no length."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One straight way from a time on, s."""
+    """One straight move that starts at a given time, s."""
 
     begin: Pose
     end: Pose
@@ -89,21 +89,21 @@ class Line:
         gone, _ = self.ramp.at(t_s - self.start_s)
         if self.ramp.length == 0 or gone >= self.ramp.length:
             return self.end
-        return self._way(gone / self.ramp.length)
+        return self._path(gone / self.ramp.length)
 
     @cached_property
-    def _way(self) -> Callable[[float], Pose]:
-        return way(self.begin, self.end)
+    def _path(self) -> Callable[[float], Pose]:
+        return straight_path(self.begin, self.end)
 
 
 class StraightMotion:
     """A tool centre point that can be sent along straight lines, on a clock in seconds.
 
-    May be asked from any thread, for times that do not run back.
+    Thread-safe; times must not decrease.
 
     Args:
-        on_line: called with every new path and the time from which it holds, s; in the moving
-            thread.
+        on_line: called with every new line and the time from which it applies, s, in the thread
+            that commands the move.
     """
 
     def __init__(
@@ -119,22 +119,22 @@ class StraightMotion:
             return self._line.pose(t_s)
 
     def moving(self, t_s: float) -> bool:
-        """Return whether it is on its way."""
+        """Return whether the tool centre point is moving."""
         with self._lock:
             return t_s < self._rest_s
 
     def move(self, to: Pose, speed_mm_s: float, acceleration_mm_s2: float, t_s: float) -> None:
-        """Leave for `to`; a turn on the spot counts its degrees as mm."""
+        """Start a move to `to`; a rotation in place counts its degrees as mm."""
         with self._lock:
             begin = self._line.pose(t_s)
             length = distance_mm(begin, to) or angle_deg(begin, to)
             self._follow(Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s), t_s)
 
     def extend(self, to: Pose, speed_mm_s: float, t_s: float) -> bool:
-        """Run on to `to` without a rest, if the way there goes on straight at the same speed.
+        """Continue to `to` without stopping, if it lies straight ahead at the same speed.
 
         Returns:
-            Whether it does; if not, nothing has changed.
+            Whether the line was extended; if not, nothing has changed.
         """
         with self._lock:
             line = self._line
@@ -149,23 +149,23 @@ class StraightMotion:
             return True
 
     def stop(self, deceleration_mm_s2: float, t_s: float) -> None:
-        """Come to rest on the line, at its end at the latest."""
+        """Brake to rest on the line, at its end at the latest."""
         with self._lock:
             if t_s >= self._rest_s:
                 return
             line = self._line
             gone, speed = line.ramp.at(t_s - line.start_s)
-            way = min(speed * speed / (2 * deceleration_mm_s2), line.ramp.length - gone)
-            share = (gone + way) / line.ramp.length
+            braking_mm = min(speed * speed / (2 * deceleration_mm_s2), line.ramp.length - gone)
+            share = (gone + braking_mm) / line.ramp.length
             target = between(line.begin, line.end, share)
-            if way <= 0 or speed <= 0:
+            if braking_mm <= 0 or speed <= 0:
                 here = line.pose(t_s)
                 self._follow(Line(here, here, STILL, t_s), t_s)
                 return
-            # A ramp down is the second half of a short way twice as long that began in the past.
-            brake = speed * speed / (2 * way)
-            past = _backwards(line, gone, way)
-            ramp = Ramp(2 * way, speed, brake)
+            # A ramp down is the second half of a move twice as long that began in the past.
+            brake = speed * speed / (2 * braking_mm)
+            past = _pose_before(line, gone, braking_mm)
+            ramp = Ramp(2 * braking_mm, speed, brake)
             self._follow(Line(past, target, ramp, t_s - ramp.seconds / 2), t_s)
 
     def _follow(self, line: Line, t_s: float) -> None:
@@ -173,19 +173,19 @@ class StraightMotion:
         self._on_line(line, t_s)
 
 
-def _backwards(line: Line, gone: float, way: float) -> Pose:
-    """The pose `way` behind where the line is, beyond its begin if need be."""
-    return between(line.begin, line.end, (gone - way) / line.ramp.length)
+def _pose_before(line: Line, gone: float, distance_mm: float) -> Pose:
+    """Return the pose `distance_mm` before the current one, extrapolated before the start."""
+    return between(line.begin, line.end, (gone - distance_mm) / line.ramp.length)
 
 
 @dataclass(frozen=True)
 class ControllerClock:
-    """A controller's clock, by which a fake counts its cycles."""
+    """A controller's clock, which times the cycles of a fake."""
 
     now_s: Callable[[], float]
     """The controller's time, s."""
     rate: float = 1.0
-    """Controller seconds a host second. More than 1 makes slow slides quick to test."""
+    """Controller seconds per host second. More than 1 makes tests of slow slides fast."""
 
 
 def running_clock(
@@ -196,8 +196,8 @@ def running_clock(
     """Return the clock of a controller that is switched on now.
 
     Args:
-        rate: controller seconds a host second.
-        offset_s: what it shows now.
+        rate: controller seconds per host second.
+        offset_s: its time now.
         host_s: the host's monotonic clock, s.
     """
     began = host_s()

@@ -1,7 +1,7 @@
-"""The common part of fake controllers: an asyncio server in its own thread, and faults by name.
+"""Common parts of fake controllers: an asyncio server in its own thread, and named faults.
 
-A fake speaks the own protocol of a device, so that the real driver can be tried without it. None of
-them copies what a device costs in time; what they copy is what it says, and how it fails.
+A fake speaks a device's own protocol, so that the real driver can be tested without the device.
+Fakes reproduce a device's replies and its failures, not its timing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion, running_clock
 
 T = TypeVar("T")
-Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 START_S = 5.0
 """Time limit for a fake to open its ports, or to close them, s."""
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
@@ -28,7 +28,7 @@ HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 
 
 class LoopThread:
-    """Runs coroutines in the background; `call` reaches into it from any other thread."""
+    """An event loop in a background thread; `call` runs a function in it from any other thread."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
@@ -38,20 +38,20 @@ class LoopThread:
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         self._loop.run_forever()
-        self._loop.run_until_complete(_one_turn())  # a task that never began could not clean up
+        self._loop.run_until_complete(_one_turn())  # a task that has not begun cannot clean up
         tasks = asyncio.all_tasks(self._loop)
         for task in tasks:
             task.cancel()
         self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
-        self._loop.run_until_complete(_one_turn())  # sockets close in the turn after
+        self._loop.run_until_complete(_one_turn())  # sockets close one iteration later
         self._loop.close()
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """The result of `work`. Raises TimeoutError after `START_S`."""
+        """Run a coroutine and return its result. Raises TimeoutError after `START_S`."""
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(START_S)
 
     def call(self, function: Callable[[], T]) -> T:
-        """The result of a plain function, run between two of the loop's own steps."""
+        """Run a plain function in the loop's thread and return its result."""
 
         async def work() -> T:
             return function()
@@ -66,7 +66,7 @@ class LoopThread:
 
 
 async def _one_turn() -> None:
-    """Let everything run that is ready to."""
+    """Run every callback that is ready, once."""
     loop = asyncio.get_running_loop()
     turn = loop.create_future()
     loop.call_soon(turn.set_result, None)
@@ -74,65 +74,65 @@ async def _one_turn() -> None:
 
 
 class Connections:
-    """TCP ports and their live connections, so that a link can be cut at one go.
+    """Listening TCP ports and their open connections, which can all be closed at once.
 
-    asyncio's own server loses a connection that is being taken while it is closed (Python 3.11), so
-    connections are taken here.
+    asyncio's own server loses a connection that is being accepted while it closes (Python 3.11), so
+    connections are accepted here.
     """
 
     def __init__(self) -> None:
-        self._doors: list[socket.socket] = []
-        self._talks: dict[asyncio.Task[None], socket.socket] = {}
+        self._listeners: list[socket.socket] = []
+        self._tasks: dict[asyncio.Task[None], socket.socket] = {}
         self._waiting: set[socket.socket] = set()
 
-    def listen(self, host: str, port: int, talk: Talk) -> None:
-        """Take connections on a port; `talk` speaks with one and may end by a lost connection.
+    def listen(self, host: str, port: int, handler: Handler) -> None:
+        """Accept connections on a port; `handler` serves each, and may end with a lost connection.
 
         Raises:
             OSError: the port is taken.
         """
-        door = socket.create_server((host, port), backlog=16)
-        door.setblocking(False)
-        self._doors.append(door)
-        asyncio.get_running_loop().add_reader(door, self._take, door, talk)
+        listener = socket.create_server((host, port), backlog=16)
+        listener.setblocking(False)
+        self._listeners.append(listener)
+        asyncio.get_running_loop().add_reader(listener, self._accept, listener, handler)
 
     def cut(self) -> None:
-        """Close every connection and take no new one."""
-        for door in self._doors:
-            asyncio.get_running_loop().remove_reader(door)
-            door.close()
-        self._doors.clear()
-        for task in list(self._talks):
+        """Close every connection and accept no new one."""
+        for listener in self._listeners:
+            asyncio.get_running_loop().remove_reader(listener)
+            listener.close()
+        self._listeners.clear()
+        for task in list(self._tasks):
             task.cancel()
 
-    def _take(self, door: socket.socket, talk: Talk) -> None:
+    def _accept(self, listener: socket.socket, handler: Handler) -> None:
         try:
-            link, _ = door.accept()
+            connection, _ = listener.accept()
         except OSError:
-            return  # it has left already
-        link.setblocking(False)
-        task = asyncio.get_running_loop().create_task(self._serve(link, talk))
-        self._talks[task] = link
-        self._waiting.add(link)
+            return  # the client has disconnected already
+        connection.setblocking(False)
+        task = asyncio.get_running_loop().create_task(self._serve(connection, handler))
+        self._tasks[task] = connection
+        self._waiting.add(connection)
         task.add_done_callback(self._forget)
 
-    async def _serve(self, link: socket.socket, talk: Talk) -> None:
-        self._waiting.discard(link)
-        reader, writer = await asyncio.open_connection(sock=link)
+    async def _serve(self, connection: socket.socket, handler: Handler) -> None:
+        self._waiting.discard(connection)
+        reader, writer = await asyncio.open_connection(sock=connection)
         try:
-            await talk(reader, writer)
+            await handler(reader, writer)
         except (OSError, asyncio.IncompleteReadError):
-            pass  # the client left
+            pass  # the client disconnected
         except asyncio.CancelledError:
-            writer.transport.abort()  # the link was cut
+            writer.transport.abort()  # the connection was cut
         finally:
             writer.close()
 
     def _forget(self, task: asyncio.Task[None]) -> None:
-        link = self._talks.pop(task)
-        if link in self._waiting:  # cut before it began
-            self._waiting.discard(link)
-            link.close()
+        connection = self._tasks.pop(task)
+        if connection in self._waiting:  # cut before it began
+            self._waiting.discard(connection)
+            connection.close()
 
 
 CLOCK_BACK_S = 5.0
@@ -145,20 +145,20 @@ class Kind(Enum):
     PROTECTIVE_STOP = "protective stop"
     EMERGENCY_STOP = "emergency stop"
     LINK_CUT = "link cut"
-    """Every connection is closed and no new one is taken."""
+    """Every connection is closed and no new one is accepted."""
     SILENCE = "silence"
-    """Connections stay open and are taken, and nothing is ever answered or sent again."""
+    """Connections stay open and are accepted, but nothing is answered or sent any more."""
     REMOTE_OFF = "remote control off"
     PROGRAM_END = "program end"
     """Somebody presses stop at the pendant."""
     PROGRAM_PAUSED = "program paused"
     """Somebody presses pause at the pendant."""
     SAFEGUARD_STOP = "safeguard stop"
-    """A light curtain or a door stops the arm; a program that runs is paused."""
+    """A light curtain or a door stops the arm; a running program is paused."""
     POWER_OFF = "power off"
-    """Somebody switches the arm off, not its controller."""
+    """Somebody switches the arm off, but not its controller."""
     CLOCK_BACK = "clock back"
-    """The controller's clock falls back by `CLOCK_BACK_S`."""
+    """The controller's clock jumps back by `CLOCK_BACK_S`."""
     PACKETS_LOST = "packets lost"
     """The next `PACKETS_LOST` packets of poses are not sent."""
 
@@ -169,18 +169,18 @@ class Stage(Enum):
     CONNECTING = "connecting"
     """With the first request of any client."""
     CONTROL = "control"
-    """When a client asks to write registers, which is how one takes control."""
+    """When a client asks to write registers, which is how it takes control."""
     UPLOADING = "uploading"
     """With the first byte of a control script or motion program."""
     MOVING = "moving"
     """Once the tool centre point has travelled `after_mm` in one move."""
     IDLE = "idle"
-    """At once, if ready and not moving."""
+    """At once, if the arm is ready and not moving."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that goes wrong, once."""
+    """One fault, injected once."""
 
     kind: Kind
     stage: Stage
@@ -188,41 +188,41 @@ class Fault:
 
 
 class FaultPlan:
-    """The faults of one fake that are yet to come, each at its stage.
+    """The pending faults of one fake, each tied to a stage.
 
     Args:
-        happen: makes a kind of fault happen now.
+        inject: causes a fault of a given kind now.
     """
 
-    def __init__(self, faults: Sequence[Fault], happen: Callable[[Kind], None]) -> None:
-        self._waiting, self._happen = list(faults), happen
+    def __init__(self, faults: Sequence[Fault], inject: Callable[[Kind], None]) -> None:
+        self._waiting, self._inject = list(faults), inject
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
     def add(self, fault: Fault) -> None:
-        """Wait for one more."""
+        """Plan one more fault."""
         self._waiting.append(fault)
 
     def reach(self, stage: Stage, gone_mm: float = math.inf) -> None:
-        """Let happen what waits for a stage that was reached.
+        """Inject the faults that are planned for a stage, now that it is reached.
 
         Args:
             gone_mm: how far the tool centre point has travelled in this move.
         """
         for fault in [f for f in self._waiting if f.stage is stage and gone_mm >= f.after_mm]:
             self._waiting.remove(fault)
-            self._happen(fault.kind)
+            self._inject(fault.kind)
 
 
 class FakeController(ABC):
-    """A base for fakes of arm controllers: `start` opens the ports, `close` gives them back.
+    """Base class of fake arm controllers: `start` opens the ports, `close` releases them.
 
     Args:
-        host: loopback address of its own.
+        host: the loopback address that this fake has for itself.
         motion: where the tool centre point is; a straight-line motion from `HOME` if left out.
-        clock: the controller's; one of its own, at `rate`, if left out.
-        rate: controller seconds a host second.
+        clock: the controller's clock; a new one that runs at `rate` if left out.
+        rate: controller seconds per host second.
     """
 
     def __init__(
@@ -249,20 +249,20 @@ class FakeController(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Cut every connection and give the ports back."""
+        """Close every connection and release the ports."""
 
     @abstractmethod
-    def happen(self, kind: Kind) -> None:
-        """Make something go wrong now."""
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now."""
 
     @abstractmethod
     def restore(self) -> None:
-        """Put everything right, as a person would."""
+        """Clear every fault, as an operator would at the pendant."""
 
     def pose(self) -> Pose:
         """Return where the tool centre point is now."""
         return self.motion.pose(self.clock.now_s())
 
     def moving(self) -> bool:
-        """Return whether it is on its way now."""
+        """Return whether the tool centre point is moving now."""
         return self.motion.moving(self.clock.now_s())

@@ -1,7 +1,7 @@
-"""Limits that a move is checked against before an arm is asked to make it.
+"""Check of a move against the rig's limits before it is sent to an arm.
 
-The controller has limits of its own; these are the rig's, and they speak of the sensor and the
-plate. A straight move stays inside a box when both its ends do, so ends are all that is looked at.
+The controller has its own limits; these are the rig's, and protect the sensor and the plate. A
+straight move stays inside a box if both its ends do, so only the ends are checked.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ class GuardError(RigError):
     """A move that the rig's limits forbid; nothing was sent to the arm.
 
     Attributes:
-        what: name of the limit.
-        value: what the move asks for, in `unit`.
-        limit: what is allowed, in `unit`.
+        what: name of the limited quantity.
+        value: requested value, in `unit`.
+        limit: allowed value, in `unit`.
     """
 
     def __init__(self, what: str, value: float, limit: float, unit: str, where: str) -> None:
@@ -38,7 +38,7 @@ class WorkspaceError(GuardError):
 
 
 class SpeedError(GuardError):
-    """A segment that is too fast, or not moving forwards in time."""
+    """A segment that is too fast, or whose speed is not positive."""
 
 
 class DepthError(GuardError):
@@ -46,18 +46,18 @@ class DepthError(GuardError):
 
 
 class TiltError(GuardError):
-    """A segment that turns the tool too far."""
+    """A segment that rotates the tool too far."""
 
 
 class SingularityError(GuardError):
-    """Joints too close to where two of the wrist's axes fall together."""
+    """Joints too close to the wrist singularity, where two wrist axes align."""
 
 
 class Guard:
-    """Holds paths against one rig's limits.
+    """Checks paths against one rig's limits.
 
     Raises:
-        ValueError: limits in the plate's frame, and no plate.
+        ValueError: limits in the plate's frame without a plate.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -72,12 +72,12 @@ class Guard:
         )
 
     def check(self, begin: Pose, path: Sequence[Segment]) -> None:
-        """Hold a path that starts at `begin` against the limits.
+        """Check a path that starts at `begin` against the limits.
 
-        `begin` itself may be outside: an arm that was moved there by hand must be able to return.
+        `begin` itself may be outside: an arm that was jogged there must be able to return.
 
         Raises:
-            GuardError: the first thing that is forbidden, with its value and its limit.
+            GuardError: the first violation, with its value and its limit.
             RigError: a number that is not finite.
         """
         at = begin
@@ -85,7 +85,7 @@ class Guard:
             where = f"segment {index + 1} of {len(path)}"
             numbers = (*segment.to.xyz_mm, *segment.to.rotvec_deg, segment.speed_mm_s)
             if not all(map(math.isfinite, numbers)):
-                raise RigError("arm", f"{where} holds a number that is not finite")
+                raise RigError("arm", f"{where} contains a number that is not finite")
             self._speed(segment.speed_mm_s, where)
             self._box(segment.to, where)
             self._depth(segment.to, where)
@@ -95,7 +95,7 @@ class Guard:
             at = segment.to
 
     def check_joints(self, joints_deg: Sequence[float]) -> None:
-        """Hold six joint angles (degrees) against the wrist's singularity.
+        """Check six joint angles (degrees) against the wrist singularity.
 
         Raises:
             SingularityError: joint 5 is within `singular_deg` of 0 or 180 degrees.

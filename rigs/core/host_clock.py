@@ -1,6 +1,6 @@
-"""The host's clock, and how long something has not moved by it.
+"""The host's clock, and a stall timer.
 
-A computer may stand still for seconds. What lived on it stood still with it, and is not at fault.
+A computer may be suspended for seconds. Its processes were suspended too, and have not stalled.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import time
 
 
 class HostClock:
-    """The host's monotonic clock, by which drivers stamp arrivals; a `Clock`."""
+    """The host's monotonic clock, which gives the arrival times of data; a `Clock`."""
 
     def __init__(self) -> None:
         self._never = threading.Event()
@@ -20,23 +20,23 @@ class HostClock:
         return time.monotonic_ns()
 
     def wait(self, seconds: float) -> None:
-        """Let `seconds` pass; a signal's handler runs at once."""
+        """Let `seconds` pass; signal handlers still run at once."""
         self._never.wait(max(seconds, 0.0))
 
 
 STEP_S = 0.1
-"""The most that the time between two looks counts, s."""
+"""Longest time between two calls that is counted, s."""
 
 
 class StallTimer:
-    """Watches a mark that ought to change; looks must follow each other."""
+    """Measures how long a value that ought to change has not changed; call it regularly."""
 
     def __init__(self) -> None:
         self._mark: int | None = None
         self._last_ns = self._waited_ns = 0
 
     def waited_s(self, mark: int) -> float:
-        """For how long the mark has been the same, s."""
+        """Return how long `mark` has been the same, s."""
         now_ns = time.monotonic_ns()
         if mark != self._mark:
             self._mark, self._waited_ns = mark, 0

@@ -1,8 +1,8 @@
-"""A maker's library in a process of its own, because that is the only way to bound its calls.
+"""A vendor library in a child process, which is the only way to bound the time of its calls.
 
-A library may hold Python's global lock while it waits, so that no thread of the same process can
-end the wait and Ctrl-C does nothing; or it may end the process that it runs in. A child can be
-killed at a stated time, and its end is an error like any other.
+A library may hold Python's global interpreter lock while it waits, so that no other thread can end
+the wait and Ctrl-C does nothing; or it may crash its process. A child process can be killed after a
+timeout, and its death is an error like any other.
 """
 
 from __future__ import annotations
@@ -20,32 +20,31 @@ from typing import Any
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 
 KILL_S = 2.0
-"""Time limit for a child to end once it was asked to, or killed, s."""
-_SAID_BYTES = 2000
-_SAID_CHARACTERS = 160
+"""Timeout for a child to end after a request or a kill, s."""
+_OUTPUT_BYTES = 2000
+_OUTPUT_CHARACTERS = 160
 
 
 class LibraryError(RuntimeError):
-    """The library refused, failed or did not answer in time; the text says which."""
+    """The library refused, failed or timed out; the text says which."""
 
 
 class LibraryProcess:
-    """The parent's side: calls by name, each with a bound.
+    """The parent's side: remote calls by name, each with a timeout.
 
-    The child sends `(True, result)` or `(False, text)` once it has begun and after each call, which
-    reaches it as `(name, arguments, within_s)`. It must end when the pipe closes.
+    The child sends `(True, result)` or `(False, text)` once it has started and after each call,
+    which it receives as `(name, arguments, within_s)`. It must end when the pipe closes.
 
     Args:
-        what: name of the library's part, for messages.
-        serve: the child's function, `module:name`; it is given the pipe's descriptor first.
-        arguments: what else it is given; each must be its own `repr`.
-        start_s: how long the child may take until it has begun, s.
-        error: what is raised.
-        patient: bounds count time that somebody watched: a computer that stood still for longer
-            than a bound has no child at fault.
+        what: name of the child's role, for messages.
+        serve: the child's function, `module:name`; its first argument is the pipe's descriptor.
+        arguments: further arguments; `eval(repr(argument))` must give each one back.
+        start_s: timeout for the child to start, s.
+        error: exception class to raise.
+        ignore_suspend: timeouts do not count time for which this computer was suspended.
 
     Raises:
-        LibraryError: it was not ready within `start_s`; the child is gone.
+        LibraryError: it was not ready within `start_s`; the child has been killed.
     """
 
     def __init__(
@@ -56,10 +55,10 @@ class LibraryProcess:
         start_s: float,
         error: type[LibraryError] = LibraryError,
         *,
-        patient: bool = False,
+        ignore_suspend: bool = False,
     ) -> None:
-        self._what, self._error, self._patient = what, error, patient
-        self._owed = 1
+        self._what, self._error, self._ignore_suspend = what, error, ignore_suspend
+        self._pending = 1
         ours, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
         self._lock = threading.Lock()
@@ -86,22 +85,22 @@ class LibraryProcess:
             raise
 
     def call(self, name: str, *arguments: Any, within_s: float) -> Any:
-        """The result of one call. Thread-safe: a second caller waits for the first.
+        """Call a function of the child and return its result. Thread-safe; calls are serialised.
 
         Raises:
             LibraryError: the library raised, died, or did not answer within `within_s`. In the
-                last two cases the child is gone and every later call fails at once.
+                last two cases the child has ended and every later call fails at once.
         """
         if not self._lock.acquire(timeout=within_s):
-            raise self._error(f"{name}: the call before it has not ended")
+            raise self._error(f"{name}: the previous call has not ended")
         try:
             if self._pipe.closed or self._child.poll() is not None:
-                raise self._error(f"{name}: the {self._what} is gone")
-            self._owed += 1  # before it is sent: an answer too many would be taken for the next
+                raise self._error(f"{name}: the {self._what} has exited")
+            self._pending += 1  # before sending: a surplus answer would be taken for the next one
             try:
                 self._pipe.send((name, arguments, within_s))
             except OSError:
-                raise self._error(f"{name}: the {self._what} is gone{self._said()}") from None
+                raise self._error(f"{name}: the {self._what} has exited{self._output()}") from None
             return self._answer(name, within_s)
         finally:
             self._lock.release()
@@ -114,7 +113,7 @@ class LibraryProcess:
             self._child.wait(KILL_S)
 
     def end(self) -> None:
-        """Let the child end by itself, and kill it if it does not within `KILL_S`; then close."""
+        """Ask the child to end, kill it if it does not within `KILL_S`, and close."""
         with contextlib.suppress(OSError, ValueError):
             self._pipe.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -122,7 +121,7 @@ class LibraryProcess:
         self.close()
 
     def close(self) -> None:
-        """Kill the child and forget it."""
+        """Kill the child and release its pipe and log."""
         self.kill()
         self._pipe.close()
         self._log.close()
@@ -130,22 +129,22 @@ class LibraryProcess:
     def _answer(self, name: str, within_s: float) -> Any:
         fine, result = False, None
         try:
-            while self._owed:  # the answer to a call that Ctrl-C interrupted comes first
-                if not self._comes(within_s):
+            while self._pending:  # the answer to a call that Ctrl-C interrupted comes first
+                if not self._poll(within_s):
                     self.kill()
-                    raise self._error(f"{name}: no answer within {within_s:g} s{self._said()}")
+                    raise self._error(f"{name}: no answer within {within_s:g} s{self._output()}")
                 fine, result = self._pipe.recv()
-                self._owed -= 1
+                self._pending -= 1
         except (OSError, EOFError):
             self.kill()
-            raise self._error(f"{name}: the {self._what} died{self._said()}") from None
+            raise self._error(f"{name}: the {self._what} died{self._output()}") from None
         if not fine:
             raise self._error(f"{name}: {result}")
         return result
 
-    def _comes(self, within_s: float) -> bool:
-        """Return whether there is an answer, after waiting for it."""
-        if not self._patient:
+    def _poll(self, within_s: float) -> bool:
+        """Wait for an answer; return whether one came."""
+        if not self._ignore_suspend:
             return self._pipe.poll(within_s)
         stall = StallTimer()
         while stall.waited_s(0) < within_s:
@@ -153,11 +152,11 @@ class LibraryProcess:
                 return True
         return False
 
-    def _said(self) -> str:
-        """The last line that the child wrote, for a person to read."""
+    def _output(self) -> str:
+        """Return the child's last line of output, as text for a message."""
         size = os.fstat(self._log.fileno()).st_size
-        # the child's offset stays
-        end = os.pread(self._log.fileno(), _SAID_BYTES, max(0, size - _SAID_BYTES))
+        # pread, because the child shares the file offset
+        end = os.pread(self._log.fileno(), _OUTPUT_BYTES, max(0, size - _OUTPUT_BYTES))
         lines = end.decode(errors="replace").strip().splitlines()
         last = "".join(c if c.isprintable() else "?" for c in lines[-1]) if lines else ""
-        return f" (it said: {last[:_SAID_CHARACTERS]})" if last else ""
+        return f" (its last output: {last[:_OUTPUT_CHARACTERS]})" if last else ""

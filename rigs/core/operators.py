@@ -1,4 +1,4 @@
-"""The person at a real rig: asked through a terminal, and who moves the plate on its slider."""
+"""The operator of a real rig: prompts on a terminal, and the plate that is moved by hand."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from sliplab.rigs.core.capabilities import Operator, RigError
 
 
 class ConsoleOperator:
-    """Asks on the terminal and takes only the expected word for done."""
+    """Prompts on the terminal; only the expected word confirms a task."""
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """Ask for `prompt` to be done; the answer must be `expected`, or ``stop``.
+        """Ask the operator to do `prompt`; the answer must be `expected`, or ``stop``.
 
         Raises:
-            RigError: nobody can answer, because there is no terminal.
+            RigError: there is no terminal to answer on.
         """
         if not sys.stdin.isatty():
             raise RigError(
-                "operator", f"'{prompt}' needs a person, and there is no terminal to ask on"
+                "operator", f"'{prompt}' needs an operator, but there is no terminal to ask on"
             )
         while True:
             print(
@@ -41,50 +41,50 @@ class ConsoleOperator:
 _MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")
 _TASKS: dict[PlateAction, tuple[str, str]] = {
     "raise": ("raise the plate and hold it against its upper stop", "raised"),
-    "release": ("let go of the plate, slowly, over {seconds:g} s", "released"),
+    "release": ("let go of the plate slowly, over {seconds:g} s", "released"),
     "catch": ("catch the plate and bring it to rest", "caught"),
 }
 
 
 def mass_of(expected: str) -> float:
-    """The mass that a changeover names, such as ``0.205 kg``, in kg.
+    """Parse the mass that a changeover names, such as ``0.205 kg``, in kg.
 
     Raises:
         RigError: it cannot be read.
     """
     match = _MASS.fullmatch(expected)
     if match is None or float(match[1]) <= 0.0:
-        raise RigError("operator", f"cannot mount {expected!r}; expected such as 0.205 kg")
+        raise RigError("operator", f"cannot mount {expected!r}; expected a mass such as 0.205 kg")
     return float(match[1]) * (0.001 if match[2] == "g" else 1.0)
 
 
 class PersonAtPlate:
-    """A `Plate` and an `Operator` in one: what a person confirms of the plate is what it is.
+    """A `Plate` moved by the operator, and an `Operator` that keeps its mass up to date.
 
     Args:
-        operator: who is asked.
-        mass_kg: mounted at first, kg.
+        operator: the operator to prompt.
+        mass_kg: mass mounted at first, kg.
     """
 
     def __init__(self, operator: Operator, mass_kg: float) -> None:
         self._operator, self._mass_kg = operator, mass_kg
 
     def act(self, action: PlateAction, seconds: float) -> None:
-        """Ask for it; returns when it is confirmed.
+        """Ask the operator to do it; returns once it is confirmed.
 
         Raises:
-            RigError: it was not done.
+            RigError: it was not confirmed.
         """
         prompt, word = _TASKS[action]
         if not self._operator.ask("plate", prompt.format(seconds=seconds), word):
             raise RigError("plate", f"'{prompt.format(seconds=seconds)}' was not confirmed")
 
     def mass_kg(self) -> float:
-        """Mass mounted now, by a person's word."""
+        """Mass mounted now, as confirmed by the operator."""
         return self._mass_kg
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """Ask for anything; a confirmed changeover mounts the mass that it names."""
+        """Ask for a task; a confirmed changeover sets the mounted mass."""
         mass = mass_of(expected) if task == "changeover" else None
         done = self._operator.ask(task, prompt, expected)
         if done and mass is not None:

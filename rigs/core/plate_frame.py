@@ -1,7 +1,7 @@
-"""Between plate coordinates and the arm's base frame.
+"""Transformation between plate coordinates and the arm's base frame.
 
-A protocol speaks of the plate (right, up, depth); an arm of its base. Between the two stands the
-contact plane, taught by touching three points: without it 0.4 degrees of tilt over a slide of
+A protocol uses plate coordinates (right, up, depth); an arm uses its base frame. The contact plane,
+taught by touching three points, relates the two: without it, a tilt of 0.4 degrees over a slide of
 15 mm would be half a depth step.
 """
 
@@ -29,7 +29,7 @@ class PlateFrame:
     Attributes:
         origin: the plate's centre, mm, shape (3,).
         axes: rows are the unit vectors x (right, as the outside camera sees the plate), y (up) and
-            z (into the plate), shape (3, 3). The tool's axes stand along them.
+            z (into the plate), shape (3, 3). The tool's axes are parallel to them.
         zero_mm: depth at which the highest papilla touches, found by touching off.
     """
 
@@ -39,7 +39,7 @@ class PlateFrame:
 
     @staticmethod
     def taught(points_mm: Sequence[Sequence[float]]) -> PlateFrame:
-        """The frame through three touched points: centre, one to its right, one above it.
+        """Build the frame from three touched points: centre, one to its right, one above it.
 
         Raises:
             ValueError: the points are on one line, or closer than 5 mm to each other.
@@ -56,11 +56,11 @@ class PlateFrame:
         return PlateFrame(centre, np.array([x, np.cross(z, x), z]))
 
     def with_zero(self, zero_mm: float) -> PlateFrame:
-        """The same frame with another depth zero."""
+        """Return the same frame with another depth zero."""
         return PlateFrame(self.origin, self.axes, zero_mm)
 
     def pose(self, position: Position) -> Pose:
-        """The pose for a place in plate coordinates, the tool facing the plate."""
+        """Return the pose at a position in plate coordinates, the tool facing the plate."""
         x, y, z = self.axes
         depth = position.depth_mm + self.zero_mm
         xyz = self.origin + position.x_mm * x + position.y_mm * y + depth * z
@@ -68,13 +68,13 @@ class PlateFrame:
 
     @cached_property
     def _rotvec_deg(self) -> tuple[float, float, float]:
-        """Return the tool's rotation vector, the same for every place."""
+        """The tool's rotation vector, the same at every position."""
         rotation = Rotation.from_matrix(np.column_stack(tuple(self.axes)))
         a, b, c = np.degrees(rotation.as_rotvec()).tolist()
         return a, b, c
 
     def position(self, xyz_mm: Sequence[float]) -> Position:
-        """The place in plate coordinates of a tool centre point in the base frame."""
+        """Convert a tool centre point in the base frame to plate coordinates."""
         x, y, z = self.axes @ (np.asarray(xyz_mm, dtype=np.float64) - self.origin)
         return Position(float(x), float(y), float(z) - self.zero_mm)
 

@@ -1,10 +1,10 @@
-"""Poses in and out of each arm's own language, converted in this one place.
+"""Conversion of poses to and from each controller's representation, all in this one place.
 
-SlipLab speaks mm and rotation vectors in degrees (`rigs.core.capabilities.Pose`). Universal Robots
-controllers speak metres and rotation vectors in radians (`p[x, y, z, rx, ry, rz]` of the URScript
-manual). ABB controllers speak mm and unit quaternions w x y z (RAPID `pose`). A rotation has
-several rotation vectors and two quaternions; what comes out here is always the short one: an angle
-of at most 180 degrees, and w >= 0.
+SlipLab uses mm and rotation vectors in degrees (`rigs.core.capabilities.Pose`). Universal Robots
+controllers use metres and rotation vectors in radians (`p[x, y, z, rx, ry, rz]` of the URScript
+manual). ABB controllers use mm and unit quaternions w x y z (RAPID `pose`). A rotation has several
+rotation vectors and two quaternions; these functions return the canonical one: an angle of at most
+180 degrees, and w >= 0.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ F64 = npt.NDArray[np.float64]
 
 
 def to_ur(pose: Pose) -> list[float]:
-    """`pose` as a UR controller writes it: x y z in m, rotation vector in rad."""
+    """Convert `pose` to a UR controller's six values: x y z in m, rotation vector in rad."""
     return [*(value / MM_PER_M for value in pose.xyz_mm), *np.radians(pose.rotvec_deg).tolist()]
 
 
 def from_ur(values: Sequence[float]) -> Pose:
-    """The pose of six values of a UR controller (m, rad)."""
+    """Convert six values of a UR controller (m, rad) to a pose."""
     x, y, z = (value * MM_PER_M for value in values[:3])
     a, b, c = short_rotvec_deg(np.degrees(np.asarray(values[3:6], np.float64))[None])[0].tolist()
     return Pose((x, y, z), (a, b, c))
@@ -41,7 +41,7 @@ def quaternion(pose: Pose) -> tuple[float, float, float, float]:
 
 
 def from_quaternion(xyz_mm: Sequence[float], wxyz: Sequence[float]) -> Pose:
-    """The pose of a place in mm and a quaternion w x y z of any length but 0."""
+    """Convert a position in mm and a quaternion w x y z of any non-zero norm to a pose."""
     rotation = Rotation.from_quat(np.asarray(wxyz, np.float64), scalar_first=True)
     x, y, z = (float(value) for value in xyz_mm)
     a, b, c = np.degrees(rotation.as_rotvec()).tolist()
@@ -49,9 +49,9 @@ def from_quaternion(xyz_mm: Sequence[float], wxyz: Sequence[float]) -> Pose:
 
 
 def short_rotvec_deg(rotvec_deg: F64) -> F64:
-    """The same rotations with angles of at most 180 degrees, shape (n, 3).
+    """Return the same rotations with angles of at most 180 degrees, shape (n, 3).
 
-    A controller may report one turn as a vector longer than 180 degrees, and jump between two
+    A controller may report a rotation as a vector longer than 180 degrees, and jump between two
     vectors for one rotation from one sample to the next.
     """
     if len(rotvec_deg) == 0:
@@ -60,7 +60,7 @@ def short_rotvec_deg(rotvec_deg: F64) -> F64:
 
 
 def compose(one: Pose, other: Pose) -> Pose:
-    """`other`, given in the frame that `one` describes, in the frame that `one` is given in."""
+    """Compose two poses: `other`, given in the frame of `one`, in the frame of `one`'s parent."""
     rotation = _rotation(one)
     x, y, z = (np.asarray(one.xyz_mm) + rotation.apply(other.xyz_mm)).tolist()
     a, b, c = np.degrees((rotation * _rotation(other)).as_rotvec()).tolist()
@@ -68,7 +68,7 @@ def compose(one: Pose, other: Pose) -> Pose:
 
 
 def inverse(pose: Pose) -> Pose:
-    """The pose that undoes `pose`: composed with it, either way, it is the origin."""
+    """Return the inverse of `pose`: composed with it on either side, it gives the identity."""
     back = _rotation(pose).inv()
     x, y, z = (-back.apply(pose.xyz_mm)).tolist()
     a, b, c = np.degrees(back.as_rotvec()).tolist()
@@ -76,7 +76,7 @@ def inverse(pose: Pose) -> Pose:
 
 
 def angle_deg(one: Pose, other: Pose) -> float:
-    """Angle of the smallest turn from one pose's rotation to the other's, degrees."""
+    """Angle of the smallest rotation from one pose's orientation to the other's, degrees."""
     return math.degrees((_rotation(one).inv() * _rotation(other)).magnitude())
 
 
@@ -86,12 +86,12 @@ def distance_mm(one: Pose, other: Pose) -> float:
 
 
 def between(one: Pose, other: Pose, share: float) -> Pose:
-    """The pose at `share` (0 to 1) of the straight way with the shortest turn."""
-    return way(one, other)(share)
+    """Interpolate between two poses at `share` (0 to 1): linear, with the shortest rotation."""
+    return straight_path(one, other)(share)
 
 
-def way(one: Pose, other: Pose) -> Callable[[float], Pose]:
-    """The straight way with the shortest turn from one pose to the other, by its share."""
+def straight_path(one: Pose, other: Pose) -> Callable[[float], Pose]:
+    """Return the straight path with the shortest rotation, as a function of the share (0 to 1)."""
     (x, y, z), (u, v, w) = one.xyz_mm, other.xyz_mm
 
     def place(share: float) -> tuple[float, float, float]:

@@ -1,6 +1,6 @@
-"""The stream of an arm's controller, kept until somebody reads it, within a bound.
+"""Bounded buffer of the samples that an arm's controller streams.
 
-One thread writes (`add`), others read. Nothing is resampled: a sample is what one packet said.
+One thread writes (`add`), others read. Nothing is resampled: a sample is the content of one packet.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from sliplab.rigs.core.pose import short_rotvec_deg
 from sliplab.storage.streams import PoseChunk, PulseChunk
 
 BACKLOG_SAMPLES = 60_000
-"""Poses kept for a reader: two minutes at 500 a second. Older ones are dropped, and counted."""
+"""Buffered poses: two minutes at 500 per second. Older ones are dropped and counted."""
 BACKLOG_PULSES = 60_000
-"""Pulses kept for a reader."""
+"""Buffered pulses."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Sample:
 
     @property
     def pose(self) -> Pose:
-        """The sample's pose with its short rotation vector."""
+        """The sample's pose with a rotation vector of at most 180 degrees."""
         a, b, c = short_rotvec_deg(np.array([self.rotvec_deg]))[0].tolist()
         return Pose(self.xyz_mm, (a, b, c))
 
 
 class PoseStream:
-    """Samples and pulses that have come and were not read yet."""
+    """Samples and pulses that were received and not read yet."""
 
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=BACKLOG_SAMPLES)
@@ -51,7 +51,7 @@ class PoseStream:
         self._changed = Condition()
         self._last: Sample | None = None
         self.dropped = 0
-        """Samples that nobody read in time."""
+        """Number of samples that were not read in time."""
 
     @property
     def last(self) -> Sample | None:
@@ -59,7 +59,7 @@ class PoseStream:
         return self._last
 
     def add(self, sample: Sample) -> None:
-        """Take one sample; a rising sync level is a pulse at its time."""
+        """Add one sample; a rising edge of the sync level is a pulse at its time."""
         with self._changed:
             if self._last is not None and sample.sync and not self._last.sync:
                 self._pulses.append(sample.t_ns)
@@ -70,12 +70,12 @@ class PoseStream:
             self._changed.notify_all()
 
     def wake(self) -> None:
-        """Let everybody who waits look again: something else has changed."""
+        """Make waiting threads check their conditions again after another change."""
         with self._changed:
             self._changed.notify_all()
 
     def wait_for(self, condition: Callable[[], bool], within_s: float) -> bool:
-        """Return whether `condition` became true within `within_s`; looked at with every sample."""
+        """Return whether `condition` became true within `within_s`; checked with every sample."""
         with self._changed:
             return self._changed.wait_for(condition, within_s)
 

@@ -1,17 +1,17 @@
-"""The code on the sync line: what makes a train of pulses unambiguous.
+"""The code on the sync line, which makes a train of pulses unambiguous.
 
 A regular train looks the same after a shift by one period, so a device that misses its first
-pulse would be aligned wrongly by one tick. Three codes say where in the train one is; which one a
-sync box sends is set by the rig file (`protocols.timing.Timing.code`):
+pulse would be aligned wrongly by one tick. Three codes mark the position within the train; the rig
+file sets which one the sync box sends (`protocols.timing.Timing.code`):
 
-* ``lfsr``: bits of a maximal linear-feedback shift register of 32 bits. A run of 32 comes again
-  after 4,294,967,295 ticks (497 days at 100 Hz), and every seed begins somewhere else: two trials
-  share no stretch (docs/decisions/0078).
-* ``irregular``: pulses at pseudo-random intervals, for a box that times pulses and knows no bits.
-* ``regular``: pulses at equal intervals after one long silence, the start marker, for a box that
-  can do nothing else. Only who sees the marker knows where he is.
+* ``lfsr``: bits of a maximal 32-bit linear-feedback shift register. A run of 32 bits repeats after
+  4,294,967,295 ticks (497 days at 100 Hz), and every seed starts at another position: two trials
+  share no sequence (docs/decisions/0078).
+* ``irregular``: pulses at pseudo-random intervals, for a box that generates intervals, not bits.
+* ``regular``: pulses at equal intervals after one long gap, the start marker, for a box that can
+  do nothing else. Only a device that records the marker can be aligned without ambiguity.
 
-The sync box, simulated ones and the check of its reports share this file; a fit needs no code.
+The driver, the fakes and the check of the box's reports use this module; a clock fit needs no code.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ import numpy.typing as npt
 from sliplab.protocols.timing import MARKER_TICKS, Code
 
 SEEDS = (1 << 32) - 2
-"""Seeds are 1 to this, whatever the code."""
+"""Largest seed of every code; the smallest is 1."""
 TAPS = (0, 1, 2, 22)
-"""Of the Fibonacci register x^32 + x^22 + x^2 + x + 1, which is primitive."""
+"""Taps of the Fibonacci register with the primitive polynomial x^32 + x^22 + x^2 + x + 1."""
 LONGEST_GAP_TICKS = 32
-"""No code is silent for longer from one pulse to the next, but for a board with an older code."""
+"""Longest gap between two pulses of any code; firmware with an older code may exceed it."""
 SHORTEST_TICKS, LONGEST_TICKS = 2, 9
-"""Intervals of the code `irregular`."""
+"""Shortest and longest interval of the code `irregular`."""
 REGULAR_TICKS = 2
-"""Between all later pulses of the code `regular`."""
+"""Interval between the later pulses of the code `regular`."""
 
 U8 = npt.NDArray[np.uint8]
 _WORD = (1 << 32) - 1
 _SPREAD = 2_654_435_761
 _FIRST_BITS = 1 << 12
-"""Bits that are made at first; more when they are needed."""
+"""Number of bits generated at first; more are generated on demand."""
 
 
 def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
-    """The first `n` bits of a code, one a tick, shape (n,), uint8: 1 is a pulse on that tick.
+    """Return the first `n` bits of a code, one per tick, shape (n,), uint8; 1 is a pulse.
 
-    ``lfsr``: the register begins as `seed` times 2654435761 modulo 2**32, so that small seeds do
-    not begin with silence. Each bit is the register's lowest one; then the register shifts down,
-    and the exclusive or of its taps comes in at the top.
+    ``lfsr``: the register starts as `seed` times 2654435761 modulo 2**32, so that small seeds do
+    not start with a long gap. Each bit is the lowest of the register, which then shifts right;
+    the exclusive or of its taps enters at the top.
 
     ``irregular``: a pulse on tick 0, then one after each interval in turn. Intervals are drawn by
-    a xorshift generator of 32 bits, here as a sync box has it in C (all unsigned, modulo 2**32)::
+    a 32-bit xorshift generator, shown here as in the sync box's C code (unsigned, modulo 2**32)::
 
         uint32_t x = seed * 2654435761u;
         uint32_t interval(void) {           // ticks to the next pulse, 2 to 9
@@ -58,8 +58,8 @@ def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
     ``regular``: pulses on the ticks 0, 16, 18, 20 and so on, whatever the seed.
 
     Args:
-        seed: 1 to 4,294,967,294 (a register in the state 0 would stay there for ever).
-        n: how many bits.
+        seed: 1 to 4,294,967,294 (a register in the state 0 would never leave it).
+        n: number of bits.
 
     Raises:
         ValueError: `seed` outside 1 to 4,294,967,294, or `n` negative.
@@ -72,14 +72,14 @@ def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
 
 
 class CodeBits:
-    """A code without an end, made as far as somebody asked."""
+    """An endless code, generated on demand."""
 
     def __init__(self, seed: int, code: Code = "lfsr") -> None:
         self._seed, self._code = seed, code
         self._made = code_bits(seed, _FIRST_BITS, code)
 
     def upto(self, ticks: int) -> U8:
-        """Return the bits of the first `ticks` ticks, uint8, and perhaps of more."""
+        """Return the bits of at least the first `ticks` ticks, uint8."""
         if ticks > len(self._made):
             self._made = code_bits(self._seed, 2 * ticks, self._code)
         return self._made

@@ -1,8 +1,8 @@
-"""One trial's motion that a watcher may cut short: the arm stops at a slip, or presses on.
+"""One trial's motion with a reflex: when slip is detected, the arm stops, or presses deeper.
 
-`Rig.run_trial` takes trials to be kept; here nothing is kept, and whoever reads the events may ask
-for a reflex by raising `SlipSeen` while the arm slides or retracts. The arm is stopped first, then
-all else is done. Whatever fails on the way ends as in any trial: stopped, and clear if healthy.
+`Rig.run_trial` records trials; here nothing is recorded. The watcher that reads the events triggers
+the reflex by raising `SlipDetected` while the arm slides or retracts. The arm is stopped before
+anything else. A failure ends as in any trial: the arm is stopped, and moved clear if healthy.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from sliplab.rigs.core.rig import Rig, arm_fault
 from sliplab.storage.streams import Sink
 
 ACTING = ("slide", "retract")
-"""The phases in which a reflex may act: those that this program itself moves the arm in."""
+"""Phases in which a reflex may act."""
 REST_S = 2.0
-"""The longest that a stopped arm takes to stand still, s."""
+"""Timeout for a stopped arm to come to rest, s."""
 
 
-class SlipSeen(Exception):
-    """A watcher saw slip and wants the reflex; only while it is armed."""
+class SlipDetected(Exception):
+    """A watcher detected slip and triggers the reflex; raised only while it is armed."""
 
 
 class Watcher(Sink, Protocol):
-    """A sink that looks at the events."""
+    """A sink that monitors the events."""
 
     armed: bool
-    """True while it may raise `SlipSeen`; set by the run."""
+    """True while it may raise `SlipDetected`; set by `run_watched`."""
 
     def step(self, phase: str, acting: bool) -> None:
-        """A step of the program begins."""
+        """Receive the start of a step of the program."""
 
 
 @dataclass(frozen=True)
 class Reflex:
-    """The arm's reaction when slip is seen.
+    """The arm's reaction to detected slip.
 
     Attributes:
-        kind: ``stop``, or ``press``: stop, and then press on by `press_mm` at `speed_mm_s`.
-        deepest_mm: no reflex goes deeper than this.
-        hold_s: how long the arm then stands and the stream is watched.
+        kind: ``stop``; or ``press``: stop, then press deeper by `press_mm` at `speed_mm_s`.
+        deepest_mm: largest depth of a reflex.
+        hold_s: time for which the arm then holds its position and the stream is monitored.
     """
 
     kind: Literal["stop", "press"]
@@ -57,10 +57,10 @@ class Reaction:
     """The outcome of a reflex; times on the rig's clock.
 
     Attributes:
-        phase: the motion that it cut short.
-        stop_ms: from when the slip was reported until the arm stood still.
-        stopped_mm: where it stood then: x, y, depth in plate coordinates.
-        depth_mm: its depth in the end.
+        phase: the interrupted phase.
+        stop_ms: time from the detection until the arm was at rest.
+        stopped_mm: position at which it came to rest: x, y, depth in plate coordinates.
+        depth_mm: final depth.
     """
 
     phase: str
@@ -72,17 +72,17 @@ class Reaction:
 def run_watched(
     rig: Rig, program: Program, watcher: Watcher, seed: int, rate_hz: int, reflex: Reflex | None
 ) -> Reaction | None:
-    """Move through a program while `watcher` reads the streams of its recorded steps.
+    """Run a program while `watcher` reads the streams of its recorded steps.
 
-    After a reflex the arm leaves the plate straight out from where it stands, and the rest of the
-    program follows.
+    After a reflex the arm leaves the plate straight out from its current position, and the rest of
+    the program follows.
 
     Args:
-        seed: of a simulated trial's randomness.
-        reflex: None where slip is only watched.
+        seed: seed of a simulated trial's randomness.
+        reflex: None to monitor slip without a reaction.
 
     Returns:
-        what the reflex did; None where there was none.
+        the outcome of the reflex; None if there was none.
 
     Raises:
         StopRequested: as `Rig.run_trial`.
@@ -100,14 +100,14 @@ def run_watched(
                 rig.stop_streams(watcher, False)
                 streaming = False
             if reaction is not None:
-                step = _from_where_it_stands(step, at)
+                step = _from_current_position(step, at)
             acting = isinstance(step, Move) and step.phase in ACTING and reflex is not None
             watcher.step(step.phase, acting)
             watcher.armed = acting
             try:
                 rig.take_step(index, step, at, watcher if streaming else None)
                 at = step_seconds(step, at)[1]
-            except SlipSeen:
+            except SlipDetected:
                 assert reflex is not None
                 reaction = _react(rig, step.phase, reflex, watcher)
                 at = rig.position()
@@ -124,14 +124,14 @@ def _react(rig: Rig, phase: str, reflex: Reflex, watcher: Watcher) -> Reaction:
     deadline = began_ns + int(REST_S * 1e9)
     while not (progress := rig.arm.progress()).done:
         if rig.clock.now_ns() > deadline:
-            raise ArmFault("arm", f"was told to stop and still moves after {REST_S:g} s")
+            raise ArmFault("arm", f"is still moving {REST_S:g} s after the stop command")
         rig.wait(min(rig.poll_s, 0.002))
     if not progress.state.healthy:
         raise arm_fault(progress.state, phase)
     stop_ms = (rig.clock.now_ns() - began_ns) / 1e6
     here = at = rig.position()
     if reflex.kind == "press":
-        # what is measured scatters about the command; the limit holds whatever it says
+        # measured depths scatter about the command; the limit applies all the same
         depth = min(at.depth_mm + reflex.press_mm, reflex.deepest_mm)
         if depth > at.depth_mm:
             at = Position(at.x_mm, at.y_mm, depth)
@@ -140,8 +140,8 @@ def _react(rig: Rig, phase: str, reflex: Reflex, watcher: Watcher) -> Reaction:
     return Reaction(phase, stop_ms, (here.x_mm, here.y_mm, here.depth_mm), rig.position().depth_mm)
 
 
-def _from_where_it_stands(step: Step, at: Position) -> Step:
-    """A step after a reflex: it was planned from the end of a motion that never came there."""
+def _from_current_position(step: Step, at: Position) -> Step:
+    """Adapt a step after a reflex: it was planned from the end of the interrupted motion."""
     if isinstance(step, Move) and step.phase == "release":
         return replace(step, to=Position(at.x_mm, at.y_mm, step.to.depth_mm))
     return step

@@ -1,8 +1,8 @@
-"""One rig: runs one trial's motion while its streams flow, and owns the ordered safe stop.
+"""One rig: runs one trial's motion while its streams are recorded, and performs the safe stop.
 
-The same code drives a simulated and a real rig: it knows only capabilities. On any failure the
-arm is stopped before anything else; it retracts only if it is healthy; nothing here unlocks a
-protective stop.
+The same code drives simulated and real rigs: it uses capabilities only. On any failure the arm is
+stopped before anything else; it retracts only if it is healthy; nothing here unlocks a protective
+stop.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from sliplab.rigs.core.capabilities import (
 )
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pulse_code import SEEDS
-from sliplab.rigs.core.touching import LOOK_S, QUIET_S, RateTouch, count_central
+from sliplab.rigs.core.touching import POLL_S, QUIET_S, RateTouch, count_central
 from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
-"""Time for which cameras are read after the last pulse, unless a rig says otherwise."""
+"""Default time for which cameras are read after the last pulse."""
 FORCE = "force"
 """Name of the force sensor's stream."""
 _MOVE_GRACE_S = 10.0
 _STOP_RETRIES = 10
-"""Retries of a stop that was interrupted."""
+"""Attempts at a stop that Ctrl-C interrupts."""
 
 
 class StopRequested(Exception):
-    """A person asked the rig to stop; the arm has been stopped."""
+    """A stop of the rig was requested; the arm has been stopped."""
 
 
 @dataclass(frozen=True)
 class TrialRun:
-    """The record of a trial besides its streams."""
+    """The record of a trial apart from its streams."""
 
     steps: tuple[tuple[StepTimes, bool], ...]
-    """Each step with its times, and whether it was recorded."""
+    """Each step's times, and True for a recorded step."""
     zero_mm: float
     truth: Json | None
     path: tuple[PathSegment, ...] = ()
@@ -69,18 +69,18 @@ class TrialRun:
 
 @dataclass
 class Rig:
-    """Arm, cameras, sync box and what else a trial needs.
+    """Arm, cameras, sync box and the other parts that a trial needs.
 
     Attributes:
-        poll_s: how often streams are read and stop requests looked at.
-        timing: which signal reaches which device, and so what else has to be read.
-        touch_mm: how deep the centre papilla is when touching off notices it.
-        centre_px: where the event camera sees that papilla; by default in its picture's centre.
-        tail_s: how long cameras are read after the last pulse: they send in blocks, and a busy
-            host is late to read them.
-        force: a sensor of force and torque; None costs nothing.
+        poll_s: period at which streams are read and stop requests checked.
+        timing: signals that reach each device, which decide what else must be read.
+        touch_mm: depth of the centre papilla when touching off detects it.
+        centre_px: that papilla in the event camera's image; by default the image centre.
+        tail_s: time for which cameras are read after the last pulse: they send in blocks, and a
+            busy host reads them late.
+        force: a force/torque sensor, or None.
         simulation: the world behind a simulated rig, None on a real one.
-        ending: called last when the rig is closed.
+        on_close: called last when the rig is closed.
     """
 
     name: str
@@ -100,14 +100,14 @@ class Rig:
     force: ForceSensor | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
-    ending: tuple[Callable[[], None], ...] = ()
+    on_close: tuple[Callable[[], None], ...] = ()
     _reported: str = field(default="", init=False)
-    """Failure of a stop that `safely` has raised already."""
+    """Text of the failed stop that `safely` has raised already."""
     _plate_uncaught: bool = field(default=False, init=False)
-    """The plate was let go and not caught: it hangs on the sensor, or falls."""
+    """True while the plate is released and not caught: it hangs on the sensor, or falls."""
 
     def connect(self) -> None:
-        """Connect sync box, arm and force sensor; cameras connect when they are built.
+        """Connect sync box, arm and force sensor; cameras connect on construction.
 
         Raises:
             RigError: one of them does not answer.
@@ -118,13 +118,13 @@ class Rig:
             self.force.connect()
 
     def close(self) -> None:
-        """Give every device back, the arm stopped first; safe to call more than once.
+        """Stop the arm, then close every device; safe to call more than once.
 
-        A device that fails must not stop the others from being closed.
+        A device that fails does not keep the others from being closed.
 
         Raises:
-            ArmFault: everything was given back, but the arm could not be seen to stand still.
-                Not raised again where `safely` has said the same.
+            ArmFault: everything is closed, but the arm could not be confirmed at rest. Not raised
+                again where `safely` has raised the same.
         """
         fault: RigError | None = None
         try:
@@ -134,7 +134,7 @@ class Rig:
                 with suppress(Exception):
                     if device is not None:
                         device.close()
-            for end in self.ending:
+            for end in self.on_close:
                 end()
         before = sys.exception()
         if fault is not None and str(fault) not in {self._reported, str(before)}:
@@ -142,10 +142,10 @@ class Rig:
             raise ArmFault("arm", f"{_text(fault)}{text}")
 
     def health(self) -> list[DeviceHealth]:
-        """Return the reports of the connected devices; simulated ones have none.
+        """Return the health reports of the connected devices; simulated devices have none.
 
         Raises:
-            RigError: one does not answer.
+            RigError: a device does not answer.
         """
         devices = (self.arm, self.events, self.frames, self.sync, self.force)
         return [device.health() for device in devices if device and hasattr(device, "health")]
@@ -170,7 +170,7 @@ class Rig:
         frame_px: tuple[int, int] | None,
         rate_hz: int,
     ) -> TrialRun:
-        """Run one trial; its recorded steps flow into `sink`.
+        """Run one trial; the streams of its recorded steps go to `sink`.
 
         Raises:
             StopRequested: `should_stop` became true; the arm is stopped and clear.
@@ -206,7 +206,7 @@ class Rig:
             return TrialRun(tuple(steps), self.plate_frame.zero_mm, truth, tuple(path))
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
-        """Warm the skin up: press at the plate's centre and let go, `times` times."""
+        """Warm up the skin: press at the plate's centre and release, `times` times."""
         home = Position(0.0, 0.0, -clearance_mm)
         with self.safely(home):
             self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
@@ -216,10 +216,10 @@ class Rig:
                 self.move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
 
     def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
-        """Find depth zero: creep in until the event rate says that the centre papilla touches.
+        """Find depth zero: creep in until the event rate shows that the centre papilla touches.
 
-        See `rigs.core.touching.RateTouch`. A skin is noticed only some way in: `touch_mm` of the
-        rig's calibration.
+        See `rigs.core.touching.RateTouch`. A touch is detected only after some indentation:
+        `touch_mm` of the rig's calibration.
 
         Args:
             search_mm: hard limit beyond the taught plane.
@@ -228,7 +228,7 @@ class Rig:
             The new depth zero in the taught frame, mm; the frame uses it from now on.
 
         Raises:
-            RigError: nothing was touched within `search_mm`.
+            RigError: no touch was detected within `search_mm`.
         """
         self.plate_frame = self.plate_frame.with_zero(0.0)
         start = Position(0.0, 0.0, -search_mm)
@@ -245,7 +245,7 @@ class Rig:
         return zero
 
     def listen(self, seconds: float, sink: Sink, rate_hz: int) -> None:
-        """Let events, poses and pulses flow into `sink` without moving anything."""
+        """Record events, poses and pulses to `sink` without moving anything."""
         if self.simulation is not None:
             self.simulation.begin_trial(0)
         with ExitStack() as stopping:
@@ -261,7 +261,7 @@ class Rig:
         target = Position(0.0, 0.0, search_mm)
         self.arm.start([Segment(self.plate_frame.pose(target), speed_mm_s)])
         while not self.arm.progress().done:
-            self.wait(LOOK_S)
+            self.wait(POLL_S)
             depth = self.plate_frame.position(self.arm.pose().xyz_mm).depth_mm
             if rate.touched(self.central_events()):
                 self.arm.stop()
@@ -271,21 +271,21 @@ class Rig:
             raise arm_fault(state, "touching off")
         raise RigError(
             "arm",
-            f"touching off met nothing within {search_mm:g} mm of the taught plane; "
+            f"touching off found no plate within {search_mm:g} mm of the taught plane; "
             "teach the contact plane again",
         )
 
     def central_events(self) -> int:
-        """New events where the event camera sees the centre papilla."""
+        """Read the events; return their number around the centre papilla."""
         size = self.events.width, self.events.height
         return count_central(self.events.read(), size, self.centre_px)
 
     def take_step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
-        """Carry out one step of a program from `at`, where the arm stands; inside `safely`.
+        """Carry out one step of a program from `at`, the arm's position; call it inside `safely`.
 
         Raises:
             StopRequested, ArmFault: as `move`.
-            RigError: the step moves a plate that this rig does not have.
+            RigError: the step moves a plate, and this rig has none.
         """
         start = self.arm.now_ns()
         if isinstance(step, Move):
@@ -301,11 +301,11 @@ class Rig:
         return StepTimes(index, step.phase, start, self.arm.now_ns())
 
     def move(self, step: Move, at: Position, sink: Sink | None = None) -> tuple[int, int]:
-        """Move from `at`, where the arm stands, and wait for the end; controller times, ns.
+        """Move from `at`, the arm's position, and wait for the end; return controller times, ns.
 
         Raises:
-            StopRequested: as `wait`; the arm still moves then, and `safely` stops it.
-            ArmFault: it stopped, or did not come to an end in time.
+            StopRequested: as `wait`; the arm is still moving then, and `safely` stops it.
+            ArmFault: the arm stopped, or did not finish in time.
         """
         start = self.arm.now_ns()
         seconds = at.distance_mm(step.to) / step.speed_mm_s
@@ -317,7 +317,7 @@ class Rig:
             if not progress.state.healthy:
                 raise arm_fault(progress.state, step.phase)
             if self.clock.now_ns() > deadline:
-                raise ArmFault("arm", f"did not end the phase '{step.phase}' in time")
+                raise ArmFault("arm", f"did not finish the phase '{step.phase}' in time")
             left = seconds - (self.arm.now_ns() - start) / 1e9
             self.wait(min(self.poll_s, max(left, 1e-3)), sink)
         if not progress.state.healthy:
@@ -327,7 +327,7 @@ class Rig:
         return progress.finished[-1]
 
     def wait(self, seconds: float, sink: Sink | None = None) -> None:
-        """Let time pass in polls; streams are read and stop requests looked at in each.
+        """Let time pass; read streams and check for stop requests every `poll_s`.
 
         Raises:
             StopRequested: `should_stop` became true.
@@ -341,22 +341,22 @@ class Rig:
                 raise StopRequested
 
     def start_streams(self, seed: int, rate_hz: int, with_frames: bool) -> None:
-        """Begin to stream; what came before is dropped. Raises RigError."""
+        """Start the streams; earlier data are discarded. Raises RigError."""
         self.arm.read_poses()
         self.arm.read_pulses()
         self.events.start()
         if self.force is not None:
             self.force.start()
-        by_itself = with_frames and self.timing.frames == "exposure line"
-        if with_frames and not by_itself:
+        free_running = with_frames and self.timing.frames == "exposure line"
+        if with_frames and not free_running:
             self.frames.start()
         self.sync.start(rate_hz, seed % SEEDS + 1, self.timing.code)
-        if by_itself:
-            # the box must stamp every exposure, the first one too
+        if free_running:
+            # the box must be running to stamp the first exposure too
             self.frames.start()
 
     def stop_streams(self, sink: Sink, with_frames: bool) -> None:
-        """Stop the pulses, and read what the cameras still hold before and after they stop.
+        """Stop the pulses, and read the data that cameras still hold before and after they stop.
 
         Events later than `tail_s` after the motion are discarded; late pulses and frames are read.
         """
@@ -390,9 +390,9 @@ class Rig:
             sink.add_stream(FORCE, self.force.read())
 
     def begin_trial(self, home: Position, seed: int) -> None:
-        """Move to the start position, then let a simulation draw its random values.
+        """Move to the start position, then let the simulation draw its random values.
 
-        There the sensor is clear of the plate, and a force sensor takes its load for zero.
+        The sensor is clear of the plate there, so a force sensor is zeroed.
         """
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:
@@ -407,16 +407,16 @@ class Rig:
         return PathSegment(times.start_ns, times.end_ns, *places, speed)
 
     def position(self) -> Position:
-        """Return where the tool centre point is now, in plate coordinates."""
+        """Return the current tool centre point in plate coordinates."""
         return self.plate_frame.position(self.arm.pose().xyz_mm)
 
     @contextmanager
     def safely(self, clear: Position) -> Iterator[None]:
-        """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras.
+        """Stop on any exception inside: stop the arm, retract it if healthy, stop the cameras.
 
-        A device that fails while it is stopped does not keep the others from being stopped. Then
-        what went wrong first is raised; but an arm that could not be stopped or moved clear, and a
-        plate that nobody has caught, are always reported.
+        A device that fails to stop does not keep the others from being stopped. The first error is
+        raised; but an arm that could not be stopped or moved clear, and a plate that was not
+        caught, are always reported.
         """
         try:
             yield
@@ -439,14 +439,14 @@ class Rig:
             raise
 
     def _with_plate_warning(self, error: RigError) -> RigError:
-        """The same error, with a word on a plate that nobody has caught."""
+        """Return the error with a warning if the plate was released and not caught."""
         if not self._plate_uncaught:
             return error
-        text = f"{_text(error)}. The plate was let go and nobody has caught it: catch it first"
+        text = f"{_text(error)}. The plate was released and not caught: catch it first"
         return ArmFault("arm", text) if error.device == "arm" else RigError(error.device, text)
 
     def _stop_arm(self) -> RigError | None:
-        """Stop the arm; why that could not be done or seen, None if it stands still.
+        """Stop the arm; return None once it is at rest, else the error.
 
         A second Ctrl-C must not interrupt the stop.
         """
@@ -458,15 +458,15 @@ class Rig:
             except RigError as fault:
                 return fault
             except Exception as error:
-                return ArmFault("arm", f"could not be stopped: {error!r}; look at the arm")
+                return ArmFault("arm", f"could not be stopped: {error!r}; check the arm")
             return None
-        return ArmFault("arm", "was not seen to stand still: its stop was interrupted")
+        return ArmFault("arm", "could not be confirmed at rest: its stop was interrupted")
 
     def _retract(self, clear: Position) -> RigError | None:
-        """Straight out along the plate's normal, only with a healthy arm, bounded in time.
+        """Retract straight out along the plate's normal if the arm is healthy, bounded in time.
 
         Returns:
-            Why a healthy arm did not come clear; it has been stopped then.
+            the error if a healthy arm did not come clear, in which case it has been stopped.
         """
         try:
             if not self.arm.state().healthy:
@@ -494,7 +494,7 @@ class Rig:
 
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:
-    """Return the error for an arm's state, with the action that a person must take."""
+    """Return the error for an arm's state, with the action that the operator must take."""
     lost = state is ArmState.DISCONNECTED
     where = "the arm may still move" if lost else "the arm stays where it is"
     return ArmFault(

@@ -1,7 +1,7 @@
-"""Motions that teach a rig where its plate is: touches, and what a person jogs by hand.
+"""Motions that teach a rig where its plate is: automatic touches, and poses jogged by hand.
 
-Every motion here ends by itself, has a hard limit beyond which the arm never goes, and looks at
-stop requests every 10 ms; whatever goes wrong, the arm is stopped before anything else.
+Every motion here is bounded in time, has a hard limit beyond which the arm never goes, and checks
+for stop requests every 10 ms. On any failure the arm is stopped before anything else.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
-from sliplab.rigs.core.touching import LOOK_S, QUIET_S, MarkerTouch, RateTouch
+from sliplab.rigs.core.touching import POLL_S, QUIET_S, MarkerTouch, RateTouch
 from sliplab.storage.streams import FrameChunk
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 MarkerFinder = Callable[[FrameChunk], F64]
-"""From frames to column and row of every marker, the centre's first, (k, m, 2), NaN where lost."""
+"""Maps frames to column and row of every marker, the centre's first, (k, m, 2), NaN if lost."""
 
 FRAMES_HZ = 100
 APPROACH_MM_S = 5.0
-"""From clear of the plate to where creeping begins; events are watched on the way."""
-MOST_CREEP_MM_S = 1.0
-ASLANT = 0.1
-"""Sideways motion of an oblique path for each mm in."""
-_UNTRUE = {ArmState.PROTECTIVE_STOP, ArmState.EMERGENCY_STOP, ArmState.DISCONNECTED}
-_APPROACH_LOOK_S = 0.05
+"""Speed from clear of the plate to where creeping begins; events are monitored meanwhile."""
+MAX_CREEP_MM_S = 1.0
+OBLIQUE_SLOPE = 0.1
+"""Lateral motion of an oblique approach per mm of depth."""
+_POSE_INVALID = {ArmState.PROTECTIVE_STOP, ArmState.EMERGENCY_STOP, ArmState.DISCONNECTED}
+_APPROACH_POLL_S = 0.05
 _GRACE_S = 5.0
-_OVER_MM = 0.05
-"""Distance beyond its limit at which the arm is stopped; poses are noisy."""
+_OVERTRAVEL_MM = 0.05
+"""Distance beyond the limit at which the arm is stopped, because measured poses are noisy."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Creep:
     """Parameters of the search for a touch.
 
     Attributes:
-        speed_mm_s: creeping speed, at most `MOST_CREEP_MM_S`.
+        speed_mm_s: creeping speed, at most `MAX_CREEP_MM_S`.
         search_mm: hard limit beyond the plane that the rig assumes.
-        clearance_mm: how far before that plane creeping begins.
-        after_mm: how much farther it may go, within the limit, after events have shown a touch
-            and the markers, which are looked at, have not.
+        clearance_mm: distance before that plane at which creeping begins.
+        after_mm: when the markers decide, the distance that the arm may still go, within the
+            limit, once events have shown a touch and the markers have not.
     """
 
     speed_mm_s: float = 0.5
@@ -56,12 +56,12 @@ class Creep:
     after_mm: float = 0.3
 
     def __post_init__(self) -> None:
-        """Raises ValueError where a number is not positive or creeping would not be creeping."""
+        """Raise ValueError if a number is not positive or the speed is too high for creeping."""
         numbers = (self.speed_mm_s, self.search_mm, self.clearance_mm, self.after_mm)
         if not all(0.0 < number < 1e3 for number in numbers):
             raise ValueError("creeping speed and distances must be more than 0")
-        if self.speed_mm_s > MOST_CREEP_MM_S:
-            raise ValueError(f"a creeping speed is at most {MOST_CREEP_MM_S:g} mm/s")
+        if self.speed_mm_s > MAX_CREEP_MM_S:
+            raise ValueError(f"the creeping speed must be at most {MAX_CREEP_MM_S:g} mm/s")
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class Touch:
     """One touch at (x, y) of the assumed plane; depths in mm from it into the plate.
 
     Attributes:
-        depth_mm: of the surface; by event rate `touch_mm` of the rig is taken off.
-        deepest_mm: how deep the arm went.
+        depth_mm: depth of the surface; `touch_mm` of the rig is subtracted where events decided.
+        deepest_mm: greatest depth that the arm reached.
     """
 
     x_mm: float
@@ -82,26 +82,26 @@ class Touch:
 def touch(
     rig: Rig, x_mm: float, y_mm: float, creep: Creep, seed: int, find: MarkerFinder | None = None
 ) -> Touch:
-    """Touch the plate once at (x, y) of the plane that the rig assumes, and let go.
+    """Touch the plate once at (x, y) of the plane that the rig assumes, and retract.
 
-    Out along the plate's normal, across, in at `APPROACH_MM_S` to `clearance_mm` before the plane
-    and at creeping speed from there, until the touch is noticed, or to `search_mm` beyond the
-    plane, where the arm's path ends. Without `find` a touch is noticed by event rate, on a path
-    straight in. With it by the motion of markers, on a path that goes aslant: then a papilla that
-    holds on to the plate stays behind the free ones.
+    The arm moves out along the plate's normal, then across, then in at `APPROACH_MM_S` to
+    `clearance_mm` before the plane. From there it creeps until a touch is detected, or to
+    `search_mm` beyond the plane, where its path ends. Without `find` the event rate shows the
+    touch, and the path goes straight in. With `find` the motion of the markers shows it, on an
+    oblique path: a papilla that sticks to the plate then stays behind the free ones.
 
     Args:
-        seed: what a simulated rig draws its randomness from.
+        seed: seed of a simulated rig's randomness.
         find: finds the markers in frames of the outside camera.
 
     Raises:
         StopRequested: `rig.should_stop` became true; the arm is stopped and clear.
-        RigError: nothing was noticed within the limit, something was met before creeping began,
+        RigError: no touch was detected within the limit, contact was made before creeping began,
             or a device failed; the arm is stopped, and clear if it is healthy.
     """
-    aslant = 0.0 if find is None else ASLANT
-    clear = Position(x_mm - aslant * creep.clearance_mm, y_mm, -creep.clearance_mm)
-    deepest = Position(x_mm + aslant * creep.search_mm, y_mm, creep.search_mm)
+    slope = 0.0 if find is None else OBLIQUE_SLOPE
+    clear = Position(x_mm - slope * creep.clearance_mm, y_mm, -creep.clearance_mm)
+    deepest = Position(x_mm + slope * creep.search_mm, y_mm, creep.search_mm)
     with rig.safely(clear):
         at = rig.position()
         out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
@@ -110,13 +110,13 @@ def touch(
         rig.move(Move("across", across, RETRACT_SPEED_MM_S), out)
         if rig.simulation is not None:
             rig.simulation.begin_trial(seed)
-        # on any failure it is left to `safely` to stop them: the arm comes first
+        # on any failure `safely` stops the streams, after the arm
         _start(rig, seed, find is not None)
         rig.wait(QUIET_S)
         rate = RateTouch(rig.central_events())
         _approach(rig, across, clear, rate)
-        watch = _Watch(rig, creep, rate, find)
-        _creep(rig, clear, deepest, watch)
+        detector = _TouchDetector(rig, creep, rate, find)
+        _creep(rig, clear, deepest, detector)
         for device in (rig.events, rig.frames, rig.sync):
             with suppress(RigError):
                 device.stop()
@@ -124,41 +124,41 @@ def touch(
         rig.move(
             Move("release", Position(at.x_mm, at.y_mm, clear.depth_mm), RETRACT_SPEED_MM_S), at
         )
-    if watch.touched_mm is None:
-        raise watch.nothing()
-    return Touch(x_mm, y_mm, watch.touched_mm, watch.deepest_mm)
+    if detector.touched_mm is None:
+        raise detector.not_found()
+    return Touch(x_mm, y_mm, detector.touched_mm, detector.deepest_mm)
 
 
 def _start(rig: Rig, seed: int, with_frames: bool) -> None:
     rig.events.start()
     if not with_frames:
         return
-    by_itself = rig.timing.frames == "exposure line"
-    if not by_itself:
+    free_running = rig.timing.frames == "exposure line"
+    if not free_running:
         rig.frames.start()
     rig.sync.start(FRAMES_HZ, seed % SEEDS + 1, rig.timing.code)
-    if by_itself:
+    if free_running:
         rig.frames.start()
 
 
 def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None:
-    """In to where creeping begins, faster; whatever is met on the way ends it."""
-    way = begin.distance_mm(end)
-    if way == 0.0:
+    """Move fast to where creeping begins; contact before that is an error."""
+    distance = begin.distance_mm(end)
+    if distance == 0.0:
         return
     rig.arm.start([Segment(rig.plate_frame.pose(end), APPROACH_MM_S)])
-    deadline = rig.clock.now_ns() + int((2 * way / APPROACH_MM_S + _GRACE_S) * 1e9)
+    deadline = rig.clock.now_ns() + int((2 * distance / APPROACH_MM_S + _GRACE_S) * 1e9)
     while not (progress := rig.arm.progress()).done:
         if rig.clock.now_ns() > deadline:
-            raise ArmFault("arm", "did not come near the plate in time")
-        rig.wait(_APPROACH_LOOK_S)
+            raise ArmFault("arm", "did not finish its approach to the plate in time")
+        rig.wait(_APPROACH_POLL_S)
         if rig.central_events() > rate.limit:
             rig.arm.stop()
             depth = rig.position().depth_mm
             raise RigError(
                 "arm",
-                f"met something {-depth:.1f} mm before the plane that the rig assumes, where it "
-                "was not creeping yet: begin farther away (--clearance), or teach by hand",
+                f"made contact {-depth:.1f} mm before the plane that the rig assumes, during the "
+                "fast approach: begin farther away (--clearance), or teach by hand",
             )
     if not progress.state.healthy:
         raise arm_fault(progress.state, "approach")
@@ -166,8 +166,8 @@ def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None
         raise ArmFault("arm", f"was stopped from outside, at {rig.position().depth_mm:.2f} mm")
 
 
-class _Watch:
-    """Looks for a touch while the arm creeps, and knows how deep it may go."""
+class _TouchDetector:
+    """Detects a touch while the arm creeps, and holds the depth limit."""
 
     def __init__(self, rig: Rig, creep: Creep, rate: RateTouch, find: MarkerFinder | None) -> None:
         self._rig, self._creep, self._rate, self._find = rig, creep, rate, find
@@ -175,13 +175,13 @@ class _Watch:
         self._host_ns: list[int] = []
         self._depth_mm: list[float] = []
         self._by_events_mm: float | None = None
-        self._limit_mm = creep.search_mm + _OVER_MM
+        self._limit_mm = creep.search_mm + _OVERTRAVEL_MM
         self.speed_mm_s = creep.speed_mm_s
         self.deepest_mm = -creep.clearance_mm
         self.touched_mm: float | None = None
 
-    def look(self) -> bool:
-        """Look once; whether creeping is over."""
+    def poll(self) -> bool:
+        """Read the streams once; return whether creeping is over."""
         rig = self._rig
         depth = rig.position().depth_mm
         self.deepest_mm = max(self.deepest_mm, depth)
@@ -200,67 +200,67 @@ class _Watch:
                 self.touched_mm = float(np.interp(when, self._host_ns, self._depth_mm))
         return self.touched_mm is not None or depth > self._limit_mm
 
-    def nothing(self) -> RigError:
-        """Return the error that says why nothing was found."""
+    def not_found(self) -> RigError:
+        """Return the error that says why no touch was found."""
         if self._by_events_mm is not None:
             return RigError(
                 "frame camera",
-                f"saw no marker move up to {self.deepest_mm:.3f} mm, but events told of a touch "
-                f"at {self._by_events_mm:.3f} mm: does it see the centre marker? (--by events "
-                "does without)",
+                f"saw no marker move up to {self.deepest_mm:.3f} mm, but events showed a touch "
+                f"at {self._by_events_mm:.3f} mm: check that the centre marker is in view, or use "
+                "--by events",
             )
-        if self.deepest_mm < self._creep.search_mm - _OVER_MM:
+        if self.deepest_mm < self._creep.search_mm - _OVERTRAVEL_MM:
             return ArmFault("arm", f"was stopped from outside, at {self.deepest_mm:.2f} mm")
         return RigError(
             "arm",
-            f"met nothing within the hard limit of {self._creep.search_mm:g} mm beyond the plane "
-            "that the rig assumes, and has gone back: teach by hand, or allow more (--search)",
+            f"found no plate within the hard limit of {self._creep.search_mm:g} mm beyond the "
+            "assumed plane, and has retracted: teach by hand, or allow more (--search)",
         )
 
 
-def _creep(rig: Rig, clear: Position, deepest: Position, watch: _Watch) -> None:
-    seconds = clear.distance_mm(deepest) / watch.speed_mm_s
-    rig.arm.start([Segment(rig.plate_frame.pose(deepest), watch.speed_mm_s)])
+def _creep(rig: Rig, clear: Position, deepest: Position, detector: _TouchDetector) -> None:
+    seconds = clear.distance_mm(deepest) / detector.speed_mm_s
+    rig.arm.start([Segment(rig.plate_frame.pose(deepest), detector.speed_mm_s)])
     deadline = rig.clock.now_ns() + int((2 * seconds + _GRACE_S) * 1e9)
     while not rig.arm.progress().done:
-        rig.wait(LOOK_S)
-        if watch.look():
+        rig.wait(POLL_S)
+        if detector.poll():
             break
         if rig.clock.now_ns() > deadline:
-            raise ArmFault("arm", "did not end creeping in time")
+            raise ArmFault("arm", "did not finish creeping in time")
     rig.arm.stop()
     state = rig.arm.state()
-    if not state.healthy:  # a stopped arm touched nothing, but the plane is not to blame
+    if not state.healthy:  # a stopped arm finds no plate, though the taught plane may be right
         raise arm_fault(state, "creeping")
 
 
-def jogged(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
-    """Poses to which a person jogs the arm, one a prompt.
+def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
+    """Ask the operator to jog the arm, and return the pose after each prompt.
 
     Args:
-        prompts: what to do, and the word that says that it is done.
+        prompts: the instruction, and the word that confirms it.
 
     Raises:
-        StopRequested: the person said stop, or `rig.should_stop` became true.
-        RigError: the arm moves while it should stand, was stopped, or does not answer.
+        StopRequested: the operator said stop, or `rig.should_stop` became true.
+        RigError: the arm moves while it should be at rest, was stopped, or does not answer.
     """
     poses = []
     for prompt, word in prompts:
         if not rig.operator.ask("jog", prompt, word) or rig.should_stop():
             raise StopRequested
         state = rig.arm.state()
-        if state in _UNTRUE:  # others, such as local control, only keep it from being commanded
+        if state in _POSE_INVALID:  # in others, such as local control, the pose is still right
             raise arm_fault(state, word)
         pose = rig.arm.pose()
         rig.wait(0.2)
         if not np.allclose(rig.arm.pose().xyz_mm, pose.xyz_mm, atol=0.05):
-            raise RigError("arm", f"still moves after '{word}': let it stand, then confirm")
+            raise RigError("arm", f"is still moving after '{word}': let it stop, then confirm")
         poses.append(pose)
     return poses
 
 
-def look(rig: Rig, seconds: float = 0.3) -> FrameChunk:
-    """Frames of the outside camera while nothing moves; the region has to be set before.
+def grab_frames(rig: Rig, seconds: float = 0.3) -> FrameChunk:
+    """Return frames of the outside camera while nothing moves; set the camera's region first.
 
     Raises:
         RigError: no frame came.
@@ -279,15 +279,17 @@ def look(rig: Rig, seconds: float = 0.3) -> FrameChunk:
                 device.stop()
     chunks = [chunk for chunk in chunks if len(chunk)]
     if not chunks:
-        raise RigError("frame camera", f"gave no frame in {seconds:g} s")
+        raise RigError("frame camera", f"delivered no frame within {seconds:g} s")
     return chunks[-1]
 
 
-def stir(rig: Rig, depth_mm: float, radius_mm: float, speed_mm_s: float, seed: int) -> I64:
-    """Press the skin at the plate's centre and move it in a circle, once either way round.
+def press_in_circles(
+    rig: Rig, depth_mm: float, radius_mm: float, speed_mm_s: float, seed: int
+) -> I64:
+    """Press the skin at the plate's centre and move it in a circle, once in each direction.
 
     Returns:
-        events of each pixel in the first round and in the second, (2, height, width).
+        events per pixel in the first circle and in the second, (2, height, width).
 
     Raises:
         StopRequested, RigError: as `touch`.
@@ -308,9 +310,9 @@ def stir(rig: Rig, depth_mm: float, radius_mm: float, speed_mm_s: float, seed: i
         rig.wait(1.0)
         rig.events.start()
         at = middle
-        for number, way in enumerate((ring, ring[::-1])):
-            for place in (*way, middle):
-                rig.move(Move("stir", place, speed_mm_s), at)
+        for number, circle in enumerate((ring, ring[::-1])):
+            for place in (*circle, middle):
+                rig.move(Move("circle", place, speed_mm_s), at)
                 at = place
                 chunk = rig.events.read()
                 np.add.at(count[number], (chunk.y, chunk.x), 1)

@@ -1,7 +1,7 @@
-"""The common part of the drivers of real arms: a thread follows a path and notes its progress.
+"""Common parts of the drivers of real arms: a thread follows a path and records its progress.
 
-A driver brings its own connection, its own way to send a path and its own ways to stop. What it
-says of a path while it runs, and what becomes of one that fails, is the same for all.
+Each driver has its own connection, and its own means to send a path and to stop. How progress is
+reported and how a failed path ends are the same for all drivers.
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ from sliplab.rigs.core.pose_stream import PoseStream
 from sliplab.storage.streams import PoseChunk, PulseChunk
 
 LEFT_MM = 0.001
-"""A segment has begun once the tool centre point is this far from where it stood."""
+"""Distance from its rest position at which the tool centre point has begun a segment."""
 NEAR_MM = 0.05
 """Largest distance from its target at which a segment may end."""
 REST_SHARE = 0.02
-"""Below this share of its speed, near its target, a segment has ended."""
+"""Share of its speed below which a segment, near its target, has ended."""
 _LEFT_DEG, _NEAR_DEG = 0.001, 0.1
 
 
 @dataclass
 class Run:
-    """A path that was started; before the first one there is an empty one that is done."""
+    """One run of a path; before the first, an empty run that is done."""
 
     path: Sequence[Segment]
     finished: list[tuple[int, int]] = field(default_factory=list)
     """Start and end of finished segments, controller clock in ns."""
     done: bool = False
     cancelled: bool = False
-    """Somebody asked for a stop."""
+    """True once a stop was requested."""
     error: ArmFault | None = None
-    """Reason for which the path was given up, where the arm's state does not show it."""
+    """Reason why the path was aborted, where the arm's state does not show it."""
     thread: threading.Thread | None = None
 
     def progress(self, state: ArmState) -> Progress:
-        """Return how far it has come.
+        """Return the progress of the path.
 
         Raises:
-            ArmFault: it was given up for a reason that `state` does not say: the arm is healthy, or
-                its program was ended because of that reason.
+            ArmFault: the path was aborted for a reason that `state` does not show: the arm is
+                healthy, or its program was ended for that reason.
         """
         if self.error is not None and (state.healthy or state is ArmState.NOT_RUNNING):
             raise self.error
         return Progress(state, tuple(self.finished), self.done)
 
     def join(self, within_s: float) -> None:
-        """Wait for its thread to end, unless that thread itself asks."""
+        """Wait for the path's thread to end; returns at once in that thread itself."""
         if self.thread is not None and self.thread is not threading.current_thread():
             self.thread.join(within_s)
 
@@ -61,26 +61,25 @@ class Run:
 class ThreadedArm(ABC):
     """A base for drivers of arms that follow a path in a thread of their own.
 
-    A subclass has `state`, and follows a path in `_follow_path` and gives one up in
-    `_give_up`.
+    A subclass implements `state`, `_follow_path` and `_abort`.
     """
 
     def __init__(self, limits: Limits) -> None:
         self._guard = Guard(limits)
         self._stream = PoseStream()
         self._lost: str | None = "not connected"
-        """Reason for which the arm cannot be reached; None while it can."""
+        """Reason why the arm cannot be reached; None while it can."""
         self._run = Run((), done=True)
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Return the arm's state; never waits."""
+        """Return the arm's state without waiting."""
 
     def progress(self) -> Progress:
-        """Return how far the path has come.
+        """Return the progress of the path.
 
         Raises:
-            ArmFault: the path was given up for a reason that `state` does not tell.
+            ArmFault: the path was aborted for a reason that `state` does not show.
         """
         return self._run.progress(self.state())
 
@@ -93,38 +92,38 @@ class ThreadedArm(ABC):
         return self._stream.read_pulses()
 
     def _begin(self, run: Run) -> None:
-        """Follow a path from now on, in a thread of its own."""
+        """Start the thread that follows a path."""
         run.thread = threading.Thread(target=self._follow, args=(run,), daemon=True)
         run.thread.start()
 
     def _follow(self, run: Run) -> None:
-        """A path's thread; one that dies must not look like a stop from outside."""
+        """Run a path's thread; an exception in it must not look like a stop from outside."""
         try:
             self._follow_path(run)
         except Exception as error:
-            given_up = ArmFault("arm", f"its path was given up: {error!r}")
-            run.error = error if isinstance(error, ArmFault) else given_up
-            self._give_up()
+            aborted = ArmFault("arm", f"its path was aborted: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else aborted
+            self._abort()
         finally:
             run.done = True
-            self._path_is_over()
+            self._on_path_end()
 
     @abstractmethod
     def _follow_path(self, run: Run) -> None:
-        """Wait for each segment to end, and note it in `run.finished`. May raise anything."""
+        """Wait for each segment to end, and append it to `run.finished`. May raise anything."""
 
     @abstractmethod
-    def _give_up(self) -> None:
-        """Stop what nobody follows any more."""
+    def _abort(self) -> None:
+        """Stop the arm, whose path is no longer followed."""
 
-    def _path_is_over(self) -> None:
-        """Wake whoever waits for poses: the path's thread has come to its end."""
+    def _on_path_end(self) -> None:
+        """Wake the threads that wait for poses: the path's thread is ending."""
         self._stream.wake()
 
     def _refuse(self, path: Sequence[Segment], moving: bool) -> None:
-        """Raise RigError for an empty path, or for one that comes too early."""
+        """Raise RigError if the path is empty or the arm is still moving."""
         if not path:
-            raise RigError("arm", "was given an empty path")
+            raise RigError("arm", "received an empty path")
         if moving:
             raise RigError("arm", "is still moving; wait for its path to end, or stop it")
 
@@ -134,14 +133,14 @@ class ThreadedArm(ABC):
 
 
 class SegmentWatch:
-    """Tells when each segment of a path began and ended, from the pose stream alone.
+    """Detects start and end of each segment of a path from the pose stream alone.
 
-    For controllers that do not say so themselves: commanded poses are exact, so leaving a place and
-    coming to rest at another one can be seen to a sample.
+    For controllers that do not report them: commanded poses are exact, so departure from one
+    position and rest at the next can be seen to a sample.
 
     Args:
-        begin: where the arm stands.
-        path: its segments, each from rest to rest.
+        begin: pose of the arm at rest before the path.
+        path: segments, each from rest to rest.
     """
 
     def __init__(self, begin: Pose, path: Sequence[Segment]) -> None:
@@ -160,8 +159,8 @@ class SegmentWatch:
         """True once the arm has left the start of the path."""
         return self._count > 0 or self._start_ns is not None
 
-    def see(self, t_ns: int, pose: Pose) -> tuple[int, int] | None:
-        """Take one sample; start and end of the segment that has ended with it, if one has."""
+    def add(self, t_ns: int, pose: Pose) -> tuple[int, int] | None:
+        """Add one sample; return start and end of the segment that ended with it, if any."""
         before, self._before = self._before, (t_ns, pose)
         if self.done or before is None or t_ns <= before[0]:
             return None
@@ -180,10 +179,10 @@ class SegmentWatch:
 
 
 def is_at(pose: Pose, target: Pose) -> bool:
-    """Return whether a pose is as close to a target as a segment that has ended."""
+    """Return whether a pose is close enough to a target for a segment to have ended."""
     return distance_mm(pose, target) <= NEAR_MM and angle_deg(pose, target) <= _NEAR_DEG
 
 
 def has_left(begin: Pose, pose: Pose) -> bool:
-    """Return whether a pose is another one than where the arm stood."""
+    """Return whether a pose differs from the pose at rest, `begin`."""
     return distance_mm(begin, pose) > LEFT_MM or angle_deg(begin, pose) > _LEFT_DEG

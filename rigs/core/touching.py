@@ -1,7 +1,7 @@
-"""The moment of touching the plate: by the rate of events, or by the centre marker's motion.
+"""Detection of the touch on the plate: from the event rate, or from the centre marker's motion.
 
-Both look while the arm creeps in. The event camera sees the centre papilla's image change; the
-outside camera sees that its white top no longer goes where all the others go.
+Both work while the arm creeps in. The event camera sees the image of the centre papilla change; the
+outside camera sees its white tip stop moving with the others.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from sliplab.storage.streams import EventChunk
 F64 = npt.NDArray[np.float64]
 
 TOUCH_HALF_PX = 30
-"""Half the side of the square in which touching off looks for the centre papilla."""
+"""Half the side of the square around the centre papilla in which events are counted."""
 QUIET_S = 0.5
-"""Time for which the arm stands still to measure the noise."""
-LOOK_S = 0.01
+"""Time for which the arm is at rest to measure the noise."""
+POLL_S = 0.01
 """Period of the checks during the slow approach."""
 
 
 def count_central(
     chunk: EventChunk, size_px: tuple[int, int], centre_px: tuple[float, float] | None
 ) -> int:
-    """Events within `TOUCH_HALF_PX` of where the centre papilla is seen.
+    """Count events within `TOUCH_HALF_PX` of the centre papilla's image.
 
     Args:
         size_px: width and height of the event camera.
-        centre_px: column and row; None: the picture's centre.
+        centre_px: column and row; None: the image centre.
     """
     column, row = centre_px or (size_px[0] // 2, size_px[1] // 2)
     x, y = np.abs(chunk.x - np.float64(column)), np.abs(chunk.y - np.float64(row))
@@ -39,42 +39,42 @@ def count_central(
 
 
 class RateTouch:
-    """A touch by events round the centre papilla.
+    """Detects a touch from the events around the centre papilla.
 
-    The count in `QUIET_S` of standing still is the noise; a touch is a count in 50 ms above its
-    mean by eight standard deviations (Poisson) and ten events.
+    The noise is the count in `QUIET_S` at rest; a touch is a count in 50 ms above the noise mean by
+    eight standard deviations (Poisson) plus ten events.
     """
 
     LATE_S: ClassVar[float] = 0.025
-    """From the middle of those 50 ms to their end, when the touch is noticed."""
+    """Delay from the middle of those 50 ms to their end, when the touch is detected."""
 
     def __init__(self, quiet: int) -> None:
-        """`quiet`: central events in `QUIET_S`."""
+        """Set the limit from `quiet`, the number of central events in `QUIET_S`."""
         mean = quiet * 0.1  # per 50 ms
         self.limit = mean + 8 * mean**0.5 + 10
         self._recent: deque[int] = deque(maxlen=5)
 
     def touched(self, count: int) -> bool:
-        """Return whether the last 50 ms, with `count` events in the last `LOOK_S`, are a touch."""
+        """Return whether the last 50 ms, with `count` events in the last `POLL_S`, are a touch."""
         self._recent.append(count)
         return sum(self._recent) > self.limit
 
 
 class MarkerTouch:
-    """A touch by the centre marker: it leaves the others, or it appears.
+    """Detects a touch from the centre marker: it departs from the others, or it appears.
 
-    What all markers do together (the arm's sway, its tremor, a camera that is knocked) is the
-    median of the others' shifts, and is taken away. What is left of the centre marker's way is
-    foretold by a straight line through the frames before; a touch is `RUN` frames in a row that
-    are off it by eight standard deviations, and by `LEAST_PX`. A centre marker that was never
-    seen in the first `HISTORY` frames touches with the first of `RUN` frames that show it.
+    The common motion of all markers (sway or tremor of the arm, a knocked camera) is the median of
+    the others' shifts, and is subtracted. A straight line through earlier frames predicts the rest
+    of the centre marker's motion; a touch is `RUN` consecutive frames that are off this line by
+    eight standard deviations, and by `MIN_PX`. A centre marker that was not visible in the first
+    `HISTORY` frames touches at the first of `RUN` frames that show it.
     """
 
     RUN: ClassVar[int] = 3
     HISTORY: ClassVar[int] = 40
     SKIP: ClassVar[int] = 10
-    """Latest frames that the line leaves out: a slow beginning must not bend it."""
-    LEAST_PX: ClassVar[float] = 0.05
+    """Number of latest frames that the fit leaves out, lest a slow onset bias it."""
+    MIN_PX: ClassVar[float] = 0.05
     KEPT: ClassVar[int] = 200
 
     def __init__(self) -> None:
@@ -87,21 +87,21 @@ class MarkerTouch:
         self._seen = 0
 
     def add(self, markers_px: F64, host_ns: npt.NDArray[np.int64]) -> int | None:
-        """Look at frames; the host time of the first one of a touch, or None.
+        """Add frames; return the host time of the first frame of a touch, or None.
 
         Args:
             markers_px: column and row of every marker, the centre's first, (k, m, 2), NaN where
-                it was not seen.
-            host_ns: when each frame came, (k,).
+                a marker is not visible.
+            host_ns: arrival time of each frame, (k,).
         """
         for places, when in zip(markers_px, host_ns.tolist(), strict=True):
             self.frames += 1
-            found = self._look(places.astype(np.float64), when)
+            found = self._add_frame(places.astype(np.float64), when)
             if found is not None:
                 return found
         return None
 
-    def _look(self, places: F64, when: int) -> int | None:
+    def _add_frame(self, places: F64, when: int) -> int | None:
         if not np.isfinite(places[0]).all():
             self._appeared.clear()
             return None
@@ -128,16 +128,16 @@ class MarkerTouch:
         return None
 
     def _off_line(self, apart: F64, when: int) -> tuple[float, float]:
-        """Return how far a frame is from the line through those before, and its limit, px."""
+        """Return the distance of a frame from the fitted line, and its limit, px."""
         host = np.array(self._host, np.float64)[: -self.SKIP] - self._host[0]
-        way = np.array(self._apart)[: -self.SKIP]
+        apart_px = np.array(self._apart)[: -self.SKIP]
         centre = host.mean()
         spread = ((host - centre) ** 2).sum()
-        slope = ((host - centre)[:, None] * way).sum(axis=0) / spread
+        slope = ((host - centre)[:, None] * apart_px).sum(axis=0) / spread
         ahead = when - self._host[0] - centre
-        rest = way - way.mean(axis=0) - (host - centre)[:, None] * slope
-        sigma = float(np.sqrt((rest**2).sum() / (2 * len(way) - 4)))
-        # the line itself is not exact, the less so the farther it is drawn out
-        sigma *= (1.0 + 1.0 / len(way) + ahead**2 / spread) ** 0.5
-        off = apart - way.mean(axis=0) - ahead * slope
-        return float(np.hypot(*off)), max(8.0 * sigma, self.LEAST_PX)
+        residual = apart_px - apart_px.mean(axis=0) - (host - centre)[:, None] * slope
+        sigma = float(np.sqrt((residual**2).sum() / (2 * len(apart_px) - 4)))
+        # the line itself is uncertain, more so the farther it is extrapolated
+        sigma *= (1.0 + 1.0 / len(apart_px) + ahead**2 / spread) ** 0.5
+        off = apart - apart_px.mean(axis=0) - ahead * slope
+        return float(np.hypot(*off)), max(8.0 * sigma, self.MIN_PX)

@@ -1,1 +1,1 @@
-"""Drivers of real devices, a folder each: settings, driver, and the fake that speaks its wire."""
+"""Drivers of real devices, one folder each: settings, driver, and a fake with its protocol."""

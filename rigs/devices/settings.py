@@ -1,4 +1,4 @@
-"""The devices of a real rig as its rig file names them: which driver, and how to reach it.
+"""The devices of a real rig in its rig file: the driver of each, and how to reach it.
 
 The driver that a device names has the rest of its keys (`rigs.core.registry`). Cheap to import:
 `sliplab plan` reads rig files, and no maker's library is needed for that.
@@ -73,11 +73,11 @@ class _OfKind:
 
 
 class OperatedPlate(StrictModel):
-    """A plate on its slider that a person raises, releases and catches when asked."""
+    """A plate on a slider that the operator raises, releases and catches on request."""
 
     driver: Literal["person"] = "person"
     mass_kg: Annotated[float, Field(gt=0, le=5)]
-    """Mounted when the session begins, kg; a changeover asks for another one."""
+    """Mass mounted when the session begins, kg; a changeover requests another one."""
 
 
 class DeviceSettings(StrictModel):
@@ -91,7 +91,7 @@ class DeviceSettings(StrictModel):
     sync_box: Annotated[DriverSettings, _OfKind("sync box", "sync_box")] | None = None
     """Needed by a real rig; a loopback rig brings its own."""
     plate: OperatedPlate | None = None
-    """Left out, the rig has no sliding plate, and takes kinematic protocols only."""
+    """If left out, the rig has no sliding plate, and supports only kinematic protocols."""
 
     def drivers(self) -> Iterator[tuple[Driver[Any], DriverSettings]]:
         """The driver of every device, with its settings, the arm first."""

@@ -1,5 +1,5 @@
-"""Fakes that speak the devices' own protocols, so that real drivers can be tried without them.
+"""The loopback rig: real drivers on fakes that speak the devices' protocols and share one scene.
 
-They are for tests and rehearsals. None of them copies what a device costs in time; what they copy
-is what it says, and how it fails.
+It is for tests and rehearsals. The fakes reproduce the devices' replies and failures, not their
+timing.
 """

@@ -1,8 +1,8 @@
-"""The fakes of a loopback rig: a process of their own, and what the rig may ask of it.
+"""The fakes of a loopback rig in a separate process, and the rig's interface to it.
 
-Drivers and fakes in one process would wait for each other, and would share one Python; a real
-rig does neither. Frames come back through a pipe of their own, for pylon's emulated camera lives in
-the drivers' process: `rigs.devices.basler.fake` puts them in place of its pictures.
+In one process, drivers and fakes would wait for each other and share one interpreter, unlike on a
+real rig. Frames return through a second pipe, because pylon's emulated camera is in the drivers'
+process: `rigs.devices.basler.fake_live` substitutes them for its images.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.streams import FrameChunk, Sink
 
 READY_S = 180.0
-"""The longest that the fakes take to begin: kernels may have to be compiled, s."""
+"""Timeout for the fakes to start: kernels may have to be compiled, s."""
 ANSWER_S = 20.0
-"""The longest that they take to answer, s."""
+"""Timeout of an answer, s."""
 TURN_S = 0.004
 """Period at which the scene follows the clock, s."""
 END_S = 5.0
 
 
 class Loopback:
-    """Fakes that run until `close`.
+    """The fakes of a loopback rig, running until `close`.
 
-    Also the `rigs.core.capabilities.Simulation`, `Plate` and `Operator` of the rig.
+    It is also the `Simulation`, `Plate` and `Operator` of the rig (`rigs.core.capabilities`).
 
     Args:
-        on_frames: is given the frames that the outside camera sees, in a thread.
+        on_frames: called in a thread with the frames of the outside camera.
 
     Attributes:
         sync_port: name of the sync box's serial port.
         event_address: where the event camera's driver finds its fake.
 
     Raises:
-        RigError: they do not begin.
+        RigError: they do not start.
     """
 
     def __init__(self, settings: MockSettings, timing: Timing, devices: DeviceSettings) -> None:
@@ -71,7 +71,7 @@ class Loopback:
         self._reader.start()
 
     def close(self) -> None:
-        """End the fakes, whatever they do; any number of times."""
+        """End the fakes; safe to call more than once."""
         self._pipe.close()
         self._process.join(END_S)
         if self._process.is_alive():
@@ -80,7 +80,7 @@ class Loopback:
         self._frames.close()
 
     def reached_by(self, devices: DeviceSettings) -> DeviceSettings:
-        """Settings of drivers that reach these fakes."""
+        """Return the settings for drivers to reach these fakes."""
         camera, box = devices.event_camera_driver.reach, devices.sync_box_driver.reach
         assert camera is not None  # the rig file was held against it
         assert box is not None
@@ -98,18 +98,18 @@ class Loopback:
         self._ask("begin_trial", seed)
 
     def sink(self, sink: Sink) -> Sink:
-        """`sink` itself: the disk is a real one."""
+        """Return `sink` itself, because the disk is real."""
         return sink
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """The truth of a trial after these moments of the arm controller's clock."""
+        """Return the ground truth of a trial, counted from these arm controller times."""
         found: dict[str, Any] = self._ask("truth", reference_arm_ns, hold_arm_ns)
         return found
 
     # -- Plate and Operator ----------------------------------------------------------------
 
     def act(self, action: PlateAction, seconds: float) -> None:
-        """Raise the plate and hold it, release or catch it."""
+        """Raise and hold, release or catch the plate."""
         self._ask("act", action, seconds)
 
     def mass_kg(self) -> float:
@@ -118,47 +118,47 @@ class Loopback:
         return mass
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """Ask the simulated person, who does it at once."""
+        """Ask the simulated operator, who does it at once."""
         done: bool = self._ask("ask", task, prompt, expected)
         return done
 
     # -- the frame camera ------------------------------------------------------------------
 
     def grab(self, width_px: int, height_px: int) -> None:
-        """The frame camera begins to grab; frames arrive by `on_frames`."""
+        """Start the frame camera; frames are passed to `on_frames`."""
         self._ask("grab", width_px, height_px)
 
     def stop_grabbing(self) -> None:
-        """The frame camera stops."""
+        """Stop the frame camera."""
         self._ask("stop_grabbing")
 
     # -- tests -----------------------------------------------------------------------------
 
-    def happen(self, device: str, kind: str) -> None:
-        """Make something go wrong now; see `SimulationServer.happen`."""
-        self._ask("happen", device, kind)
+    def inject(self, device: str, kind: str) -> None:
+        """Inject a fault now; see `SimulationServer.inject`."""
+        self._ask("inject", device, kind)
 
     def restore(self, device: str) -> None:
-        """A person puts it right; see `SimulationServer.restore`. Drivers have to be built anew."""
+        """Clear a device's faults; see `SimulationServer.restore`. Drivers must be rebuilt."""
         self.sync_port, self.event_address = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
-        """Return where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        """Return the true position of the sensor: right and up on the plate, and depth, mm."""
         place: tuple[float, float, float] = self._ask("arm_place")
         return place
 
     def at_rest(self) -> bool:
-        """Return whether the arm truly stands still."""
+        """Return whether the arm is truly at rest."""
         rest: bool = self._ask("at_rest")
         return rest
 
     def sent(self) -> Counter[str]:
-        """Return the counts of what was sent since the trial began, by stream."""
+        """Return the counts of data sent since the trial began, by stream."""
         found: Counter[str] = self._ask("sent")
         return found
 
     def events_between(self, first_us: int, last_us: int) -> int:
-        """Return how many events with stamps from the first to the last of these were sent, us."""
+        """Return the number of sent events with time stamps from first to last, us, inclusive."""
         found: int = self._ask("events_between", first_us, last_us)
         return found
 
@@ -166,17 +166,17 @@ class Loopback:
 
     def _ask(self, what: str, *arguments: Any) -> Any:
         with self._asking:
-            with suppress(OSError, ValueError):  # what they said last may still be there
+            with suppress(OSError, ValueError):  # their last message may still be in the pipe
                 self._pipe.send((what, arguments))
             return self._answer(ANSWER_S)
 
     def _answer(self, within_s: float) -> Any:
         try:
             if not self._pipe.poll(within_s):
-                raise RigError("stand-ins", f"no answer within {within_s:g} s")
+                raise RigError("fakes", f"no answer within {within_s:g} s")
             good, value = self._pipe.recv()
         except (EOFError, OSError):
-            raise RigError("stand-ins", "have ended") from None
+            raise RigError("fakes", "their process has ended") from None
         if not good:
             raise RigError(*value)
         return value
@@ -185,11 +185,11 @@ class Loopback:
         with suppress(EOFError, OSError):
             while True:
                 frames = self._frames.recv()
-                self.on_frames(frames)  # whoever listens now, not when the wait began
+                self.on_frames(frames)  # looked up now, because it may have changed meanwhile
 
 
 def _forget(frames: FrameChunk) -> None:
-    """Nobody looks at the frames."""
+    """Discard frames."""
 
 
 def _serve(
@@ -199,7 +199,7 @@ def _serve(
     timing: Timing,
     devices: DeviceSettings,
 ) -> None:
-    """The process: it ends with its parent, and never waits for a library to be taken down."""
+    """Run the process; it ends with its parent, without waiting for libraries to shut down."""
     from sliplab.rigs.loopback.simulation_server import SimulationServer
 
     sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes
@@ -216,7 +216,7 @@ def _serve(
         status = 0
     except Exception as error:
         with suppress(OSError):
-            pipe.send((False, ("stand-ins", f"failed: {error!r}")))
+            pipe.send((False, ("fakes", f"failed: {error!r}")))
     with suppress(Exception):
         if server is not None:
             server.close()

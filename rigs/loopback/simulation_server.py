@@ -1,9 +1,9 @@
-"""One simulated scene on one real-time clock, behind fakes that speak the devices' wires.
+"""One simulated scene in real time, behind fakes that speak the devices' protocols.
 
-What a fake sends is what the simulated devices of `rigs.mock` would have handed over: the same
-world, the same noise, the same faults by name. Only the way to the host differs, so a trial looks
-the same through either. The world follows the host's monotonic clock a little behind it, so that a
-controller's move never lies in the world's past.
+The fakes send the same data that the simulated devices of `rigs.mock` would return: the same world,
+the same noise, the same named faults. Only the path to the host differs, so a trial is the same
+through either. The world lags slightly behind the host's monotonic clock, so that a controller's
+move never lies in the world's past.
 """
 
 from __future__ import annotations
@@ -41,30 +41,30 @@ from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
 
 REACH_MM = 2_000.0
-"""Limits of the fake itself; those of the rig file are the driver's to hold."""
+"""Reach of the fake arm; the driver enforces the rig file's limits."""
 PULSE_NS = 5_000_000
-"""Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
+"""Length of a pulse on the line, as in the firmware at 100 ticks per second."""
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000
 """Delay of the world behind the host's clock: longer than a controller's cycle."""
 REST_S = 2.0
-"""The longest that a trial's begin waits for the arm to be at rest."""
+"""Timeout for the arm to come to rest when a trial begins, s."""
 CLEAR_MM = 5.0
 PENDANT_MM_S, PENDANT_MM_S2 = 20.0, 500.0
-"""Distance and speed at which a person moves a stopped arm clear of the plate."""
+"""Speed and acceleration at which the operator moves a stopped arm clear of the plate."""
 _NONE = np.empty(0, np.int64)
 NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE.astype(np.uint8))
 """Message that ends the frames."""
 
 
 class SimulationServer:
-    """The scene and its fakes; `turn` lets it follow the clock, from one thread.
+    """The scene and its fakes; call `turn` from one thread to let it follow the clock.
 
     Args:
         settings: the simulated scene and devices, with their faults.
-        timing: which signals reach which device; frames by hardware trigger.
+        timing: signals that reach each device; frames by hardware trigger.
         devices: the rig's drivers: fakes of their kinds listen where they will look.
-        on_frames: is given the frames of each turn.
+        on_frames: called with the frames of each turn.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class SimulationServer:
         devices: DeviceSettings,
         on_frames: Callable[[FrameChunk], None],
     ) -> None:
-        _rehearse(settings, timing)
+        _warm_up(settings, timing)
         self._origin_ns = time.monotonic_ns() - LAG_NS
         clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
         plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
@@ -109,14 +109,14 @@ class SimulationServer:
         self._events.start()
 
     def close(self) -> None:
-        """Take every fake away."""
+        """Close every fake."""
         for part in (self.arm, self.camera, self.sync_box):
             part.close()
 
     # -- time ------------------------------------------------------------------------------
 
     def _total_ns(self) -> int:
-        """True time of all trials: the host's clock."""
+        """Return the total true time across all trials, by the host's clock."""
         return time.monotonic_ns() - self._origin_ns
 
     def _box_now_ns(self) -> int:
@@ -129,7 +129,7 @@ class SimulationServer:
         return self._level.high(self._arm_clock.to_device(round(t_s * 1e9)))
 
     def turn(self) -> None:
-        """Let the world follow the clock, and send what its devices have to say."""
+        """Advance the world to the clock, and send its devices' data."""
         world = self.world
         passed = self._total_ns() - LAG_NS - world.past_ns - world.now_ns
         while self._trains:
@@ -139,7 +139,7 @@ class SimulationServer:
         if self._path.cut_ns is not None:
             self._path.cut_ns = None
             protective = world.arm_state is ArmState.PROTECTIVE_STOP
-            self.arm.happen(Kind.PROTECTIVE_STOP if protective else Kind.PROGRAM_END)
+            self.arm.inject(Kind.PROTECTIVE_STOP if protective else Kind.PROGRAM_END)
         chunk, pulses = self._events.read(), self._events.read_pulses()
         if len(chunk) or len(pulses.t_ns):
             self.camera.send(chunk, pulses)
@@ -158,7 +158,7 @@ class SimulationServer:
     # -- the sync box ----------------------------------------------------------------------
 
     def _on_train(self, train: Train | None, sent: int) -> None:
-        """In the box's thread."""
+        """Receive a train; called in the box's thread."""
         self._level.follow(train, sent)
         self._trains.append((train, sent))
 
@@ -168,14 +168,14 @@ class SimulationServer:
             first = self._box_clock.to_device(train.first_ns) - self.world.past_ns
             self._box.start(train.rate_hz, train.seed, train.code, first)
         elif self._train is not None:
-            # half a tick behind the last one
+            # half a tick after the last one
             end = self._train.first_ns + round((sent - 0.5) * 1e9 / self._train.rate_hz)
             self._box.stop(self._box_clock.to_device(end) - self.world.past_ns)
 
-    # -- what a rig asks of a simulation ---------------------------------------------------
+    # -- Simulation ------------------------------------------------------------------------
 
     def begin_trial(self, seed: int) -> None:
-        """Draw everything that varies by trial from `seed`; the skin is at rest.
+        """Draw everything that varies by trial from `seed`, with the skin at rest.
 
         Raises:
             RigError: the arm is moving.
@@ -192,7 +192,7 @@ class SimulationServer:
         self._stamps_us.clear()
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """Return the truth of a trial after these moments of the arm's clock.
+        """Return the ground truth of a trial, counted from these arm controller times.
 
         See `rigs.mock.truth.truth_of`.
         """
@@ -211,11 +211,11 @@ class SimulationServer:
         )
 
     def sent(self) -> Counter[str]:
-        """Return the counts sent since the trial began; the box's pulses since its last ARM."""
+        """Return the counts of data sent since the trial began; pulses since the last ARM."""
         return self._sent + Counter({"box_pulses": self.sync_box.pulses})
 
     def events_between(self, first_us: int, last_us: int) -> int:
-        """Return how many events with stamps from the first to the last of these were sent, us."""
+        """Return the number of sent events with time stamps from first to last, us, inclusive."""
         return sum(
             int(np.count_nonzero((stamps >= first_us) & (stamps <= last_us)))
             for stamps in self._stamps_us
@@ -231,13 +231,13 @@ class SimulationServer:
         return self._plate.mass_kg()
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """Let the simulated person do a task."""
+        """Let the simulated operator do a task."""
         if task == "protective_stop":
             self.arm.restore()
         return self._operator.ask(task, prompt, expected)
 
     def grab(self, width_px: int, height_px: int) -> None:
-        """The frame camera begins to grab a region; its counter is at 0."""
+        """Start the frame camera on a region, with its counter at 0."""
         self.turn()
         self._frames.stop()
         self._frames.set_region(width_px, height_px)
@@ -245,37 +245,37 @@ class SimulationServer:
         self._grabbing = True
 
     def stop_grabbing(self) -> None:
-        """The frame camera stops; what it exposed before is sent, and an empty chunk."""
+        """Stop the frame camera; send the frames exposed before, and an empty chunk."""
         if self._grabbing:
             self.turn()
             self._frames.stop()
             self._grabbing = False
         self._on_frames(NO_FRAMES)
 
-    # -- what a person at the rig would see and do -----------------------------------------
+    # -- for tests: true state, faults and repairs -----------------------------------------
 
     def arm_place(self) -> tuple[float, float, float]:
-        """Return where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        """Return the true position of the sensor: right and up on the plate, and depth, mm."""
         x, y, depth = self.world.plane.sensor(self.arm.pose())[:3]
         return float(x), float(y), float(depth)
 
     def at_rest(self) -> bool:
-        """Return whether the arm truly stands still."""
+        """Return whether the arm is truly at rest."""
         return not self.arm.moving()
 
-    def happen(self, device: str, kind: str) -> None:
-        """Make something go wrong on the wire now.
+    def inject(self, device: str, kind: str) -> None:
+        """Inject a fault of a device now.
 
         Args:
             device: ``arm``, ``sync_box`` or ``event_camera``.
-            kind: of the arm a value of `rigs.core.fakes.Kind`; of the sync box ``reset``,
-                ``silence`` or ``unplug``; of the event camera ``stall`` or ``unplug``.
+            kind: for the arm a value of `rigs.core.fakes.Kind`; for the sync box ``reset``,
+                ``silence`` or ``unplug``; for the event camera ``stall`` or ``unplug``.
 
         Raises:
             RigError: no such fault.
         """
         known: dict[str, dict[str, Callable[[], None]]] = {
-            "arm": {found.value: partial(self.arm.happen, found) for found in Kind},
+            "arm": {found.value: partial(self.arm.inject, found) for found in Kind},
             "sync_box": {
                 "reset": self.sync_box.reset,
                 "silence": self.sync_box.silence,
@@ -286,13 +286,13 @@ class SimulationServer:
         try:
             what = known[device][kind]
         except KeyError:
-            raise RigError(device, f"no stand-in can show '{kind}' of it") from None
+            raise RigError(device, f"its fake cannot simulate '{kind}'") from None
         what()
 
     def restore(self, device: str) -> tuple[str, Any]:
         """A person puts right whatever is wrong with a device.
 
-        A stopped arm is unlocked and moved clear of the plate; the others are plugged in again.
+        A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
 
         Returns:
             The sync box's port and the event camera's address, which may be new ones.
@@ -314,15 +314,15 @@ class SimulationServer:
             self.camera.close()
             self.camera = self._make_camera()
         else:
-            raise RigError(device, "is no device of a stand-in")
+            raise RigError(device, "has no fake")
         return self.sync_box.port, self.camera.address
 
 
 class SyncLevel:
-    """The sync line's level at any time, from the train that runs; asked in the arm's thread.
+    """The sync line's level at any time, from the running train; read in the arm's thread.
 
     Args:
-        box: true time of all trials to the box's clock, ns.
+        box: total true time to the box's clock, ns.
     """
 
     def __init__(self, box: ClockMap) -> None:
@@ -332,7 +332,7 @@ class SyncLevel:
         self._ticks: int | None = None
 
     def follow(self, train: Train | None, sent: int) -> None:
-        """A train begins, or (None) the one that ran has ended after `sent` ticks."""
+        """Record the start of a train, or with None its end after `sent` ticks."""
         if train is None:
             self._ticks = sent
         else:
@@ -340,7 +340,7 @@ class SyncLevel:
             self._ticks, self._train = None, train
 
     def high(self, total_ns: int) -> bool:
-        """Return whether the line is high at a true time of all trials."""
+        """Return whether the line is high at a total true time."""
         train, ticks = self._train, self._ticks
         if train is None:
             return False
@@ -353,10 +353,10 @@ class SyncLevel:
         return bit and passed - tick * period < min(PULSE_NS, period / 2)
 
 
-def _rehearse(settings: MockSettings, timing: Timing) -> None:
-    """Let a world like this one run for a moment: what has to be compiled or loaded is then there.
+def _warm_up(settings: MockSettings, timing: Timing) -> None:
+    """Run a similar world briefly, so that everything is compiled and loaded.
 
-    Compiling holds Python's lock for seconds, in which no fake would answer.
+    Compiling holds Python's interpreter lock for seconds, in which no fake could answer.
     """
     devices = build_mock(settings, timing)
     devices.arm.connect()

@@ -1,1 +1,1 @@
-"""Simulated devices on one virtual clock: a whole rig without hardware, as fast as it computes."""
+"""Simulated devices on one virtual clock: a complete rig without hardware."""

@@ -14,14 +14,14 @@ from sliplab.rigs.mock.world import World
 from sliplab.storage.streams import PoseChunk, PulseChunk
 
 BACKLOG_NS = 120_000_000_000
-"""Poses older than this are dropped if nobody reads them."""
+"""Age above which unread poses are dropped."""
 
 
 class MockArm:
-    """An arm without ramps: each segment runs at its speed from its first nanosecond.
+    """A simulated arm without ramps: each segment has its full speed from the start.
 
     Args:
-        wired: whether the sync line reaches its digital input.
+        wired: True if the sync line reaches its digital input.
     """
 
     def __init__(self, world: World, box: MockSyncBox, *, wired: bool = True) -> None:
@@ -59,7 +59,7 @@ class MockArm:
         return ArmState.MOVING if moving else ArmState.READY
 
     def pose(self) -> Pose:
-        """Return where the tool centre point is now."""
+        """Return the current tool centre point."""
         state = self._world.path.states(np.array([self._world.now_ns], np.int64))[0].tolist()
         return Pose((state[0], state[1], state[2]), (state[3], state[4], state[5]))
 
@@ -75,7 +75,7 @@ class MockArm:
         self._legs = self._world.start_arm(path)
 
     def progress(self) -> Progress:
-        """Return how far the path begun last has come; `done` once it ended or was stopped."""
+        """Return the progress of the last path; `done` once it ended or was stopped."""
         world, clock = self._world, self._world.clocks.arm
         finished = tuple(
             (clock.to_reference(leg.start_ns), clock.to_reference(leg.end_ns))
@@ -85,9 +85,9 @@ class MockArm:
         return Progress(self.state(), finished, not world.path.moving(world.now_ns))
 
     def read_poses(self) -> PoseChunk:
-        """Poses since the last call, one a controller cycle.
+        """Return the poses since the last call, one per controller cycle.
 
-        A clock at fault stamps them wrongly; the cycles themselves go on.
+        A faulty clock stamps them wrongly; the cycles themselves continue.
         """
         world, settings = self._world, self._world.settings.arm
         clock, latency = self._cycles, settings.latency_us * 1000
@@ -97,7 +97,7 @@ class MockArm:
         cycles = np.arange(first, max(end, first), dtype=np.int64)
         true = clock.to_device(cycles * self._period_ns)
         host = true + latency + self._late.ns(cycles - self._first)
-        # in order: a pose that is late holds up the next one
+        # in order: a late pose delays the next one
         host = np.maximum(np.maximum.accumulate(host), self._arrived_ns)
         here = int(np.searchsorted(host, world.now_ns, side="right"))
         self._read = first + here
@@ -123,5 +123,5 @@ class MockArm:
         self._world.halt_arm(self._world.now_ns, self._world.arm_state)
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self._connected = False

@@ -1,7 +1,7 @@
-"""The devices' clocks: each counts from another day and at a slightly different speed.
+"""The simulated devices' clocks: each has its own offset and a slightly different rate.
 
-True time is the virtual time of the simulation, in integer nanoseconds since the trial began. It
-is known to the simulated devices and to nobody else.
+True time is the virtual time of the simulation, in integer nanoseconds since the trial began. Only
+simulated devices know it.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _CLOCK_FAULTS: tuple[type[ClockDrift | ClockJump | ClockRestart], ...] = (
 
 @dataclass(frozen=True)
 class TrialClocks:
-    """True time to device time for one trial, ns."""
+    """Maps from true time to device time for one trial, ns."""
 
     arm: ClockMap
     event_camera: ClockMap
     frame_camera: ClockMap
     sync_box_ppb: int
-    """The sync box counts from its own start: it has a drift and no offset."""
+    """Drift of the sync box, which counts from its own start and has no offset."""
 
     def after(self, past_ns: int) -> TrialClocks:
-        """The same clocks when `past_ns` of true time have passed, with that moment as time 0."""
+        """Return the same clocks with the true time `past_ns` as time 0."""
         return replace(
             self,
             arm=shifted(self.arm, past_ns),
@@ -50,14 +50,14 @@ class TrialClocks:
 
 
 def shifted(clock: ClockMap, past_ns: int) -> ClockMap:
-    """`clock`, with the moment that was `past_ns` as time 0."""
+    """Return `clock` with the time `past_ns` as time 0."""
     return ClockMap(
         tuple(time - past_ns for time in clock.device_ns), clock.reference_ns, clock.drift
     )
 
 
 def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClocks:
-    """Drifts that belong to the rig's seed, offsets that belong to the trial's."""
+    """Draw a trial's clocks: drifts from the rig's seed, offsets from the trial's."""
     drift = generator(rig_seed, "clock drift").uniform(-1.0, 1.0, 4)
     longest = int(settings.offset_h * HOUR_NS)
     offset = generator(trial_seed, "clock offset").integers(0, longest, 3, endpoint=True)
@@ -71,9 +71,9 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
 
 @dataclass(frozen=True)
 class FaultyClock(ClockMap):
-    """True time to device time by a clock that drifts more, jumps or restarts at known moments.
+    """Map from true to device time of a clock with additional drift, jumps or restarts.
 
-    The map of its superclass is the undisturbed clock: what the device's cycles run by.
+    The superclass is the undisturbed clock, which times the device's cycles.
     """
 
     device: Device
@@ -99,10 +99,10 @@ class FaultyClock(ClockMap):
     @overload
     def to_device(self, times: npt.NDArray[np.integer[Any]]) -> I64: ...
     def to_device(self, times: int | npt.NDArray[np.integer[Any]]) -> int | I64:
-        """The first true time, to the ns, at which the clock shows at least `times`.
+        """Return the first true time, to the ns, at which the clock shows at least `times`.
 
-        A clock that jumps back shows some times twice, and one that jumps on leaves some out. A
-        time within the trial is preferred to one before it.
+        A clock that jumps back shows some times twice; one that jumps forward skips some. A time
+        within the trial is preferred to one before it.
         """
         if not isinstance(times, int | np.integer):
             flat = [self._first(int(t)) for t in np.asarray(times).ravel()]
@@ -110,14 +110,14 @@ class FaultyClock(ClockMap):
         return self._first(int(times))
 
     def jumped_ns(self, true_ns: I64) -> I64:
-        """By how much the clock has jumped at true times, ns, shape of `true_ns`."""
+        """Return the accumulated jumps at true times, ns, shape of `true_ns`."""
         gained = np.zeros(true_ns.shape, np.int64)
         for due, jump_ns in self._jumps():
             gained += np.where(true_ns >= due, jump_ns, 0)
         return gained
 
     def _drifted_ns(self, true_ns: I64) -> I64:
-        """Return the gain of the clock by drifting more, at true times, ns."""
+        """Return the gain of the clock by additional drift at true times, ns."""
         gained = np.zeros(true_ns.shape, np.int64)
         for fault, due in self._drifts():
             since = np.maximum(true_ns - due, 0)
@@ -125,9 +125,9 @@ class FaultyClock(ClockMap):
         return gained
 
     def cycle_ns(self, true_ns: I64) -> I64:
-        """True times at which cycles come that an undisturbed clock has at `true_ns`.
+        """Return the true times of the cycles that an undisturbed clock has at `true_ns`.
 
-        A clock that gains comes to them sooner. Jumps change what a clock shows, not its pace.
+        A fast clock reaches them earlier. Jumps change a clock's reading, not its rate.
         """
         result = true_ns
         for fault, due in self._drifts():
@@ -136,7 +136,7 @@ class FaultyClock(ClockMap):
         return result
 
     def pace_ns(self, true_ns: I64) -> I64:
-        """True times at which an undisturbed clock has the cycles that come at `true_ns`.
+        """Return the true times at which an undisturbed clock has the cycles of `true_ns`.
 
         The inverse of `cycle_ns`.
         """
@@ -154,7 +154,7 @@ class FaultyClock(ClockMap):
         ]
 
     def _jumps(self) -> list[tuple[int, int]]:
-        """True times at which the clock jumps, rising, and by how much, ns."""
+        """Return the true times of the jumps, increasing, and their sizes, ns."""
         mine: list[tuple[int, ClockJump | ClockRestart]] = []
         mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockJump)]
         mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockRestart)]
@@ -174,21 +174,21 @@ class FaultyClock(ClockMap):
 
     def _first(self, shown: int) -> int:
         dues = sorted({due for due, _ in self._jumps()})
-        # a clock that began again at 0 shows what it may have shown long before the trial, too
+        # a clock restarted at 0 repeats readings from long before the trial
         for low, high in zip([0, *dues], [*dues, 1 << 61], strict=True):
             if low < high and self.to_reference(low) <= shown <= self.to_reference(high - 1):
-                return self._halved(shown, low, high)
+                return self._bisect(shown, low, high)
         low = -(1 << 61)
         for high in [*dues, 1 << 61]:
             if self.to_reference(high - 1) >= shown:
-                return self._halved(shown, low, high)
+                return self._bisect(shown, low, high)
             low = high
         raise OverflowError(f"the clock never shows {shown} ns")
 
-    def _halved(self, shown: int, low: int, high: int) -> int:
-        """The first time from `low` on, before `high`, at which the clock shows at least `shown`.
+    def _bisect(self, shown: int, low: int, high: int) -> int:
+        """Return the first time in `low` to `high` at which the clock shows at least `shown`.
 
-        Between jumps the clock never runs backwards, so that halving finds the time.
+        Between jumps the clock is monotonic, so bisection finds the time.
         """
         while low < high - 1:
             middle = (low + high - 1) // 2
@@ -200,7 +200,7 @@ class FaultyClock(ClockMap):
 
 
 def with_faults(clocks: TrialClocks, faults: FaultBook) -> TrialClocks:
-    """The same clocks, disturbed where the trial's faults say so; otherwise as they are."""
+    """Return the clocks with the trial's clock faults applied."""
     if not any(faults.of(kind) for kind in _CLOCK_FAULTS):
         return clocks
     return replace(
@@ -212,7 +212,7 @@ def with_faults(clocks: TrialClocks, faults: FaultBook) -> TrialClocks:
 
 
 def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
-    """`clock`, as the trial's faults disturb it."""
+    """Return `clock` with the trial's faults applied."""
     hit = [fault.device for kind in _CLOCK_FAULTS for fault in faults.of(kind)]
     if device not in hit:
         return clock
@@ -220,25 +220,25 @@ def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
 
 
 def undisturbed(clock: ClockMap) -> ClockMap:
-    """Return `clock` without its faults, by which the device's cycles run."""
+    """Return `clock` without its faults, which times the device's cycles."""
     if type(clock) is ClockMap:
         return clock
     return ClockMap(clock.device_ns, clock.reference_ns, clock.drift)
 
 
 class HighestStamp:
-    """Keeps the stamps of a stream from running backwards.
+    """Makes the time stamps of a stream non-decreasing.
 
-    The contract of event streams, which every consumer of events relies on. While a clock that
-    jumped back has not caught up, events keep their order and carry the highest stamp so far; the
-    sync pulses show the jump, so that no such trial is taken for good.
+    Every consumer of event streams relies on this. Until a clock that jumped back has caught up,
+    events keep their order and carry the highest stamp so far; the sync pulses show the jump, so
+    such a trial is not accepted.
     """
 
     def __init__(self) -> None:
         self._highest = -(1 << 62)
 
     def of(self, stamps: I64) -> I64:
-        """Stamps (n,) that do not decrease, from one call to the next either."""
+        """Return stamps (n,) that do not decrease, also from one call to the next."""
         if len(stamps):
             stamps = np.maximum(np.maximum.accumulate(stamps), self._highest)
             self._highest = int(stamps[-1])
@@ -246,19 +246,19 @@ class HighestStamp:
 
 
 class Noise:
-    """Normal numbers that belong to numbered instants, in whatever pieces they are asked for."""
+    """Normal random numbers of numbered instants, independent of how they are requested."""
 
     def __init__(self, seed: int, purpose: str, width: int) -> None:
         self._seed, self._purpose, self._width = seed, purpose, width
         self._blocks: dict[int, F64] = {}
 
     def of(self, numbers: I64) -> F64:
-        """Standard normal, cut at four, for the instants `numbers` (not negative), (n, width)."""
+        """Standard normal, clipped at four, for instants `numbers` (not negative), (n, width)."""
         if not len(numbers):
             return np.empty((0, self._width))
         first, last = int(numbers.min()) // JITTER_BLOCK, int(numbers.max()) // JITTER_BLOCK
         if first == last:
-            # a new array, for the numbers are picked by an array
+            # indexing by an array makes a copy
             return self._block(first)[numbers - first * JITTER_BLOCK]
         result = np.empty((len(numbers), self._width))
         block, inside = np.divmod(numbers, JITTER_BLOCK)
@@ -284,14 +284,14 @@ class Jitter:
         self._noise, self._sigma_ns = Noise(seed, purpose, 1), sigma_us * 1000
 
     def ns(self, numbers: I64) -> I64:
-        """Offsets of the instants `numbers` (not negative), cut at four sigma, shape (n,)."""
+        """Offsets of the instants `numbers` (not negative), clipped at four sigma, (n,)."""
         if self._sigma_ns == 0.0:
             return np.zeros(len(numbers), np.int64)
         return np.rint(self._noise.of(numbers)[:, 0] * self._sigma_ns).astype(np.int64)
 
 
 class Lateness:
-    """Delays of messages beyond the shortest one: half-normal, cut at four sigma."""
+    """Delays of messages beyond the shortest one: half-normal, clipped at four sigma."""
 
     def __init__(self, seed: int, purpose: str, longest_us: float) -> None:
         self._jitter = Jitter(seed, purpose, longest_us / 4)

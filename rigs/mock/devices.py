@@ -1,4 +1,4 @@
-"""A whole simulated rig, put together: what a rig file of the kind `mock` stands for."""
+"""Assembly of a simulated rig, as a rig file with `driver: mock` describes it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 class Guarded:
-    """Hands every call on to another object, unless a check made before it raises."""
+    """A proxy that calls a check before each call of another object."""
 
     def __init__(self, target: Any, check: Callable[[], None]) -> None:
         self._target, self._check = target, check
@@ -44,7 +44,7 @@ class Guarded:
 
 
 def on_cable(device: T, name: Device, world: World) -> T:
-    """`device`, whose calls fail while a fault keeps it away; itself when no fault ever does."""
+    """Wrap `device` so that calls fail while a fault disconnects it; unchanged without faults."""
     if not any(isinstance(f, DeviceGone) and f.device == name for f in world.settings.faults):
         return device
 
@@ -61,7 +61,7 @@ def on_cable(device: T, name: Device, world: World) -> T:
 
 
 def on_disk(sink: Sink, world: World) -> Sink:
-    """`sink`, which cannot be written once a fault has filled the disk; itself without one."""
+    """Wrap `sink` so that writes fail once a fault fills the disk; unchanged without faults."""
     full = world.faults.of(DiskFull)
     if not full:
         return sink
@@ -75,7 +75,7 @@ def on_disk(sink: Sink, world: World) -> Sink:
 
 @dataclass(frozen=True)
 class MockDevices:
-    """All devices of one simulated rig; they share one world and its virtual clock."""
+    """The devices of one simulated rig, which share one world and its virtual clock."""
 
     clock: VirtualClock
     arm: MockArm
@@ -89,17 +89,17 @@ class MockDevices:
     force: MockForceSensor | None = None
 
     def begin_trial(self, seed: int) -> None:
-        """Make what follows depend on `seed` and the program alone; see `World.begin_trial`."""
+        """Make the trial depend only on `seed` and the program; see `World.begin_trial`."""
         self.world.begin_trial(seed)
 
     def sink(self, sink: Sink) -> Sink:
-        """Return the sink of the streams in this world, whose disk may be full."""
+        """Wrap `sink` in this world's storage faults, such as a full disk."""
         return on_disk(sink, self.world)
 
     def truth(
         self, reference_true_ns: int, hold_true_ns: int | None = None, threshold_px: float = 2.0
     ) -> dict[str, Any]:
-        """Return what really happened since `reference_true_ns`, and what the clocks truly showed.
+        """Return the ground truth since `reference_true_ns`, and the true clock readings.
 
         See `truth_of` and `clocks_of` in `rigs.mock.truth`.
         """
@@ -118,10 +118,10 @@ class MockDevices:
 
 
 def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevices:
-    """The devices of a simulated rig. The same settings give the same rig.
+    """Build the devices of a simulated rig. The same settings give the same rig.
 
     Args:
-        timing: which signals reach which device; left out, all that there are.
+        timing: signals that reach each device; all if left out.
     """
     timing = timing or Timing()
     world = World(settings)

@@ -1,4 +1,4 @@
-"""The simulated event camera: what it sends when, on its own clock, and what gets lost."""
+"""The simulated event camera: its events, their times on its own clock, and losses."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _BIN_NS = 1_000_000
 
 
 class Bursts:
-    """The events of `event_burst`: a Poisson process in time, even over pixels and polarities."""
+    """Events of `event_burst`: Poisson in time, uniform over pixels and polarities."""
 
     def __init__(self, world: World, width: int, height: int) -> None:
         self._world, self._width, self._height = world, width, height
 
     def into(self, events: Events, begin_ns: int, end_ns: int, scans: Scans) -> Events:
-        """`events` of the time from `begin_ns` (left out) to `end_ns`, with the burst's among them.
+        """Merge the burst's events into `events` of the interval `begin_ns` (excluded) to `end_ns`.
 
         Args:
-            scans: of the read-out; the burst's events carry the times of its columns, too.
+            scans: scans of the read-out; the burst's events also carry the times of its columns.
         """
         if not self._world.faults.of(EventBurst):
             return events
@@ -43,8 +43,8 @@ class Bursts:
         return _merge([events, burst]) if len(burst[0]) else events
 
     def between(self, begin_ns: int, end_ns: int, scans: Scans) -> Events:
-        """The burst's events alone; in whatever pieces they are asked for."""
-        # a scan is handed over when its last column has been read
+        """Return only the burst's events, independent of how the interval is divided."""
+        # a scan is delivered when its last column has been read
         begin_ns, end_ns = begin_ns - scans.reading_ns, end_ns - scans.reading_ns
         parts = [_none()]
         for index, (fault, first_ns, last_ns) in enumerate(self._world.faults.spans(EventBurst)):
@@ -88,8 +88,8 @@ def _none() -> Events:
 class MockEventCamera:
     """The event camera inside the sensor.
 
-    It sends whole blocks of the scene's steps (32 ms by default): that is its latency. After
-    `stop`, what is left can still be read.
+    It sends complete blocks of the scene's steps (32 ms by default), which is its latency. After
+    `stop`, the remaining events can still be read.
     """
 
     def __init__(self, world: World, box: MockSyncBox) -> None:
@@ -112,7 +112,7 @@ class MockEventCamera:
         self._stamps = HighestStamp()
 
     def start(self) -> None:
-        """Begin to stream: every pixel takes the present image as its reference."""
+        """Start streaming: every pixel takes the current image as its reference."""
         world = self._world
         loads = self._loads = world.keep_loads()
         self._next_ns = loads.end_ns
@@ -121,13 +121,13 @@ class MockEventCamera:
         self._input.skip()
 
     def read(self) -> EventChunk:
-        """Events since the last call, camera clock, whole microseconds."""
+        """Return events since the last call, camera clock, integer microseconds."""
         world = self._world
         done_ns = world.advance()
         loads = self._loads
         if loads is None:
             return _no_events()
-        # what is complete and has not been sent, in whole blocks of the global grid
+        # complete and unsent data, in whole blocks of the global grid
         last_ns = done_ns
         if self._running:
             last_ns -= last_ns % self._sensor.optics.block_ns
@@ -164,14 +164,14 @@ class MockEventCamera:
         return PulseChunk(stamp // 1000 * 1000)
 
     def stop(self) -> None:
-        """Stop streaming; the rest, up to the last whole step, can still be read."""
+        """Stop streaming; the rest, up to the last complete step, can still be read."""
         if self._running:
             self._world.advance()
             self._world.drop_loads()
             self._running, self._until_ns = False, self._world.now_ns
 
     def close(self) -> None:
-        """Give the device back."""
+        """Close the device."""
         self.stop()
 
 

@@ -1,7 +1,7 @@
-"""Faults on purpose, as a rig file or a test writes them down: `mock: faults: [...]`.
+"""Settings of simulated faults, as in rig files and tests: `mock: faults: [...]`.
 
-Each kind of fault has a model of its own with the parameters that mean something for it, and no
-others; docs/faults.md is the same list for a reader. Cheap to import, as all settings are.
+Each kind of fault has its own model with only the parameters that apply to it; docs/faults.md lists
+them for users. Cheap to import, as all settings are.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
 class _Fault(StrictModel):
     trial: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    """Number of the trial begun on this rig, from 1; left out, every one."""
+    """Number of the trial on this rig, from 1; every trial if left out."""
 
 
 class _TimedFault(_Fault):
     at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.5
-    """When it happens, after the moment that `since` names."""
+    """Time of the fault after the moment that `since` names."""
     since: Literal["trial", "recording"] = "recording"
-    """`trial`: the trial's first moment; `recording`: the start of the sync box."""
+    """`trial`: the trial's start; `recording`: the start of the sync box."""
 
 
 class ArmProtectiveStop(_TimedFault):
-    """The arm stops by itself and moves no more until a person clears it."""
+    """The arm makes a protective stop, and does not move until the operator clears it."""
 
     kind: Literal["arm_protective_stop"]
     at_mm: Annotated[float, Field(gt=0, le=10_000)] | None = None
-    """A point instead of a time: once the tool has gone this far since `since`, mm of its way."""
+    """A distance instead of a time: the path length of the tool since `since`, mm."""
 
     @model_validator(mode="after")
     def _one_moment(self) -> ArmProtectiveStop:
@@ -47,27 +47,27 @@ class ArmProtectiveStop(_TimedFault):
 
 
 class ArmOffPath(_TimedFault):
-    """The tool leaves its path sideways, and its poses say so."""
+    """The tool leaves its path sideways, which its poses show."""
 
     kind: Literal["arm_off_path"]
     mm: Annotated[float, Field(gt=0, le=10)] = 0.5
     """Largest deviation, in the plate's plane."""
     seconds: Seconds = 1.0
-    """Time in which the deviation grows evenly; then it stays to the trial's end."""
+    """Time in which the deviation grows linearly; then it stays until the trial's end."""
     direction_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
-    """Direction on the plate, from its x towards its y; left out, to the left of the way that the
-    tool goes at that moment (the plate's y when it does not move along the plate)."""
+    """Direction on the plate, from its x towards its y; if left out, to the left of the tool's
+    motion at that time (the plate's y if it does not move along the plate)."""
 
 
 class FramesLost(_TimedFault):
-    """Frames that never reach the host; the camera's counter goes on."""
+    """Frames that never reach the host; the camera's counter continues."""
 
     kind: Literal["frames_lost"]
     count: Count = 1
 
 
 class FrameLate(_TimedFault):
-    """Frames that reach the host late, in order and rightly stamped; later ones wait for them."""
+    """Frames that reach the host late, in order and correctly stamped; they delay later ones."""
 
     kind: Literal["frame_late"]
     count: Count = 1
@@ -75,35 +75,35 @@ class FrameLate(_TimedFault):
 
 
 class EventGap(_TimedFault):
-    """The event camera loses everything, pulses too, for some time."""
+    """The event camera loses all data, including pulses, for some time."""
 
     kind: Literal["event_gap"]
     seconds: Seconds = 0.1
 
 
 class EventStall(_TimedFault):
-    """The event camera sends nothing for some time and then all that it had."""
+    """The event camera sends nothing for some time, and then everything."""
 
     kind: Literal["event_stall"]
     seconds: Seconds = 0.1
 
 
 class EventBurst(_TimedFault):
-    """Flicker: noise events all over the array."""
+    """Flicker: noise events on the whole array."""
 
     kind: Literal["event_burst"]
     seconds: Seconds = 0.1
     million_per_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
-    """Mean rate of the additional events, both polarities together, in 1e6 a second."""
+    """Mean rate of the additional events, both polarities together, in 1e6 per second."""
 
 
 class ClockDrift(_TimedFault):
-    """A device's clock runs faster from a moment on."""
+    """A device's clock runs faster or slower from some time on."""
 
     kind: Literal["clock_drift"]
     device: Device
     ppm: Annotated[float, Field(ge=-10_000, le=10_000)]
-    """Change of its drift; negative, it loses."""
+    """Change of the clock's drift; negative if it loses time."""
 
 
 class ClockJump(_TimedFault):
@@ -112,11 +112,11 @@ class ClockJump(_TimedFault):
     kind: Literal["clock_jump"]
     device: Device
     seconds: Annotated[float, Field(ge=-1e6, le=1e6)]
-    """Forwards, or backwards when negative."""
+    """Size of the jump, backwards if negative."""
 
 
 class ClockRestart(_TimedFault):
-    """A device's clock begins again at 0, as after a moment without power."""
+    """A device's clock restarts at 0, as after a power loss."""
 
     kind: Literal["clock_restart"]
     device: RestartDevice
@@ -136,7 +136,7 @@ class PulsesDuplicated(_TimedFault):
     kind: Literal["pulses_duplicated"]
     count: Count = 1
     seconds: Seconds = 0.0002
-    """From a pulse to its double: a contact that bounces."""
+    """Time from a pulse to its duplicate, as of a bouncing contact."""
     device: PulseDevice = "event_camera"
 
 
@@ -150,7 +150,7 @@ class PulsesLate(_TimedFault):
 
 
 class PapillaTorn(_TimedFault):
-    """A papilla tears off: no contact force, and no white spot, from that moment on."""
+    """A papilla tears off: no contact force and no marker from then on."""
 
     kind: Literal["papilla_torn"]
     papilla: Papilla
@@ -162,9 +162,9 @@ class MarkerOccluded(_TimedFault):
 
     kind: Literal["marker_occluded"]
     papilla: Papilla | None = None
-    """Whose white spot, counted as for `papilla_torn`."""
+    """Papilla of the marker, counted as for `papilla_torn`."""
     plate: bool = False
-    """The plate's ArUco marker instead."""
+    """True for the plate's ArUco marker instead."""
     seconds: Seconds = 0.3
 
     @model_validator(mode="after")
@@ -181,18 +181,18 @@ class PlateStuck(_Fault):
 
 
 class DiskFull(_TimedFault):
-    """The recording cannot be written any further (ENOSPC), for the rest of the trial."""
+    """Writes of the recording fail (ENOSPC) for the rest of the trial."""
 
     kind: Literal["disk_full"]
 
 
 class DeviceGone(_TimedFault):
-    """A device loses its power or its cable: each call fails."""
+    """A device loses its power or its cable; every call fails."""
 
     kind: Literal["device_gone"]
     device: Device
     seconds: Seconds | None = None
-    """Until it answers again; left out, for good. It comes back switched on, and idle."""
+    """Time until it answers again, permanent if left out. It returns switched on and idle."""
 
 
 AnyFault = (
@@ -224,7 +224,7 @@ register_tags(*KINDS)
 
 
 def check_papillae(faults: tuple[AnyFault, ...], count: int) -> None:
-    """Hold the papillae that `faults` name against a skin of `count` papillae.
+    """Check the papillae that `faults` name against a skin of `count` papillae.
 
     Raises:
         KeyedError: the skin has no such papilla.

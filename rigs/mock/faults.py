@@ -1,7 +1,7 @@
-"""The faults of a trial and their times: one book that all simulated devices look into.
+"""The faults of a trial and their times, in one object that all simulated devices query.
 
-Every fault has one true time at which it happens, whatever the devices do in which pieces; what it
-does then stands where it happens: with the pulses, the clocks, the frames, the arm.
+Every fault has one true time, however the devices divide time into calls. Its effect is implemented
+where it occurs: with the pulses, the clocks, the frames, the arm.
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ I64 = npt.NDArray[np.int64]
 F = TypeVar("F", bound=AnyFault)
 
 NEVER = 1 << 62
-"""True ns that no trial reaches."""
+"""True time that no trial reaches, ns."""
 _GRID_NS = 1_000_000
 _RESOLUTION_NS = 1_000
 _PM = 1e9
-"""Picometres in a millimetre: whole ones add up to the same sum in any pieces."""
+"""Picometres per millimetre; integer sums do not depend on how a path is divided."""
 
 
 class FaultBook:
-    """The faults of one trial, and which of them have happened.
+    """The faults of one trial, and those that have occurred.
 
     Attributes:
         recording_ns: true time at which the sync box first started; None until then.
     """
 
     def __init__(self, faults: Sequence[AnyFault], trial: int) -> None:
-        # before the first trial begins nothing goes wrong
+        # no faults before the first trial begins
         self._faults = [fault for fault in faults if trial and fault.trial in {None, trial}]
         self._happened: set[int] = set()
         self._travels: dict[int, _Travel] = {}
         self.recording_ns: int | None = None
 
     def of(self, kind: type[F]) -> list[F]:
-        """The trial's faults of one kind."""
+        """Return the trial's faults of one kind."""
         return [fault for fault in self._faults if isinstance(fault, kind)]
 
     def due_ns(self, fault: AnyFault) -> int | None:
-        """True time at which `fault` happens; None while its recording has not begun.
+        """Return the true time of `fault`; None while its recording has not begun.
 
-        A fault without a time of its own is there from the trial's first moment.
+        A fault without a time is active from the trial's start.
         """
         since, at_s = getattr(fault, "since", "trial"), getattr(fault, "at_s", 0.0)
         origin = 0 if since == "trial" else self.recording_ns
         return None if origin is None else origin + round(at_s * 1e9)
 
     def spans(self, kind: type[F]) -> list[tuple[F, int, int]]:
-        """Faults of one kind whose time is known, each with its true begin and end, ns.
+        """Return the faults of one kind with a known time, with true begin and end, ns.
 
-        The end is `NEVER` for a fault that lasts.
+        The end is `NEVER` for a permanent fault.
         """
         found = []
         for fault in self.of(kind):
@@ -79,14 +79,14 @@ class FaultBook:
     def arm_halt(
         self, begin_ns: int, end_ns: int, places: Callable[[I64], F64]
     ) -> tuple[int, bool] | None:
-        """Return when the arm stops by itself in `begin_ns` to `end_ns`; each fault does it once.
+        """Return the first stop of the arm by a fault in `begin_ns` to `end_ns`; one per fault.
 
         Args:
-            places: true times (n,) to places of the tool (n, 3), mm, on the path as it is known.
+            places: maps true times (n,) to tool positions (n, 3), mm, on the known path.
 
         Returns:
-            The true time, and whether it is a protective stop; an arm whose connection is gone
-            stands still, too, but may move again.
+            the true time, and True for a protective stop; an arm that is disconnected stops too,
+            but may move again.
         """
         found: list[tuple[int, bool, int]] = []
         for index, fault in enumerate(self._faults):
@@ -120,20 +120,20 @@ class FaultBook:
     # -- the event camera ------------------------------------------------------------------
 
     def gaps_ns(self) -> list[tuple[int, int]]:
-        """True times between which the event camera loses what it sees."""
+        """Return the true intervals in which the event camera loses its data."""
         gone = [span for span in self.spans(DeviceGone) if span[0].device == "event_camera"]
         gaps = [(begin, end) for _, begin, end in self.spans(EventGap)]
         return gaps + [(begin, end) for _, begin, end in gone]
 
     def sent_until_ns(self, now_ns: int) -> int:
-        """Up to which true time the event camera has sent what it has: earlier while it stalls."""
+        """Return the true time up to which the event camera has sent its data."""
         stalls = [begin for _, begin, end in self.spans(EventStall) if begin <= now_ns < end]
         return min(stalls, default=now_ns)
 
     # -- the skin --------------------------------------------------------------------------
 
     def torn(self) -> list[tuple[int, int]]:
-        """Papillae that tear off, and the true times at which they do, ns."""
+        """Return the papillae that tear off, and the true times, ns."""
         return [(fault.papilla, begin) for fault, begin, _ in self.spans(PapillaTorn)]
 
     # -- any device ------------------------------------------------------------------------
@@ -146,31 +146,31 @@ class FaultBook:
         )
 
     def lost_power_ns(self, device: Device, since_ns: int) -> int:
-        """Return when `device` first loses its power from `since_ns` on; `NEVER` if it does not."""
+        """Return the first power loss of `device` from `since_ns` on; `NEVER` if there is none."""
         times = [begin for fault, begin, _ in self.spans(DeviceGone) if fault.device == device]
         return min((begin for begin in times if begin >= since_ns), default=NEVER)
 
 
 class _Travel:
-    """Distance of the tool since a moment, on a grid of true time that no caller decides."""
+    """Path length of the tool since a given time, on a fixed grid of true time."""
 
     def __init__(self, origin_ns: int, target_mm: float) -> None:
         self._cell_ns, self._travelled, self._target = origin_ns, 0, round(target_mm * _PM)
 
     def reached_ns(self, end_ns: int, places: Callable[[I64], F64]) -> int | None:
-        """Return when the target is reached, if that is not after `end_ns`."""
+        """Return the time at which the target is reached; None if that is after `end_ns`."""
         first = self._cell_ns - self._cell_ns % _GRID_NS + _GRID_NS
         inner = np.arange(first, end_ns, _GRID_NS, dtype=np.int64)
         edges = np.concatenate([[self._cell_ns], inner, [end_ns]]).astype(np.int64)
-        way_mm = np.linalg.norm(np.diff(places(edges), axis=0), axis=1)
-        total = self._travelled + np.cumsum(np.rint(way_mm * _PM).astype(np.int64))
+        step_mm = np.linalg.norm(np.diff(places(edges), axis=0), axis=1)
+        total = self._travelled + np.cumsum(np.rint(step_mm * _PM).astype(np.int64))
         over = np.flatnonzero(total >= self._target)
         if len(over):
             cell = int(over[0])
             before = self._travelled if cell == 0 else int(total[cell - 1])
             low, high = edges[cell : cell + 2].tolist()
             return _first_beyond(low, high, (self._target - before) / _PM, places)
-        if len(inner):  # the last, partial cell is measured again, from its beginning
+        if len(inner):  # the last, partial cell is measured again from its start
             self._travelled, self._cell_ns = int(total[-2]), int(inner[-1])
         return None
 
@@ -178,10 +178,10 @@ class _Travel:
 def _first_beyond(
     low_ns: int, high_ns: int, distance_mm: float, places: Callable[[I64], F64]
 ) -> int:
-    """First time, to a microsecond, at which the tool is `distance_mm` from its place at the low.
+    """Return the first time, to a microsecond, at which the tool is `distance_mm` from its start.
 
-    Within a cell of the grid the way is as good as straight, so that halving finds it; the halves
-    are cut on a fixed grid, so that the answer does not depend on where the cell was cut off.
+    Within a cell of the grid the path is practically straight, so bisection finds the time; it runs
+    on a fixed grid, so that the result does not depend on where the cell was cut off.
     """
     origin, base = places(np.array([low_ns], np.int64))[0], low_ns
     steps_low, steps_high = 0, -(-(high_ns - low_ns) // _RESOLUTION_NS)

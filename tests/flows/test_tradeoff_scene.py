@@ -182,7 +182,7 @@ def test_a_stop_leaves_nothing_behind(
 
 
 def test_a_rig_that_is_none_is_said(protocol: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file, nor a rig that ships"):
+    with pytest.raises(InputError, match="no such file, and not one of the shipped rigs"):
         tradeoff.tradeoff_scene(protocol, Path("nowhere"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
     taken = tmp_path / "a file"

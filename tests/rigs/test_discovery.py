@@ -37,10 +37,8 @@ def devices(**more: Any) -> DeviceSettings:
 def test_what_is_not_there_is_named_with_what_to_look_at() -> None:
     found = ping_devices(devices())
     assert set(found) == {"arm", "event camera", "frame camera", "sync box"}
-    assert "look at its power, its cable and the address" in (found["arm"] or "")
-    assert (
-        found["sync box"] == "there is no /dev/nothing; look at its cable, and at /dev/serial/by-id"
-    )
+    assert "check its power, its cable and the address" in (found["arm"] or "")
+    assert found["sync box"] == "there is no /dev/nothing; check its cable and /dev/serial/by-id"
     assert "was not found" in (found["event camera"] or "")
 
 
@@ -87,7 +85,7 @@ def test_a_port_is_reached_and_a_rig_without_one_is_told() -> None:
     master, slave = os.openpty()
     try:
         assert ping_devices(devices(sync_box={"port": os.ttyname(slave)}))["sync box"] is None
-        assert ping_devices(devices(sync_box=None))["sync box"] == "no port is named"
+        assert ping_devices(devices(sync_box=None))["sync box"] == "the rig file names no port"
     finally:
         os.close(master)
         os.close(slave)

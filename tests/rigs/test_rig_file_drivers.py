@@ -64,11 +64,11 @@ CASES: dict[str, tuple[Change, str, str]] = {
     ),
     "an output that is an input": (
         _set("devices", "frame_camera", "exposure_line", to="Line1"),
-        "devices.frame_camera.exposure_line", "is an input already: trigger_line",
+        "devices.frame_camera.exposure_line", "is already used as an input: trigger_line",
     ),
     "ticks on the line of the code": (
         _set("devices", "frame_camera", "sync_line", to=1),
-        "devices.frame_camera.sync_line", "must be another line than trigger_line",
+        "devices.frame_camera.sync_line", "must differ from trigger_line",
     ),
     "frames that no fake times so": (
         _set("timing", "frames", to="exposure line"),

@@ -117,11 +117,11 @@ def test_a_fault_is_blamed_on_the_file_that_has_it(
     ("text", "says"),
     [
         ("extends: none.yaml\n", "extends = none.yaml: no such file"),
-        ("extends: child.yaml\n", "extends = child.yaml: leads in a circle"),
+        ("extends: child.yaml\n", "extends = child.yaml: is circular"),
         ("extends: [mock.yaml]\n", "must be the path of a rig file"),
         ('extends: "a\\0b"\n', "must be the path of a rig file"),
         ("extends: /dev/zero\n", "is no plain file"),
-        ("extends: loop.yaml\n", "extends = child.yaml: leads in a circle"),
+        ("extends: loop.yaml\n", "extends = child.yaml: is circular"),
     ],
 )
 def test_what_cannot_be_extended_is_said(text: str, says: str, base: Path) -> None:
@@ -141,7 +141,8 @@ def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "mine").write_text(MOCK)
     assert load_rig_file(Path("mine"))[0].name == "mock"
     with pytest.raises(
-        InputError, match=r"rehersal: .* ships: irb120, loopback, mock, mock_force, mock_noisy"
+        InputError,
+        match=r"rehersal: .* shipped rigs: irb120, loopback, mock, mock_force, mock_noisy",
     ):
         rig_path(Path("rehersal"))
 

@@ -1,9 +1,9 @@
-"""Driver of ABB arms on an IRC5 controller by motion programs: the default way in.
+"""Driver of ABB arms on an IRC5 controller by motion programs: the default driver.
 
 A path is one motion program (abb-motion-program-exec 0.7.4): the controller plans each straight
-move at a constant speed of the tool centre point, from rest to rest. Poses come by EGM, the state
-and the commands go through Robot Web Services. That this host or the network has gone is noticed
-by a task on the controller, which stops the arm then (`watchdog`, `docs/arms.md`).
+move at a constant speed of the tool centre point, from rest to rest. Poses come by EGM; state and
+commands go through Robot Web Services. A watchdog task on the controller stops the arm when it
+loses this host or the network (`watchdog`, `docs/arms.md`).
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ from sliplab.storage.streams import Json
 ENTRY, MODULES = "motion_program_main", "motion_program"
 """Task that runs motion programs, and the prefix of its modules' names."""
 MONITOR_S = 0.2
-"""Period at which the web services are asked for the state, in four requests, s."""
+"""Period at which the state is polled, in four requests, s."""
 FAILURES = 2
-"""So many askings in a row without an answer are a lost connection."""
+"""Consecutive polls without an answer after which the connection is lost."""
 FIRST_POSE_S = 3.0
-"""From a motion program being started to its first pose by EGM, s."""
+"""Timeout from the start of a motion program to its first EGM pose, s."""
 SILENCE_S = 0.5
-"""Poses that stay away for this long are not fresh any more, s."""
+"""Age at which the last pose is stale, s."""
 STOPPED_S = 2.0
-"""From a stop being taken to the arm standing still, s."""
+"""Timeout from an accepted stop to the arm at rest, s."""
 STILL_S = 0.2
-"""An arm whose poses have not changed for so long stands; more than the rest after a segment, s."""
+"""Time of unchanged poses after which the arm is at rest; longer than between segments, s."""
 UNSEEN_STILL_S = 0.5
-"""The same where only its poses say so, because the web services do not answer, s."""
-LOOK_S = MONITOR_S + 2 * STATUS_REQUESTS * REQUEST_S
-"""To the answer to a look at the state that has begun after now, s."""
+"""The same when only poses are available, because the web services do not answer, s."""
+STATUS_S = MONITOR_S + 2 * STATUS_REQUESTS * REQUEST_S
+"""Longest time to the answer of a status poll that has not begun yet, s."""
 OVERTIME_S = 5.0
 """Time beyond 1.5 times its duration after which a path is stopped, s."""
 AGREE_MM = 0.5
@@ -66,7 +66,7 @@ AGREE_MM = 0.5
 
 
 class AbbArm(ThreadedArm):
-    """An ABB arm by motion programs; an `Arm` of `rigs.core.capabilities`."""
+    """An ABB arm driven by motion programs; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: AbbSettings) -> None:
         super().__init__(settings.limits)
@@ -84,21 +84,21 @@ class AbbArm(ThreadedArm):
         self._starting = threading.Lock()
         self._stopping = threading.Lock()
         self._may_move = False
-        """A path was sent, and nobody has seen the arm at rest since."""
+        """True from sending a path until the arm is confirmed at rest."""
         self._not_stopped: tuple[float, ArmFault] | None = None
-        """When the last attempt to stop it failed, and how."""
+        """Time and error of the last failed stop."""
         self._began_s = 0.0
-        """When the last path was started."""
-        self._stands_at: tuple[Pose, int] | None = None
-        """Commanded pose that all newer ones are the same as, and when it came, host's ns."""
+        """Start time of the last path."""
+        self._at_rest: tuple[Pose, int] | None = None
+        """Commanded pose that has not changed since, and its arrival time, host's ns."""
 
     def connect(self) -> None:
-        """Reach the web services, start the pose stream, see that both tell the same place.
+        """Connect to the web services, start the pose stream, and check that their poses agree.
 
-        Takes at most (14 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `LOOK_S`.
+        Takes at most (14 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `STATUS_S`.
 
         Raises:
-            ArmFault: no connection, no poses, no watchdog, or the arm may not move now.
+            ArmFault: no connection, no poses, no watchdog, or the arm is not ready to move.
         """
         if self._lost is None:
             return
@@ -111,18 +111,8 @@ class AbbArm(ThreadedArm):
             self._release()
             raise
 
-    def recover(self) -> None:
-        """Connect again after a person has put right what stopped the arm; unlocks nothing.
-
-        Raises:
-            ArmFault: the arm is still stopped or cannot be reached.
-        """
-        with contextlib.suppress(ArmFault):  # connecting finds out, and says so
-            self.close()
-        self.connect()
-
     def state(self) -> ArmState:
-        """The arm's state as last reported; never waits."""
+        """Return the last reported state without waiting."""
         if self._lost is not None or self._status is None:
             return ArmState.DISCONNECTED
         if self._status.state is not ArmState.READY:
@@ -130,24 +120,26 @@ class AbbArm(ThreadedArm):
         return ArmState.READY if self._run.done else ArmState.MOVING
 
     def pose(self) -> Pose:
-        """Return where the tool centre point is: by the last EGM pose, else by the web services.
+        """Return the tool centre point from the last EGM pose, else from the web services.
+
+        Takes at most `REQUEST_S`.
 
         Raises:
-            ArmFault: neither is there. Takes at most `REQUEST_S`.
+            ArmFault: neither is available.
         """
         last = self._stream.last
         if last is not None and not self._is_stale(last):
             return last.pose
         try:
-            return self._stands()
+            return self._web_pose()
         except WebError as error:
             raise ArmFault("arm", str(error)) from None
 
     def now_ns(self) -> int:
-        """The controller's EGM clock, ns: the last pose's, carried on by the host's if it is old.
+        """Return the controller's EGM clock, ns, extrapolated by the host's if the pose is stale.
 
         Raises:
-            ArmFault: no pose has come yet.
+            ArmFault: no pose has been received yet.
         """
         last = self._stream.last
         if last is None:
@@ -157,30 +149,30 @@ class AbbArm(ThreadedArm):
         return last.t_ns + time.monotonic_ns() - last.host_ns
 
     def health(self) -> DeviceHealth:
-        """Return the controller's own report; takes at most 6 `REQUEST_S`.
+        """Return the controller's health report; takes at most 6 `REQUEST_S`.
 
         Raises:
             ArmFault: it does not answer.
         """
         if self._web is None:
-            raise self._fault(ArmState.DISCONNECTED, "cannot be asked")
+            raise self._fault(ArmState.DISCONNECTED, "cannot report its health")
         try:
             return abb_health(self._web, self._notes())
         except WebError as error:
             raise ArmFault("arm", str(error)) from None
 
     def describe(self) -> Json:
-        """Packets of its poses that gave none since connecting, by why."""
+        """Return the number of lost and rejected pose packets since connecting, by reason."""
         return {**self._losses()}
 
     def start(self, path: Sequence[Segment]) -> None:
-        """Begin to follow `path`: checked against the limits, uploaded, started.
+        """Check `path` against the limits, upload and start it.
 
         Takes at most (13 + `rws.START_REQUESTS`) `REQUEST_S` + `STOPPED_S`.
 
         Raises:
             GuardError: a limit forbids the path; nothing was sent.
-            ArmFault: the arm cannot move, or not at the speed asked for.
+            ArmFault: the arm cannot move, or not at the requested speed.
             RigError: it is still moving, or the path is empty.
         """
         with self._starting:
@@ -189,7 +181,7 @@ class AbbArm(ThreadedArm):
                 raise self._fault(ArmState.DISCONNECTED, "cannot move")
             begin = self.pose()
             try:
-                self._see(self._web.status())
+                self._update(self._web.status())
                 if self.state() is not ArmState.READY:
                     raise self._fault(self.state(), "cannot move")
                 self._check_speed()
@@ -202,11 +194,11 @@ class AbbArm(ThreadedArm):
                 run = Run(path)
                 self._watch = SegmentWatch(self._planned or begin, path)
                 self._run = run
-                self._began_s, self._may_move = math.inf, True  # no state tells of it until later
+                self._began_s, self._may_move = math.inf, True  # no status covers this path yet
                 self._web.start(program)
             except WebError as error:
-                self._give_up()
-                raise ArmFault("arm", f"did not take a path: {error}") from None
+                self._abort()
+                raise ArmFault("arm", f"did not accept the path: {error}") from None
             self._began_s = time.monotonic()
             self._begin(run)
 
@@ -214,39 +206,39 @@ class AbbArm(ThreadedArm):
         """Return how far the path has come.
 
         Raises:
-            ArmFault: the path was given up for a reason that `state` does not tell.
+            ArmFault: the path was aborted for a reason that `state` does not show.
         """
         run, state = self._run, self.state()
         if run.error is not None and run.done and state is ArmState.DISCONNECTED:
-            raise run.error  # it says more than that the arm cannot be reached
+            raise run.error  # more specific than that the arm cannot be reached
         return run.progress(state)
 
     def stop(self) -> None:
         """Stop the program and the arm; safe at any time; never unlocks anything.
 
-        Every way is tried: the connection there is, a new one, and no more beats for the
-        controller's watchdog. Takes at most 6 `REQUEST_S` + `STOPPED_S`, or, where poses still
-        come, `settings.watchdog_s` + `UNSEEN_STILL_S` longer; twice that if another thread is
-        about to stop it.
+        Tries the open connection, then a new one, then withholds the heartbeat of the controller's
+        watchdog. Takes at most 6 `REQUEST_S` + `STOPPED_S`; `settings.watchdog_s` +
+        `UNSEEN_STILL_S` longer where poses still arrive; twice that if another thread is stopping
+        the arm at the same time.
 
         Raises:
-            ArmFault: a path was sent, and the arm was not seen at rest since.
+            ArmFault: a path was sent, and the arm is not confirmed at rest since.
         """
         began_s, run = time.monotonic(), self._run
         run.cancelled = True
         self._stream.wake()
         with self._stopping:
             if self._not_stopped is not None and self._not_stopped[0] > began_s:
-                raise self._not_stopped[1]  # another thread has tried meanwhile
+                raise self._not_stopped[1]  # another thread has just tried
             if self._may_move:
                 self._halt(run)
         run.join(SILENCE_S + 1.0)
 
     def close(self) -> None:
-        """Stop if it moves, and give every connection back.
+        """Stop the arm if it moves, and close every connection.
 
         Raises:
-            ArmFault: it was not seen at rest; the connections are given back all the same.
+            ArmFault: the arm is not confirmed at rest; the connections are closed all the same.
         """
         try:
             self.stop()
@@ -254,13 +246,13 @@ class AbbArm(ThreadedArm):
             self._release()
 
     def _release(self) -> None:
-        """Give every connection back; the watchdog goes on watching an arm that may move."""
+        """Close every connection; the controller's watchdog stays active if the arm may move."""
         self._closing.set()
         self._lost = self._lost or "closed"
         self._run.cancelled = True
         self._stream.wake()
         for thread in self._threads:
-            thread.join(LOOK_S)
+            thread.join(STATUS_S)
         self._threads.clear()
         if self._egm is not None:
             self._egm.close()
@@ -272,14 +264,14 @@ class AbbArm(ThreadedArm):
         self._run.done = True
 
     def _halt(self, run: Run) -> None:
-        """Stop by every way there is, and see that it stands.
+        """Stop the arm by every available means, and confirm that it is at rest.
 
         Raises:
-            ArmFault: it was not seen to.
+            ArmFault: this was not confirmed.
         """
         left_s = sum(self._seconds(run))
         try:
-            self._halt_and_see(left_s)
+            self._halt_and_confirm(left_s)
         except ArmFault as fault:
             self._not_stopped = time.monotonic(), fault
             if self._watchdog is not None:
@@ -292,7 +284,7 @@ class AbbArm(ThreadedArm):
         if self._watchdog is not None:
             self._watchdog.resume()
 
-    def _halt_and_see(self, left_s: float) -> None:
+    def _halt_and_confirm(self, left_s: float) -> None:
         web = self._web
         try:
             if web is None:
@@ -311,39 +303,39 @@ class AbbArm(ThreadedArm):
         except WebError:
             watched = self._settings.watchdog_s
             if self._stream.wait_for(
-                lambda: self._stands_since(UNSEEN_STILL_S), self._unseen_s(watched or 0.0)
+                lambda: self._at_rest_for(UNSEEN_STILL_S), self._rest_timeout_s(watched or 0.0)
             ):
                 return
             ends = (
                 f"its path of {left_s:.0f} s runs to its end"
                 if watched is None
-                else f"its controller stops it {watched:g} s after the last beat, unseen from here"
+                else f"its controller stops it {watched:g} s after the last beat, unconfirmed"
             )
             raise ArmFault(
                 "arm",
-                f"cannot be reached to be stopped ({why}); {ends}: press its emergency stop",
+                f"cannot be reached to stop it ({why}); {ends}: press its emergency stop",
             ) from None
         finally:
             web.close()
 
-    def _unseen_s(self, watched_s: float) -> float:
-        """Return how long to look at its poses for standing still; 0 where none come."""
+    def _rest_timeout_s(self, watched_s: float) -> float:
+        """Return the timeout for the poses to show the arm at rest; 0 where none arrive."""
         last = self._stream.last
         if last is None or self._is_stale(last):
             return 0.0
         return watched_s + UNSEEN_STILL_S + STOPPED_S
 
     def _await_rest(self, web: WebServices) -> None:
-        """Wait until no program runs and the arm stands, by its poses or by the web services.
+        """Wait until no program runs and poses or web services show the arm at rest.
 
         Raises:
-            ArmFault: it goes on.
+            ArmFault: the arm does not stop.
             WebError: no answer.
         """
         deadline, before = time.monotonic() + STOPPED_S, None
         while True:
             if not web.is_running():
-                if self._stream.wait_for(lambda: self._stands_since(STILL_S), 2 * STILL_S):
+                if self._stream.wait_for(lambda: self._at_rest_for(STILL_S), 2 * STILL_S):
                     return
                 here = web.flange()[0]
                 if before is not None and is_at(before, here):
@@ -352,9 +344,9 @@ class AbbArm(ThreadedArm):
             if time.monotonic() > deadline:
                 raise ArmFault("arm", "does not stop: press its emergency stop")
 
-    def _stands_since(self, seconds: float) -> bool:
-        """Return whether fresh poses have not moved for so long."""
-        last, first = self._stream.last, self._stands_at
+    def _at_rest_for(self, seconds: float) -> bool:
+        """Return whether fresh poses have not changed for this long."""
+        last, first = self._stream.last, self._at_rest
         if last is None or first is None or self._is_stale(last):
             return False
         return last.host_ns - first[1] >= seconds * 1e9
@@ -371,13 +363,13 @@ class AbbArm(ThreadedArm):
                 f"UDP port {settings.egm_port} cannot be opened for poses from {sender}: {error}",
             ) from None
         self._web = WebServices(settings)
-        self._see(self._web.status())
+        self._update(self._web.status())
         self._lost = None
         if self.state() is not ArmState.READY:
             raise self._fault(self.state(), "cannot connect")
         self._check_speed()
         self._check_task()
-        for work in (self._listen, self._monitor):
+        for work in (self._receive, self._monitor):
             self._threads.append(threading.Thread(target=work, daemon=True))
             self._threads[-1].start()
         began_ns = time.monotonic_ns()
@@ -388,20 +380,20 @@ class AbbArm(ThreadedArm):
             raise self._fault(ArmState.DISCONNECTED, "cannot connect")
         if not self._fresh_since(began_ns):
             counts = self._egm.counts
-            others = f" ({counts.foreign} packets of others were dropped)" if counts.foreign else ""
+            foreign = f" ({counts.foreign} from other addresses dropped)" if counts.foreign else ""
             raise ArmFault(
                 "arm",
-                f"no pose came on UDP port {settings.egm_port} from {sender}{others}: check the "
+                f"no pose came on UDP port {settings.egm_port} from {sender}{foreign}: check the "
                 "address and port of the device 'UCdevice' in the controller's configuration",
             )
-        self._agree()
+        self._check_agreement()
         asked = time.monotonic()
-        if not self._stream.wait_for(lambda: self._has_stopped(asked), STOPPED_S + LOOK_S):
+        if not self._stream.wait_for(lambda: self._has_stopped(asked), STOPPED_S + STATUS_S):
             raise ArmFault("arm", "its program does not end")
         self._may_move, self._not_stopped = False, None
 
     def _begin_watch(self) -> None:
-        """Have the controller stop the arm when this host is gone. Raises WebError, ArmFault."""
+        """Activate the controller's watchdog on this host. Raises WebError, ArmFault."""
         limit_s = self._settings.watchdog_s
         if limit_s is None:
             return
@@ -413,30 +405,30 @@ class AbbArm(ThreadedArm):
         except WebRefused as error:
             raise ArmFault(
                 "arm",
-                f"has no watchdog that would stop it when this computer is gone ({error}); load "
-                "docs/rapid/sliplab_watchdog.mod into its controller (docs/arms.md), or write "
-                "devices.arm.watchdog_s: null to do without",
+                f"has no watchdog to stop it when this computer fails ({error}); load "
+                "docs/rapid/sliplab_watchdog.mod into its controller (docs/arms.md), or set "
+                "devices.arm.watchdog_s: null to run without one",
             ) from None
 
     def _check_task(self) -> None:
-        """Refuse to start or to end what is somebody else's. Raises ArmFault, WebError."""
+        """Check that the task has no other user's program. Raises ArmFault, WebError."""
         assert self._web is not None
         task = self._settings.task
         entry = self._web.about(f"rw/rapid/tasks/{task}").get("prodentrypt", ENTRY)
         if entry.lower() != ENTRY:
             raise ArmFault(
                 "arm",
-                f"has a task {task} that begins with {entry}, so that starting it would run "
-                f"somebody else's program: it is to begin with {ENTRY} of abb-motion-program-exec",
+                f"has a task {task} with the entry routine {entry}, so that starting it would run "
+                f"another user's program: set it to {ENTRY} of abb-motion-program-exec",
             )
-        # RobotWare's own spelling of the key, and the right one
+        # RobotWare misspells the key; the correct spelling is accepted too
         pointer = self._web.about(f"rw/rapid/tasks/{task}/pcp")
         module = pointer.get("modulemame", pointer.get("modulename", ""))
         if module and not module.lower().startswith(MODULES):
             raise ArmFault(
                 "arm",
-                f"has somebody else's program paused in module {module} of task {task}: let that "
-                "person end it (PP to Main at the pendant)",
+                f"has another user's program paused in module {module} of task {task}: have it "
+                "ended first (PP to Main at the pendant)",
             )
 
     def _check_speed(self) -> None:
@@ -444,25 +436,25 @@ class AbbArm(ThreadedArm):
         if status is not None and status.speed_percent != FULL_SPEED_PERCENT:
             raise ArmFault(
                 "arm",
-                f"its speed ratio stands at {status.speed_percent:g} %, so every move would be "
-                "slower than asked for: set it to 100 % at the pendant",
+                f"its speed ratio is {status.speed_percent:g} %, so every move would be slower "
+                "than requested: set it to 100 % at the pendant",
             )
 
     def _await_end(self) -> None:
-        """Wait for the last program's end, a rest after its last segment. Raises as it says."""
+        """Wait for the last program to end. Raises ArmFault, WebError."""
         assert self._web is not None
         deadline = time.monotonic() + STOPPED_S
         while self._web.is_running():
             if time.monotonic() > deadline:
-                raise ArmFault("arm", "runs a program already: stop it at the pendant")
+                raise ArmFault("arm", "is already running a program: stop it at the pendant")
 
     def _notes(self) -> tuple[str, ...]:
-        """Return notes for a person on its poses and its watchdog."""
+        """Return the notes of the health report on poses and watchdog."""
         limit_s = self._settings.watchdog_s
         watch = (
-            "no watchdog: a path runs to its end if this computer is gone"
+            "no watchdog: a path runs to its end if this computer fails"
             if limit_s is None
-            else f"stopped by its controller {limit_s:g} s after this computer is gone"
+            else f"stopped by its controller {limit_s:g} s after this computer fails"
         )
         losses = ", ".join(f"{name} {count}" for name, count in self._losses().items())
         return (watch, losses)
@@ -476,25 +468,25 @@ class AbbArm(ThreadedArm):
             "packets_of_others": counts.foreign,
         }
 
-    def _agree(self) -> None:
+    def _check_agreement(self) -> None:
         last = self._stream.last
         assert last is not None
-        apart = distance_mm(last.pose, self._stands())
+        apart = distance_mm(last.pose, self._web_pose())
         if apart > AGREE_MM:
             raise ArmFault(
                 "arm",
-                f"EGM and web services tell places {apart:.1f} mm apart: set `egm_point` to the "
-                "one that this controller's EGM tells, tool or flange",
+                f"EGM and web services report positions {apart:.1f} mm apart: set `egm_point` to "
+                "the point that this controller's EGM reports, tool or flange",
             )
 
-    def _stands(self) -> Pose:
-        """The tool centre point by the web services. Raises WebError."""
+    def _web_pose(self) -> Pose:
+        """Return the tool centre point from the web services. Raises WebError."""
         if self._web is None:
             raise self._fault(ArmState.DISCONNECTED, "has no pose")
         return compose(self._web.flange()[0], self._tool)
 
-    def _listen(self) -> None:
-        """Every pose that comes, until the arm is closed or its poses cannot be used."""
+    def _receive(self) -> None:
+        """Receive poses until the arm is closed or the stream is unusable."""
         flange = self._settings.egm_point == "flange"
         egm = self._egm
         while egm is not None and not self._closing.is_set():
@@ -502,14 +494,14 @@ class AbbArm(ThreadedArm):
                 came = egm.read(MONITOR_S)
             except EgmFault as fault:
                 if not self._run.done:
-                    self._run.error = ArmFault("arm", f"{fault}; its path was given up")
+                    self._run.error = ArmFault("arm", f"{fault}; its path was aborted")
                 self._lost = str(fault)
                 self._stream.wake()
                 return
             if came is not None:
                 self._take(came, self._tool if flange else None)
             else:
-                self._stream.wake()  # who waits for a pose looks at how long it has stayed away
+                self._stream.wake()  # waiting threads check the age of the last pose
 
     def _take(self, came: EgmPose, tool: Pose | None) -> None:
         planned = came.planned if tool is None else compose(came.planned, tool)
@@ -517,20 +509,20 @@ class AbbArm(ThreadedArm):
         self._planned = planned
         watch, run = self._watch, self._run
         if watch is not None and not run.done:
-            times = watch.see(came.t_ns, planned)
+            times = watch.add(came.t_ns, planned)
             if times is not None:
                 run.finished.append(times)
-        if self._stands_at is None or has_left(self._stands_at[0], planned):
-            self._stands_at = planned, came.host_ns
+        if self._at_rest is None or has_left(self._at_rest[0], planned):
+            self._at_rest = planned, came.host_ns
         self._stream.add(Sample(came.t_ns, came.host_ns, measured.xyz_mm, measured.rotvec_deg))
 
     def _monitor(self) -> None:
-        """The state, asked for again and again over a session of its own."""
+        """Poll the state over a separate session."""
         web, failures = WebServices(self._settings), 0
         while not self._closing.wait(MONITOR_S):
             asked = time.monotonic()
             try:
-                self._see(web.status(), asked)
+                self._update(web.status(), asked)
                 failures = 0
             except WebError as error:
                 failures += 1
@@ -540,7 +532,7 @@ class AbbArm(ThreadedArm):
                     break
         web.close()
 
-    def _see(self, status: WebStatus, asked_s: float = 0.0) -> None:
+    def _update(self, status: WebStatus, asked_s: float = 0.0) -> None:
         self._status = status
         self._asked_s = max(self._asked_s, asked_s)
         if self._run.done and self._has_stopped(self._began_s):
@@ -548,7 +540,7 @@ class AbbArm(ThreadedArm):
         self._stream.wake()
 
     def _follow_path(self, run: Run) -> None:
-        """Wait until all segments have ended, or something else has."""
+        """Wait until all segments have ended, or the path has ended otherwise."""
         watch = self._watch
         assert watch is not None
 
@@ -556,44 +548,44 @@ class AbbArm(ThreadedArm):
             return watch.done or run.cancelled or self._has_stopped(self._began_s)
 
         def over() -> bool:
-            return ended() or not self.state().healthy or self._why_given_up() is not None
+            return ended() or not self.state().healthy or self._abort_reason() is not None
 
         seconds = sum(self._seconds(run))
         if not self._stream.wait_for(over, 1.5 * seconds + OVERTIME_S):
-            raise ArmFault("arm", f"did not end a path of {seconds:.1f} s in time")
-        why = self._why_given_up()
+            raise ArmFault("arm", f"did not finish a path of {seconds:.1f} s in time")
+        why = self._abort_reason()
         if why is not None and not ended():
             raise ArmFault("arm", why)
         if self._has_stopped(self._began_s):  # the last poses may still be on their way
             self._stream.wait_for(lambda: watch.done, SILENCE_S)
             self._finish(run)
         elif self._lost is not None and not run.cancelled:
-            self._give_up()
+            self._abort()
 
-    def _path_is_over(self) -> None:
+    def _on_path_end(self) -> None:
         if self._has_stopped(self._began_s):
             self._may_move = False
-        super()._path_is_over()
+        super()._on_path_end()
 
-    def _why_given_up(self) -> str | None:
-        """Return why the path is to be given up, if it is: no poses, or another speed."""
+    def _abort_reason(self) -> str | None:
+        """Return the reason to abort the path, if any: no poses, or a changed speed ratio."""
         watch, last, status = self._watch, self._stream.last, self._status
         seen_s = max(self._began_s, last.host_ns / 1e9 if last is not None else 0.0)
         silent_s = time.monotonic() - seen_s
         if silent_s > (SILENCE_S if watch is not None and watch.begun else FIRST_POSE_S):
-            return f"sent no pose for {silent_s:.1f} s while it moved; its path was given up"
+            return f"sent no pose for {silent_s:.1f} s while it moved; its path was aborted"
         if status is not None and status.speed_percent != FULL_SPEED_PERCENT:
             return (
                 f"had its speed ratio set to {status.speed_percent:g} % while it moved; its path "
-                "was given up: set it to 100 % at the pendant"
+                "was aborted: set it to 100 % at the pendant"
             )
         return None
 
     def _finish(self, run: Run) -> None:
-        """The program ended by itself: the last segment has too if the arm is at its target."""
+        """Conclude a path whose program has ended; its last segment ended if at its target."""
         last = self._stream.last
         if last is None or self._is_stale(last):
-            raise ArmFault("arm", "sent no poses to the end of its path")
+            raise ArmFault("arm", "sent no poses at the end of its path")
         one_left = len(run.finished) == len(run.path) - 1
         if one_left and not run.cancelled and is_at(last.pose, run.path[-1].to):
             begin = run.finished[-1][1] if run.finished else last.t_ns
@@ -603,23 +595,23 @@ class AbbArm(ThreadedArm):
         web, watchdog = self._web, self._watchdog
         if web is None or watchdog is None:
             return
-        with contextlib.suppress(WebError):  # then the link is lost, and the state says so
+        with contextlib.suppress(WebError):  # then the connection is lost, which the state shows
             if watchdog.stopped_it(web):
                 raise ArmFault(
                     "arm",
-                    "was stopped by its controller's watchdog: no beat of this computer reached "
-                    f"it for {self._settings.watchdog_s:g} s; look at the network and the load",
+                    "was stopped by its controller's watchdog: no heartbeat of this computer "
+                    f"arrived for {self._settings.watchdog_s:g} s; check the network and the load",
                 )
 
-    def _give_up(self) -> None:
-        """Stop what nobody follows any more; `stop` tells if it does not."""
+    def _abort(self) -> None:
+        """Stop the arm, whose path is no longer followed; `stop` raises if that fails."""
         self._run.done = True
         with self._stopping, contextlib.suppress(ArmFault):
             if self._may_move:
                 self._halt(self._run)
 
     def _has_stopped(self, since_s: float) -> bool:
-        """Return whether no program runs, by a question asked after `since_s`."""
+        """Return whether a status requested after `since_s` shows no running program."""
         status = self._status
         return status is not None and self._asked_s > since_s and status.execution == "stopped"
 
@@ -631,7 +623,7 @@ class AbbArm(ThreadedArm):
         return time.monotonic_ns() - sample.host_ns > SILENCE_S * 1e9
 
     def _seconds(self, run: Run) -> list[float]:
-        """Return how long each segment takes, without its ramps."""
+        """Return the duration of each segment without its ramps, s."""
         places = [self._planned or run.path[0].to, *(segment.to for segment in run.path)]
         return [
             distance_mm(one, segment.to) / segment.speed_mm_s + PAUSE_S

@@ -1,9 +1,9 @@
-"""Poses from ABB's Externally Guided Motion: UDP packets that the controller sends by itself.
+"""Poses from ABB's Externally Guided Motion: UDP packets that the controller streams.
 
 abb-motion-program-exec's RAPID module starts the stream with every motion program. The time of a
-pose is the controller's (`feedBack.time`, s and us); its planned pose is the commanded one and has
-no noise, so a segment's start and end are read from it where it is sent. UDP carries no proof of
-its sender, order or completeness: address, sequence number and time of every packet are checked.
+pose is the controller's (`feedBack.time`, s and us). The planned pose is the commanded one and has
+no noise, so segment starts and ends are detected from it where it is sent. UDP guarantees neither
+sender, order nor delivery: address, sequence number and time of every packet are checked.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from sliplab.rigs.core.pose import from_quaternion
 
 _BUFFER_BYTES = 1 << 20
 _SO_TIMESTAMPNS = 35
-"""Linux's option, and the type of its message: when the kernel took a packet, by the wall clock."""
+"""Linux socket option and message type: wall-clock time at which the kernel received a packet."""
 _TIMESPEC = struct.Struct("@ll")
 _OLDEST_NS = 10_000_000_000
-"""A packet said to be older than this was stamped before the wall clock was set."""
+"""Largest age; a packet that seems older was stamped before the wall clock was set."""
 LATE_NS = 1_000_000_000
-"""A packet this much older than the last one was not delayed: the controller's clock went back."""
+"""A packet this much older than the last was not delayed: the controller's clock jumped back."""
 _FURTHEST_MM = 1e5
 _UNIT_TOLERANCE = 0.01
 """Largest deviation of a quaternion from length 1; the controller sends doubles."""
 
 
 class EgmFault(RuntimeError):
-    """The stream cannot be used: no times, or times that run backwards; the text says which."""
+    """The stream is unusable: no times, or times that decrease; the text says which."""
 
 
 @dataclass(frozen=True)
@@ -46,39 +46,39 @@ class EgmPose:
 
     t_ns: int
     host_ns: int
-    """When it arrived at this computer, as well as its kernel knows, on the monotonic clock."""
+    """Arrival time at this computer, from the kernel where possible, monotonic clock."""
     measured: Pose
     planned: Pose
-    """Commanded; the measured one where the controller does not send it."""
+    """Commanded pose; the measured one where the controller does not send it."""
 
 
 @dataclass
 class EgmCounts:
-    """Packets that gave no pose, since the port was opened."""
+    """Lost and rejected packets since the port was opened."""
 
     lost: int = 0
-    """Numbers missing in the sequence."""
+    """Missing sequence numbers."""
     late: int = 0
-    """Came after a newer one, or twice."""
+    """Packets out of order, or duplicates."""
     malformed: int = 0
-    """From the controller's address, and no whole packet with a finite pose."""
+    """Packets from the controller without a complete, finite pose."""
     foreign: int = 0
-    """From any other address."""
+    """Packets from any other address."""
 
 
 class _StampedSocket(socket.socket):
-    """A UDP socket that knows when the packet read last arrived, not only when it was read."""
+    """A UDP socket that reports the arrival time of the last packet, not only its reading time."""
 
     arrived_ns = 0
 
     def stamp(self) -> None:
-        """Ask the kernel for arrival times, where it is Linux."""
+        """Request arrival times from the kernel; Linux only."""
         if sys.platform == "linux":
             with suppress(OSError):
                 self.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, Any]:
-        """The next packet and its sender."""
+        """Return the next packet and its sender."""
         data, notes, _, sender = self.recvmsg(size, socket.CMSG_SPACE(_TIMESPEC.size), flags)
         self.arrived_ns = time.monotonic_ns()
         for level, kind, note in notes:
@@ -90,18 +90,18 @@ class _StampedSocket(socket.socket):
 
 
 class EgmReceiver:
-    """Listens on one UDP port for the packets of one controller.
+    """Receives the packets of one controller on a UDP port.
 
     Args:
         bind: address of the network card that the controller sends to.
         port: UDP port that the controller sends to.
-        sender: address or name of the controller; packets of others are counted and dropped.
+        sender: address or name of the controller; other packets are counted and dropped.
 
     Attributes:
-        counts: packets that gave no pose.
+        counts: lost and rejected packets.
 
     Raises:
-        OSError: the port is taken, or the sender's name is not known.
+        OSError: the port is taken, or the sender's name cannot be resolved.
     """
 
     def __init__(self, bind: str, port: int, sender: str) -> None:
@@ -121,10 +121,10 @@ class EgmReceiver:
         self._egm.socket = self._link = link
 
     def read(self, within_s: float) -> EgmPose | None:
-        """The next packet's pose; None after `within_s`, or for a packet that gives none.
+        """Return the next packet's pose; None after `within_s`, or for a rejected packet.
 
         Raises:
-            EgmFault: packets without times, or a clock that went back.
+            EgmFault: packets carry no time, or the clock jumped back.
         """
         self._egm.egm_addr = None
         try:
@@ -146,10 +146,7 @@ class EgmReceiver:
             return None
         message = state.robot_message
         if not message.feedBack.HasField("time"):
-            raise EgmFault(
-                "its EGM packets carry no time, so poses would have none: RobotWare 6.07 or "
-                "newer is needed"
-            )
+            raise EgmFault("its EGM packets carry no time stamp: RobotWare 6.07 or newer is needed")
         clock = message.feedBack.time
         t_ns = clock.sec * 1_000_000_000 + clock.usec * 1_000
         if not self._is_next(message.header.seqno, t_ns):
@@ -157,27 +154,27 @@ class EgmReceiver:
         return EgmPose(t_ns, self._link.arrived_ns, measured, planned)
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         self._egm.close()
 
     def _is_next(self, number: int, t_ns: int) -> bool:
-        """Return whether a packet is newer than the last one; counts those missing between."""
+        """Return whether a packet is newer than the last one; count the missing ones between."""
         if self._last is not None:
             last, last_ns = self._last
             back_ns = last_ns - t_ns
             if back_ns > LATE_NS or (back_ns > 0 and number > last):
-                raise EgmFault(f"the controller's clock went back by {back_ns / 1e9:.3f} s")
+                raise EgmFault(f"the controller's clock jumped back by {back_ns / 1e9:.3f} s")
             if back_ns >= 0:
                 self.counts.late += 1
                 return False
-            if number > last:  # else the controller began to count anew, as with each program
+            if number > last:  # else the controller restarted its count, as with each program
                 self.counts.lost += number - last - 1
         self._last = number, t_ns
         return True
 
 
 def _pose(cartesian: tuple[Any, Any]) -> Pose | None:
-    """The pose of a place in mm and a quaternion; None if they are not one."""
+    """Convert a position in mm and a quaternion to a pose; None if they are invalid."""
     xyz_mm, wxyz = cartesian[0].tolist(), cartesian[1].tolist()
     if not all(math.isfinite(value) and abs(value) < _FURTHEST_MM for value in (*xyz_mm, *wxyz)):
         return None

@@ -1,10 +1,10 @@
-"""A fake for an ABB IRC5 controller: Robot Web Services, motion programs, poses by EGM.
+"""A fake ABB IRC5 controller: Robot Web Services, motion programs, poses by EGM.
 
 HTTP with digest authentication and JSON on one port, as abb-robot-client 0.4.0 and
-abb-motion-program-exec 0.7.4 ask for it; EGM packets are sent to a UDP port from the first motion
-program on, as the RAPID module on the controller does it. There is one mechanical unit, ROB_1.
-The module `docs/rapid/sliplab_watchdog.mod` is loaded, unless it is left out. What is not simulated
-is refused.
+abb-motion-program-exec 0.7.4 expect it; EGM packets are sent to a UDP port from the first motion
+program on, as by the RAPID module on the controller. There is one mechanical unit, ROB_1. The
+module `docs/rapid/sliplab_watchdog.mod` is loaded, unless it is left out. Requests that are not
+simulated are refused.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LOAD = 11
 
 
 class ProgramError(ValueError):
-    """Not a motion program, or one with commands that are not known here."""
+    """Not a motion program, or one with commands that are not simulated."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ class MoveL:
 
 @dataclass(frozen=True)
 class Wait:
-    """Standing still for some seconds."""
+    """A pause of some seconds."""
 
     seconds: float
 
 
 @dataclass(frozen=True)
 class Program:
-    """A whole motion program without EGM commands."""
+    """A motion program without EGM commands."""
 
     tool: Pose
     tool_mass_kg: float
@@ -84,7 +84,7 @@ class _Reader:
         try:
             values = struct.unpack_from(f"<{count}f", self._data, self._at)
         except struct.error:
-            raise ProgramError("the file ends too soon") from None
+            raise ProgramError("the file is truncated") from None
         self._at += 4 * count
         return values
 
@@ -101,10 +101,10 @@ class _Reader:
 
 
 def read_program(data: bytes) -> Program:
-    """The motion program in a file's bytes. Raises ProgramError."""
+    """Parse a motion program file. Raises ProgramError."""
     reader = _Reader(data)
     if reader.number() != FILE_VERSION:
-        raise ProgramError("another file version")
+        raise ProgramError("unsupported file version")
     reader.number()  # the robot holds the tool
     tool = reader.pose()
     mass_kg = reader.numbers(_LOAD)[0]
@@ -114,7 +114,7 @@ def read_program(data: bytes) -> Program:
     reader.skip_text()
     reader.number()  # sequence number
     if reader.number() != 0:
-        raise ProgramError("EGM commands are not known here")
+        raise ProgramError("EGM commands are not simulated")
     commands: list[MoveL | Wait] = []
     while not reader.ended:
         _, operation = reader.numbers(2)
@@ -127,7 +127,7 @@ def read_program(data: bytes) -> Program:
         elif operation == _WAIT:
             commands.append(Wait(reader.number()))
         else:
-            raise ProgramError(f"the command {operation:g} is not known here")
+            raise ProgramError(f"the command {operation:g} is not simulated")
     return Program(tool, mass_kg, tuple(commands))
 
 
@@ -137,38 +137,37 @@ STOP_MM_S2 = 2000.0
 _ORIGIN = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _TICK_S = 0.002
 LATE_S = 0.005
-"""A packet that would leave later than this is lost: a controller is never late, the network may
-lose."""
+"""Delay after which a packet is dropped: a controller is never late, but networks lose packets."""
 WATCH_S = 0.02
 """Cycle of the watchdog module, s."""
 _SIGNALS = "rw/iosystem/signals/Local/DRV_1/"
 _NO_AXIS = "9E+09"
-"""Value that RAPID gives an external axis that is not there."""
+"""RAPID's value for an external axis that does not exist."""
 
 
 class FakeAbb(FakeController):
     """One fake controller.
 
     Args:
-        host, motion, rate, clock: as of any `FakeController`.
-        port: of its web services.
-        egm: address and UDP port that it sends its poses to.
-        cycle_hz: EGM packets a controller second; 250 from the real one.
-        egm_point: what EGM tells: the tool centre point, or the flange.
-        faults: what will go wrong.
-        watchdog: whether the watchdog module is loaded. It counts the host's seconds, whatever
-            the rate: it watches the host.
-        answer_s: how long each answer takes.
-        egm_time: whether its packets tell the time, as from RobotWare 6.07 on.
+        host, motion, rate, clock: as in `FakeController`.
+        port: port of the web services.
+        egm: address and UDP port to which poses are sent.
+        cycle_hz: EGM packets per controller second; 250 on the real controller.
+        egm_point: the point that EGM reports: tool centre point or flange.
+        faults: faults to inject.
+        watchdog: True to load the watchdog module. It counts the host's seconds at any rate,
+            because it watches the host.
+        answer_s: delay of each answer.
+        egm_time: True if packets carry the time, as from RobotWare 6.07 on.
 
     Attributes:
-        speed_percent: the pendant's speed ratio, for moves that begin from now on.
-        egm_on: whether it sends poses.
-        web_on: whether its web services answer.
-        entry: where its task begins.
-        pointer: module in which its program stands.
-        mute_after_start: whether they do so no more once the next program has started.
-        watchdog_stops: how often the watchdog module has stopped the arm.
+        speed_percent: the pendant's speed ratio, for subsequent moves.
+        egm_on: True while poses are sent.
+        web_on: True while the web services answer.
+        entry: entry routine of the task.
+        pointer: module of the program pointer.
+        mute_after_start: True to switch `egm_on` and `web_on` off when the next program starts.
+        watchdog_stops: number of stops by the watchdog module.
     """
 
     def __init__(
@@ -189,7 +188,7 @@ class FakeAbb(FakeController):
     ) -> None:
         super().__init__(host, motion, clock, rate)
         self.port, self._egm = port, egm
-        self._faults = FaultPlan(faults, self._happen)
+        self._faults = FaultPlan(faults, self._inject)
         self.controller, self.mode = "motoron", "AUTO"
         self.running = False
         self.speed_percent = 100.0
@@ -226,7 +225,7 @@ class FakeAbb(FakeController):
         self._thread.start()
 
     def close(self) -> None:
-        """Cut every connection and give the port back."""
+        """Close every connection and release the port."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(START_S)
@@ -235,18 +234,18 @@ class FakeAbb(FakeController):
             self._unplugging.join(START_S)
         self._udp.close()
 
-    def happen(self, kind: Kind) -> None:
-        """Make something go wrong now."""
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now."""
         with self._lock:
-            self._happen(kind)
+            self._inject(kind)
 
     def drop_connections(self) -> None:
-        """Cut the connections there are; new ones are taken."""
+        """Close the open connections; new ones are accepted."""
         if self._http is not None:
             self._http.cut()
 
     def restore(self) -> None:
-        """A person has put everything right: link, motors, mode."""
+        """Clear every fault of connection, motors and mode, as an operator would."""
         self._unplug()
         if self._unplugging is not None:
             self._unplugging.join(START_S)
@@ -257,17 +256,17 @@ class FakeAbb(FakeController):
 
     @property
     def sessions(self) -> int:
-        """Number of clients that are logged in."""
+        """Number of logged-in clients."""
         return 0 if self._http is None else self._http.sessions
 
     def _unplug(self) -> None:
-        """Cut the connections from a thread of its own: a handler cannot wait for itself to end."""
+        """Close the connections in another thread, since a handler cannot wait for its own end."""
         http, self._http = self._http, None
         if http is not None:
             self._unplugging = threading.Thread(target=http.close, daemon=True)
             self._unplugging.start()
 
-    def _happen(self, kind: Kind) -> None:
+    def _inject(self, kind: Kind) -> None:
         if kind in {Kind.LINK_CUT, Kind.SILENCE}:
             self._silent = True
             if kind is Kind.LINK_CUT:
@@ -285,7 +284,7 @@ class FakeAbb(FakeController):
             Kind.EMERGENCY_STOP: ("emergencystop", self.mode),
             Kind.REMOTE_OFF: ("motoroff", "MANR"),
             Kind.POWER_OFF: ("motoroff", self.mode),
-            Kind.PROGRAM_PAUSED: (self.controller, self.mode),  # a stopped program may go on
+            Kind.PROGRAM_PAUSED: (self.controller, self.mode),  # a stopped program may continue
             Kind.PROGRAM_END: (self.controller, self.mode),
         }
         if kind not in states:
@@ -309,7 +308,7 @@ class FakeAbb(FakeController):
                     self._step(self._cycle / self._cycle_hz)
 
     def _watch(self, now_s: float) -> None:
-        """The watchdog module's loop."""
+        """Run one cycle of the watchdog module."""
         signals = self._signals
         if not signals:
             return
@@ -372,7 +371,7 @@ class FakeAbb(FakeController):
         return data
 
     def _answer(self, method: str, path: str, query: dict[str, str], body: bytes) -> Reply | None:
-        """The answer to one request; None is none, ever."""
+        """Answer one request; None leaves it unanswered."""
         if self._answer_s:
             self._closing.wait(self._answer_s)
         with self._lock:
@@ -402,7 +401,7 @@ class FakeAbb(FakeController):
         if path.startswith(_SIGNALS) and query.get("action") == "set":
             return self._set_signal(path.removeprefix(_SIGNALS), values)
         if path != "rw/rapid/execution":
-            return Reply(404, None)  # the driver asks for nothing else
+            return Reply(404, None)  # the driver uses no other resource
         action = query.get("action")
         if action == "stop":
             self._halt()
@@ -497,11 +496,11 @@ class FakeAbb(FakeController):
 
 
 def main() -> None:
-    """Run one fake until the process is ended."""
-    parser = argparse.ArgumentParser(description="A fake for an ABB IRC5 controller.")
-    parser.add_argument("host", help="loopback address of its own, such as 127.0.0.2")
-    parser.add_argument("--port", type=int, default=8080, help="of its web services")
-    parser.add_argument("--egm", type=int, default=6510, help="UDP port for its poses")
+    """Run one fake until the process is terminated."""
+    parser = argparse.ArgumentParser(description="A fake ABB IRC5 controller.")
+    parser.add_argument("host", help="loopback address to listen on, such as 127.0.0.2")
+    parser.add_argument("--port", type=int, default=8080, help="port of the web services")
+    parser.add_argument("--egm", type=int, default=6510, help="UDP port for poses")
     arguments = parser.parse_args()
     with FakeAbb(arguments.host, arguments.port, ("127.0.0.1", arguments.egm)):
         threading.Event().wait()

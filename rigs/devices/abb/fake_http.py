@@ -20,23 +20,23 @@ REALM = "validusers@robapi.abb"
 _END_S = 5.0
 _COOKIE = "ABBCX"
 MOST_SESSIONS = 70
-"""So many clients may be logged in; a further one is answered 503, as the controller does."""
+"""Largest number of logged-in clients; a further one gets 503, as on the controller."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """Status code, and the list that stands under `_embedded._state`."""
+    """Status code, and the list under `_embedded._state`."""
 
     code: int
     states: list[dict[str, Any]] | None
 
 
 Answer = Callable[[str, str, dict[str, str], bytes], Reply | None]
-"""From method, path, query and body to a reply; None leaves the client waiting."""
+"""Maps method, path, query and body to a reply; None leaves the client waiting."""
 
 
 class HttpServer:
-    """Answers until it is closed; a client that is left waiting waits until then."""
+    """An HTTP server; clients without an answer wait until it is closed."""
 
     def __init__(self, host: str, port: int, answer: Answer) -> None:
         self._server = _Server((host, port), _Handler)
@@ -48,15 +48,15 @@ class HttpServer:
 
     @property
     def sessions(self) -> int:
-        """Number of clients that are logged in."""
+        """Number of logged-in clients."""
         return len(self._server.sessions)
 
     def cut(self) -> None:
-        """Cut the connections there are."""
+        """Close the open connections."""
         self._server.cut()
 
     def close(self) -> None:
-        """Cut every connection and give the port back."""
+        """Close every connection and release the port."""
         self._server.released.set()
         self._server.shutdown()
         self._server.cut()
@@ -86,10 +86,10 @@ class _Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that left in the middle is no error here."""
+        """Ignore a client that disconnects during a request."""
 
     def cut(self) -> None:
-        """End every connection."""
+        """Shut down every connection."""
         for request in list(self._open):
             with contextlib.suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
@@ -102,7 +102,7 @@ class _Handler(BaseHTTPRequestHandler):
     _session = ""
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing is logged."""
+        """Log nothing."""
 
     def _serve(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
@@ -128,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_GET = do_POST = do_PUT = do_DELETE = _serve
 
     def _log_in(self) -> bool:
-        """Find the session of the request's cookie, or begin one if there is room."""
+        """Find the session of the request's cookie, or open one below the limit."""
         sent = re.search(rf"{_COOKIE}=(\w+)", self.headers.get("Cookie", ""))
         self._session = sent[1] if sent else ""
         if self._session in self.server.sessions:
@@ -140,7 +140,7 @@ class _Handler(BaseHTTPRequestHandler):
         return True
 
     def _is_allowed(self) -> bool:
-        """RFC 2617 digest with MD5 and qop=auth, which is what the controller asks for."""
+        """Check the RFC 2617 digest with MD5 and qop=auth, as the controller does."""
         header = self.headers.get("Authorization", "")
         found = re.findall(r'(\w+)=(?:"([^"]*)"|([^\s,]+))', header)
         sent = {name: quoted or plain for name, quoted, plain in found}

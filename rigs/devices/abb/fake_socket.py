@@ -1,10 +1,10 @@
-"""A fake for the small RAPID socket server on an ABB controller (port 5000).
+"""A fake of the small RAPID socket server on an ABB controller (port 5000).
 
-One client at a time; a second one is taken by the network and not answered until the first has
-left. A fly-by move is answered inside its zone, so that the next one can run on from it without a
-rest; a fine-point move is answered at rest. A move that a safety stop ends is never answered. A
-server that lost its client in a move ends that move before it takes the next one. What is not
-simulated is refused.
+It serves one client at a time: a second connection is accepted, but not answered until the first
+has closed. A fly-by move is answered inside its zone, so that the next one can follow without a
+stop; a fine-point move is answered at rest. A move that a safety stop ends is never answered. If
+the client disconnects during a move, the move ends before the next client is served. Requests that
+are not simulated are refused.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class FakeRapidServer(FakeController):
     """One fake server.
 
     Args:
-        host, motion, rate, clock: as of any `FakeController`.
-        port: of the server.
-        faults: what will go wrong.
+        host, motion, rate, clock: as in `FakeController`.
+        port: port of the server.
+        faults: faults to inject.
 
     Attributes:
-        speed_percent: the pendant's speed ratio, for moves that begin from now on; the server
-            does not tell it.
+        speed_percent: the pendant's speed ratio, for subsequent moves; the server does not report
+            it.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class FakeRapidServer(FakeController):
     ) -> None:
         super().__init__(host, motion, clock, rate)
         self.port = port
-        self._faults = FaultPlan(faults, self._happen)
+        self._faults = FaultPlan(faults, self._inject)
         self.tool = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self.speed_percent = 100.0
         self._speed_mm_s = 10.0
@@ -70,29 +70,29 @@ class FakeRapidServer(FakeController):
 
     def start(self) -> None:
         """Open the port and run. Raises OSError if it is taken."""
-        self._thread = LoopThread(f"stand-in {self.host}")
+        self._thread = LoopThread(f"fake {self.host}")
         self._thread.call(self._listen)
 
     def close(self) -> None:
-        """Cut every connection and give the port back."""
+        """Close every connection and release the port."""
         if self._thread is not None:
             self._thread.call(self._connections.cut)
             self._thread.close()
             self._thread = None
 
-    def happen(self, kind: Kind) -> None:
-        """Make something go wrong now."""
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now."""
         assert self._thread is not None
-        self._thread.call(lambda: self._happen(kind))
+        self._thread.call(lambda: self._inject(kind))
 
     def drop_connections(self) -> None:
-        """Cut the connections there are; new ones are taken."""
+        """Close the open connections; new ones are accepted."""
         assert self._thread is not None
         self._thread.call(self._connections.cut)
         self._thread.call(self._listen)
 
     def restore(self) -> None:
-        """A person has put everything right: link and safety."""
+        """Clear every fault of connection and safety, as an operator would."""
         assert self._thread is not None
         self._thread.call(self._connections.cut)
         self._stopped = self._silent = False
@@ -100,20 +100,20 @@ class FakeRapidServer(FakeController):
 
     def _listen(self) -> None:
         self._turn = asyncio.Lock()
-        self._connections.listen(self.host, self.port, self._talk)
+        self._connections.listen(self.host, self.port, self._serve)
 
-    def _happen(self, kind: Kind) -> None:
+    def _inject(self, kind: Kind) -> None:
         if kind is Kind.LINK_CUT:
             self._connections.cut()
         elif kind is Kind.SILENCE:
             self._silent = True
         elif kind in {Kind.CLOCK_BACK, Kind.PACKETS_LOST}:
-            raise ValueError(f"{kind.value} is not simulated: this server tells no time")
+            raise ValueError(f"{kind.value} is not simulated: this server reports no time")
         else:
             self._stopped = True
             self.motion.stop(ACCELERATION_MM_S2, self.clock.now_s())
 
-    async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         assert self._turn is not None
         async with self._turn:
             while self.moving() or self._stopped:
@@ -154,7 +154,7 @@ class FakeRapidServer(FakeController):
             pose = self.pose()
             return _DONE + struct.pack(">7f", *pose.xyz_mm, *quaternion(pose))
         elif command is not Command.SET_WORK_OBJECT or values != (0, 0, 0, 1, 0, 0, 0):
-            return _REFUSED  # moves by joints and on circles, other frames: not simulated
+            return _REFUSED  # joint moves, circular moves and other frames are not simulated
         return _DONE
 
     async def _move(self, to: Pose) -> None:

@@ -1,4 +1,4 @@
-"""A path as a motion program of abb-motion-program-exec 0.7.4, which an ABB controller runs."""
+"""Conversion of a path to a motion program of abb-motion-program-exec 0.7.4 for ABB arms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.core.pose import quaternion
 
 PAUSE_S = 0.05
-"""Rest after each segment, so that its end can be seen, s."""
+"""Pause after each segment, so that its end can be detected, s."""
 _TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S = 500.0, 5000.0, 1000.0
 _NO_AXES = [0.0] * 6
 
@@ -28,12 +28,12 @@ _NO_AXES = [0.0] * 6
 def motion_program(
     tool: ToolSettings, path: Sequence[Segment] = (), configuration: Sequence[float] = ()
 ) -> MotionProgram:
-    """The program that follows `path` from rest to rest; without one it only sets the tool.
+    """Build the program that follows `path` from rest to rest; without a path it sets the tool.
 
     Args:
-        tool: what is on the flange.
+        tool: tool on the flange.
         path: straight segments; the controller plans each at its speed.
-        configuration: RAPID's `confdata` of the arm as it stands (cf1, cf4, cf6, cfx).
+        configuration: RAPID's `confdata` of the arm's current configuration (cf1, cf4, cf6, cfx).
     """
     program = MotionProgram(tool=_tooldata(tool))
     for segment in path:

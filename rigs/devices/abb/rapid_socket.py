@@ -1,8 +1,8 @@
-"""The wire of the small RAPID socket server that some labs' ABB arms run (port 5000).
+"""Protocol of the small RAPID socket server that some labs run on ABB controllers (port 5000).
 
 Big-endian. A request is `u16 command` and its float32s; a reply is `u16` 1 (done) or 0 (error) and
-its float32s. One connection at a time; nothing can be asked while a move runs, because a move is
-answered when the RAPID instruction returns; no stop and no time-out exist.
+its float32s. There is one connection at a time. No request is answered during a move, because a
+move is answered when the RAPID instruction returns. There is no stop command and no timeout.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ ARGUMENTS = {
     Command.POSE: "",
     Command.CLOSE: "",
 }
-"""Arguments of a command: joints in degrees; x y z in mm and a quaternion w x y z; mm/s and
-degrees/s; fine point, zone in mm, zone for turns in mm and in degrees."""
+"""Arguments of each command: joints in degrees; x y z in mm and a quaternion w x y z; mm/s and
+degrees/s; fine point, zone in mm, orientation zone in mm and in degrees."""
 RESULTS = {Command.JOINTS: 6, Command.POSE: 7}
 """Count of numbers after the reply's first word."""
 
@@ -65,8 +65,8 @@ class RapidSocket:
 
     Args:
         host: the controller's address.
-        port: of the server, 5000 by default.
-        within_s: how long connecting may take.
+        port: port of the server, 5000 by default.
+        within_s: timeout to connect.
 
     Raises:
         RapidError: no connection.
@@ -82,10 +82,10 @@ class RapidSocket:
     def ask(
         self, command: Command, *arguments: float | Sequence[float], within_s: float
     ) -> tuple[float, ...]:
-        """The numbers of the reply to one request.
+        """Send one request and return the numbers of its reply.
 
         Raises:
-            RapidError: refused, no whole reply within `within_s` seconds, or a malformed one.
+            RapidError: a refusal, no complete reply within `within_s` seconds, or a malformed one.
         """
         flat = [
             value
@@ -107,16 +107,16 @@ class RapidSocket:
         except OSError as error:
             raise RapidError(f"no answer to {command.name}: {error}") from None
         if not all(map(math.isfinite, values)):
-            raise RapidError(f"the answer to {command.name} holds a number that is not finite")
+            raise RapidError(f"the answer to {command.name} has a number that is not finite")
         if command is Command.POSE and abs(math.hypot(*values[3:]) - 1) > _UNIT_TOLERANCE:
-            raise RapidError("the answer to POSE holds no rotation: its quaternion has no length 1")
+            raise RapidError("the answer to POSE has a quaternion whose norm is not 1")
         return values
 
     def info(self, within_s: float) -> str:
-        """Return the server's own description: text without a length, taken as one piece.
+        """Return the server's description: text without a length prefix, read in one piece.
 
         Raises:
-            RapidError: as `ask`; another client that holds the one connection looks like that.
+            RapidError: as `ask`; also if another client holds the only connection.
         """
         self.ask(Command.INFO, within_s=within_s)
         try:
@@ -126,11 +126,11 @@ class RapidSocket:
             raise RapidError(f"no answer to INFO: {error}") from None
 
     def close(self) -> None:
-        """Say goodbye, so that the server takes the next client, and give the socket back."""
+        """Send CLOSE, so that the server accepts the next client, and close the socket."""
         try:
             self._socket.sendall(_WORD.pack(Command.CLOSE))
         except OSError:
-            pass  # it is gone already
+            pass  # the connection is lost already
         finally:
             self._socket.close()
 
@@ -149,19 +149,19 @@ class RapidSocket:
 
 
 def pack(command: Command, values: Sequence[float]) -> bytes:
-    """A request's numbers as they go over the wire."""
+    """Encode the numbers of a request."""
     layout = ARGUMENTS[command]
     first = [int(values[0]), *values[1:]] if layout.startswith("H") else values
     return struct.pack(">" + layout, *first)
 
 
 def socket_health(info: str) -> DeviceHealth:
-    """Return the report of the server that some labs run on an ABB controller."""
+    """Return the health report of the RAPID socket server."""
     return DeviceHealth(
         device="arm",
         model=info or UNKNOWN,
         serial=UNKNOWN,
         firmware=UNKNOWN,
         temperature_c=None,
-        clock="the host's: this server tells no time",
+        clock="the host's: this server reports no time",
     )

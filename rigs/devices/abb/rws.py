@@ -1,7 +1,7 @@
-"""ABB Robot Web Services with a bound on every wait, for motion programs on an IRC5 controller.
+"""ABB Robot Web Services with a timeout on every request, for motion programs on an IRC5.
 
-abb-robot-client 0.4.0 asks without a time-out, so its session gets one here. A request is bounded
-from its last byte to the next one of the answer; answers are a few hundred bytes.
+abb-robot-client 0.4.0 sets no timeout, so its session gets one here. The timeout applies to each
+wait for the next bytes of an answer; answers are a few hundred bytes.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ from sliplab.rigs.core.pose import from_quaternion
 from sliplab.rigs.devices.abb.settings import AbbSettings
 
 REQUEST_S = 1.0
-"""Connecting, and each wait for bytes of an answer, s."""
+"""Timeout to connect, and of each wait for bytes of an answer, s."""
 STATUS_REQUESTS = 4
-"""Requests of one look at the state."""
+"""Requests per status poll."""
 FULL_SPEED_PERCENT = 100.0
-"""The speed ratio at which a segment has the speed that was asked for."""
+"""Speed ratio at which a segment has the requested speed."""
 START_REQUESTS = 12
-"""Requests that starting a motion program takes at most, with those of logging in."""
+"""Largest number of requests to start a motion program, including login."""
 T = TypeVar("T")
 
 
 class WebError(RuntimeError):
-    """The web services did not answer in time, or refused; the text says which."""
+    """The web services timed out or refused; the text says which."""
 
 
 class WebRefused(WebError):
-    """The web services answered, and not with what was asked for."""
+    """The web services refused a request, or answered with something else."""
 
 
 class _Bounded(HTTPAdapter):  # type: ignore[misc, unused-ignore]
-    """An HTTP adapter that never waits without a bound."""
+    """An HTTP adapter with a timeout."""
 
     def send(self, request: Any, **how: Any) -> Any:
-        """The answer to a request. Raises requests.RequestException after `REQUEST_S`."""
+        """Send a request. Raises requests.RequestException after `REQUEST_S`."""
         how["timeout"] = REQUEST_S
         return super().send(request, **how)
 
 
 @dataclass(frozen=True)
 class WebStatus:
-    """The controller's status by its web services."""
+    """The controller's status as reported by the web services."""
 
     controller: str
     """motoron, motoroff, guardstop, emergencystop, ..."""
@@ -62,11 +62,11 @@ class WebStatus:
     execution: str
     """running or stopped."""
     speed_percent: float
-    """The speed ratio of the pendant: every move is slower by it."""
+    """Speed ratio of the pendant, which scales every move."""
 
     @property
     def state(self) -> ArmState:
-        """The arm's state as far as it is known without a path."""
+        """The arm's state, apart from whether it is moving."""
         if self.controller.startswith("emergencystop"):
             return ArmState.EMERGENCY_STOP
         if self.controller == "guardstop":
@@ -77,7 +77,7 @@ class WebStatus:
 
 
 class WebServices:
-    """One session of one thread at a time; others wait for it."""
+    """One session of the web services; thread-safe, one request at a time."""
 
     def __init__(self, settings: AbbSettings) -> None:
         url = f"http://{settings.host}:{settings.rws_port}"
@@ -89,7 +89,7 @@ class WebServices:
         self._answers = False
 
     def status(self) -> WebStatus:
-        """State of controller, mode, execution and speed ratio. Raises WebError."""
+        """Read the state of controller, mode, execution and speed ratio. Raises WebError."""
         return self._ask(
             lambda: WebStatus(
                 self._rws.get_controller_state(),
@@ -100,21 +100,21 @@ class WebServices:
         )
 
     def is_running(self) -> bool:
-        """Return whether a program runs, in one request. Raises WebError."""
+        """Return whether a program is running; one request. Raises WebError."""
         return self._ask(lambda: self._rws.get_execution_state().ctrlexecstate != "stopped")
 
     def flange(self) -> tuple[Pose, tuple[float, ...]]:
-        """The flange's pose in the base frame and the arm's configuration. Raises WebError."""
+        """Read the flange's pose in the base frame and the arm's configuration. Raises WebError."""
         target = self._ask(self._rws.get_robtarget)
         return from_quaternion(target.trans, target.rot), tuple(target.robconf.tolist())
 
     def joints_deg(self) -> list[float]:
-        """The six joints, degrees. Raises WebError."""
+        """Read the six joint angles, degrees. Raises WebError."""
         joints: list[float] = self._ask(self._rws.get_jointtarget).robax.tolist()
         return joints
 
     def about(self, resource: str) -> dict[str, str]:
-        """Return the fields of a resource such as ``rw/system``; empty where it is not there.
+        """Return the fields of a resource such as ``rw/system``; empty if it does not exist.
 
         Raises:
             WebError: no answer.
@@ -130,11 +130,11 @@ class WebServices:
         self._ask(lambda: self._client.execute_motion_program(program, self._task, wait=False))
 
     def stop(self) -> None:
-        """Stop the program that runs, and the arm with it. Raises WebError."""
+        """Stop the running program, and the arm with it. Raises WebError."""
         self._ask(self._client.stop_motion_program)
 
     def read_signal(self, name: str) -> float:
-        """The value of an analog signal. Raises WebError; WebRefused if there is none."""
+        """Read an analog signal. Raises WebError; WebRefused if there is none."""
         return self._ask(lambda: self._rws.get_analog_io(name))
 
     def write_signal(self, name: str, value: float) -> None:
@@ -142,9 +142,9 @@ class WebServices:
         self._ask(lambda: self._rws.set_analog_io(name, value))
 
     def close(self) -> None:
-        """Log out if it answers, and close the connection; takes at most 2 `REQUEST_S`.
+        """Log out if the controller answers, and close the connection; at most 2 `REQUEST_S`.
 
-        A controller keeps a session that nobody logs out of for minutes, and has few of them.
+        A controller keeps an abandoned session for minutes, and supports only a few.
         """
         with self._lock:
             if self._answers:
@@ -162,16 +162,16 @@ class WebServices:
             raise WebError(f"the controller's web services do not answer: {error}") from None
         except ABBException as error:
             raise WebRefused(f"the controller refused: {error}") from None
-        except Exception as error:  # the client raises bare exceptions for what it does not like
+        except Exception as error:  # the client raises bare exceptions too
             raise WebRefused(str(error)) from None
 
 
 def abb_health(web: WebServices, notes: tuple[str, ...]) -> DeviceHealth:
-    """Return the report of an ABB controller, by its web services (RobotWare 6).
+    """Return the health report of an ABB controller from its web services (RobotWare 6).
 
     Args:
-        web: a session of them.
-        notes: what the driver has to say besides.
+        web: a session of the web services.
+        notes: the driver's additional notes.
 
     Raises:
         WebError: it does not answer.

@@ -1,15 +1,14 @@
-"""Driver of ABB arms behind the small RAPID socket server: for labs that have it already.
+"""Driver of ABB arms behind the small RAPID socket server, for labs that already run it.
 
-What that server cannot do shapes this driver. It has no stop, so a way is sent in pieces of at most
-`segment_s` seconds and a stop waits for the one that runs. It answers nothing while a move runs, so
-poses are known only between pieces. It tells no time, so times are the host's. It tells no safety
-state, so a protective stop is a move that is not answered. `rigs.devices.abb.driver` has none of
-these limits.
+The server's limits shape this driver. It has no stop command, so a path is sent in pieces of at
+most `segment_s` seconds, and a stop waits for the current piece. It answers nothing during a move,
+so poses are known only between pieces. It reports no time, so times are the host's. It reports no
+safety state, so a protective stop appears as a move without an answer. `rigs.devices.abb.driver`
+has none of these limits.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
@@ -33,39 +32,39 @@ from sliplab.storage.streams import PoseChunk
 
 T = TypeVar("T")
 ANSWER_S = 2.0
-"""Connecting, and every request but a move, s."""
+"""Timeout to connect, and of every request except a move, s."""
 OVERTIME_S = 3.0
-"""Time beyond twice its duration after which a move's arm is taken for lost, s."""
+"""Time beyond twice its duration after which a move counts as lost, s."""
 TURN_DEG_S = 20.0
-"""Speed of turns on the way."""
+"""Reorientation speed during a move."""
 ZONE = (0, 0.3, 0.3, 0.03)
-"""Pieces of one segment run into each other: a fly-by point of RAPID's z0."""
+"""Zone between the pieces of one segment: a fly-by point, RAPID's z0."""
 FINE = (1, 0.0, 0.0, 0.0)
-"""The last piece of a segment ends at rest."""
+"""Zone at the end of a segment: a fine point, at rest."""
 STILL_MM, STILL_S = 0.001, 0.02
-"""An arm that went no further than this in that time stands still, mm and s."""
+"""Largest motion within a time for which the arm counts as at rest, mm and s."""
 ARRIVED_MM = 0.1
-"""A segment that ends further than this from its target was stopped by somebody."""
+"""A segment that ends farther than this from its target was stopped from outside."""
 
 
 class AbbSocketArm(ThreadedArm):
-    """An ABB arm by the RAPID socket server; an `Arm` of `rigs.core.capabilities`."""
+    """An ABB arm driven by the RAPID socket server; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: AbbSocketSettings) -> None:
         super().__init__(settings.limits)
         self._settings = settings
         self._link: RapidSocket | None = None
         self._info = ""
-        self._leaves_from = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._start_pose = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self._one = threading.Lock()
         self._may_move = False
-        """A path was begun, and nobody has seen the arm at rest since."""
+        """True from the start of a path until the arm is confirmed at rest."""
 
     def connect(self) -> None:
-        """Take the one connection, set the tool, see that it stands. Takes at most 7 `ANSWER_S`.
+        """Connect, set the tool, and check that the arm is at rest. Takes at most 7 `ANSWER_S`.
 
         Raises:
-            ArmFault: no connection, no answer (perhaps another client has it), or it moves.
+            ArmFault: no connection, no answer (another client may hold it), or the arm moves.
         """
         if self._lost is None:
             return
@@ -81,42 +80,36 @@ class AbbSocketArm(ThreadedArm):
             self._release()
             raise ArmFault(
                 "arm",
-                f"{error}; the server takes one client: end the other one, or check its power",
+                f"{error}; the server accepts one client: end the other, or check the power",
             ) from None
         self._lost, self._may_move = None, False
 
-    def recover(self) -> None:
-        """Connect again after a person has put right what stopped the arm; unlocks nothing."""
-        with contextlib.suppress(ArmFault):  # connecting finds out, and says so
-            self.close()
-        self.connect()
-
     def state(self) -> ArmState:
-        """Ready, moving or disconnected: the server tells no more."""
+        """Return ready, moving or disconnected; the server reports no more."""
         if self._lost is not None:
             return ArmState.DISCONNECTED
         return ArmState.READY if self._run.done else ArmState.MOVING
 
     def pose(self) -> Pose:
-        """Return the pose that was asked for last: now if it stands, else before this piece."""
+        """Return the current pose if the arm is at rest, else the pose before this piece."""
         if self._run.done and self._lost is None:
             with self._one:
-                self._watched(self._look)
+                self._watched(self._read_pose)
         last = self._stream.last
         if last is None:
             raise self._fault(self.state(), "has no pose")
         return last.pose
 
     def now_ns(self) -> int:
-        """The host's monotonic clock, which stamps this arm's times, ns."""
+        """Return the host's monotonic clock, which is this arm's clock, ns."""
         return time.monotonic_ns()
 
     def health(self) -> DeviceHealth:
-        """Return the server's own description from when it was reached."""
+        """Return the server's description as read on connecting."""
         return socket_health(self._info)
 
     def start(self, path: Sequence[Segment]) -> None:
-        """Begin to follow `path` in pieces of at most `segment_s` each.
+        """Start to follow `path` in pieces of at most `segment_s` each.
 
         Takes at most 2 `ANSWER_S`.
 
@@ -132,54 +125,54 @@ class AbbSocketArm(ThreadedArm):
         self._guard.check(begin, path)
         with self._one:
             self._guard.check_joints(self._watched(lambda: self._ask(Command.JOINTS)))
-        self._leaves_from = begin
+        self._start_pose = begin
         self._run, self._may_move = Run(path), True
         self._begin(self._run)
 
     def read_poses(self) -> PoseChunk:
-        """Poses since the last call, on the host's clock: one a piece, and one now if it stands.
+        """Return poses since the last call, host's clock: one per piece, and one now if at rest.
 
-        Takes at most `ANSWER_S`. Raises ArmFault: an arm that stands does not answer.
+        Takes at most `ANSWER_S`. Raises ArmFault if an arm at rest does not answer.
         """
         if self._run.done and self._lost is None:
             with self._one:
-                self._watched(self._look)
+                self._watched(self._read_pose)
         return self._stream.read()
 
     def stop(self) -> None:
-        """Send no further piece and wait for the one that runs: there is no stop on this wire.
+        """Send no further piece and wait for the current one: the protocol has no stop command.
 
-        Where the connection was lost, a new one is asked whether the arm stands. Takes at most
-        2 `segment_s` + `OVERTIME_S` + 4 `ANSWER_S`.
+        If the connection was lost, a new one is opened to check that the arm is at rest. Takes at
+        most 2 `segment_s` + `OVERTIME_S` + 4 `ANSWER_S`.
 
         Raises:
-            ArmFault: the piece that runs did not end in time, or the arm was not seen at rest.
+            ArmFault: the current piece did not end in time, or the arm is not confirmed at rest.
         """
         run = self._run
         run.cancelled = True
         if run.thread is not None and run.thread is not threading.current_thread():
             run.join(self._bound_s(self._settings.segment_s) + ANSWER_S)
             if not run.done:
-                raise ArmFault("arm", "does not end its move: press its emergency stop")
+                raise ArmFault("arm", "does not finish its move: press its emergency stop")
         if self._may_move:
-            self._see_rest()
+            self._confirm_rest()
 
     def close(self) -> None:
-        """Send no further piece, and give the connection to the next client.
+        """Send no further piece, and close the connection for the next client.
 
         Raises:
-            ArmFault: it was not seen at rest; the connection is given back all the same.
+            ArmFault: the arm is not confirmed at rest; the connection is closed all the same.
         """
         try:
             self.stop()
         finally:
             self._release()
 
-    def _see_rest(self) -> None:
-        """See the arm stand, by a new connection if the one there was is lost.
+    def _confirm_rest(self) -> None:
+        """Confirm that the arm is at rest, over a new connection if the old one is lost.
 
         Raises:
-            ArmFault: it was not seen to.
+            ArmFault: this was not confirmed.
         """
         settings = self._settings
         try:
@@ -187,7 +180,7 @@ class AbbSocketArm(ThreadedArm):
                 if self._lost is None:
                     self._settle(self._link)
                 else:
-                    self._hang_up()  # the server takes one client at a time
+                    self._hang_up()  # the server accepts one client at a time
                     link = RapidSocket(settings.host, settings.port, ANSWER_S)
                     try:
                         self._settle(link)
@@ -196,14 +189,14 @@ class AbbSocketArm(ThreadedArm):
         except RapidError as error:
             raise ArmFault(
                 "arm",
-                f"was not seen at rest ({error}); a piece of at most {settings.segment_s:g} s may "
-                "have gone on, and no other follows it: look at it, and press its emergency stop "
-                "if it moves",
+                f"is not confirmed at rest ({error}); it may have moved on for at most "
+                f"{settings.segment_s:g} s, and no further move follows: check it, and press its "
+                "emergency stop if it moves",
             ) from None
         self._may_move = False
 
     def _release(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self._lost = self._lost or "closed"
         self._hang_up()
         self._run.done = True
@@ -213,12 +206,12 @@ class AbbSocketArm(ThreadedArm):
         if link is not None:
             link.close()
 
-    def _give_up(self) -> None:
-        """Send nothing more: the arm stands still at the end of its piece."""
+    def _abort(self) -> None:
+        """Send nothing more: the arm stops at the end of the current piece."""
 
     def _follow_path(self, run: Run) -> None:
-        """Send piece after piece."""
-        at = self._leaves_from
+        """Send the path piece by piece."""
+        at = self._start_pose
         for segment in run.path:
             start_ns = time.monotonic_ns()
             make = partial(self._segment, run, at, segment)
@@ -231,7 +224,7 @@ class AbbSocketArm(ThreadedArm):
         self._may_move = False
 
     def _segment(self, run: Run, begin: Pose, segment: Segment) -> bool:
-        """Make one segment; whether its end was reached. Raises RapidError."""
+        """Run one segment; return whether its end was reached. Raises RapidError."""
         seconds = distance_mm(begin, segment.to) / segment.speed_mm_s
         seconds = max(seconds, angle_deg(begin, segment.to) / TURN_DEG_S)
         pieces = max(1, math.ceil(seconds / self._settings.segment_s))
@@ -247,16 +240,16 @@ class AbbSocketArm(ThreadedArm):
             target = between(begin, segment.to, piece / pieces)
             bound_s = self._bound_s(seconds / pieces)
             self._ask(Command.MOVE_LINEAR, target.xyz_mm, quaternion(target), within_s=bound_s)
-            self._look()
+            self._read_pose()
         last = self._stream.last
         return last is not None and distance_mm(last.pose, segment.to) <= ARRIVED_MM
 
     def _settle(self, link: RapidSocket | None) -> None:
-        """Wait until it stands: a fly-by move is answered before its end. Raises RapidError."""
+        """Wait until the arm is at rest: a fly-by move is answered early. Raises RapidError."""
         deadline, poll = time.monotonic() + ANSWER_S, threading.Event()
         before = None
         while time.monotonic() < deadline:
-            self._look(link)
+            self._read_pose(link)
             here = self._stream.last
             if before is not None and here and distance_mm(before.pose, here.pose) < STILL_MM:
                 return
@@ -264,8 +257,8 @@ class AbbSocketArm(ThreadedArm):
             poll.wait(STILL_S)
         raise RapidError("the arm does not come to rest")
 
-    def _look(self, link: RapidSocket | None = None) -> None:
-        """Ask for the pose; its time is the middle of the question. Raises RapidError."""
+    def _read_pose(self, link: RapidSocket | None = None) -> None:
+        """Read the pose; its time is the middle of the request. Raises RapidError."""
         asked = time.monotonic_ns()
         link = self._link if link is None else link
         if link is None:
@@ -283,7 +276,7 @@ class AbbSocketArm(ThreadedArm):
         return self._link.ask(command, *arguments, within_s=within_s)
 
     def _watched(self, work: Callable[[], T]) -> T:
-        """The result of requests; an arm that does not answer one of them is lost.
+        """Run requests and return their result; without an answer the connection is lost.
 
         Raises:
             ArmFault: no answer, or a refusal.
@@ -295,7 +288,7 @@ class AbbSocketArm(ThreadedArm):
             raise ArmFault(
                 "arm",
                 f"{error}; it may be in a protective or emergency stop, which this server does "
-                "not tell: look at it, then connect again",
+                "not report: check it, then connect again",
             ) from None
 
     def _bound_s(self, seconds: float) -> float:

@@ -1,8 +1,8 @@
-"""The heartbeat of the watchdog on an ABB controller: `docs/rapid/sliplab_watchdog.mod`.
+"""The heartbeat for the watchdog on an ABB controller, `docs/rapid/sliplab_watchdog.mod`.
 
-A background task of the controller stops the arm when the beat has not changed for a given time.
-It copies each beat that it sees, so that this host knows that the task runs. The signals are
-analog outputs: writing one needs no mastership, so a beat never gets into the way of a command.
+A background task of the controller stops the arm when the heartbeat signal has not changed for a
+given time. It echoes each value, so that this host knows that the task is running. The signals are
+analog outputs: writing one needs no mastership, so the heartbeat never interferes with commands.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from sliplab.rigs.devices.abb.rws import WebError, WebRefused, WebServices
 from sliplab.rigs.devices.abb.settings import AbbSettings
 
 BEAT, ECHO, LIMIT = "sliplab_beat", "sliplab_echo", "sliplab_limit"
-"""Signals: the beat; the last one that the task saw; after how many seconds it stops the arm, 0
-for never. It sets the limit to 0 when it has stopped the arm."""
+"""Signals: the heartbeat; its echo by the task; the timeout after which the task stops the arm, s,
+0 for never. The task sets the timeout to 0 when it has stopped the arm."""
 BEAT_S = 0.2
-"""From one beat to the next, or as long as the controller takes to answer one, s."""
+"""Period of the heartbeat, or the controller's answer time if longer, s."""
 ECHO_S = 1.0
-"""From a beat to its echo at most, s; the task looks every 0.02 s."""
+"""Timeout from a heartbeat to its echo, s; the task's cycle is 0.02 s."""
 _WRAP = 10_000
 
 
 class Watchdog:
-    """Beats for as long as it is asked to, from a thread and over a session of its own.
+    """Sends the heartbeat from a separate thread and over a separate session.
 
     Args:
-        settings: the arm's.
-        limit_s: how long the beat may stay away before the controller stops the arm, s.
+        settings: settings of the arm.
+        limit_s: time without a heartbeat after which the controller stops the arm, s.
     """
 
     def __init__(self, settings: AbbSettings, limit_s: float) -> None:
@@ -42,15 +42,15 @@ class Watchdog:
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def begin(self, web: WebServices) -> None:
-        """Beat from now on, and see that the controller's task watches.
+        """Start the heartbeat, and check that the controller's task is active.
 
         Takes at most 4 requests and `ECHO_S`.
 
         Args:
-            web: another session, so that beats need not wait for what is asked here.
+            web: another session, so that these requests do not delay the heartbeat.
 
         Raises:
-            WebRefused: the controller has no such task, or it does not run.
+            WebRefused: the controller has no such task, or it is not running.
             WebError: no answer.
         """
         first = self._beat()
@@ -61,32 +61,32 @@ class Watchdog:
         deadline = time.monotonic() + ECHO_S
         while (web.read_signal(ECHO) - first) % _WRAP >= _WRAP / 2:
             if time.monotonic() > deadline:
-                raise WebRefused(f"{ECHO} does not follow {BEAT}: its task does not run")
+                raise WebRefused(f"{ECHO} does not follow {BEAT}: the task is not running")
 
     def pause(self) -> None:
-        """Beat no more: if it stays so, the controller stops the arm."""
+        """Suspend the heartbeat; unless it resumes, the controller stops the arm."""
         self._beating = False
 
     def resume(self) -> None:
-        """Beat again; a task that has stopped the arm meanwhile watches from `begin` on."""
+        """Resume the heartbeat; a task that has stopped the arm meanwhile needs `begin`."""
         self._beating = self._begun
 
     def stopped_it(self, web: WebServices) -> bool:
-        """Return whether the controller has stopped the arm for want of a beat. Raises WebError."""
+        """Return whether the watchdog task has stopped the arm. Raises WebError."""
         return web.read_signal(LIMIT) == 0
 
     def close(self, watch: bool) -> None:
-        """Beat no more and log out; takes at most 5 requests.
+        """End the heartbeat and log out; takes at most 5 requests.
 
         Args:
-            watch: leave the task watching, which stops the arm if it still moves.
+            watch: True to leave the task active, so that it stops an arm that still moves.
         """
         self._beating = False
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()
         if self._begun and not watch:
-            with contextlib.suppress(WebError):  # then it runs out, and finds an arm that stands
+            with contextlib.suppress(WebError):  # then the timeout expires with the arm at rest
                 self._web.write_signal(LIMIT, 0.0)
         self._web.close()
 
@@ -95,7 +95,7 @@ class Watchdog:
         while not self._closing.wait(wait_s):
             began = time.monotonic()
             if self._beating:
-                with contextlib.suppress(WebError):  # the monitor tells of a lost link
+                with contextlib.suppress(WebError):  # the monitor reports a lost connection
                     self._beat()
             wait_s = max(0.0, BEAT_S - (time.monotonic() - began))
 

@@ -1,4 +1,4 @@
-"""Basler cameras through pylon. `frame_time` says how the time of a frame is known."""
+"""Basler cameras through pylon; `frame_time` determines how frames are time-stamped."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def _build(settings: BaslerSettings, px_per_mm: float) -> FrameCamera:
 
 
 def _ping(settings: BaslerSettings) -> str | None:
-    from sliplab.rigs.devices.basler.driver import look_for_camera
+    from sliplab.rigs.devices.basler.driver import find_device_info
 
-    look_for_camera(settings.serial)
+    find_device_info(settings.serial)
     return None
 
 

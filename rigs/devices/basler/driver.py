@@ -1,9 +1,10 @@
 """The camera that looks through the plate: a Basler camera through pylon.
 
-Written for the a2A1920-160ucBAS (USB 3 Vision) and pypylon 26.9, which brings pylon 12.4; a camera
-is asked what it has, so others of the maker may do. Settings are named as in GenICam's SFNC 2.5
-and, where pylon's emulation of an older family differs, by its older name too. What a frame's time
-means stands in `frame_time.py`; what was never tried on a real camera stands in docs/cameras.md.
+Written for the a2A1920-160ucBAS (USB 3 Vision) and pypylon 26.9, which includes pylon 12.4. The
+driver queries the camera's features, so other Basler models may work. Settings have their GenICam
+SFNC 2.5 names and, where pylon's emulation of an older family differs, its older name too. For the
+meaning of a frame's time see `frame_time.py`; docs/cameras.md lists what is untested on a real
+camera.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ _LEAST_BUFFERS = 8
 _END_OF_EXPOSURE = "EventExposureEndData"
 
 
-def look_for_camera(serial: str | None, device_class: str | None = None) -> Any:
-    """pylon's description of a camera that is plugged in; nothing is opened.
+def find_device_info(serial: str | None, device_class: str | None = None) -> Any:
+    """Return pylon's description of a connected camera, without opening it.
 
     Args:
-        device_class: of pylon's, such as `BaslerCamEmu`; any where None.
+        device_class: pylon's device class, such as `BaslerCamEmu`; any if None.
 
     Raises:
         RigError: no camera, none with this serial number, or several to choose from.
@@ -57,20 +58,20 @@ def look_for_camera(serial: str | None, device_class: str | None = None) -> Any:
         return fitting[0]
     there = ", ".join(info.GetSerialNumber() for info in found) or "none"
     if fitting:
-        raise RigError(DEVICE, f"there are several: {there}; name one by serial")
+        raise RigError(DEVICE, f"found several: {there}; select one by serial")
     wanted = "no camera" if serial is None else f"no camera with serial number {serial}"
-    raise RigError(DEVICE, f"{wanted}; found: {there}. Look at its cable and its power")
+    raise RigError(DEVICE, f"{wanted}; found: {there}. Check its cable and its power")
 
 
 def find_camera(serial: str | None, device_class: str | None = None) -> Any:
-    """An `InstantCamera` of pypylon that is not open yet; see `look_for_camera`.
+    """Return a pypylon `InstantCamera` that is not open yet; see `find_device_info`.
 
     Raises:
-        RigError: it is not there, not the only one, or another program has it.
+        RigError: no camera, several to choose from, or another program has it.
     """
     from pypylon import genicam, pylon
 
-    info = look_for_camera(serial, device_class)
+    info = find_device_info(serial, device_class)
     try:
         return pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateDevice(info))
     except genicam.GenericException as error:
@@ -78,13 +79,13 @@ def find_camera(serial: str | None, device_class: str | None = None) -> Any:
 
 
 class BaslerCamera:
-    """A `rigs.core.capabilities.FrameCamera`; it is open from the beginning and grabs from `start`.
+    """A `rigs.core.capabilities.FrameCamera`; opened on construction, grabbing from `start`.
 
     Args:
-        device: an `InstantCamera` that is not open; searched for where None.
+        device: an `InstantCamera` that is not open; None to search for one.
 
     Raises:
-        RigError: no such camera, or one that refuses a setting.
+        RigError: no such camera, or a setting that it refuses.
     """
 
     def __init__(self, settings: BaslerSettings, device: Any = None) -> None:
@@ -106,7 +107,7 @@ class BaslerCamera:
             self._configure()
         except genicam.GenericException as error:
             self.close()
-            raise RigError(DEVICE, f"it cannot be opened: {error}") from None
+            raise RigError(DEVICE, f"cannot be opened: {error}") from None
         except RigError:
             self.close()
             raise
@@ -121,7 +122,7 @@ class BaslerCamera:
         self._in_force = read_back(nodes)
 
     def _abilities(self) -> Abilities:
-        """Return the camera's abilities, with those switched on that are used."""
+        """Detect the camera's abilities, and enable those that are used."""
         nodes, settings = self._nodes, self.settings
         chunk = self._chunk("Timestamp")
         level = chunk and settings.sync_line is not None and self._chunk("LineStatusAll")
@@ -139,13 +140,13 @@ class BaslerCamera:
         )
 
     def _chunk(self, name: str) -> bool:
-        """Switch a chunk on if the camera has it."""
+        """Enable a chunk if the camera has it; return whether it does."""
         nodes = self._nodes
         if not nodes.has("ChunkModeActive"):
             return False
         nodes.put(True, "ChunkModeActive")
         if not nodes.offers("ChunkSelector", name):
-            # pylon's emulation has the mode and not one chunk: left on, no grab would begin
+            # pylon's emulation has the mode but no chunks: left on, no grab would start
             nodes.put(bool(self._chunks), "ChunkModeActive")
             return False
         nodes.put(name, "ChunkSelector")
@@ -154,7 +155,7 @@ class BaslerCamera:
         return True
 
     def _listen(self) -> None:
-        """Take note of every end of an exposure: frame id and time, ns."""
+        """Record the end of every exposure: frame id and time, ns."""
         from pypylon import pylon
 
         ends = self._ends
@@ -165,7 +166,7 @@ class BaslerCamera:
                     camera.EventExposureEndTimestamp.Value
                 )
 
-        # pylon keeps no reference, and must be told before the listener goes
+        # pylon keeps no reference, so deregister the listener before it is deleted
         self._listener = Listener()
         self._device.RegisterCameraEventHandler(
             self._listener, _END_OF_EXPOSURE, 1, pylon.RegistrationMode_Append,
@@ -176,11 +177,11 @@ class BaslerCamera:
 
     @property
     def counts(self) -> GrabCounts:
-        """Counts of the frames of this run, or of the last one."""
+        """Frame counts of this run, or of the last one."""
         return self._grab.counts if self._grab is not None else GrabCounts()
 
     def describe(self) -> Json:
-        """Return what a trial's record keeps of the camera: device, region, times and losses."""
+        """Return the camera's part of a trial's record: device, region, times and losses."""
         info, stamping = self._device.GetDeviceInfo(), self.stamping
         height, width = self._shape
         return {
@@ -196,13 +197,12 @@ class BaslerCamera:
         }
 
     def health(self) -> DeviceHealth:
-        """Return the camera's own report now, grabbing or not.
+        """Return the camera's health report, grabbing or not.
 
-        None of it was read from a real camera yet: what a camera does not have is left out or
-        `unknown`.
+        Not tested on a real camera yet: features that a camera lacks are left out or `unknown`.
 
         Raises:
-            RigError: the camera is gone.
+            RigError: the camera is disconnected.
         """
         device, nodes, stamping = self._device, self._nodes, self.stamping
         if device.IsCameraDeviceRemoved():
@@ -239,31 +239,31 @@ class BaslerCamera:
 
     @property
     def _buffers(self) -> int:
-        """Number of pylon's buffers; as many frames fit into the queue."""
+        """Number of pylon's buffers, and length of the queue."""
         half = math.ceil(self.settings.rate_hz * self.settings.back_pressure_s / 2)
         return max(half, _LEAST_BUFFERS)
 
     def set_region(self, width_px: int, height_px: int) -> None:
-        """Read out a centred region only.
+        """Read out only a centred region.
 
         Raises:
-            RigError: while grabbing, or a region that the sensor cannot read out.
+            RigError: the camera is grabbing, or the sensor cannot read out this region.
         """
         if self._running:
-            raise RigError(DEVICE, "the region cannot change while it grabs; stop first")
+            raise RigError(DEVICE, "the region cannot change while grabbing; stop first")
         centre_region(self._nodes, width_px, height_px)
         self._shape = (height_px, width_px)
 
     def start(self) -> None:
-        """Begin to grab; frames of an earlier run that nobody read are dropped.
+        """Start grabbing; unread frames of an earlier run are discarded.
 
         Raises:
-            RigError: it grabs already, it cannot keep the rate, or the camera is gone.
+            RigError: already grabbing, the rate is too high, or the camera is disconnected.
         """
         from pypylon import pylon
 
         if self._running:
-            raise RigError(DEVICE, "it grabs already; stop first")
+            raise RigError(DEVICE, "is already grabbing; stop first")
         settings = self.settings
         check_rate(self._nodes, settings)
         self._ends.clear()
@@ -271,7 +271,7 @@ class BaslerCamera:
             self._device.MaxNumBuffer.Value = self._buffers
             self._device.StartGrabbing(pylon.GrabStrategy_OneByOne)
         except self._genicam.GenericException as error:
-            raise RigError(DEVICE, f"it does not begin to grab: {error}") from None
+            raise RigError(DEVICE, f"cannot start grabbing: {error}") from None
         wired = self.stamping.grade == "hardware trigger" and settings.sync_line is not None
         grab_settings = GrabSettings(
             stamping=self.stamping,
@@ -287,7 +287,7 @@ class BaslerCamera:
         self._grab, self._running = Grab(self._device, grab_settings, self._ends), True
 
     def trigger(self) -> None:
-        """Ask for one frame, where the trigger is `software`.
+        """Trigger one frame, where the trigger is `software`.
 
         Raises:
             RigError: the camera is not ready for it within `TRIGGER_READY_MS`.
@@ -301,13 +301,13 @@ class BaslerCamera:
                 )
             self._device.ExecuteSoftwareTrigger()
         except self._genicam.GenericException as error:
-            raise RigError(DEVICE, f"no frame can be asked for: {error}") from None
+            raise RigError(DEVICE, f"cannot be triggered: {error}") from None
 
     def read(self) -> FrameChunk:
         """Frames since the last call.
 
         Raises:
-            RigError: the camera is gone or silent, and all that came before was read.
+            RigError: the camera is disconnected or silent, and all earlier frames were read.
         """
         frames = self._grab.take() if self._grab is not None else []
         if not frames:
@@ -318,7 +318,7 @@ class BaslerCamera:
                 np.empty((0, *self._shape), np.uint8), none, none, none, np.empty(0, np.uint8)
             )
         return FrameChunk(
-            # one frame, as a quick loop finds it, is handed on as it is
+            # a single frame, the usual case in a fast loop, is passed on without a copy
             np.stack([frame.image for frame in frames])
             if len(frames) > 1
             else frames[0].image[np.newaxis],
@@ -341,7 +341,7 @@ class BaslerCamera:
         if not self._running or self._grab is None:
             return
         self._running = False
-        # exposures end first, so that what pylon holds by then can be taken whole
+        # exposures end first, so that all frames in pylon can be read
         with suppress(RigError):
             self._nodes.execute("AcquisitionStop")
         try:
@@ -351,7 +351,7 @@ class BaslerCamera:
                 self._device.StopGrabbing()
 
     def close(self) -> None:
-        """Give the device back; safe at any time and more than once."""
+        """Close the device; safe at any time and more than once."""
         with suppress(RigError):
             self.stop()
         if self._listener is not None:
@@ -363,5 +363,5 @@ class BaslerCamera:
 
     @property
     def device(self) -> Any:
-        """pypylon's `InstantCamera`, for what only a fake or a person at a prompt asks."""
+        """pypylon's `InstantCamera`, for fakes and for interactive use."""
         return self._device

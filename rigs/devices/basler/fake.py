@@ -1,9 +1,9 @@
-"""A Basler camera without a camera: pylon's own emulation, with pictures and losses on request.
+"""A fake Basler camera: pylon's own camera emulation, with images and losses on request.
 
-The real driver talks to the real pylon; only the camera is emulated (pylon 12.4). It has sizes,
-formats, software triggers, free run, pictures from a folder, failed buffers and exposure-end
-events. It has no chunks, line triggers or clock that can be read, and under load it slows down
-where a camera would lose frames: `LossyDevice` loses them instead.
+The real driver runs on the real pylon; only the camera is emulated (pylon 12.4). The emulation has
+image sizes, formats, software triggers, free run, images from a folder, failed buffers and
+exposure-end events. It has no chunks, line triggers or readable clock, and under load it slows down
+where a camera would lose frames: `LossyDevice` loses frames instead.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from sliplab.storage.streams import U8
 
 VARIABLE = "PYLON_CAMEMU"
 EMULATED = "BaslerCamEmu"
-"""pylon's class of devices that are not there."""
+"""pylon's device class of emulated cameras."""
 
 
 def emulate(cameras: int = 1) -> None:
-    """List `cameras` emulated cameras from now on in this process and in those that it starts.
+    """Make pylon list `cameras` emulated cameras in this process and its children.
 
     Raises:
-        RuntimeError: pylon was loaded before and does not look again.
+        RuntimeError: pylon was loaded before, and does not enumerate again.
     """
     os.environ[VARIABLE] = str(cameras)
     from pypylon import pylon
@@ -35,18 +35,18 @@ def emulate(cameras: int = 1) -> None:
     found = pylon.TlFactory.GetInstance().EnumerateDevices()
     there = sum(info.GetDeviceClass() == EMULATED for info in found)
     if there < cameras:
-        raise RuntimeError(f"{there} emulated cameras instead of {cameras}: pylon began before")
+        raise RuntimeError(f"{there} emulated cameras instead of {cameras}: pylon loaded first")
 
 
 def scene_frames(count: int, width: int, height: int, seed: int = 1) -> U8:
-    """Pictures of seven markers that slide over the plate, (count, height, width), grey.
+    """Render images of seven markers that slide over the plate, (count, height, width), grey.
 
-    The slide is 0.1 mm a picture to and fro, with the camera's noise.
+    The markers slide back and forth by 0.1 mm per image, with camera noise.
     """
     ring = 5.6 * np.exp(2j * np.pi * np.arange(6) / 6)
     layout = np.concatenate(([0j], ring))
-    way = 0.1 * (np.abs(np.arange(count) % 40 - 20) - 10)
-    tips = np.stack((layout.real[None] + way[:, None], np.tile(layout.imag, (count, 1))), axis=-1)
+    slide = 0.1 * (np.abs(np.arange(count) % 40 - 20) - 10)
+    tips = np.stack((layout.real[None] + slide[:, None], np.tile(layout.imag, (count, 1))), axis=-1)
     images = np.empty((count, height, width), np.uint8)
     view = PlateView(FrameOptics(tip_radius_mm=1.0), width, height)
     view.draw(images, tips, None, np.arange(count, dtype=np.int64), seed)
@@ -54,7 +54,7 @@ def scene_frames(count: int, width: int, height: int, seed: int = 1) -> U8:
 
 
 def write_frames(folder: Path, images: U8) -> None:
-    """Pictures as files that the emulation reads in order; bitmaps, for it decodes each anew."""
+    """Write images as files for the emulation; as bitmaps, which decode fast."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images):
         path = folder / f"{number:06d}.bmp"
@@ -63,34 +63,34 @@ def write_frames(folder: Path, images: U8) -> None:
 
 
 def show(device: Any, folder: Path) -> None:
-    """Feed an open emulated camera, which does not grab, with the pictures in `folder`."""
+    """Make an open emulated camera, which is not grabbing, deliver the images in `folder`."""
     device.GetNodeMap().GetNode("TestImageSelector").Value = "Off"
     device.GetNodeMap().GetNode("ImageFilename").Value = str(folder)
     device.GetNodeMap().GetNode("ImageFileMode").Value = "On"
 
 
 def fail_buffers(device: Any, count: int) -> None:
-    """Let the next `count` buffers of an emulated camera come incomplete."""
+    """Make the next `count` buffers of an emulated camera incomplete."""
     nodes = device.GetNodeMap()
     nodes.GetNode("ForceFailedBufferCount").Value = count
     nodes.GetNode("ForceFailedBuffer").Execute()
 
 
 def unplug(device: Any) -> None:
-    """Let pylon believe that the cable was pulled."""
+    """Simulate an unplugged cable."""
     device.GetNodeMap().GetNode("FirePnPCallback").Execute()
 
 
 class LossyDevice:
-    """A camera of pypylon between which and its driver results get lost on request.
+    """A wrapper of a pypylon camera that loses results on request.
 
-    Everything but `RetrieveResult` is the device's own.
+    Everything except `RetrieveResult` is delegated to the device.
     """
 
     def __init__(self, device: Any) -> None:
         self._device, self._drop, self._mute = device, 0, False
         self.dropped = 0
-        """Results lost on request so far, those of a silent camera too."""
+        """Number of results lost on request, including those of a silent camera."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._device, name)
@@ -104,7 +104,7 @@ class LossyDevice:
         self._mute = True
 
     def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
-        """The next result, or an empty one in place of one that gets lost."""
+        """Return the next result, or an empty one in place of a lost one."""
         from pypylon import pylon
 
         result = self._device.RetrieveResult(timeout_ms, handling)

@@ -1,9 +1,9 @@
-"""pylon's emulated camera as the camera of a simulated scene that goes on elsewhere.
+"""A fake Basler camera on pylon's emulation that shows a scene simulated in another process.
 
-Every frame of the scene is one software trigger of the emulated camera, so that it passes through
-pylon's own buffers, threads and results; only the picture, its number and its chunks, which the
-emulation does not have, are the scene's. What pylon loses on the way is lost here too. A setting
-that the scene's pictures do not show is refused, and so is a grab with one in force.
+Every frame of the scene is one software trigger of the emulated camera, so it passes through
+pylon's own buffers, threads and results; only the image, its number and its chunks, which the
+emulation lacks, come from the scene. A frame that pylon loses is lost here too. Settings that the
+scene's images do not simulate are refused, and so is a grab while one is active.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from sliplab.storage.streams import U8, FrameChunk
 
 
 class Setting:
-    """A setting with the values that are simulated.
+    """A setting and its simulated values.
 
     Args:
-        name: GenICam's.
-        factory: value that the maker's user set has; it is simulated.
-        choices: values of an enumeration or a switch that are simulated.
-        limits: least and most of a number that are simulated; `factory` alone where neither.
-        stored: value that somebody left in the camera, simulated or not.
-        node: the emulation's setting, written as well where it has one.
+        name: GenICam name.
+        factory: value in the factory user set; always simulated.
+        choices: simulated values of an enumeration or a switch.
+        limits: simulated range of a number; only `factory` if neither is given.
+        stored: value stored in the camera, simulated or not.
+        node: the emulation's node for this setting, which is written too; None if it has none.
     """
 
     def __init__(
@@ -53,17 +53,17 @@ class Setting:
 
     @property
     def Min(self) -> Any:
-        """The least of a number."""
+        """Smallest simulated number."""
         return self._limits[0]
 
     @property
     def Max(self) -> Any:
-        """The most of a number."""
+        """Largest simulated number."""
         return self._limits[1]
 
     @property
     def Value(self) -> Any:
-        """The value in force."""
+        """Active value."""
         return self._value
 
     @Value.setter
@@ -77,7 +77,7 @@ class Setting:
         self._value = value
 
     def GetAccessMode(self) -> int:
-        """Can be read and written."""
+        """Return read-write access."""
         from pypylon import genicam
 
         mode: int = genicam.RW
@@ -85,17 +85,17 @@ class Setting:
 
     @property
     def simulated(self) -> bool:
-        """True if the value in force is the one that the pictures show."""
+        """True if the images simulate the active value."""
         return self._simulates(self._value)
 
     def refusal(self, value: Any) -> str:
-        """Return why a value is refused."""
+        """Return the reason why a value is refused."""
         low, high = self._limits
         those = " or ".join(map(str, self._choices)) if self._choices else f"{low} to {high}"
-        return f"the stand-in simulates {self.name} {those}, not {value}"
+        return f"the fake simulates {self.name} {those}, not {value}"
 
     def load(self, stored: bool) -> None:
-        """Take the value of the maker's user set, or what somebody stored."""
+        """Load the value of the factory user set, or the stored one."""
         self._value = self._left if stored else self._factory
 
     def _simulates(self, value: Any) -> bool:
@@ -105,14 +105,14 @@ class Setting:
 
 
 class Selected:
-    """A switch for each choice of a selector, off at first."""
+    """A switch for each choice of a selector, initially off."""
 
     def __init__(self, selector: Setting) -> None:
         self._selector, self._on = selector, set[Any]()
 
     @property
     def Value(self) -> bool:
-        """The value of what is selected now."""
+        """Switch of the current choice."""
         return self._selector.Value in self._on
 
     @Value.setter
@@ -121,32 +121,32 @@ class Selected:
 
     @property
     def on(self) -> frozenset[Any]:
-        """All choices that are switched on."""
+        """Choices that are switched on."""
         return frozenset(self._on)
 
     def GetAccessMode(self) -> int:
-        """Can be read and written."""
+        """Return read-write access."""
         return self._selector.GetAccessMode()
 
 
 class Command:
-    """A command that does something of ours, and then the emulation's if there is one."""
+    """A command that calls a function, and then the emulation's command if it has one."""
 
     def __init__(self, work: Callable[[], None], node: Any = None) -> None:
         self._work, self._node = work, node
 
     def Execute(self) -> None:
-        """Do it."""
+        """Execute the command."""
         self._work()
         if self._node is not None:
             self._node.Execute()
 
     def IsDone(self) -> bool:
-        """Return whether it has ended."""
+        """Return whether the command has ended."""
         return True
 
     def GetAccessMode(self) -> int:
-        """Can be given."""
+        """Return write-only access."""
         from pypylon import genicam
 
         mode: int = genicam.WO
@@ -154,18 +154,18 @@ class Command:
 
 
 class ReadOnly:
-    """A value that the camera works out."""
+    """A value that the camera computes."""
 
     def __init__(self, read: Callable[[], float]) -> None:
         self._read = read
 
     @property
     def Value(self) -> float:
-        """The value now."""
+        """Current value."""
         return self._read()
 
     def GetAccessMode(self) -> int:
-        """Can be read."""
+        """Return read-only access."""
         from pypylon import genicam
 
         mode: int = genicam.RO
@@ -173,36 +173,36 @@ class ReadOnly:
 
 
 class NodeMap:
-    """Settings of an emulated camera with others laid over them."""
+    """Node map of an emulated camera with some nodes replaced."""
 
     def __init__(self, node_map: Any, own: Mapping[str, Any]) -> None:
         self._map, self._own = node_map, own
 
     def GetNode(self, name: str) -> Any:
-        """A setting by its name; None where there is none."""
+        """Return a node by its name; None if there is none."""
         own = self._own.get(name)
         return own if own is not None else self._map.GetNode(name)
 
 
 TRIES = 3
 MISSED_S = 0.2
-"""A trigger whose picture has not come by then was missed, s."""
-LOOK_S = 0.001
-LOOK_MS = 100
+"""Timeout after which a trigger without an image counts as missed, s."""
+POLL_S = 0.001
+POLL_MS = 100
 READY_S = 2.0
-"""The longest that the emulated camera takes to be ready for the next trigger, s."""
+"""Timeout for the emulated camera to be ready for the next trigger, s."""
 EXPOSURE_US = 100.0
-"""Of the emulated camera; the scene's own is in its pictures."""
+"""Exposure of the emulated camera; the scene's exposure is in its images."""
 FEED_S = 5.0
-"""The longest that the feeding thread takes to end, s."""
+"""Timeout for the feeding thread to end, s."""
 MOST_HZ = 160.0
-"""Frames a second that the sensor gives at the most."""
+"""Maximum frame rate of the sensor."""
 LINES = (1, 2, 3)
-"""Numbers of its inputs: one has the sync line, the ticks may come by any other."""
+"""Numbers of the inputs: one has the sync line; any other may have the ticks."""
 
 
 _Frame = tuple[U8, int, int, int]
-"""Picture, number, middle of the exposure in ns, and level of the sync line."""
+"""Image, number, middle of the exposure in ns, and level of the sync line."""
 
 
 class Scene(Protocol):
@@ -211,25 +211,25 @@ class Scene(Protocol):
     on_frames: Callable[[FrameChunk], None]
 
     def grab(self, width_px: int, height_px: int) -> None:
-        """Frames of that size come from now on."""
+        """Start sending frames of this size."""
 
     def stop_grabbing(self) -> None:
-        """An empty chunk comes after the last frame."""
+        """Stop sending frames; an empty chunk follows the last one."""
 
 
 class LiveBasler:
-    """An `InstantCamera` of pypylon whose pictures are those of a scene.
+    """A pypylon `InstantCamera` whose images come from a scene.
 
-    Whatever is not listed here is the emulated camera's own.
+    Everything else is delegated to the emulated camera.
 
     Args:
-        scene: asked for frames when the camera grabs.
-        mid_exposure_ns: from a frame's start to its middle, which is what the scene's times say.
-        sync_line: number of the input that shows the sync line's level.
-        stored: settings by name that somebody left in the camera, as its user set `UserSet1`.
+        scene: source of frames while the camera grabs.
+        mid_exposure_ns: time from a frame's start to its middle; the scene's times are middles.
+        sync_line: number of the input with the sync line.
+        stored: settings by name in the camera's user set `UserSet1`.
 
     Attributes:
-        fed: frames that pylon took since the grab began.
+        fed: number of frames that pylon accepted since the grab began.
     """
 
     def __init__(
@@ -240,7 +240,7 @@ class LiveBasler:
         stored: Mapping[str, Any] | None = None,
     ) -> None:
         emulate(1)
-        # never the real one of this computer
+        # never a real camera on this computer
         self._device = find_camera(None, EMULATED)
         self._scene, self._mid_exposure_ns, self._bit = scene, mid_exposure_ns, sync_line - 1
         self._coming: deque[_Frame | None] = deque()
@@ -264,20 +264,20 @@ class LiveBasler:
         self._drop += count
 
     def unplug(self) -> None:
-        """The cable is pulled."""
+        """Simulate an unplugged cable."""
         self._gone = True
 
     # -- as pylon's ------------------------------------------------------------------------
 
     def GetNodeMap(self) -> Any:
-        """The emulated camera's settings, and those that it lacks or does not obey."""
+        """Return the emulated camera's nodes, with those that it lacks or ignores replaced."""
         emulated = self._device.GetNodeMap()
         if not self._nodes:
-            self._nodes = self._lay_over(emulated)
+            self._nodes = self._own_nodes(emulated)
         return NodeMap(emulated, self._nodes)
 
-    def _lay_over(self, emulated: Any) -> dict[str, Any]:
-        """Return the settings that the scene shows, by name; open cameras have settings."""
+    def _own_nodes(self, emulated: Any) -> dict[str, Any]:
+        """Return the replaced nodes by name; the camera must be open."""
         exposure_us = self._mid_exposure_ns / 500
         ticks = tuple(f"Line{number}" for number in LINES if number - 1 != self._bit)
         plain: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -303,7 +303,7 @@ class LiveBasler:
             "ChunkModeActive": (False, (False, True)),
             "ChunkSelector": ("Timestamp", ("Timestamp", "LineStatusAll")),
             "UserSetSelector": ("Default", ("Default", "UserSet1")),
-            # the emulated exposure stays short, so that no trigger comes too soon
+            # the emulated exposure stays short, so that no trigger comes too early
             "ExposureTime": (exposure_us, ()),
             "ExposureTimeAbs": (exposure_us, ()),
             "TriggerSource": (ticks[0], ticks),
@@ -311,7 +311,7 @@ class LiveBasler:
         held = {"ChunkModeActive", "UserSetSelector", "ExposureTime", "ExposureTimeAbs"}
         held |= {"TriggerSource"}
         if unknown := set(self._stored) - set(plain):
-            raise ValueError(f"the stand-in has no {', '.join(sorted(unknown))} to store")
+            raise ValueError(f"the fake has no {', '.join(sorted(unknown))} to store")
         own: dict[str, Any] = {
             name: Setting(
                 name,
@@ -324,7 +324,7 @@ class LiveBasler:
         }
         own["ChunkEnable"] = Selected(own["ChunkSelector"])
         own["UserSetLoad"] = Command(self._load_user_set)
-        # what was exposed by then is still to be taken by pylon
+        # frames exposed by then must still reach pylon
         own["AcquisitionStop"] = Command(self._end_frames, emulated.GetNode("AcquisitionStop"))
         own["BslResultingAcquisitionFrameRate"] = ReadOnly(lambda: min(MOST_HZ, 1e6 / exposure_us))
         return own
@@ -336,19 +336,19 @@ class LiveBasler:
                 node.load(stored=chosen != "Default")
 
     def _chunks(self) -> frozenset[str]:
-        """Chunks that come with every frame."""
+        """Return the chunks sent with every frame."""
         active = self._nodes and self._nodes["ChunkModeActive"].Value
         return self._nodes["ChunkEnable"].on if active else frozenset()
 
     def IsCameraDeviceRemoved(self) -> bool:
-        """Return whether it was unplugged."""
+        """Return whether the camera was unplugged."""
         return self._gone or bool(self._device.IsCameraDeviceRemoved())
 
     def StartGrabbing(self, strategy: Any) -> None:
-        """Begin: the scene sends frames of the region that was set.
+        """Start grabbing: the scene sends frames of the configured region.
 
         Raises:
-            genicam.GenericException: a setting is in force that the scene does not show.
+            genicam.GenericException: a setting is active that the scene does not simulate.
         """
         from pypylon import genicam
 
@@ -361,7 +361,7 @@ class LiveBasler:
             mode = nodes.GetNode("TriggerMode").Value
             if mode != ("On" if choice == "FrameStart" else "Off"):
                 raise genicam.InvalidArgumentException(
-                    f"the stand-in simulates a trigger of FrameStart alone, not {choice} {mode}"
+                    f"the fake simulates only a trigger of FrameStart, not {choice} {mode}"
                 )
         nodes.GetNode("TriggerSelector").Value = "FrameStart"
         nodes.GetNode("TriggerSource").Value = "Software"
@@ -375,19 +375,19 @@ class LiveBasler:
         self._scene.grab(nodes.GetNode("Width").Value, nodes.GetNode("Height").Value)
 
     def StopGrabbing(self) -> None:
-        """Stop; frames that came before were given to pylon."""
+        """Stop grabbing; earlier frames have reached pylon."""
         try:
             self._end_frames()
         finally:
             self._device.StopGrabbing()
 
     def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
-        """The next result of pylon's, with the scene's picture in it."""
+        """Return pylon's next result with the scene's image in it."""
         result = self._device.RetrieveResult(timeout_ms, handling)
         if result is None or not result.IsValid():
             return result
         with self._came:
-            # a trigger that pylon's camera missed gave no result
+            # a trigger that pylon's camera missed has no result
             while self._fed[0][0] < result.BlockID:
                 self._fed.popleft()
             frame = self._fed.popleft()[1]
@@ -404,7 +404,7 @@ class LiveBasler:
     # --------------------------------------------------------------------------------------
 
     def _end_frames(self) -> None:
-        """No frame comes any more, and pylon has been given all that came: at most `FEED_S`."""
+        """Stop the scene's frames, and wait until pylon has all of them, at most `FEED_S`."""
         feeder, self._feeder = self._feeder, None
         if feeder is None:
             return
@@ -412,12 +412,12 @@ class LiveBasler:
             self._scene.stop_grabbing()
             feeder.join(FEED_S)
         finally:
-            with self._came:  # a scene that is gone says nothing
+            with self._came:  # a scene that has died sends no end
                 self._coming.append(None)
                 self._came.notify()
 
     def _take(self, frames: FrameChunk) -> None:
-        """In the thread that the scene's frames come by."""
+        """Queue frames; called in the thread that receives them from the scene."""
         rows = zip(
             frames.images,
             frames.number.tolist(),
@@ -442,10 +442,10 @@ class LiveBasler:
             try:
                 self._give(frame)
             except genicam.GenericException:
-                return  # it grabs no more: what comes now is lost, and its number is missing
+                return  # no longer grabbing: later frames are lost, and their numbers missing
 
     def _give(self, frame: _Frame) -> None:
-        """One trigger for one frame; the emulation misses some, which no camera's line would."""
+        """Trigger once per frame, with retries, since the emulation misses some triggers."""
         for _ in range(TRIES):
             if self._gone or not self._ready():
                 return
@@ -459,29 +459,29 @@ class LiveBasler:
                     if self._retrieved + self._device.NumReadyBuffers.Value > self.fed:
                         self.fed += 1
                         return
-                    self._came.wait(LOOK_S)
+                    self._came.wait(POLL_S)
 
     def _ready(self) -> bool:
-        """Return whether the next trigger may come, after waiting for it."""
+        """Wait until the camera is ready for a trigger; return whether it is."""
         from pypylon import pylon
 
         end = time.monotonic() + READY_S
         while time.monotonic() < end:
-            # right after the start it says no at once
-            if self._device.WaitForFrameTriggerReady(LOOK_MS, pylon.TimeoutHandling_Return):
+            # right after the start it returns False without waiting
+            if self._device.WaitForFrameTriggerReady(POLL_MS, pylon.TimeoutHandling_Return):
                 return True
         return False
 
 
 class _Value:
-    """One of the values that a chunk is read by."""
+    """A node with the value of a chunk."""
 
     def __init__(self, value: int) -> None:
         self.Value = value
 
 
 class _Result:
-    """A result of pylon's with another picture and with chunks."""
+    """A pylon result with another image and with chunks."""
 
     def __init__(
         self,
@@ -496,7 +496,7 @@ class _Result:
     ) -> None:
         self._result = result
         self.Array, self.BlockID, self.ImageNumber = image, number, number + 1
-        self.NumberOfSkippedImages = 0  # the numbers say it
+        self.NumberOfSkippedImages = 0  # the frame numbers show losses
         self.TimeStamp = t_ns - mid_exposure_ns
         if "Timestamp" in chunks:
             self.ChunkTimestamp = _Value(self.TimeStamp)

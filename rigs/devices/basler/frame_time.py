@@ -1,9 +1,9 @@
-"""The time of a frame: the best means that the camera has to tell it, and the grade that follows.
+"""Time stamps of frames: the camera's best source, and the resulting grade.
 
-A camera is asked what it has and the answer is kept by name, for two cameras of one maker differ.
-Meaning of the stamps, from Basler's product documentation of chunks and events: a chunk's and a
-grab result's time stamp is taken when the exposure starts, that of an ExposureEnd event when it
-ends. They are 64-bit counters of the camera, nanoseconds on USB; nothing wraps.
+The source is chosen by the camera's features, which differ between models. According to Basler's
+product documentation of chunks and events, the time stamp of a chunk and of a grab result is taken
+at the start of the exposure, that of an ExposureEnd event at its end. They are 64-bit counters of
+the camera, in nanoseconds on USB; nothing wraps.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ Means = Literal["chunk", "grab result", "exposure end event", "host arrival"]
 
 @dataclass(frozen=True)
 class Abilities:
-    """Abilities of a camera that help to know a frame's time.
+    """Features of a camera that determine a frame's time.
 
     Attributes:
-        chunk: sends a time stamp with every frame.
-        result: pylon fills `GrabResult.TimeStamp`, as far as one can tell before the first frame.
-        event: sends an event with frame id and time when an exposure ends.
-        latch: lets the host read its clock.
-        sync_level: sends the level of the sync line with every frame, and it is wired.
-        exposure_line: its ExposureActive output is wired to the sync box.
+        chunk: a time stamp comes with every frame.
+        result: pylon fills `GrabResult.TimeStamp`, as expected before the first frame.
+        event: an event with frame id and time is sent when an exposure ends.
+        latch: the host can read the camera's clock.
+        sync_level: the level of the sync line comes with every frame, and the line is wired.
+        exposure_line: the ExposureActive output is wired to the sync box.
     """
 
     chunk: bool = False
@@ -40,23 +40,23 @@ class Abilities:
 
 @dataclass(frozen=True)
 class Stamping:
-    """The chosen means, and the grade of `protocols.timing` that it gives."""
+    """The chosen source of time stamps, and the resulting grade of `protocols.timing`."""
 
     means: Means
     grade: FrameGrade
 
     def middle_ns(self, stamp_ns: int, mid_exposure_ns: int) -> int:
-        """Middle of the exposure, from a stamp on the same clock, ns."""
+        """Return the middle of the exposure from a stamp on the same clock, ns."""
         if self.means == "exposure end event":
             return stamp_ns - mid_exposure_ns
         return stamp_ns if self.means == "host arrival" else stamp_ns + mid_exposure_ns
 
 
 def choose(has: Abilities, trigger: FrameTrigger) -> Stamping:
-    """The best that a camera can do.
+    """Choose the best source of time stamps of a camera.
 
-    Stamps of a clock that nothing ties to the sync box's are worth no more than arrivals, so then
-    arrivals are what the frames say: a grade never claims what cannot be checked.
+    Stamps of a clock that cannot be related to the sync box's are no better than arrival times, so
+    arrival times are used then: a grade never claims more than can be verified.
     """
     means: Means = "host arrival"
     if has.chunk:

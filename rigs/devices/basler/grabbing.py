@@ -1,9 +1,9 @@
-"""The thread that takes frames out of pylon, and never loses one without counting it.
+"""The thread that retrieves frames from pylon, and counts every lost one.
 
-Pylon fills a fixed number of buffers and drops what finds none, so they are emptied by a thread
-that does nothing else. It hands frames on in a queue that is bounded too: when nobody reads, the
-queue fills, then pylon's buffers, and only then are frames lost, which shows as a gap in the
-camera's own frame ids. A time that comes apart from its frame, as an event, is waited for here.
+Pylon fills a fixed number of buffers and drops frames that find none free, so a dedicated thread
+empties them into a bounded queue. If the queue is not read, it fills up, then pylon's buffers do,
+and only then are frames lost, which shows as a gap in the camera's frame ids. Where the time of a
+frame comes separately, as an event, the thread waits for it.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from sliplab.rigs.devices.basler.nodes import DEVICE
 from sliplab.storage.streams import U8
 
 POLL_MS = 100
-"""The longest that the thread waits in pylon before it looks round, ms."""
+"""Timeout of each wait in pylon, after which the thread checks its other conditions, ms."""
 EVENT_WAIT_S = 0.5
-"""A frame whose exposure-end event has not come by then is given up, s."""
+"""Timeout for a frame's exposure-end event, after which the frame is dropped, s."""
 HANG_S = 5.0
-"""Pylon, asked for `POLL_MS`, must have answered by then, s."""
+"""Time after which a call into pylon counts as hung, s."""
 STOP_S = 3.0
-"""The longest that a grab takes to end, s."""
+"""Timeout for a grab to end, s."""
 _DRAIN_ROUNDS = 2
-"""Empty looks in a row after which a stopped camera has nothing more to say."""
+"""Consecutive empty polls after which a stopped camera has no more frames."""
 NO_ID = (1 << 64) - 1
-"""A block id of pylon that says there is none."""
+"""Block id of pylon that means none."""
 
 
 @dataclass
@@ -39,12 +39,12 @@ class GrabCounts:
     """Counts of the frames of one run.
 
     Attributes:
-        grabbed: whole frames in order, handed on or still in the queue.
-        failed: came incomplete.
-        skipped: missing in the camera's ids, or overwritten in pylon.
-        late: arrived later after their time than `late_s` allows; they are handed on.
-        out_of_order: came after a later one or twice; they are not handed on.
-        unstamped: their time never came; they are not handed on.
+        grabbed: complete frames in order, delivered or still in the queue.
+        failed: incomplete frames.
+        skipped: frames missing in the camera's ids, or overwritten in pylon.
+        late: frames with a longer delay than `late_s` allows; they are delivered.
+        out_of_order: frames after a later one, and duplicates; they are not delivered.
+        unstamped: frames without a time stamp; they are not delivered.
     """
 
     grabbed: int = 0
@@ -56,17 +56,17 @@ class GrabCounts:
 
     @property
     def lost(self) -> int:
-        """Frames that were exposed, as far as one can tell, and not handed on."""
+        """Number of frames that were exposed, as far as known, and not delivered."""
         return self.failed + self.skipped + self.out_of_order + self.unstamped
 
     def copy(self) -> GrabCounts:
-        """As they are now."""
+        """Return a copy of the current counts."""
         return GrabCounts(*(getattr(self, field.name) for field in fields(self)))
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One whole frame. Times in ns, `t_ns` of the middle of its exposure."""
+    """One complete frame. Times in ns, `t_ns` at the middle of its exposure."""
 
     image: U8
     number: int
@@ -89,11 +89,11 @@ class GrabSettings:
 
     Attributes:
         first_id: block id of a run's first frame: 0 on USB, 1 on GigE.
-        period_ns: between two frames, where the camera runs by itself or is triggered at a rate.
-        sync_bit: of the line status chunk; None where the sync line is not wired.
-        queue: frames that the queue holds.
-        first_ns: silence before the first frame that is a fault; 0 where it may wait for ever.
-        stall_ns: silence after it that is a fault; 0 where the camera need not send by itself.
+        period_ns: period of frames in free run or with a fixed trigger rate.
+        sync_bit: bit of the sync line in the line status chunk; None where it is not wired.
+        queue: capacity of the queue, frames.
+        first_ns: timeout for the first frame; 0 for none.
+        stall_ns: timeout for each later frame; 0 for none.
     """
 
     stamping: Stamping
@@ -111,7 +111,7 @@ class Grab:
     """One run of a camera, from start to stop.
 
     Args:
-        device: an `InstantCamera` of pypylon that grabs, or what behaves like one.
+        device: a grabbing `InstantCamera` of pypylon, or an object that behaves like one.
         exposures: exposure ends by block id, ns, filled by the camera's events.
     """
 
@@ -128,39 +128,39 @@ class Grab:
         self._asked_ns = time.monotonic_ns()
         self._stall = StallTimer()
         self._silent_ns = 0
-        self._heard = False
+        self._received = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="frame camera", daemon=True)
         self._thread.start()
 
     @property
     def counts(self) -> GrabCounts:
-        """Counts of the frames so far."""
+        """Frame counts so far."""
         with self._changed:
             return self._counts.copy()
 
     @property
     def fault(self) -> RigError | None:
-        """Return why no more frames will come, if that is so."""
+        """Return the error after which no more frames will come, if any."""
         with self._changed:
             if self._fault is not None or self._stopping.is_set():
                 return self._fault
             silent_ns = self._silent_ns
             hung_s = self._stall.waited_s(self._asked_ns)
-            limit = self._settings.stall_ns if self._heard else self._settings.first_ns
+            limit = self._settings.stall_ns if self._received else self._settings.first_ns
             if hung_s > HANG_S:
                 return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")
             if limit and silent_ns > limit:
-                what = "no frame" if self._heard else "not one frame since the start,"
+                what = "no frame" if self._received else "no frame since the start,"
                 return RigError(
                     DEVICE,
-                    f"{what} for {silent_ns / 1e9:.1f} s; look at its cable, its power and "
-                    "its trigger",
+                    f"{what} for {silent_ns / 1e9:.1f} s; check its cable, its power and its "
+                    "trigger",
                 )
             return None
 
     def take(self) -> list[Frame]:
-        """All frames that are ready."""
+        """Remove and return all frames that are ready."""
         with self._changed:
             frames = list(self._ready)
             self._ready.clear()
@@ -168,7 +168,7 @@ class Grab:
             return frames
 
     def stop(self) -> None:
-        """End the run; frames that pylon holds are still taken. Returns within `STOP_S`.
+        """End the run after retrieving the frames in pylon. Returns within `STOP_S`.
 
         Raises:
             RigError: the thread does not end.
@@ -193,20 +193,20 @@ class Grab:
                 now_ns = time.monotonic_ns()
                 if result is None or not result.IsValid():
                     empty += 1
-                    # silence is what was listened to: a computer that stood still heard nothing
+                    # time for which this computer was suspended is not silence of the camera
                     self._silent_ns += min(now_ns - asked_ns, POLL_MS * 1_000_000)
                 else:
                     empty = 0
                     try:
-                        self._see(result, now_ns)
+                        self._add(result, now_ns)
                     finally:
                         result.Release()
-                self._give(now_ns)
-                # not at every frame: each call into pylon gives up the interpreter, and a busy
-                # one is slow to give it back
+                self._deliver(now_ns)
+                # not at every frame: each call into pylon releases the interpreter lock, and a busy
+                # interpreter is slow to return it
                 if now_ns - looked_ns > POLL_MS * 1_000_000:
                     looked_ns = now_ns
-                    self._look()
+                    self._check_device()
         except RigError as error:
             self._fail(error)
         except Exception as error:
@@ -215,16 +215,16 @@ class Grab:
             self._fail(RigError(DEVICE, what))
 
     def _room(self) -> bool:
-        """Return whether the queue has room, after waiting; a run that ends makes its own."""
+        """Wait until the queue has room, and return whether it has; always true once stopping."""
         with self._changed:
             if len(self._ready) < self._settings.queue or self._stopping.is_set():
                 return True
             self._changed.wait(POLL_MS / 1000)
             self._asked_ns = time.monotonic_ns()
-            self._look()
+            self._check_device()
             return len(self._ready) < self._settings.queue
 
-    def _look(self) -> None:
+    def _check_device(self) -> None:
         if self._device.IsCameraDeviceRemoved():
             raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
 
@@ -232,20 +232,20 @@ class Grab:
         with self._changed:
             self._fault = error
 
-    def _see(self, result: Any, now_ns: int) -> None:
-        """Account for one grab result, and keep it if it is a frame."""
+    def _add(self, result: Any, now_ns: int) -> None:
+        """Count one grab result, and queue it if it is a frame."""
         block = int(result.BlockID)
         counted = block if block != NO_ID else int(result.ImageNumber) - 1
         number = counted - (self._settings.first_id if block != NO_ID else 0)
         counts = self._counts
         with self._changed:
-            self._heard, self._silent_ns = True, 0
+            self._received, self._silent_ns = True, 0
             if number <= self._last:
                 counts.out_of_order += 1
                 return
             missing = number - self._last - 1
             overwritten = int(result.NumberOfSkippedImages)
-            # what pylon overwrote is missing in the ids too, where there are ids
+            # frames overwritten in pylon are missing in the ids too, where there are ids
             counts.skipped += max(missing, overwritten)
             self._last = number
             if not result.GrabSucceeded():
@@ -260,7 +260,7 @@ class Grab:
         self._waiting.append(_Waiting(result.Array, number, now_ns, sync))
 
     def _stamp(self, result: Any, now_ns: int) -> int | None:
-        """The frame's own stamp, ns; None where it comes as an event."""
+        """Return the frame's own stamp, ns; None where it comes as an event."""
         means = self._settings.stamping.means
         if means == "exposure end event":
             return None
@@ -268,11 +268,11 @@ class Grab:
             return now_ns
         stamp = int(result.ChunkTimestamp.Value if means == "chunk" else result.TimeStamp)
         if stamp == 0:
-            raise RigError(DEVICE, f"its {means} says no time, though the camera promised one")
+            raise RigError(DEVICE, f"its {means} has no time stamp, though the camera offers one")
         return stamp
 
-    def _give(self, now_ns: int) -> None:
-        """Hand on, in order, the frames whose times are known."""
+    def _deliver(self, now_ns: int) -> None:
+        """Move the frames whose times are known to the queue, in order."""
         settings = self._settings
         while self._waiting:
             frame = self._waiting[0]
@@ -292,7 +292,7 @@ class Grab:
                 )
 
     def _is_late(self, frame: _Waiting, stamp_ns: int) -> bool:
-        """Return whether it took too much longer than the fastest one of this run."""
+        """Return whether a frame's delay exceeds the shortest one of this run by too much."""
         if self._settings.stamping.means == "host arrival":
             before, self._before = self._before, (frame.number, frame.host_ns)
             if before is None or not self._settings.period_ns:

@@ -1,4 +1,4 @@
-"""Reading and writing a GenICam camera's settings by name, where they are there at all.
+"""Reading and writing a GenICam camera's settings by name, where they exist.
 
 Names differ between families (`ExposureTime`, `ExposureTimeAbs`); SFNC 2 names come first.
 """
@@ -18,8 +18,8 @@ from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.storage.streams import ClockReads, Json
 
 DEVICE = "frame camera"
-_LOOK_S = 0.01
-# command, value and ticks a second of the clock, by family; None: nanoseconds
+_POLL_S = 0.01
+# command, value and clock frequency, by family; None: nanoseconds
 _LATCHES = (
     ("TimestampLatch", "TimestampLatchValue", None),
     ("GevTimestampControlLatch", "GevTimestampValue", "GevTimestampTickFrequency"),
@@ -30,7 +30,7 @@ class Nodes:
     """The node map of an open camera.
 
     Args:
-        node_map: what `GetNodeMap` of pypylon's device gives.
+        node_map: result of `GetNodeMap` of pypylon's device.
     """
 
     def __init__(self, node_map: Any) -> None:
@@ -39,37 +39,37 @@ class Nodes:
         self._map, self._genicam = node_map, genicam
 
     def has(self, name: str) -> bool:
-        """Return whether a setting is there and may be written now."""
+        """Return whether a setting exists and is writable now."""
         node = self._map.GetNode(name)
         return node is not None and node.GetAccessMode() in (self._genicam.RW, self._genicam.WO)
 
     def offers(self, name: str, choice: str) -> bool:
-        """Return whether a setting can be set and `choice` is one of its values."""
+        """Return whether a setting is writable and `choice` is one of its values."""
         return self.has(name) and choice in self._map.GetNode(name).Symbolics
 
     def choices(self, name: str) -> tuple[str, ...]:
-        """Values that an enumeration may be set to now; none where it is none or cannot be set."""
+        """Return the values of a writable enumeration; empty otherwise."""
         return tuple(getattr(self._map.GetNode(name), "Symbolics", ())) if self.has(name) else ()
 
     def select(self, name: str, *choices: str) -> None:
-        """Set a selector to the first of `choices` that it offers; left alone where it has none."""
+        """Set a selector to the first of `choices` that it offers, if any."""
         for choice in choices:
             if self.offers(name, choice):
                 self.put(choice, name)
                 return
 
     def each(self, selector: str) -> Iterator[str]:
-        """Set a selector to each of its values; once, with nothing set, where there is none."""
+        """Iterate over a selector's values, setting each; once without setting if there is none."""
         for choice in self.choices(selector) or ("",):
             if choice:
                 self.put(choice, selector)
             yield choice
 
     def get(self, name: str) -> Any:
-        """The value of a setting.
+        """Return the value of a setting.
 
         Raises:
-            RigError: it is not there, or the camera is gone.
+            RigError: it does not exist, or the camera is disconnected.
         """
         try:
             return self._map.GetNode(name).Value
@@ -77,7 +77,7 @@ class Nodes:
             raise RigError(DEVICE, f"{name} cannot be read: {_short(error)}") from None
 
     def peek(self, *names: str) -> Any:
-        """The value of the first of `names` that can be read now; None where none can."""
+        """Return the value of the first readable one of `names`; None if none is."""
         for name in names:
             node = self._map.GetNode(name)
             if node is None:
@@ -88,21 +88,21 @@ class Nodes:
         return None
 
     def limit(self, name: str, which: str) -> int:
-        """`Min`, `Max` or `Inc` of a whole number."""
+        """Return `Min`, `Max` or `Inc` of an integer setting."""
         try:
             return int(getattr(self._map.GetNode(name), which))
         except (self._genicam.GenericException, AttributeError) as error:
             raise RigError(DEVICE, f"{name} has no {which}: {_short(error)}") from None
 
     def put(self, value: Any, *names: str) -> None:
-        """Set every one of `names` that is there.
+        """Set every one of `names` that exists.
 
         Raises:
-            RigError: none is there, or the camera refuses the value.
+            RigError: none exists, or the camera refuses the value.
         """
         found = [name for name in names if self.has(name)]
         if not found:
-            raise RigError(DEVICE, f"this camera has no {' or '.join(names)} to set")
+            raise RigError(DEVICE, f"this camera has no writable {' or '.join(names)}")
         for name in found:
             try:
                 self._map.GetNode(name).Value = value
@@ -110,24 +110,24 @@ class Nodes:
                 raise RigError(DEVICE, f"{name} = {value}: {self._why(name, error)}") from None
 
     def _why(self, name: str, error: Exception) -> str:
-        """Return why a value is refused; of an enumeration pylon says no more than its name."""
+        """Return the reason for a refused value; pylon's text omits an enumeration's choices."""
         choices, text = self.choices(name), _short(error)
         if choices and text.startswith("Feature "):
             return f"this camera has {', '.join(choices)}"
         return text
 
     def put_near(self, value: float, name: str) -> None:
-        """Set a number as near to `value` as it goes, if it is there. Raises RigError."""
+        """Set a number to `value`, clipped to its range, if it exists. Raises RigError."""
         if not self.has(name):
             return
         node = self._map.GetNode(name)
         self.put(type(value)(min(max(value, node.Min), node.Max)), name)
 
     def execute(self, name: str, within_s: float = 0.0) -> None:
-        """Give a command, and wait until it is done where a time is given.
+        """Execute a command, and wait until it is done if a timeout is given.
 
         Raises:
-            RigError: it is not there, fails or takes longer.
+            RigError: it does not exist, fails or takes longer.
         """
         try:
             node = self._map.GetNode(name)
@@ -136,13 +136,13 @@ class Nodes:
             while within_s and not node.IsDone():
                 if time.monotonic() > end:
                     raise RigError(DEVICE, f"{name} is not done within {within_s:g} s")
-                threading.Event().wait(_LOOK_S)
+                threading.Event().wait(_POLL_S)
         except (self._genicam.GenericException, AttributeError) as error:
             raise RigError(DEVICE, f"{name} failed: {_short(error)}") from None
 
 
 def centre_region(nodes: Nodes, width_px: int, height_px: int) -> None:
-    """Read out a centred region only. Raises RigError where the sensor cannot."""
+    """Read out only a centred region. Raises RigError if the sensor cannot."""
     for size, offset, wanted in (
         ("Width", "OffsetX", width_px),
         ("Height", "OffsetY", height_px),
@@ -167,7 +167,7 @@ def has_latch(nodes: Nodes) -> bool:
 
 
 def latch_clock(nodes: Nodes) -> ClockReads:
-    """Latch the camera's clock and read it: one row. Raises RigError where it has none."""
+    """Latch the camera's clock and read it: one row. Raises RigError if it has none."""
     for command, value, frequency in _LATCHES:
         if not nodes.has(command):
             continue
@@ -175,19 +175,19 @@ def latch_clock(nodes: Nodes) -> ClockReads:
         before_ns = time.monotonic_ns()
         nodes.execute(command)
         after_ns = time.monotonic_ns()
-        # the latch is what happened between the two; reading it out may take its time
+        # the clock was latched between the two; reading the value may take longer
         row = (int(nodes.get(value)) * 10**9 // per_s, before_ns, after_ns)
         return ClockReads(*(np.array([each], np.int64) for each in row))
     raise RigError(DEVICE, "this camera has no clock that the host can read")
 
 
 def _short(error: Exception) -> str:
-    """GenICam's text without the place in its source."""
+    """Return GenICam's text without its source location."""
     return str(error).split(" : ")[0].strip() or type(error).__name__
 
 
 LOAD_S = 10.0
-"""The longest that a camera takes to load a user set, s."""
+"""Timeout for a camera to load a user set, s."""
 _OFF = "Off"
 _CHOICES = (
     ("AcquisitionMode", "Continuous"),
@@ -205,12 +205,12 @@ _CHOICES = (
 _SWITCHES = (
     "ReverseX", "ReverseY", "LUTEnable", "BslMultipleROIColumnsEnable", "BslMultipleROIRowsEnable",
 )  # fmt: skip
-"""All of them off."""
+"""Switches that are turned off."""
 _SCALES = (
     "BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical",
     "BslScalingFactor",
 )  # fmt: skip
-"""All of them 1: the rig file's pixels for a millimetre are those of the sensor."""
+"""Factors that are set to 1: the rig file's scale applies to the sensor's full resolution."""
 _NUMBERS = (
     ("BlackLevel", 0.0),
     ("DigitalShift", 0),
@@ -220,9 +220,9 @@ _NUMBERS = (
     ("BslNoiseReduction", 0.0),
     ("BslSharpnessEnhancement", 0.0),
 )
-"""As near as the camera goes."""
+"""Numbers that are set as close as the camera allows."""
 _LINE_TIMES = ("BslInputFilterTime", "BslInputHoldOffTime", "LineDebouncerTime")
-"""Of an input, us: all of them 0, for they delay its edges."""
+"""Delays of an input, us, which are set to 0."""
 _RATES = ("BslResultingAcquisitionFrameRate", "ResultingFrameRate")
 _READ_BACK = (
     *(name for name, _ in _CHOICES), *_SWITCHES, *_SCALES, *(name for name, _ in _NUMBERS),
@@ -241,7 +241,7 @@ def write_settings(nodes: Nodes, settings: BaslerSettings) -> None:
     """Load the user set and write all settings. The trigger selector is left at `FrameStart`.
 
     Raises:
-        RigError: a line, a user set or a value that this camera does not have.
+        RigError: the camera lacks a line, a user set or a value.
     """
     _load_user_set(nodes, settings.user_set)
     nodes.put("Mono8", "PixelFormat")
@@ -263,7 +263,7 @@ def write_settings(nodes: Nodes, settings: BaslerSettings) -> None:
         nodes.put(settings.gain_db, "Gain")
     elif settings.gain_db:
         raise RigError(DEVICE, f"gain_db = {settings.gain_db:g}: this camera has no Gain in dB")
-    # the emulation keeps both names and obeys the older one
+    # the emulation has both names, and only the older one takes effect
     nodes.put(settings.exposure_us, "ExposureTime", "ExposureTimeAbs")
     _write_lines(nodes, settings)
     _write_trigger(nodes, settings)
@@ -331,7 +331,7 @@ def _write_lines(nodes: Nodes, settings: BaslerSettings) -> None:
 
 
 def _write_trigger(nodes: Nodes, settings: BaslerSettings) -> None:
-    """Every trigger off but that of a frame's start, which is ours."""
+    """Configure the frame-start trigger, and turn every other trigger off."""
     for _ in nodes.each("TriggerSelector"):
         if nodes.offers("TriggerMode", _OFF):
             nodes.put(_OFF, "TriggerMode")
@@ -352,10 +352,10 @@ def _write_trigger(nodes: Nodes, settings: BaslerSettings) -> None:
 
 
 def check_rate(nodes: Nodes, settings: BaslerSettings) -> None:
-    """Hold the rate that is asked for against what the camera says it can do now.
+    """Check the requested rate against the rate that the camera reports as possible.
 
     Raises:
-        RigError: it would miss triggers, or run slower.
+        RigError: the camera would miss triggers, or run slower.
     """
     most = nodes.peek(*_RATES)
     # free run asks the camera for a rate, which it rounds
@@ -364,13 +364,13 @@ def check_rate(nodes: Nodes, settings: BaslerSettings) -> None:
     raise RigError(
         DEVICE,
         f"rate_hz = {settings.rate_hz:g}: with exposure_us = {settings.exposure_us:g}, this region "
-        f"and this link it gives at most {most:.1f} frames/s; shorten the exposure or the region's "
-        "height, or lower the rate",
+        f"and this link it reaches at most {most:.1f} frames/s; shorten exposure or region height, "
+        "or lower the rate",
     )
 
 
 def read_back(nodes: Nodes) -> Json:
-    """Settings that change frames or times, as the camera says them; `Name[choice]` of a selector.
+    """Read back the settings that affect frames or times; `Name[choice]` with a selector.
 
     The trigger selector is left at `FrameStart`.
     """

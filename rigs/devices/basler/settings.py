@@ -1,4 +1,4 @@
-"""Settings of a Basler camera in a rig file; the driver asks the device for everything else."""
+"""Settings of a Basler camera in a rig file; the driver queries the device for the rest."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ class BaslerSettings(FrameCameraSettings):
 
     driver: Literal["basler"] = "basler"
     serial: str | None = None
-    """Serial number; the only camera where none is given."""
+    """Serial number; if left out, the only connected camera."""
     px_per_mm: float | None = Field(default=None, gt=0, le=1000)
-    """Pixels for a millimetre of the plate; a rig file says it elsewhere (`scale_px_per_mm`)."""
+    """Pixels per millimetre of the plate; rig files use `scale_px_per_mm` instead."""
     exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
-    """Exposure, microseconds; the camera may round it, and what it says then counts."""
+    """Exposure, microseconds; the camera may round it, and the rounded value applies."""
     gain_db: float = Field(default=0.0, ge=0, le=48)
     """Gain, dB."""
     user_set: str = "Default"
-    """Set that is loaded from the camera before all else is written; `Default` is the maker's."""
+    """User set that is loaded before settings are written; `Default` is the factory set."""
     rate_hz: float = Field(default=100.0, gt=0, le=1000)
-    """Frames a second: its own rate in free run, else the most that the triggers ask for."""
+    """Frame rate: the camera's own in free run, else the highest trigger rate."""
     trigger: FrameTrigger = "hardware"
-    """`hardware`: a rising edge on `trigger_line`. `software`: the host asks for each frame."""
+    """`hardware`: a rising edge on `trigger_line`. `software`: the host triggers each frame."""
     trigger_line: str = "Line1"
     """Name of the input that is wired to the sync box's ticks."""
     sync_line: int | None = Field(default=None, ge=1, le=8)
-    """Number of the input that is wired to the sync box's code; its level comes as a chunk."""
+    """Number of the input that is wired to the sync box's code; its level is sent as a chunk."""
     exposure_line: str | None = None
-    """Name of the output that tells the sync box of exposures; None where it is not wired."""
+    """Name of the output that signals exposures to the sync box; None where it is not wired."""
     back_pressure_s: float = Field(default=5.0, ge=0.1, le=60)
-    """Seconds for which nobody need call `read`: half in pylon's buffers, half in a queue."""
+    """Buffered seconds between calls of `read`: half in pylon's buffers, half in a queue."""
     late_s: float = Field(default=0.1, gt=0, le=10)
-    """A frame that arrives by this much after its time counts as late, seconds."""
+    """Delay after which a frame counts as late, seconds."""
     first_frame_s: float = Field(default=5.0, ge=0.2, le=60)
-    """In free run, no frame for so long after the start is a fault, seconds: a camera and pylon
-    need time to set up buffers. Triggered, it may wait for ever for its first trigger."""
+    """Timeout for the first frame in free run, seconds: camera and pylon need time to set up
+    buffers. A triggered camera may wait for its first trigger without limit."""
     stall_s: float = Field(default=1.0, ge=0.2, le=60)
-    """Silence for so long after the first frame is a fault, seconds."""
+    """Timeout for each later frame, seconds."""
 
     @model_validator(mode="after")
     def _exposure_fits(self) -> BaslerSettings:
@@ -63,11 +63,11 @@ class BaslerSettings(FrameCameraSettings):
             inputs["trigger_line"] = self.trigger_line
         for key, line in inputs.items():
             if self.exposure_line == line:
-                raise KeyedError(".exposure_line", line, f"is an input already: {key}")
+                raise KeyedError(".exposure_line", line, f"is already used as an input: {key}")
         if self.trigger == "hardware" and self.trigger_line == inputs["sync_line"]:
             raise KeyedError(
                 ".sync_line",
                 self.sync_line,
-                "must be another line than trigger_line: it has a code",
+                "must differ from trigger_line: this line carries the code",
             )
         return self

@@ -1,4 +1,4 @@
-"""The DVXplorer event camera through dv-processing."""
+"""The DVXplorer event camera, driven through dv-processing."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ def _build(settings: DvxplorerSettings) -> EventCamera:
 
 
 def _ping(settings: DvxplorerSettings) -> str | None:
-    from sliplab.rigs.devices.dvxplorer.source import find_camera, greet
+    from sliplab.rigs.devices.dvxplorer.source import check_header, find_camera
 
     source = settings.source
     if isinstance(source, NetworkStream):
-        greet(source.host, source.events_port)
-        greet(source.host, source.triggers_port)
+        check_header(source.host, source.events_port)
+        check_header(source.host, source.triggers_port)
     else:
         find_camera(source.serial)
     return None

@@ -1,9 +1,9 @@
-"""The event camera inside the sensor: a DVXplorer through dv-processing 2.0.4.
+"""Driver of the event camera inside the sensor: a DVXplorer through dv-processing 2.0.4.
 
-The library keeps what it receives only for a while, so a thread takes it out as it comes, from the
-moment the camera is opened; what comes while nothing is wanted is thrown away. What is kept waits
-in memory that is bounded. Times are the camera's, whole microseconds in 64 bits, which the library
-counts on from the camera's own 32: nothing wraps here.
+The library buffers data only briefly, so a thread reads them continuously from the moment the
+camera is opened, and discards them while no run is active. The driver's own buffer is bounded.
+Times are the camera's, integer microseconds in 64 bits, which the library extends from the camera's
+32-bit counter, so nothing wraps here.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from sliplab.rigs.core.capabilities import DeviceHealth, RigError
 from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.devices.dvxplorer.process import EventProcess
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.dvxplorer.source import DEVICE, Look
+from sliplab.rigs.devices.dvxplorer.source import DEVICE, Batch
 from sliplab.storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001
-"""The pause after a look that found nothing, s."""
+"""Pause after a poll without data, s."""
 SETTLE_S = 1.0
-"""The longest that `start` and `stop` wait until all is taken that came before, s."""
+"""Timeout for `start` and `stop` to read all earlier data, s."""
 HANG_S = 10.0
-"""The thread must have come back from a look by then, s; longer than `process.ANSWER_S`."""
+"""Time after which a poll counts as hung, s; longer than `process.ANSWER_S`."""
 CLOSE_S = 3.0
-"""The longest that `close` waits for the thread, s."""
+"""Timeout for the thread to end in `close`, s."""
 RISING_EDGE, TIMESTAMP_RESET = 1, 0
 """`EXTERNAL_SIGNAL_RISING_EDGE` and `TIMESTAMP_RESET` of `dv.TriggerType`."""
 _EVENT_BYTES = 13
-_LOOK_NS = 10_000_000
-"""The most that one look which found nothing counts as silence, ns."""
+_POLL_NS = 10_000_000
+"""Longest silence that one poll without data is counted as, ns."""
 
 
 @dataclass
 class EventCounts:
-    """Counts of what one run received.
+    """Counts of the data received in one run.
 
     Attributes:
-        events: kept, read or not.
+        events: events kept, read or not.
         pulses: rising edges.
-        gaps: silences of more than `gap_s` between events, on the camera's clock.
-        longest_gap_us: the longest silence between two events.
-        filtered: dropped by the noise filter, if it is on.
-        overflowed: dropped because nobody read; the run ends with an error then.
-        other_triggers: triggers that are no rising edges.
-        before: events thrown away before the run.
+        gaps: intervals of more than `gap_s` between events, on the camera's clock.
+        longest_gap_us: longest interval between two events.
+        filtered: events dropped by the noise filter, if it is on.
+        overflowed: events dropped because the buffer was full; the run then ends with an error.
+        other_triggers: triggers other than rising edges.
+        before: events discarded before the run.
     """
 
     events: int = 0
@@ -73,24 +73,24 @@ class Source(Protocol):
     def run(self, on: bool, noise_filter_us: int | None = None) -> None:
         """Switch events and triggers. Raises RigError."""
 
-    def look(self) -> Look:
-        """Take all that has come."""
+    def poll(self) -> Batch:
+        """Read all available data."""
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
-        """Return the camera's own report. Raises RigError."""
+        """Return the camera's health report. Raises RigError."""
 
     def close(self) -> None:
-        """Give it back; any number of times."""
+        """Close the inputs; safe to call more than once."""
 
 
 class DvxplorerCamera:
-    """A `rigs.core.capabilities.EventCamera`; it is open from the beginning.
+    """A `rigs.core.capabilities.EventCamera`, opened on construction.
 
     Args:
-        source: opened inputs; opened as the settings say where None.
+        source: opened inputs; None to open those in the settings.
 
     Raises:
-        RigError: nothing there, or nothing that sends events and triggers.
+        RigError: no such camera or stream, or one that does not send events and triggers.
     """
 
     def __init__(self, settings: DvxplorerSettings, source: Source | None = None) -> None:
@@ -119,12 +119,12 @@ class DvxplorerCamera:
 
     @property
     def counts(self) -> EventCounts:
-        """Counts of what this run, or the last one, has received so far."""
+        """Counts of this run, or of the last one."""
         with self._lock:
             return EventCounts(**asdict(self._counts))
 
     def describe(self) -> Json:
-        """Return what a trial's record keeps of the camera."""
+        """Return the camera's part of a trial's record."""
         return {
             "camera": self._source.name,
             "resolution_px": [self.width, self.height],
@@ -134,20 +134,20 @@ class DvxplorerCamera:
         }
 
     def health(self) -> DeviceHealth:
-        """Return the camera's own report now, streaming or not.
+        """Return the camera's health report, streaming or not.
 
         Raises:
-            RigError: the camera is gone, or does not answer.
+            RigError: the camera is disconnected, or does not answer.
         """
         if self._closed:
             raise RigError(DEVICE, "it is closed; open it again")
         return self._source.health(self.settings)
 
     def start(self) -> None:
-        """Begin to stream; what came before is dropped. Returns within `SETTLE_S`.
+        """Start streaming; earlier data are discarded. Returns within `SETTLE_S`.
 
         Raises:
-            RigError: the camera is gone.
+            RigError: the camera is disconnected.
         """
         if not self._thread.is_alive():
             raise self._fault or RigError(DEVICE, "it is closed; open it again")
@@ -161,11 +161,11 @@ class DvxplorerCamera:
                 raise self._fault
 
     def read(self) -> EventChunk:
-        """Events since the last call.
+        """Return the events since the last call.
 
         Raises:
-            RigError: the camera is gone, silent, set back its clock or was not read in time, and
-                all that came before was read.
+            RigError: the camera is disconnected or silent, its clock jumped back, or its buffer
+                overflowed, and all earlier events were read.
         """
         with self._lock:
             parts, self._events, self._held = self._events, [], 0
@@ -183,7 +183,7 @@ class DvxplorerCamera:
         )
 
     def read_pulses(self) -> PulseChunk:
-        """Sync pulses since the last call, camera clock in ns. Raises RigError like `read`."""
+        """Return the pulses since the last call, camera clock in ns. Raises RigError as `read`."""
         with self._lock:
             pulses, self._pulses = self._pulses, []
             if not pulses and not self._events:
@@ -191,14 +191,14 @@ class DvxplorerCamera:
         return PulseChunk(np.array(pulses, np.int64) * 1000)
 
     def stop(self) -> None:
-        """Stop streaming; what had arrived can still be read. Returns within `SETTLE_S`."""
+        """Stop streaming; earlier data can still be read. Returns within `SETTLE_S`."""
         if self._wanted:
             with suppress(RigError):
                 self._source.run(False)
             self._want(False)
 
     def close(self) -> None:
-        """Give the device back; safe at any time and more than once.
+        """Close the device; safe at any time and more than once.
 
         Raises:
             RigError: the thread does not end within `CLOSE_S`.
@@ -222,15 +222,15 @@ class DvxplorerCamera:
             raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
         if self._keep and silent_s > self.settings.stall_s:
             raise RigError(
-                DEVICE, f"neither event nor pulse for {silent_s:.1f} s; look at cable and lens"
+                DEVICE, f"sent no event and no pulse for {silent_s:.1f} s; check cable and lens"
             )
 
     def _want(self, wanted: bool) -> None:
-        """Keep from now on, or no more, once all is taken that has arrived by now."""
+        """Switch keeping on or off, once all data that have arrived by now are read."""
         self._settled.clear()
         self._wanted = wanted
         self._settled.wait(SETTLE_S)
-        # a stream that never pauses is cut where it stands
+        # a stream that never pauses is cut at its current position
         with self._lock:
             self._keep = wanted
 
@@ -239,27 +239,27 @@ class DvxplorerCamera:
         while not self._closing.is_set():
             try:
                 wanted = self._wanted
-                look = source.look()
-                if look.events is not None:
-                    self._take_events(look.events, look.filtered)
-                if len(look.trigger_us):
-                    self._take_triggers(look)
+                batch = source.poll()
+                if batch.events is not None:
+                    self._take_events(batch.events, batch.filtered)
+                if len(batch.trigger_us):
+                    self._take_triggers(batch)
                 now_ns = time.monotonic_ns()
-                if look.empty:
+                if batch.empty:
                     with self._lock:
                         self._keep = wanted
-                        # silence is what was listened to: a computer that stood still heard nothing
-                        self._silent_ns += min(now_ns - self._asked_ns, _LOOK_NS)
+                        # time for which this computer was suspended is not the camera's silence
+                        self._silent_ns += min(now_ns - self._asked_ns, _POLL_NS)
                     if wanted == self._wanted:
                         self._settled.set()
-                    if not look.running:
-                        self._fail("the connection is gone; look at its cable and open it again")
+                    if not batch.running:
+                        self._fail("the connection is lost; check its cable and open it again")
                         break
                     self._closing.wait(POLL_S)
                 self._asked_ns = now_ns
             except Exception as error:
                 why = str(error).removeprefix(f"{DEVICE}: ")
-                self._fail(f"reading failed: {why}; look at what sends, and open it again")
+                self._fail(f"reading failed: {why}; check the sender, and open it again")
                 break
         self._settled.set()
 
@@ -282,12 +282,12 @@ class DvxplorerCamera:
             if (self._held + len(chunk)) * _EVENT_BYTES > self.settings.buffer_mb * 1e6:
                 counts.overflowed += len(chunk)
                 self._fault = RigError(
-                    DEVICE, f"nobody read for so long that {self.settings.buffer_mb:g} MB are full"
+                    DEVICE, f"was not read in time: {self.settings.buffer_mb:g} MB are full"
                 )
                 return
             if not self._in_order(chunk.t_us):
                 self._fault = RigError(
-                    DEVICE, f"its clock fell back after {self._last_us} us; begin a new trial"
+                    DEVICE, f"its clock jumped back after {self._last_us} us; begin a new trial"
                 )
                 return
             self._last_us = int(chunk.t_us[-1])
@@ -296,7 +296,7 @@ class DvxplorerCamera:
             self._events.append(chunk)
 
     def _in_order(self, t_us: I64) -> bool:
-        """Return whether times go on without a step back; silences are counted on the way."""
+        """Return whether times do not decrease; count gaps."""
         before = t_us[0] if self._last_us is None else self._last_us
         steps = np.diff(t_us, prepend=before)
         if int(steps.min()) < 0:
@@ -306,19 +306,20 @@ class DvxplorerCamera:
         counts.longest_gap_us = max(counts.longest_gap_us, int(steps.max()))
         return True
 
-    def _take_triggers(self, look: Look) -> None:
+    def _take_triggers(self, batch: Batch) -> None:
         if not self._keep:
             return
         with self._lock:
             self._silent_ns = 0
-            for at, kind in zip(look.trigger_us.tolist(), look.trigger_kind.tolist(), strict=True):
+            kinds = batch.trigger_kind.tolist()
+            for at, kind in zip(batch.trigger_us.tolist(), kinds, strict=True):
                 if kind == TIMESTAMP_RESET:
-                    self._fault = RigError(DEVICE, f"its clock began anew at {at} us")
+                    self._fault = RigError(DEVICE, f"its clock was reset at {at} us")
                 elif kind != RISING_EDGE:
                     self._counts.other_triggers += 1
                 elif self._last_pulse_us is not None and at < self._last_pulse_us:
                     self._fault = RigError(
-                        DEVICE, f"its clock fell back after the pulse at {self._last_pulse_us} us"
+                        DEVICE, f"its clock jumped back after the pulse at {self._last_pulse_us} us"
                     )
                 elif self._fault is None:
                     self._last_pulse_us = at

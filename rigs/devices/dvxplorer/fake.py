@@ -1,8 +1,9 @@
-"""A DVXplorer without a camera: a process that serves events and triggers on the network.
+"""A fake DVXplorer: a process that serves events and triggers over the network.
 
-It serves dv's two network streams, one port for events and one for triggers, and says at its end
-what it sent, so that both ends can be compared. It is a process of its own because the library's
-reader holds Python's lock while it connects, and a server beside it could not answer.
+It serves dv's two network streams, one port for events and one for triggers, and reports at its end
+what it sent, so that both ends can be compared. It is a separate process because the library's
+reader holds Python's interpreter lock while it connects, and a server in the same process could not
+answer.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ from sliplab.rigs.scene.events import EventOptics, MarkerSensor
 from sliplab.storage.streams import I64, EventChunk
 
 Packet = tuple[EventChunk, I64]
-"""Events, and the rising edges that came with them, us of the camera's clock."""
+"""Events, and the rising edges that belong to them, us of the camera's clock."""
 Source = Callable[[], Iterable[Packet]]
 READY_S = 600.0
-"""The longest that it takes to make all packets, s."""
+"""Timeout to generate all packets, s."""
 CLIENT_S = 30.0
-"""The longest that it waits for its client, and for what is queued to leave, s."""
+"""Timeout for the client to connect, and for the queue to be sent, s."""
 _MOST_WAITING = 256
-"""Packets that may wait for the client before the next one is made to wait."""
+"""Queue length above which the next packet waits for the client."""
 
 
 @dataclass(frozen=True)
 class Sent:
-    """Counts of what a server has sent."""
+    """Counts of the data that a server has sent."""
 
     events: int
     pulses: int
@@ -51,18 +52,18 @@ class Sent:
 
 
 class ServerError(RuntimeError):
-    """The serving process failed or did not answer in time."""
+    """The serving process failed or timed out."""
 
 
 class DvxplorerServer:
-    """A process that makes packets, and sends them on command.
+    """A process that generates packets, and sends them on command.
 
     Args:
-        source: makes the packets; it is called in the process, so it must be a module's function
+        source: generates the packets; called in the process, so it must be a module-level function
             or a `functools.partial` of one.
-        realtime: send each packet when its last event is due; else as fast as it goes.
-        stall_after: packets after which it falls silent until `resume`.
-        size: columns and rows that the stream claims.
+        realtime: True to send each packet when its last event is due; else as fast as possible.
+        stall_after: number of packets after which the server pauses until `resume`.
+        size: columns and rows in the stream's header.
     """
 
     def __init__(
@@ -88,35 +89,35 @@ class DvxplorerServer:
 
     @property
     def settings(self) -> DvxplorerSettings:
-        """Settings of a driver that listens to this server."""
+        """Settings of a driver for this server."""
         return DvxplorerSettings(
             source=NetworkStream(events_port=self.events_port, triggers_port=self.triggers_port)
         )
 
     def go(self) -> None:
-        """Send, once both streams have a client."""
+        """Start sending once both streams have a client."""
         self._pipe.send("go")
 
     def await_stall(self, timeout_s: float) -> None:
-        """Return when it has fallen silent as it was asked to. Raises ServerError."""
+        """Wait until the server has paused at `stall_after`. Raises ServerError."""
         self._expect("stalled", timeout_s)
 
     def resume(self) -> None:
-        """Go on after a stall."""
+        """Continue after a stall."""
         self._pipe.send("resume")
 
     @property
     def answered(self) -> bool:
-        """True if it has something to report, so that `finish` need not wait."""
+        """True if the process has reported, so that `finish` need not wait."""
         return self._pipe.poll(0)
 
     def finish(self, timeout_s: float) -> Sent:
-        """Return what was sent, once all of it has left. Raises ServerError."""
+        """Wait until everything is sent, and return its counts. Raises ServerError."""
         sent: Sent = self._expect("sent", timeout_s)
         return sent
 
     def close(self) -> None:
-        """End the process, whatever it does; the streams break."""
+        """Kill the process; the streams break."""
         self._process.kill()
         self._process.join(CLIENT_S)
         self._pipe.close()
@@ -130,19 +131,19 @@ class DvxplorerServer:
     def _expect(self, wanted: str, timeout_s: float) -> Any:
         try:
             if not self._pipe.poll(timeout_s):
-                raise ServerError(f"the server has not said '{wanted}' within {timeout_s:g} s")
+                raise ServerError(f"the server did not report '{wanted}' within {timeout_s:g} s")
             said, value = self._pipe.recv()
         except (EOFError, OSError):
-            raise ServerError(f"the server has ended before it said '{wanted}'") from None
+            raise ServerError(f"the server ended before it reported '{wanted}'") from None
         if said != wanted:
-            raise ServerError(f"the server said '{said}' instead of '{wanted}': {value}")
+            raise ServerError(f"the server reported '{said}' instead of '{wanted}': {value}")
         return value
 
 
 def arrays(chunk: EventChunk, pulses_us: I64, packet_us: int) -> Iterator[Packet]:
-    """Packets of `packet_us` from arrays in order of time; pulses go with the events' times.
+    """Split arrays in order of time into packets of `packet_us`, with the pulses of each interval.
 
-    A span without events has a packet all the same, for its pulses.
+    An interval without events also has a packet, for its pulses.
     """
     every = np.concatenate([chunk.t_us[[0, -1]] if len(chunk) else [], pulses_us]).astype(np.int64)
     if not len(every):
@@ -156,7 +157,7 @@ def arrays(chunk: EventChunk, pulses_us: I64, packet_us: int) -> Iterator[Packet
 
 
 def scene(seconds: float, seed: int = 1) -> Iterator[Packet]:
-    """Packets of seven markers that are pushed to and fro under steady contact; a pulse in 10 ms.
+    """Generate packets of seven markers pushed back and forth in contact; a pulse every 10 ms.
 
     Simulated: normal force 0.3 N on a tip, tangential 0.1 N once a second.
     """
@@ -187,7 +188,7 @@ def _serve(
     stall_after: int | None,
     size: tuple[int, int],
 ) -> None:
-    """The process; it never returns."""
+    """Run the serving process; never returns."""
     status = 1
     try:
         packets = [_made(*packet) for packet in source()]
@@ -207,7 +208,7 @@ def _serve(
 
 @dataclass(frozen=True)
 class _Made:
-    """A packet as it goes on the wire, for each of the two streams."""
+    """A serialised packet for each of the two streams."""
 
     on_events: bytes
     on_triggers: bytes
@@ -237,7 +238,7 @@ def _send(
     events, triggers = servers
     for server in servers:
         if not server.wait_for_client(CLIENT_S):
-            raise TimeoutError(f"no client has come in {CLIENT_S:g} s")
+            raise TimeoutError(f"no client connected within {CLIENT_S:g} s")
     began = time.monotonic()
     first_us = packets[0].end_us if packets else 0
     sent_events = sent_pulses = 0
@@ -246,7 +247,7 @@ def _send(
             pipe.send(("stalled", None))
             pipe.recv()
         wait = began + (packet.end_us - first_us) / 1e6 - time.monotonic()
-        # nothing is said meanwhile: this only lets time pass, and notices the other side's end
+        # nothing is sent meanwhile: this only lets time pass, and detects the parent's end
         if realtime and wait > 0 and pipe.poll(wait):
             pipe.recv()
         if packet.events:

@@ -1,10 +1,10 @@
-"""dv's network streams, byte by byte, served to whoever connects: a DVXplorer's on the network.
+"""A server of dv's network streams, as a DVXplorer's data are served over the network.
 
-The library's own writer (2.0.4) cannot stand in for a camera here: each of its threads asks its
-sockets without ever resting and takes a core, and events go in one by one, at 0.7 million a second.
-On the wire there is a header and then packets. A header is a length and a flatbuffer `IOHE` with
-the stream's description; a packet is stream and length (int32 each) and a flatbuffer with its
-length in front (`storage.formats.flatbuffers`).
+The library's own writer (2.0.4) is not suitable as a fake: each of its threads polls its sockets
+without pause and occupies a core, and it accepts events one by one, at 0.7 million per second.
+A stream is a header and then packets. A header is a length and a flatbuffer `IOHE` with the
+stream's description; a packet is stream and length (int32 each) and a flatbuffer with a length
+prefix (`storage.formats.flatbuffers`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SIZE = '                <attr key="size{axis}" type="int">{value}</attr>\n'
 
 
 def events_header(size: tuple[int, int], source: str) -> bytes:
-    """Return the first bytes on a stream of events of so many columns and rows."""
+    """Return the header of an event stream with `size` columns and rows."""
     info = "".join(
         _SIZE.format(axis=axis, value=value) for axis, value in zip("XY", size, strict=True)
     )
@@ -47,30 +47,30 @@ def events_header(size: tuple[int, int], source: str) -> bytes:
 
 
 def triggers_header(source: str) -> bytes:
-    """Return the first bytes on a stream of triggers."""
+    """Return the header of a trigger stream."""
     text = _INFO.format(output="triggers", kind="TRIG", info="", source=source)
     return header_buffer(text, 0)
 
 
 def events_packet(chunk: EventChunk) -> bytes:
-    """Events in order of time as one packet."""
+    """Serialise events in order of time as one packet."""
     return _packet(events_buffer(chunk))
 
 
 def triggers_packet(t_us: I64, kind: int = RISING_EDGE) -> bytes:
-    """Triggers of one kind at these times, us, as one packet."""
+    """Serialise triggers of one kind at these times, us, as one packet."""
     return _packet(triggers_buffer(t_us, kind))
 
 
 def _packet(buffer: bytes) -> bytes:
-    """Stream 0, length, and what comes."""
+    """Prefix a buffer with stream 0 and its length."""
     return struct.pack("<ii", 0, len(buffer)) + buffer
 
 
 MOST_WAITING = 256 << 20
-"""Bytes that may wait for a client to take them; then the stream breaks, as a camera's would."""
+"""Largest backlog of a client, bytes; beyond it the stream breaks, as a camera's would."""
 SEND_S = 10.0
-"""A client that has taken nothing for so long is cut off, s."""
+"""Time without progress after which a client is disconnected, s."""
 JOIN_S = 2.0
 
 
@@ -78,10 +78,10 @@ class DvServer:
     """Serves a stream on a free loopback port until `close`.
 
     Args:
-        header: sent to each client first.
+        header: header that is sent to each client first.
 
     Attributes:
-        port: where it listens.
+        port: listening port.
     """
 
     def __init__(self, header: bytes) -> None:
@@ -108,12 +108,12 @@ class DvServer:
 
     @property
     def waiting(self) -> int:
-        """Packets that have not left yet."""
+        """Number of packets that are not sent yet."""
         with self._changed:
             return len(self._waiting)
 
     def send(self, packet: bytes) -> None:
-        """Hand a packet to every client that is there; returns at once."""
+        """Queue a packet for every connected client; returns at once."""
         with self._changed:
             if self._closing or not self._clients:
                 return
@@ -124,17 +124,17 @@ class DvServer:
             self._changed.notify_all()
 
     def wait_for_client(self, within_s: float) -> bool:
-        """Return whether somebody is connected, after waiting for it."""
+        """Wait for a client; return whether one is connected."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._clients), within_s)
 
     def drain(self, within_s: float) -> bool:
-        """Return whether everything has left, after waiting for it."""
+        """Wait until the queue is empty; return whether it is."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._waiting, within_s)
 
     def close(self) -> None:
-        """Cut every client and give the port back; any number of times."""
+        """Disconnect every client and release the port; safe to call more than once."""
         with self._changed:
             self._closing = True
             self._cut()
@@ -196,13 +196,13 @@ NAME = "stand-in"
 
 
 class LiveDvxplorer:
-    """An event camera whose data come from elsewhere in this process.
+    """A fake event camera whose data are supplied by this process.
 
     Args:
         size: columns and rows.
 
     Attributes:
-        ports: of events and of triggers.
+        ports: ports of the event and the trigger stream.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
@@ -217,7 +217,7 @@ class LiveDvxplorer:
         return self.ports
 
     def send(self, chunk: EventChunk, pulses: PulseChunk) -> None:
-        """Send events, and rising edges of its input; nothing while it is stalled."""
+        """Send events and rising edges of the input; nothing while stalled."""
         if self._silent:
             return
         if len(chunk):
@@ -226,14 +226,14 @@ class LiveDvxplorer:
             self._triggers.send(triggers_packet(pulses.t_ns // 1000))
 
     def stall(self) -> None:
-        """Send nothing from now on; the connections stay."""
+        """Stop sending; the connections stay open."""
         self._silent = True
 
     def resume(self) -> None:
-        """Send again what comes from now on; what a stall kept back is lost."""
+        """Resume sending; data from during the stall are lost."""
         self._silent = False
 
     def close(self) -> None:
-        """The cable is pulled: connections break. Any number of times."""
+        """Break the connections, as an unplugged cable would; safe to call more than once."""
         self._events.close()
         self._triggers.close()

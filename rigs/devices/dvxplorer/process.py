@@ -1,8 +1,8 @@
-"""dv-processing in a process of its own: its constructors can be ended, its crashes are errors.
+"""dv-processing in a child process, so that its hanging constructors and crashes do no harm.
 
-Tried with 2.0.4: the network reader holds Python's lock while it connects and waits for a header
-without a deadline, so Ctrl-C does nothing; and a packet that is none ends the process (`terminate
-called after throwing`), with the arm's driver in it. Here that is a child's end.
+Observed with 2.0.4: the network reader holds Python's interpreter lock while it connects and waits
+for a header without a timeout, so Ctrl-C does nothing; and an invalid packet terminates the process
+(`terminate called after throwing`), which would include the arm's driver. Here only a child ends.
 """
 
 from __future__ import annotations
@@ -18,32 +18,33 @@ from typing import Any
 from sliplab.rigs.core.capabilities import DeviceHealth, RigError
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.dvxplorer.source import DEVICE, Look, open_source
+from sliplab.rigs.devices.dvxplorer.source import DEVICE, Batch, open_source
 from sliplab.storage.streams import Json
 
 OPEN_S = 20.0
-"""The longest that the process may take to begin and to open a camera or streams, s."""
+"""Timeout for the process to start and to open a camera or streams, s."""
 ANSWER_S = 5.0
-"""The library, which answers at once, must have answered by then, s."""
+"""Timeout of a call; the library answers at once, s."""
 WAIT_S = 0.005
-"""A look that would find nothing waits for so long that something comes, s."""
-_LOOK_S = 0.001
+"""Time for which a poll waits for data, s."""
+_POLL_S = 0.001
 _SELF_END_S = 30.0
-"""Time after its parent's bound at which the child ends itself, s; only without a parent."""
+"""Time after the parent's timeout at which the child ends itself, s; only without a parent."""
 _CLOSE_S = 2.0
-"""Time limit for the library to close the camera, s."""
+"""Timeout for the library to close the camera, s."""
 
 
 class EventProcess:
-    """A `rigs.devices.dvxplorer.source.EventSource` in a process of its own.
+    """A `rigs.devices.dvxplorer.source.EventSource` in a child process.
 
     Attributes:
-        name: model and serial number, or what the stream says of itself.
+        name: model and serial number, or the name in the stream's header.
         resolution: columns and rows.
-        in_force: settings as the camera says them.
+        in_force: active settings as the camera reports them.
 
     Raises:
-        RigError: nothing there, or nothing that sends events and triggers, or too slow.
+        RigError: no such camera or stream, one that does not send events and triggers, or a
+            timeout.
     """
 
     def __init__(self, settings: DvxplorerSettings) -> None:
@@ -53,7 +54,7 @@ class EventProcess:
                 "sliplab.rigs.devices.dvxplorer.process:serve",
                 (settings.model_dump_json(), OPEN_S),
                 OPEN_S,
-                patient=True,
+                ignore_suspend=True,
             )
         )
         self.name: str
@@ -62,21 +63,21 @@ class EventProcess:
         self.name, self.resolution, self.in_force = self._process.begun
 
     def run(self, on: bool, noise_filter_us: int | None = None) -> None:
-        """Switch a camera's events and its trigger input. Raises RigError."""
+        """Switch a camera's events and its trigger input on or off. Raises RigError."""
         self._call("run", on, noise_filter_us)
 
-    def look(self) -> Look:
-        """Take all that has come. Raises RigError where the library failed, died or hangs."""
-        found: Look = self._call("look")
+    def poll(self) -> Batch:
+        """Read all available data. Raises RigError if the library failed, died or hangs."""
+        found: Batch = self._call("poll")
         return found
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
-        """Return the report of the camera, or of the stream. Raises RigError."""
+        """Return the health report of the camera, or of the stream. Raises RigError."""
         found: DeviceHealth = self._call("health", settings)
         return found
 
     def close(self) -> None:
-        """End the process; any number of times."""
+        """End the process; safe to call more than once."""
         self._process.end()
 
     def _call(self, name: str, *arguments: Any) -> Any:
@@ -87,15 +88,15 @@ def _raised(work: Callable[[], Any]) -> Any:
     try:
         return work()
     except LibraryError as error:
-        # the call is ours, the reason is what a person needs
+        # drop the call's name, which means nothing to a user
         reason = str(error).partition(": ")[2]
         raise RigError(DEVICE, reason.removeprefix(f"{DEVICE}: ")) from None
 
 
 def serve(fd: int, settings_json: str, start_s: float) -> None:
-    """The child: take calls from the pipe on `fd` until it closes.
+    """Run the child: serve calls from the pipe on `fd` until it closes.
 
-    A timer of the kernel ends it if a call outlives its bound: that needs no lock of Python's.
+    A kernel timer ends it if a call exceeds its timeout, which needs no interpreter lock.
     """
     pipe = Connection(fd)
     signal.setitimer(signal.ITIMER_REAL, start_s + _SELF_END_S)
@@ -115,16 +116,16 @@ def serve(fd: int, settings_json: str, start_s: float) -> None:
             try:
                 answer = (True, getattr(source, name)(*arguments))
                 end = time.monotonic() + WAIT_S
-                # what comes next is worth a short wait here: it costs less than to be asked again
-                while name == "look" and answer[1].empty and answer[1].running:
-                    if time.monotonic() > end or pipe.poll(_LOOK_S):
+                # a short wait for data here costs less than another call
+                while name == "poll" and answer[1].empty and answer[1].running:
+                    if time.monotonic() > end or pipe.poll(_POLL_S):
                         break
-                    answer = (True, source.look())
+                    answer = (True, source.poll())
             except Exception as error:
                 answer = (False, str(error))
             pipe.send(answer)
     signal.setitimer(signal.ITIMER_REAL, _CLOSE_S)
     with suppress(Exception):
         source.run(False)
-    del source  # the library closes what nobody holds any more
+    del source  # the library closes inputs on deletion
     os._exit(0)

@@ -1,9 +1,9 @@
-"""The source of events and triggers: a DVXplorer on USB, or two streams on the network.
+"""The source of events and triggers: a DVXplorer on USB, or two network streams.
 
-All of them are `dv.io.InputBase` of dv-processing 2.0.4, whose `getNext...` calls return at once,
-with None where there is nothing. A network stream carries one kind of data, so there are two; a
-camera gives both. The library's constructors have no deadline, and what is no packet ends the
-process that it runs in: `rigs.devices.dvxplorer.process` keeps all of this in a process of its own.
+Both are `dv.io.InputBase` of dv-processing 2.0.4, whose `getNext...` calls return at once, with
+None if there are no data. A network stream carries one kind of data, so there are two; a camera
+provides both. The library's constructors have no timeout, and an invalid packet terminates the
+process: `rigs.devices.dvxplorer.process` runs all of this in a child process.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from sliplab.storage.streams import I64, U8, EventChunk, Json
 
 DEVICE = "event camera"
 COMMIT_MS = 2
-"""Period at which a USB camera sends its data, ms: its part of the latency."""
-GREETING_S = 2.0
-"""A stream that is connected to sends its header at once; it must be there by then, s."""
+"""Period at which a USB camera sends data, ms; it adds to the latency."""
+HEADER_S = 2.0
+"""Timeout for a stream's header, which is sent on connecting, s."""
 UNKNOWN = "unknown"
 _MOST_HEADER = 1 << 20
-"""Bytes; the header of a stream is below 1 kB."""
+"""Largest accepted header, bytes; real headers are below 1 kB."""
 
 
 class Input(Protocol):
@@ -41,19 +41,19 @@ class Input(Protocol):
         """A sequence of triggers, or None."""
 
     def isRunning(self) -> bool:
-        """Return whether the device or the connection still lives."""
+        """Return whether the device or the connection is alive."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """All that an input had at one moment.
+class Batch:
+    """The data that one read of an input returned.
 
     Attributes:
-        events: in the order of arrival, after the noise filter if it is on; None where none came.
-        filtered: events that the noise filter dropped.
+        events: in order of arrival, after the noise filter if it is on; None if there are none.
+        filtered: number of events that the noise filter dropped.
         trigger_us: times of triggers, us of the camera's clock.
         trigger_kind: `dv.TriggerType` of each.
-        running: the device or the connection still lives.
+        running: True while the device or the connection is alive.
     """
 
     events: EventChunk | None
@@ -64,7 +64,7 @@ class Look:
 
     @property
     def empty(self) -> bool:
-        """Nothing had come."""
+        """True if there were no data."""
         return self.events is None and not len(self.trigger_us)
 
 
@@ -72,12 +72,12 @@ class EventSource:
     """Opened inputs, in the process that opened them.
 
     Args:
-        events: input that gives events.
-        triggers: input that gives triggers; the same one for a camera.
-        camera: the camera, if it is one that can be switched.
+        events: input that provides events.
+        triggers: input that provides triggers; the same one for a camera.
+        camera: the camera; None for streams.
         resolution: columns and rows.
-        name: model and serial number, or what the stream says of itself.
-        in_force: settings as the camera says them.
+        name: model and serial number, or the name in the stream's header.
+        in_force: active settings as the camera reports them.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class EventSource:
         self._filter: Any = None
 
     def run(self, on: bool, noise_filter_us: int | None = None) -> None:
-        """Switch a camera's events and its trigger input; a stream flows as it likes.
+        """Switch a camera's events and its trigger input on or off; streams are not affected.
 
         Args:
-            noise_filter_us: drop events without a neighbour within so many microseconds.
+            noise_filter_us: drop events without a neighbour within this time, us.
 
         Raises:
             RigError: the camera does not answer.
@@ -110,10 +110,10 @@ class EventSource:
             self._camera.setEventsRunning(on)
             self._camera.setDetectorRunning(on)
         except RuntimeError as error:
-            raise RigError(DEVICE, f"it cannot be switched: {short(error)}") from None
+            raise RigError(DEVICE, f"cannot be switched on or off: {short(error)}") from None
 
-    def look(self) -> Look:
-        """Take all that has come; returns at once. Raises whatever the library raises."""
+    def poll(self) -> Batch:
+        """Read all available data at once. Raises any exception of the library."""
         batch, triggers = self._events.getNextEventBatch(), self._triggers.getNextTriggerBatch()
         events, filtered = None, 0
         if batch is not None:
@@ -130,7 +130,7 @@ class EventSource:
                 np.ascontiguousarray(rows["timestamp"], np.int64),
             )
         rows_of = [] if triggers is None else list(triggers)
-        return Look(
+        return Batch(
             events,
             filtered,
             np.array([int(trigger.timestamp) for trigger in rows_of], np.int64),
@@ -139,17 +139,17 @@ class EventSource:
         )
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
-        """Return the report of the camera, or of the stream.
+        """Return the health report of the camera, or of the stream.
 
-        Its only thermometer is the IMU's, and the IMU is off.
+        The only temperature sensor is in the IMU, which is off.
 
         Raises:
-            RigError: the camera is gone.
+            RigError: the camera is disconnected.
         """
         if not (self._events.isRunning() and self._triggers.isRunning()):
-            raise RigError(DEVICE, "the connection is gone; look at its cable")
+            raise RigError(DEVICE, "the connection is lost; check its cable")
         width, height = self.resolution
-        notes = [f"{width} x {height} px", f"{settings.buffer_mb:g} MB for events nobody has read"]
+        notes = [f"{width} x {height} px", f"{settings.buffer_mb:g} MB for unread events"]
         serial = firmware = UNKNOWN
         camera = self._camera
         if camera is not None:
@@ -160,7 +160,7 @@ class EventSource:
                 notes.append(f"link {speed}")
                 notes.append(f"read-out {_plain(camera.getReadoutFPS())}")
             except RuntimeError as error:
-                raise RigError(DEVICE, f"it does not answer: {short(error)}") from None
+                raise RigError(DEVICE, f"does not answer: {short(error)}") from None
         else:
             notes.append("from the network")
         return DeviceHealth(
@@ -174,7 +174,7 @@ class EventSource:
         )
 
     def close(self) -> None:
-        """Nothing: the library closes what nobody holds any more."""
+        """Do nothing: the library closes inputs on deletion."""
 
     def _new_filter(self, within_us: int | None) -> Any:
         if within_us is None:
@@ -187,10 +187,10 @@ class EventSource:
 
 
 def open_source(settings: UsbCamera | NetworkStream) -> EventSource:
-    """Open what the settings say, in this process: the library may hang, or end it.
+    """Open the source in the settings, in this process; the library may hang or terminate it.
 
     Raises:
-        RigError: not there, in use, or not of the kind that is needed.
+        RigError: not found, in use, or not of the required kind.
     """
     if isinstance(settings, UsbCamera):
         return _open_camera(settings)
@@ -198,11 +198,11 @@ def open_source(settings: UsbCamera | NetworkStream) -> EventSource:
 
 
 def find_camera(serial: str | None) -> Any:
-    """The descriptor of a DVXplorer that is plugged in.
+    """Return the descriptor of a connected DVXplorer.
 
     Raises:
-        RigError: none, none with this serial number, or several to choose from; with all that are
-            there.
+        RigError: none, none with this serial number, or several to choose from; the message lists
+            the cameras found.
     """
     import dv_processing as dv
 
@@ -213,12 +213,12 @@ def find_camera(serial: str | None) -> Any:
         return fitting[0]
     there = ", ".join(f"{_plain(camera.cameraModel)} {camera.serialNumber}" for camera in found)
     if fitting:
-        raise RigError(DEVICE, f"there are several: {there}; name one by source.serial")
+        raise RigError(DEVICE, f"found several: {there}; select one by source.serial")
     wanted = "a DVXplorer" if serial is None else f"a DVXplorer with serial number {serial}"
     raise RigError(
         DEVICE,
-        f"{wanted} was not found; there: {there or 'none'}. Look at its cable, and at iniVation's "
-        "udev rules",
+        f"{wanted} was not found; found: {there or 'none'}. Check its cable and iniVation's udev "
+        "rules",
     )
 
 
@@ -234,7 +234,7 @@ def _open_camera(settings: UsbCamera) -> EventSource:
             f"{there.serialNumber} cannot be opened: {short(error)}; is another program using it?",
         ) from None
     if not isinstance(camera, dv.io.camera.DVXplorer):
-        raise RigError(DEVICE, f"{camera.getCameraName()} is no DVXplorer")
+        raise RigError(DEVICE, f"{camera.getCameraName()} is not a DVXplorer")
     configure(camera, settings)
     found = in_force(camera)
     check_taken(found, settings)
@@ -243,14 +243,14 @@ def _open_camera(settings: UsbCamera) -> EventSource:
 
 
 def configure(camera: Any, settings: UsbCamera) -> None:
-    """Set a `dv.io.camera.DVXplorer`: all that changes its events, whatever was set before.
+    """Configure a `dv.io.camera.DVXplorer`: every setting that affects its events.
 
-    The whole sensor, every pixel, both polarities, not mirrored, global hold as the maker has it;
-    read-out, thresholds, rising edges. What nobody reads would only fill the library's buffers, so
-    the IMU is off, and so is the camera's own signal generator.
+    The full sensor, every pixel, both polarities, not mirrored, global hold as by default;
+    read-out, thresholds, rising edges. The IMU is off, because its unread data would fill the
+    library's buffers, and so is the camera's signal generator.
 
     Raises:
-        RigError: the camera refuses.
+        RigError: the camera refuses a setting.
     """
     import dv_processing as dv
 
@@ -282,7 +282,7 @@ def configure(camera: Any, settings: UsbCamera) -> None:
         camera.setDetectorFallingEdges(False)
         camera.setTimeInterval(timedelta(milliseconds=COMMIT_MS))
     except (RuntimeError, ValueError) as error:
-        raise RigError(DEVICE, f"it refuses a setting: {short(error)}") from None
+        raise RigError(DEVICE, f"refuses a setting: {short(error)}") from None
 
 
 _READ_BACK = (
@@ -292,11 +292,11 @@ _READ_BACK = (
     "GeneratorInjectTriggerOnRisingEdge", "GeneratorInjectTriggerOnFallingEdge",
     "TimeInterval", "TimestampOffset",
 )  # fmt: skip
-"""Settings that change what is recorded, by the names of the library's `get...`."""
+"""Settings that affect recorded data, by the names of the library's `get...` methods."""
 
 
 def in_force(camera: Any) -> Json:
-    """All settings that change what is recorded, as the camera says them; None where it does not.
+    """Read back all settings that affect recorded data; None where the camera reports nothing.
 
     Times are microseconds; choices are the library's names.
     """
@@ -317,10 +317,10 @@ def in_force(camera: Any) -> Json:
 
 
 def check_taken(found: Json, settings: UsbCamera) -> None:
-    """Hold what is in force against what the rig file says: a camera may take another value.
+    """Check the active settings against the rig file, as a camera may set another value.
 
     Raises:
-        RigError: it did.
+        RigError: a setting differs.
     """
     for key, name, asked in (
         ("readout", "ReadoutFPS", settings.readout),
@@ -329,7 +329,7 @@ def check_taken(found: Json, settings: UsbCamera) -> None:
     ):
         if asked is not None and found[name] != asked:
             raise RigError(
-                DEVICE, f"source.{key} = {asked}: the camera took {found[name]}; give what it takes"
+                DEVICE, f"source.{key} = {asked}: the camera set {found[name]}; write a valid value"
             )
 
 
@@ -338,7 +338,7 @@ def _open_streams(settings: NetworkStream) -> EventSource:
 
     inputs = []
     for port in (settings.events_port, settings.triggers_port):
-        greet(settings.host, port)
+        check_header(settings.host, port)
         try:
             inputs.append(dv.io.NetworkReader(settings.host, port))
         except RuntimeError as error:
@@ -353,18 +353,18 @@ def _open_streams(settings: NetworkStream) -> EventSource:
     return EventSource(events, triggers, None, (width, height), events.getCameraName())
 
 
-def greet(host: str, port: int) -> None:
-    """Look at what a port sends first: the header of one of dv's streams. At most 2 `GREETING_S`.
+def check_header(host: str, port: int) -> None:
+    """Check that a port sends the header of a dv stream. Takes at most 2 `HEADER_S`.
 
     Raises:
-        RigError: nobody listens, or sends no such header in time; with what came instead.
+        RigError: nothing listens there, or no such header comes in time; shows what came instead.
     """
     at = f"{host}:{port}"
-    belongs = "a stream of dv-processing sends its header at once"
+    expected = "a stream of dv-processing sends its header on connecting"
     came = bytearray()
-    end = time.monotonic() + GREETING_S
+    end = time.monotonic() + HEADER_S
     try:
-        with socket.create_connection((host, port), GREETING_S) as link:
+        with socket.create_connection((host, port), HEADER_S) as link:
             need = 12
             while len(came) < need:
                 link.settimeout(max(end - time.monotonic(), 0.001))
@@ -377,28 +377,28 @@ def greet(host: str, port: int) -> None:
                     if came[8:12] != b"IOHE" or length > _MOST_HEADER:
                         raise RigError(
                             DEVICE,
-                            f"{at} is no stream of dv-processing: it began with {bytes(came)!r}; "
-                            "look at events_port and triggers_port",
+                            f"{at} is not a dv-processing stream: it began with {bytes(came)!r}; "
+                            "check events_port and triggers_port",
                         )
                     need = 4 + length
     except TimeoutError:
         if came:
-            raise RigError(DEVICE, f"{at} sent {len(came)} bytes of its header, no more") from None
+            raise RigError(DEVICE, f"{at} sent only {len(came)} bytes of its header") from None
         raise RigError(
             DEVICE,
-            f"{at}: no answer within {GREETING_S:g} s; {belongs}. Look at events_port, "
-            "triggers_port and at what listens there",
+            f"{at}: no answer within {HEADER_S:g} s; {expected}. Check events_port, "
+            "triggers_port and the server there",
         ) from None
     except OSError as error:
-        raise RigError(DEVICE, f"{at}: {error}; look at the address and its server") from None
+        raise RigError(DEVICE, f"{at}: {error}; check the address and its server") from None
     if len(came) < need:
         raise RigError(
-            DEVICE, f"{at} hung up after {len(came)} bytes; {belongs}. Look at its server"
+            DEVICE, f"{at} disconnected after {len(came)} bytes; {expected}. Check its server"
         )
 
 
 def short(error: Exception) -> str:
-    """The text of one of the library's errors, without its source's line and stack."""
+    """Return the text of a library error without source line and stack trace."""
     text = str(error).split("\nStacktrace")[0].strip()
     return text.rsplit("Error: ", 1)[-1].strip() or type(error).__name__
 

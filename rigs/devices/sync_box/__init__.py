@@ -1,4 +1,4 @@
-"""The sync box at its serial port; its firmware stands in `rigs/firmware`."""
+"""The sync box on a serial port; its firmware is in `rigs/firmware`."""
 
 from __future__ import annotations
 

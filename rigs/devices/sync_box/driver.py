@@ -1,8 +1,8 @@
 """Driver of the sync box: a board with firmware/sync_box.c on a serial port.
 
-Reports are checked against the train that was asked for, and what is missing is counted. Nothing
-is mended in silence once a train runs: a box that begins anew, falls silent or goes away is a
-`SyncBoxFault` at the next call, and the next `start` connects anew.
+Reports are checked against the requested train, and missing ones are counted. Nothing is repaired
+silently while a train runs: if the box restarts, falls silent or is disconnected, the next call
+raises a `SyncBoxFault`, and the next `start` reconnects.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import DeviceHealth, RigError
 from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import LEAST_HZ, MOST_HZ, NAME, whole
-from sliplab.rigs.devices.sync_box.port import DEVICE, SyncBoxFault, SyncPort, began_anew
+from sliplab.rigs.devices.sync_box.port import DEVICE, SyncBoxFault, SyncPort, restarted
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.storage.streams import ClockReads, PulseChunk
 
 _FARTHEST_TICKS = 1 << 24
-"""A tick further on than this is no tick of a trial: 4 hours at 1,000 Hz."""
+"""Largest tick number of a trial: 4 hours at 1,000 Hz."""
 _MOST_MISSED = 10_000
-"""A jump in the numbers of exposures above this is a garbled line."""
+"""Largest plausible gap in exposure numbers; a larger one is a garbled line."""
 
 
 @dataclass
 class Losses:
-    """Losses on the way to the host since the last start; all 0 in a good trial."""
+    """Data lost between box and host since the last start; all 0 in a good trial."""
 
     pulses: int = 0
-    """Pulses whose report is missing, found by their numbers."""
+    """Pulses without a report, from gaps in their numbers."""
     exposures: int = 0
-    """Exposures whose report is missing, found by their numbers."""
+    """Exposures without a report, from gaps in their numbers."""
     told_by_box: int = 0
-    """Reports that the box itself says it dropped, its buffer being full; among the above."""
+    """Reports that the box dropped by its own count, its buffer being full; included above."""
     lines: int = 0
-    """Lines that were garbled, of whatever kind."""
+    """Garbled lines of any kind."""
     unread: int = 0
-    """Reports dropped by the host because nobody read them; see `MOST_WAITING` of the driver."""
+    """Reports dropped by the host because they were not read; see `MOST_WAITING`."""
 
     def __bool__(self) -> bool:
         return any((self.pulses, self.exposures, self.told_by_box, self.lines, self.unread))
 
 
 class Train:
-    """Checks reports, and counts what is missing.
+    """Checks reports, and counts missing ones.
 
     Args:
         millihertz: rate of the ticks, thousandths of a hertz.
-        seed: of the code, see `rigs.core.pulse_code`.
-        code: which code.
+        seed: seed of the code, see `rigs.core.pulse_code`.
+        code: name of the code.
     """
 
     def __init__(self, millihertz: int, seed: int, code: Code) -> None:
@@ -60,19 +60,19 @@ class Train:
         self._next_tick = self._next_exposure = 0
         self._last_exposure_us = 0
         self.first_us: int | None = None
-        """Of tick 0 on the box's clock, as the box said; None until it did."""
+        """Time of tick 0 on the box's clock, as the box reports it; None before that."""
         self.losses = Losses()
 
     @property
     def longest_gap_s(self) -> float:
-        """The longest time between two pulses, s."""
+        """Longest time between two pulses, s."""
         return LONGEST_GAP_TICKS * 1000 / self._millihertz
 
     def tick(self, number: int, bit: int, us: int) -> int | None:
-        """A tick's time since tick 0, us, if it has a pulse; None if not.
+        """Check a tick's report; return its time since tick 0, us, if it has a pulse, else None.
 
         Raises:
-            ValueError: that is no tick of this train.
+            ValueError: it is not a tick of this train.
         """
         if self.first_us is None or not self._next_tick <= number < _FARTHEST_TICKS:
             raise ValueError(f"tick {number} after {self._next_tick - 1}")
@@ -85,25 +85,25 @@ class Train:
         return since_us if bit else None
 
     def exposure(self, number: int, us: int, latest_us: int) -> int:
-        """An exposure's time since tick 0, us: below 0 if it began before.
+        """Check an exposure's report; return its time since tick 0, us, below 0 if it is earlier.
 
         Args:
-            latest_us: since tick 0, where it would be yet to come.
+            latest_us: latest plausible time since tick 0.
 
         Raises:
-            ValueError: that cannot be the next exposure, nor one soon after.
+            ValueError: it cannot be the next exposure, or one soon after.
         """
         missed = number - self._next_exposure
         if self.first_us is None or not 0 <= missed <= _MOST_MISSED or us < self._last_exposure_us:
             raise ValueError(f"exposure {number} after {self._next_exposure - 1}")
-        if us - self.first_us > latest_us:  # else every later one would come before it
-            raise ValueError(f"exposure {number} at {us} us is yet to come")
+        if us - self.first_us > latest_us:  # otherwise every later one would seem too early
+            raise ValueError(f"exposure {number} at {us} us lies in the future")
         self.losses.exposures += missed
         self._next_exposure, self._last_exposure_us = number + 1, us
         return us - self.first_us
 
     def end(self, ticks: int) -> None:
-        """The box says that it stopped after so many ticks: those not reported are missing."""
+        """Record that the box stopped after `ticks` ticks; those not reported are missing."""
         if self._next_tick < ticks < _FARTHEST_TICKS:
             self._miss_to(ticks)
             self._next_tick = ticks
@@ -114,20 +114,20 @@ class Train:
 
 
 MOST_WAITING = 100_000
-"""Pulses or exposures kept for who reads them: 17 minutes at 100 Hz. More are counted, not kept."""
+"""Buffered pulses or exposures: 17 minutes at 100 Hz. Further ones are counted, not kept."""
 AHEAD_US = 1_000_000
-"""An exposure further ahead of the host's clock than this, and 2 %, is a garbled line."""
+"""Largest lead of an exposure over the host's clock, besides 2 %; a larger one is garbled."""
 MOST_EARLY = 1000
-"""Reports kept that come before the answer to `GO`, should that have to be asked for again."""
+"""Buffered reports before the answer to `GO`, in case the request must be repeated."""
 
 
 class SerialSyncBox:
     """A sync box on a serial port; see `rigs.core.capabilities.SyncBox`.
 
-    Opens the port at `connect`, or at the first call that needs it.
+    The port is opened by `connect`, or by the first call that needs it.
 
     Args:
-        settings: port and time limits.
+        settings: port and timeouts.
         now_ns: the host's monotonic clock.
     """
 
@@ -144,21 +144,21 @@ class SerialSyncBox:
         self._asked_ns = self._heard_ns = self._questions = self._clock_us = 0
 
     def connect(self) -> None:
-        """Open the port and see that a sync box answers; anew if there was a fault.
+        """Open the port and check that a sync box answers; reconnects after a fault.
 
         Raises:
-            SyncBoxFault: no such port, or no sync box with this protocol behind it.
+            SyncBoxFault: no such port, or no sync box with this protocol on it.
         """
         if self._port is None or self._port.fault is not None:
             self._disconnect()
             self._port = SyncPort(self._settings, self._now_ns, self._take)
 
     def close(self) -> None:
-        """Stop the ticks if the box still answers, and give the port back; any number of times."""
+        """Stop the ticks if the box answers, and close the port; safe to call more than once."""
         try:
             self.stop()
         except SyncBoxFault:
-            pass  # a box that is gone cannot be stopped, and this call is about the port
+            pass  # a disconnected box cannot be stopped; close the port all the same
         finally:
             self._disconnect()
 
@@ -168,7 +168,7 @@ class SerialSyncBox:
         self._port, self._train, self._running, self._clock_us = None, None, False, 0
 
     def health(self) -> DeviceHealth:
-        """Return the box's own report, and its clock since it got power.
+        """Return the box's health report.
 
         Raises:
             SyncBoxFault: no answer.
@@ -186,21 +186,21 @@ class SerialSyncBox:
         )
 
     def start(self, rate_hz: float, seed: int, code: Code = "lfsr") -> None:
-        """Begin ticks and code; a train that runs is given up, and what it sent is dropped.
+        """Start ticks and code; a running train is ended, and its reports are discarded.
 
         Args:
-            rate_hz: 1 to 1,000, to a thousandth.
+            rate_hz: 1 to 1,000, in steps of a thousandth.
             seed: 1 to 4,294,967,294.
             code: see `rigs.core.pulse_code`.
 
         Raises:
-            RigError: such a train cannot be sent.
+            RigError: the box cannot send such a train.
             SyncBoxFault: the box does not answer.
         """
         millihertz = round(rate_hz * 1000)
         if not LEAST_HZ <= rate_hz <= MOST_HZ or abs(millihertz - rate_hz * 1000) > 1e-6:
             raise RigError(
-                DEVICE, f"rate {rate_hz} Hz: must be {LEAST_HZ:g} to {MOST_HZ:g}, to a thousandth"
+                DEVICE, f"rate {rate_hz} Hz: must be {LEAST_HZ:g} to {MOST_HZ:g}, in steps of 0.001"
             )
         if not 1 <= seed <= SEEDS:
             raise RigError(DEVICE, f"seed {seed}: must lie between 1 and {SEEDS}")
@@ -209,7 +209,7 @@ class SerialSyncBox:
         port = self._open()
         port.ask(f"ARM {millihertz / 1000:.3f} {seed} 0 {code}", "OK ARM")
         with port.news:
-            # nothing of an older train comes behind the answer to ARM
+            # no report of an older train follows the answer to ARM
             self._train = Train(millihertz, seed, code)
             self._pulses, self._exposures, self._early = [], [], []
             port.lines.wrong = 0
@@ -219,10 +219,10 @@ class SerialSyncBox:
             self._heard_ns, self._running = self._now_ns(), True
 
     def read_pulses(self) -> PulseChunk:
-        """Pulses sent since the last call, box clock, whole microseconds; tick 0 is at 0.
+        """Return pulses since the last call, box clock, integer microseconds; tick 0 is at 0.
 
         Raises:
-            SyncBoxFault: the box began anew, went away, or sends no pulses any more.
+            SyncBoxFault: the box restarted, was disconnected, or has stopped sending pulses.
         """
         if self._port is not None:
             with self._port.news:
@@ -233,7 +233,7 @@ class SerialSyncBox:
         return PulseChunk(np.array(pulses, np.int64) * 1000)
 
     def read_exposures(self) -> PulseChunk:
-        """Starts of exposures since the last call, box clock, whole microseconds.
+        """Return starts of exposures since the last call, box clock, integer microseconds.
 
         Raises:
             SyncBoxFault: as `read_pulses`.
@@ -247,33 +247,33 @@ class SerialSyncBox:
         return PulseChunk(np.array(exposures, np.int64) * 1000)
 
     def read_clock(self) -> ClockReads:
-        """The box's clock now, whole microseconds: one row.
+        """Read the box's clock, integer microseconds: one row.
 
-        The clock is 0 at tick 0 of the last train; before the first one, when the box got power.
+        The clock is 0 at tick 0 of the last train; before the first train, at power-on.
 
         Raises:
-            SyncBoxFault: no answer, or the clock fell back.
+            SyncBoxFault: no answer, or the clock jumped back.
         """
         port = self._open()
         with port.news:
             self._check(port)
-        # a number, for an answer that comes late must not be taken for the next one
+        # numbered, because a late answer must not be taken for the next one
         self._questions += 1
         found, before_ns, after_ns = port.ask(f"T? {self._questions}", f"T {self._questions} ")
         us = int(found)
         with port.news:
             fell_us, self._clock_us = self._clock_us - us, us
             if fell_us > 0:
-                port.fail(began_anew(f"its clock fell back by {fell_us / 1e6:.3f} s"))
+                port.fail(restarted(f"its clock jumped back by {fell_us / 1e6:.3f} s"))
                 port.check()
             first_us = self._train.first_us if self._train is not None else None
         row = ((us - (first_us or 0)) * 1000, before_ns, after_ns)
         return ClockReads(*(np.array([value], np.int64) for value in row))
 
     def stop(self) -> None:
-        """Stop the ticks, with the pulse that is being sent; the clock goes on.
+        """Stop the ticks after the current pulse; the clock keeps running.
 
-        All pulses can be read afterwards: the box answers behind its last report.
+        All pulses can be read afterwards, because the box answers after its last report.
 
         Raises:
             SyncBoxFault: no answer.
@@ -284,7 +284,7 @@ class SerialSyncBox:
         with port.news:
             self._running = False
             if port.fault is not None:
-                return  # the next read says so; nothing can be stopped any more
+                return  # the next read raises it; there is nothing left to stop
         port.ask("STOP", "OK STOP")
 
     @property
@@ -302,26 +302,26 @@ class SerialSyncBox:
         return self._port
 
     def _check(self, port: SyncPort) -> None:
-        """Raise what is wrong; the port's news are held."""
+        """Raise a fault if there is one; call with `port.news` held."""
         if self._running and self._train is not None:
             quiet_s = (port.read_to_ns - self._heard_ns) / 1e9
             if quiet_s > self._train.longest_gap_s + self._settings.silence_s:
                 port.fail(
                     SyncBoxFault(
-                        f"no pulse reported for {quiet_s:.1f} s. It was reset, unplugged or hangs: "
-                        f"check its cable and supply, then start the trial again"
+                        f"no pulse reported for {quiet_s:.1f} s: it was reset, unplugged or hangs. "
+                        f"Check its cable and supply, then start the trial again"
                     )
                 )
         port.check()
 
-    # -- in the reading thread, the port's news held -----------------------------------------
+    # -- in the reading thread, with the port's `news` held ----------------------------------
 
     def _take(self, body: str) -> bool:
         kind, _, rest = body.partition(" ")
         train = self._train
         if kind not in {"P", "X", "D"}:
             if kind == "T":
-                whole(rest.rpartition(" ")[2])  # else it is garbled, and no answer
+                whole(rest.rpartition(" ")[2])  # raises if the line is garbled
             elif train is not None:
                 self._begin_or_end(train, body)
             return False

@@ -1,7 +1,7 @@
-"""A sync box on a pty: the firmware's protocol in real time, with faults on request.
+"""A fake sync box on a pty: the firmware's protocol in real time, with faults on request.
 
-The driver opens it like a board, so its whole way is tested without one. What its clock shows
-comes from a callable: a simulated scene may drive it.
+The driver opens it like a board, so its complete path is tested without one. The clock is a
+callable, so that a simulated scene can drive it.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from sliplab.rigs.core.pulse_code import SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
 
 TURN_S = 0.001
-"""Period at which the fake checks what is due."""
+"""Period at which the fake sends due reports."""
 LEAD_US = 2000
-"""From GO to tick 0."""
+"""Time from GO to tick 0."""
 JOIN_S = 2.0
 CODES: dict[str, Code] = {code: code for code in get_args(Code)}
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """A train as ARM named it: `last` ticks, 0 without end."""
+    """A train as requested by ARM: `last` ticks, 0 for endless."""
 
     millihertz: int
     last: int
@@ -39,13 +39,13 @@ class _Plan:
 
     @cached_property
     def bits(self) -> CodeBits:
-        """The code, tick by tick."""
+        """Bits of the code, tick by tick."""
         return CodeBits(self.seed, self.code)
 
 
 @dataclass(frozen=True)
 class Train:
-    """A train of pulses that the box began, as the rest of a simulated scene sees it."""
+    """A train of pulses that the box started, for the rest of a simulated scene."""
 
     first_ns: int
     """Tick 0 on the clock that drives the box, ns."""
@@ -55,18 +55,18 @@ class Train:
 
 
 class FakeSyncBox:
-    """A sync box to open at `port`. A context manager: its thread ends with it.
+    """A fake sync box on the pty `port`; a context manager that ends its thread.
 
     Args:
-        now_ns: the box's clock; any origin, it shows 0 when the box gets power or is reset.
-        exposure_us: where the camera's output is wired, exposures begin this long after each
-            tick; None where it is not.
-        on_train: called with every train before its first tick, and at its end with None and the
-            number of ticks sent. In the box's thread.
+        now_ns: the box's clock with any origin; the box reports 0 at power-on and reset.
+        exposure_us: delay of each exposure after its tick; None if the camera's output is not
+            wired.
+        on_train: called in the box's thread with every train before its first tick, and at its end
+            with None and the number of ticks sent.
 
     Attributes:
         port: name of the pty.
-        pulses: how many pulses (code bits 1) the train that runs, or the last one, has sent.
+        pulses: number of pulses (code bits 1) of the running or last train.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class FakeSyncBox:
         self.close()
 
     def close(self) -> None:
-        """End the thread and the pty: to the host the board is unplugged, and it ticks no more."""
+        """End the thread and the pty; to the host the board is unplugged."""
         self._ending.set()
         self._thread.join(JOIN_S)
         with self._lock:
@@ -109,23 +109,23 @@ class FakeSyncBox:
     # -- faults ----------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Begin anew as after a brown-out: no train, and a clock at 0. Says so, as the board."""
+        """Restart as after a brown-out: no train, clock at 0, and the board's start message."""
         with self._lock:
             self._power_on()
             self._say(f"B {NAME}")
 
     def silence(self, silent: bool = True) -> None:
-        """Hang: neither read nor send, until restored."""
+        """Hang: neither read nor send until `silent` is False again."""
         with self._lock:
             self._silent = silent
 
     def corrupt(self, lines: int) -> None:
-        """Garble the next `lines` lines that are sent."""
+        """Garble the next `lines` sent lines."""
         with self._lock:
             self._corrupt = lines
 
     def drop(self, reports: int) -> None:
-        """Drop the next `reports` reports as with a full buffer: they are counted and reported."""
+        """Drop the next `reports` reports as with a full buffer; their number is reported."""
         with self._lock:
             self._drop = reports
 
@@ -161,7 +161,7 @@ class FakeSyncBox:
         try:
             os.write(self._master, line)
         except BlockingIOError:
-            self._dropped += 1  # nobody reads: a real line would be gone as well
+            self._dropped += 1  # nothing reads: a real line would lose it too
 
     def _report(self, body: str) -> None:
         if self._drop:
@@ -188,7 +188,7 @@ class FakeSyncBox:
                 self._tick()
 
     def _tick(self) -> None:
-        """Send what is due."""
+        """Send the reports that are due."""
         now_us = self._us()
         if self._train is not None:
             train, first_us = self._train, self._first_us

@@ -1,7 +1,7 @@
-"""The serial port of a sync box: questions with answers, and a thread that reads all else.
+"""The serial port of a sync box: requests with answers, and a thread that reads all lines.
 
-The thread notes when each line arrived, so that an answer's time does not depend on who waits for
-it. Every wait ends: the limits stand in `SyncBoxSettings` and in the constants here.
+The thread records the arrival time of each line, so an answer's time does not depend on the thread
+that waits for it. Every wait has a timeout, in `SyncBoxSettings` or in the constants here.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 
 DEVICE = "sync box"
 TRIES = 3
-"""Tries of a request whose answer is missing or garbled."""
+"""Attempts at a request whose answer is missing or garbled."""
 READ_S = 0.05
-"""The reading thread looks this often whether it shall end."""
+"""Period at which the reading thread checks whether to end."""
 JOIN_S = 1.0
-"""Time for which `close` waits for the reading thread."""
+"""Timeout for the reading thread to end in `close`."""
 MOST_ANSWERS = 64
-"""Lines kept that nobody asked for."""
+"""Buffered lines that no request waits for."""
 
 
 class SyncBoxFault(RigError):
-    """The box began anew, fell silent or went away: what it sent since is not to be trusted."""
+    """The box restarted, fell silent or was disconnected; its data since then are invalid."""
 
     def __init__(self, message: str) -> None:
         super().__init__(DEVICE, message)
 
 
 class SyncPort:
-    """One open port, from `SyncPort(...)` to `close`.
+    """One open port, from construction to `close`.
 
     Args:
-        settings: port and time limits.
+        settings: port and timeouts.
         now_ns: the host's monotonic clock.
-        take: is given each line's body in the reading thread, `news` held; what it does not want
-            (False) may be an answer. A `ValueError` of it is a garbled line.
+        take: called with each line's body in the reading thread, with `news` held; returns False
+            for a line that may be an answer. A `ValueError` marks a garbled line.
 
     Attributes:
-        news: held by whoever looks at what the reading thread changes.
-        fault: the first one, while `news` is held; everything raises it from then on.
-        lines: cuts lines, and counts garbled ones.
-        read_to_ns: all that came before this time of the host's has been taken; a host that was
-            busy for a while has not heard a silence.
+        news: condition to hold while reading state that the reading thread changes.
+        fault: the first fault; read with `news` held. Every call raises it from then on.
+        lines: splits lines, and counts garbled ones.
+        read_to_ns: host time up to which all data have been read; a delay of the host is not
+            silence of the box.
 
     Raises:
-        SyncBoxFault: no such port, or no sync box with this protocol behind it, after `boot_s` and
-            three answers at the most.
+        SyncBoxFault: no such port, or no sync box with this protocol on it, after `boot_s` and
+            three answers at most.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class SyncPort:
         except (OSError, ValueError) as error:
             raise SyncBoxFault(
                 f"cannot open {settings.port}: {error}. Check that the box is plugged in, that "
-                f"the rig file names its port and that no other program holds it"
+                f"the rig file names its port and that no other program is using it"
             ) from error
         self._thread = threading.Thread(target=self._listen, name="sync box", daemon=True)
         self._thread.start()
@@ -91,16 +91,16 @@ class SyncPort:
             raise
 
     def close(self) -> None:
-        """Give the port back; any number of times."""
+        """Close the port; safe to call more than once."""
         self._closing.set()
         self._thread.join(JOIN_S)
         self._serial.close()
 
     def ask(self, question: str, answer: str) -> tuple[str, int, int]:
-        """Ask until there is an answer that begins with `answer`, `TRIES` times at the most.
+        """Send a request until an answer begins with `answer`, at most `TRIES` times.
 
         Returns:
-            What follows `answer`, and the host's times before asking and behind the answer, ns.
+            the text after `answer`, and the host's times before the request and at the answer, ns.
 
         Raises:
             SyncBoxFault: no answer, or the box refuses.
@@ -118,13 +118,13 @@ class SyncPort:
         raise fault
 
     def fail(self, fault: SyncBoxFault) -> None:
-        """Remember the first fault; `news` is held."""
+        """Store the first fault; call with `news` held."""
         if self.fault is None:
             self.fault = fault
         self.news.notify_all()
 
     def check(self) -> None:
-        """Raise the fault if there is one; `news` is held."""
+        """Raise the fault if there is one; call with `news` held."""
         if self.fault is not None:
             raise self.fault
 
@@ -139,15 +139,15 @@ class SyncPort:
                 )
         if found[0] != NAME:
             raise SyncBoxFault(
-                f"{self._settings.port} answers as '{found[0]}', not as '{NAME}': flash the "
-                f"firmware that belongs to this version (docs/sync-box.md)"
+                f"{self._settings.port} identifies itself as '{found[0]}', not '{NAME}': flash the "
+                f"firmware of this SlipLab version (docs/sync-box.md)"
             )
         with self.news:
             self._greeted = True
-        self.ask("STOP", "OK STOP")  # a train of whoever came before
+        self.ask("STOP", "OK STOP")  # end a train of an earlier client
 
     def _try(self, question: str, answer: str) -> tuple[str, int, int] | None:
-        """Ask once; None where no answer comes in time, or the box could not read the question."""
+        """Send a request once; None if it times out, or if the box received it garbled."""
         with self.news:
             self._answers.clear()
         before_ns = self._now_ns()
@@ -192,7 +192,7 @@ class SyncPort:
     def _sort(self, body: str, arrived_ns: int) -> None:
         if body.startswith("B "):
             if self._greeted:
-                self.fail(began_anew("it said so"))
+                self.fail(restarted("start message received"))
             return
         try:
             if not self._take(body):
@@ -201,10 +201,10 @@ class SyncPort:
             self.lines.wrong += 1
 
 
-def began_anew(how: str) -> SyncBoxFault:
-    """The board was reset; `how` says how one knows."""
+def restarted(how: str) -> SyncBoxFault:
+    """Return the fault of a board that was reset; `how` names the evidence."""
     return SyncBoxFault(
-        f"the board began anew ({how}); its clock is another one now. Check its supply and "
+        f"the board restarted ({how}), so its clock was reset. Check its supply and "
         f"USB cable, then start the trial again"
     )
 

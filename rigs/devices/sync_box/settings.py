@@ -1,4 +1,4 @@
-"""Settings that reach a sync box, as a rig file gives them; cheap to import."""
+"""Settings of a sync box, as rig files give them; cheap to import."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sliplab.rigs.devices.sync_box.line import BAUD
 
 
 class SyncBoxSettings(DriverSettings):
-    """Settings that reach a sync box; the defaults fit the firmware that ships."""
+    """Settings of a sync box; the defaults match the shipped firmware."""
 
     driver: Literal["sync_box"] = "sync_box"
     port: str = Field(min_length=1)
-    """The serial port's name, best one that stays: /dev/serial/by-id/..."""
+    """Name of the serial port, preferably a persistent one: /dev/serial/by-id/..."""
     baud: int = Field(default=BAUD, ge=9600, le=2_000_000)
     answer_s: float = Field(default=0.25, gt=0, le=10)
-    """For each answer and for each write; a question is asked `TRIES` times."""
+    """Timeout of each answer and each write; a request is sent up to `TRIES` times."""
     boot_s: float = Field(default=4.0, gt=0, le=60)
-    """From opening the port, which resets most boards, to the first answer."""
+    """Timeout from opening the port, which resets most boards, to the first answer."""
     silence_s: float = Field(default=1.0, gt=0, le=60)
-    """A train of which nothing is heard for this much longer than its longest gap has failed."""
+    """Silence beyond a train's longest gap after which the train has failed."""

@@ -1,4 +1,4 @@
-"""Universal Robots arms: RTDE, dashboard, script port, and ur_rtde in a process of its own."""
+"""Universal Robots arms: RTDE, dashboard, script port, and ur_rtde in a child process."""
 
 from __future__ import annotations
 

@@ -1,13 +1,14 @@
-"""ur_rtde's control client in a process of its own, because that is the only way to bound it.
+"""ur_rtde's control client in a child process, which is the only way to bound its calls.
 
-What ur_rtde 1.6.5 does when a link dies (its source, and tried): the constructor holds Python's
-global lock while it connects, reads answers and uploads, without a deadline, so no thread of the
-same process could end the wait; a blocking call waits up to 300 s; and when the connection is lost
-it connects again by itself, uploads the script again and *sends the interrupted move again*. A
-process can be killed at a stated time, and then nothing of this happens.
+When a connection dies, ur_rtde 1.6.5 behaves as follows (from its source, and confirmed by trial):
+the constructor holds Python's global interpreter lock while it connects, reads answers and uploads,
+without a timeout, so no thread of the same process can end the wait; a blocking call waits up to
+300 s; and after a lost connection the client reconnects automatically, uploads the script again and
+*repeats the interrupted move*. A child process can be killed after a timeout, which prevents all
+of this.
 
-The child ends itself too if a call outlives its bound (a timer in C that needs no lock), and when
-its parent is gone it stops the arm first.
+The child also ends itself if a call exceeds its timeout (a timer in C that needs no lock), and
+stops the arm first when its parent has died.
 """
 
 from __future__ import annotations
@@ -21,36 +22,36 @@ from typing import Any
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
 
 START_S = 10.0
-"""Time limit for the child to connect, upload the control script and see it run, s."""
+"""Timeout for the child to connect, upload the control script and see it running, s."""
 WATCHDOG_HZ = 1.0
-"""The controller ends the program, and with it any move, unless it is written to this often.
+"""Rate of writes below which the controller's watchdog ends the program, and with it any move.
 
-A host that records cameras may keep a process waiting for half a second; and a move that goes on
-for a second more goes no further than its own target, which was held against all limits.
+A host that records cameras may delay a process by half a second. A move that continues for another
+second goes no farther than its target, which was checked against all limits.
 """
 KICK_S = 0.1
-"""Period at which the child writes to the controller when it has nothing else to send, s."""
+"""Period of the writes that keep the watchdog from expiring while nothing else is sent, s."""
 _IDLE_KICK_S = 1.0
-"""The same once the controller's program has ended and there is nothing to keep alive."""
+"""The same once the controller's program has ended, s."""
 _SELF_END_S = 2.0
-"""Time after its parent's bound at which the child ends itself, s."""
+"""Time after the parent's timeout at which the child ends itself, s."""
 _PARENT_GONE_STOP_S = 2.0
 _STOP_DECELERATION_M_S2 = 1.0
 
 
 class ControlError(LibraryError):
-    """The control client refused, failed or did not answer in time; the text says which."""
+    """The control client refused, failed or timed out; the text says which."""
 
 
 class ControlProcess(LibraryProcess):
-    """The parent's side: calls of `RTDEControlInterface` by name, each with a bound.
+    """The parent's side: calls of `RTDEControlInterface` by name, each with a timeout.
 
     Args:
         host: the controller's address.
         frequency_hz: rate at which the client reads the controller's state.
 
     Raises:
-        ControlError: it was not ready within `START_S`; the child is gone.
+        ControlError: it was not ready within `START_S`; the child has been killed.
     """
 
     def __init__(self, host: str, frequency_hz: float) -> None:
@@ -64,7 +65,7 @@ class ControlProcess(LibraryProcess):
 
 
 def serve(fd: int, host: str, frequency_hz: float, start_s: float) -> None:
-    """The child: take calls from the pipe on `fd` until it closes, then stop the arm and end."""
+    """Run the child: serve calls from the pipe on `fd` until it closes, then stop the arm."""
     pipe = Connection(fd)
     faulthandler.dump_traceback_later(start_s + _SELF_END_S, exit=True)
     try:
@@ -82,11 +83,11 @@ def serve(fd: int, host: str, frequency_hz: float, start_s: float) -> None:
     faulthandler.dump_traceback_later(_PARENT_GONE_STOP_S, exit=True)
     with contextlib.suppress(Exception):
         control.stopL(_STOP_DECELERATION_M_S2, True)
-    os._exit(0)  # the client's own clean-up may hang, and holds nothing that matters
+    os._exit(0)  # the client's own clean-up may hang, and nothing depends on it
 
 
 def _serve_one(pipe: Connection, control: Any, wait_s: float) -> float:
-    """One call, or one sign of life to the controller; how long to wait for the next call, s."""
+    """Serve one call, or reset the watchdog; return the time to wait for the next call, s."""
     if not pipe.poll(wait_s):
         faulthandler.dump_traceback_later(START_S, exit=True)
         alive = control.isConnected() and control.kickWatchdog()

@@ -1,12 +1,12 @@
 """Driver of Universal Robots e-Series arms (PolyScope 5.6 and later 5.x, remote control on).
 
-Three ways lead to the controller and the driver keeps them apart, so that losing one leaves two:
-the pose stream (`rigs.devices.ur.rtde`), the control client ur_rtde in a process of its own
-(`rigs.devices.ur.control`), and the two text ports (`rigs.devices.ur.ports`). No wait is without a
-bound; the bounds are the constants below, and `docs/arms.md` has them measured.
+The driver uses three independent channels to the controller, so that losing one leaves two: the
+pose stream (`rigs.devices.ur.rtde`), the control client ur_rtde in a child process
+(`rigs.devices.ur.control`), and the two text ports (`rigs.devices.ur.ports`). Every wait has a
+timeout, one of the constants below; `docs/arms.md` has measured times.
 
 A segment is one `movel`, from rest to rest. Its start and end are the first controller cycles in
-which the control script says that the move runs, and that it has ended (bit 15 of
+which the control script reports that the move is running, and that it has ended (bit 15 of
 output_int_register_2), so they are known to one cycle (2 ms at 500 Hz).
 """
 
@@ -37,33 +37,33 @@ from sliplab.rigs.devices.ur.settings import UrSettings
 from sliplab.storage.streams import Json
 
 ANSWER_S = 3.0
-"""Connecting the pose stream, with every answer of its set-up, s."""
+"""Timeout to connect the pose stream, including its set-up, s."""
 SILENCE_S = 1.0
-"""A pose stream silent for this long is lost, s."""
+"""Silence after which the pose stream counts as lost, s."""
 COMMAND_S = 2.0
-"""One call of the control client: the controller takes a command within a few cycles, s."""
+"""Timeout of one call of the control client; the controller needs a few cycles, s."""
 PORT_S = 1.0
-"""One request on a text port, s."""
+"""Timeout of one request on a text port, s."""
 BEGIN_S = 1.0
-"""From a move being taken to the controller saying that it runs, s."""
+"""Timeout from an accepted move to the report that it is running, s."""
 OVERTIME_S = 3.0
 """Time beyond 1.5 times its duration after which a move is stopped, s."""
 STILL_S = 1.0
-"""From a stop being asked for to the arm standing still, for each way of asking, s."""
+"""Timeout from a stop command to the arm at rest, for each channel, s."""
 STOP_DECELERATION_MM_S2 = 1000.0
 """Deceleration of a stop."""
 ARRIVED_MM = 0.1
-"""A move that ends further than this from its target was stopped by somebody."""
+"""A move that ends farther than this from its target was stopped from outside."""
 STILL_MM_S = 0.01
-"""Below this commanded speed the arm stands still."""
+"""Commanded speed below which the arm is at rest."""
 JUMP_S = 1.0
-"""A controller clock that moves on by more than this from one packet to the next has jumped, s."""
+"""Step of the controller's clock between two packets above which it has jumped, s."""
 _NEWS_S = 0.1
-"""Time limit for a packet with news of the state to arrive, s."""
+"""Timeout for a packet with the new state to arrive, s."""
 _UNKNOWN_NS = 1 << 62
-"""A move is being handed over: nobody knows yet when the controller took it."""
+"""Marks a move that is being sent, before the time of its acceptance is known."""
 _FULL_SPEED = 0.999
-"""The speed slider is up when it stands at least here."""
+"""Position from which the speed slider counts as fully up."""
 
 
 class UrArm(ThreadedArm):
@@ -79,13 +79,13 @@ class UrArm(ThreadedArm):
         self._remote = True
         self._closing = False
         self._moved_ns: int | None = None
-        """Host's time when the last move was handed over; None once the arm was seen at rest."""
+        """Host time at which the last move was sent; None once the arm is confirmed at rest."""
         self._missing = 0
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
         self._starting = threading.Lock()
         self._commanding = threading.Lock()
-        """Held while a move or a stop is handed over: no move may follow the stop that ends it."""
+        """Held while a move or a stop is sent: no move may follow the stop that ends it."""
 
     def connect(self) -> None:
         """Open the pose stream, take control, set tool, payload and watchdog.
@@ -94,7 +94,7 @@ class UrArm(ThreadedArm):
         `control.START_S` + 3 `COMMAND_S`.
 
         Raises:
-            ArmFault: no connection, somebody else has control, or the arm may not move now.
+            ArmFault: no connection, another client has control, or the arm is not ready to move.
         """
         if self._lost is None and self._control is not None:
             return
@@ -107,28 +107,8 @@ class UrArm(ThreadedArm):
             self.close()
             raise
 
-    def recover(self) -> None:
-        """Take control again after a person has put right what stopped the arm.
-
-        Whatever program is left on the controller is ended first, so that no interrupted move
-        can go on. Takes as long as `connect`. Never unlocks anything.
-
-        Raises:
-            ArmFault: the arm is still in a protective or emergency stop, or not in remote
-                control, or not reachable: a person must go there.
-        """
-        if self._lost is None and self.state() in {
-            ArmState.PROTECTIVE_STOP,
-            ArmState.EMERGENCY_STOP,
-        }:
-            raise self._fault(self.state(), "cannot recover")
-        self.close()
-        with contextlib.suppress(ports.PortError):
-            ports.dashboard(self._settings.host, "stop", PORT_S)
-        self.connect()
-
     def state(self) -> ArmState:
-        """The arm's state as its last packet says; never waits."""
+        """Return the state in the last packet without waiting."""
         if self._lost is not None or self._status is None:
             return ArmState.DISCONNECTED
         if self._status.stopped is not None:
@@ -144,11 +124,11 @@ class UrArm(ThreadedArm):
         return self._last().pose
 
     def now_ns(self) -> int:
-        """The controller's clock in the last packet, ns. Raises ArmFault without one."""
+        """Return the controller's clock in the last packet, ns. Raises ArmFault without one."""
         return self._last().t_ns
 
     def health(self) -> DeviceHealth:
-        """Return the controller's own report; takes at most 8 s.
+        """Return the controller's health report; takes at most 8 s.
 
         Raises:
             ArmFault: it does not answer.
@@ -160,11 +140,11 @@ class UrArm(ThreadedArm):
             raise ArmFault("arm", f"{error}; check its power and network") from None
 
     def describe(self) -> Json:
-        """Poses that the controller did not send since connecting, by the gaps in its clock."""
+        """Return the number of missing poses since connecting, from gaps in the clock."""
         return {"poses_missing": self._missing}
 
     def start(self, path: Sequence[Segment]) -> None:
-        """Begin to follow `path`: checked against all limits, first move taken by the controller.
+        """Check `path` against all limits, and start its first move on the controller.
 
         Takes at most `PORT_S` + `BEGIN_S` + (1 + segments) `COMMAND_S`, and 2 `PORT_S` on a fault.
 
@@ -191,14 +171,14 @@ class UrArm(ThreadedArm):
             self._begin(run)
 
     def stop(self) -> None:
-        """Stop the arm by every way that is left; never unlocks anything.
+        """Stop the arm over every available channel; never unlocks anything.
 
         Takes at most 2 `COMMAND_S` + 4 `PORT_S` + 3 `STILL_S`.
 
         Raises:
-            ArmFault: a move was handed over, and the arm could not be seen to stand still since,
-                neither in its stream nor on a new connection. Its own watchdog ends the move after
-                1 / `control.WATCHDOG_HZ` s if the network is gone.
+            ArmFault: a move was sent, and the arm is not confirmed at rest since, neither by its
+                stream nor over a new connection. The controller's watchdog ends the move after
+                1 / `control.WATCHDOG_HZ` s if the network has failed.
         """
         run = self._run
         run.cancelled = True
@@ -206,30 +186,30 @@ class UrArm(ThreadedArm):
         resting = self._status is None or self._is_still()
         if run.done and resting and self._moved_ns is None:
             return
-        if not (self._ask_control_to_stop() and self._wait_still()):
+        if not (self._stop_by_control() and self._wait_still()):
             reached = self._end_program()
-            if not (self._wait_still() if self._lost is None else self._is_still_anew()):
+            if not (self._wait_still() if self._lost is None else self._is_still_by_new_stream()):
                 if self._lost is None:
                     raise ArmFault("arm", "does not stop: press its emergency stop")
                 if reached:
                     raise ArmFault(
                         "arm",
-                        f"took a stop and cannot be seen to stand still ({self._lost}): look at "
+                        f"accepted a stop but cannot be confirmed at rest ({self._lost}): check "
                         "the arm before you go near it",
                     )
                 raise ArmFault(
                     "arm",
-                    f"cannot be reached to be stopped ({self._lost}); its own watchdog ends a "
-                    f"move after {1 / WATCHDOG_HZ:g} s: look at the arm before you go near it",
+                    f"cannot be reached to stop it ({self._lost}); its own watchdog ends a "
+                    f"move after {1 / WATCHDOG_HZ:g} s: check the arm before you go near it",
                 )
         self._moved_ns = None
         run.join(STILL_S)
         run.done = True
 
     def close(self) -> None:
-        """Stop, end the control program and give every connection back.
+        """Stop the arm, end the control program and close every connection.
 
-        Raises nothing: `stop` before it, or after it, says whether the arm stands still.
+        Raises nothing; call `stop` before or after it to confirm that the arm is at rest.
         """
         self._closing = True
         control, self._control = self._control, None
@@ -269,34 +249,32 @@ class UrArm(ThreadedArm):
         self._listener.start()
         first = self._stream.wait_for(lambda: bool(self._status or self._lost), SILENCE_S + 0.5)
         if not first or self._lost is not None:
-            raise ArmFault("arm", f"no pose came: {self._lost}")
+            raise ArmFault("arm", f"sent no pose: {self._lost}")
 
     def _check_free(self) -> None:
-        """The arm stands still, may move, and nobody's program is on it.
+        """Check that the arm is at rest, may move, and has no program loaded.
 
         Raises:
-            ArmFault: not so. The control client would end a program, even a paused one, and
-                would wait in vain for an arm without power.
+            ArmFault: it does not. The control client would end any program, even a paused one,
+                and would wait in vain for an arm without power.
         """
 
-        def ending() -> bool:  # a program that was just asked to end takes a cycle or two
+        def has_program() -> bool:  # a program that was just told to end takes a cycle or two
             return self._status is not None and self._status.program
 
         state = self.state()
         if state not in {ArmState.READY, ArmState.NOT_RUNNING}:
             raise self._fault(state, "cannot connect")
-        self._stream.wait_for(lambda: not ending(), _NEWS_S)
+        self._stream.wait_for(lambda: not has_program(), _NEWS_S)
         status = self._status
         assert status is not None
         if status.program:
-            what = (
-                "runs somebody's program" if status.playing else "holds somebody's paused program"
-            )
-            raise ArmFault("arm", f"{what}; end it at the pendant first")
+            what = "running" if status.playing else "paused"
+            raise ArmFault("arm", f"a program is already {what} on it; end it at the pendant first")
         if status.off:
             raise ArmFault("arm", f"is not switched on ({status.off}); {self.state().advice}")
         if not self._stream.wait_for(self._is_still, STILL_S):
-            raise ArmFault("arm", "moves though no program runs on it; look at the arm")
+            raise ArmFault("arm", "is moving though no program is running on it; check the arm")
         self._moved_ns = None
 
     def _take_control(self) -> None:
@@ -307,11 +285,11 @@ class UrArm(ThreadedArm):
             if "already in use" in str(error):
                 raise ArmFault(
                     "arm",
-                    "another program has control of it, or a fieldbus holds its registers; end "
-                    f"that program first, or switch the fieldbus off. Its client says: {error}",
+                    "another client has control of it, or a fieldbus holds its registers; end "
+                    f"that client first, or switch the fieldbus off. The client reports: {error}",
                 ) from None
-            self._end_program()  # its script may have come through
-            raise ArmFault("arm", f"gave no control: {error}") from None
+            self._end_program()  # its script may have arrived
+            raise ArmFault("arm", f"did not give control: {error}") from None
         tcp = to_ur(Pose(tool.tcp_mm, tool.tcp_rotvec_deg))
         centre = [value / MM_PER_M for value in tool.centre_of_mass_mm]
         self._call("setTcp", tcp)
@@ -322,17 +300,17 @@ class UrArm(ThreadedArm):
             raise self._fault(self.state(), "cannot connect")
 
     def _listen(self, reader: RtdeReader) -> None:
-        """The reader's thread: every packet, until the stream ends or cannot be believed."""
+        """Receive packets in the reader's thread until the stream ends or is invalid."""
         try:
             while not self._closing:
                 for packet in reader.read():
                     self._take(packet)
-        except Exception as error:  # a thread that dies must not look like an arm that stands
+        except Exception as error:  # a thread that dies must not look like an arm at rest
             if self._closing:
                 return
             self._lost = str(error) if isinstance(error, RtdeError) else f"its stream: {error!r}"
             if self._control is not None:
-                self._control.kill()  # or it would connect again and send the move again
+                self._control.kill()  # or it would reconnect and repeat the move
             self._stream.wake()
 
     def _take(self, packet: Packet) -> None:
@@ -340,8 +318,10 @@ class UrArm(ThreadedArm):
         before = self._status
         if before is not None and not 0 <= status.t_ns - before.t_ns <= JUMP_S * 1e9:
             seconds = (status.t_ns - before.t_ns) / 1e9
-            how = f"fell back by {-seconds:.3f} s" if seconds < 0 else f"jumped by {seconds:.3f} s"
-            raise RtdeError(f"its clock {how}: it began anew, or its packets are not its own")
+            how = (
+                f"jumped back by {-seconds:.3f} s" if seconds < 0 else f"jumped by {seconds:.3f} s"
+            )
+            raise RtdeError(f"its clock {how}: the controller restarted, or packets are invalid")
         if before is not None:
             cycles = (status.t_ns - before.t_ns) * self._settings.frequency_hz / 1e9
             self._missing += max(round(cycles) - 1, 0)
@@ -360,8 +340,8 @@ class UrArm(ThreadedArm):
         self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
 
     def _rested(self, moved_ns: int) -> None:
-        """The arm was seen at rest after the move of `moved_ns`, if that is still the last one."""
-        if self._commanding.acquire(blocking=False):  # held: another move is being handed over
+        """Record that the arm is at rest after the move of `moved_ns`, if that is the last one."""
+        if self._commanding.acquire(blocking=False):  # held: another move is being sent
             try:
                 if self._moved_ns == moved_ns:
                     self._moved_ns = None
@@ -369,38 +349,38 @@ class UrArm(ThreadedArm):
                 self._commanding.release()
 
     def _check(self, path: Sequence[Segment]) -> None:
-        """Every limit known here, then the controller's own."""
+        """Check a path against the rig's limits, then against the controller's."""
         assert self._status is not None
         self._guard.check(self.pose(), path)
         self._guard.check_joints(self._status.joints_deg)
         self._check_slider("every move would be too slow")
         for segment in path:
             if not self._call("isPoseWithinSafetyLimits", to_ur(segment.to)):
-                # The client says no as well when the program has ended under it.
+                # The client also answers no once its program has ended.
                 if self._stream.wait_for(lambda: self.state() is not ArmState.READY, _NEWS_S):
                     raise self._fault(self.state(), "cannot move")
                 x, y, z = segment.to.xyz_mm
                 raise RigError(
                     "arm",
-                    f"its controller holds ({x:.1f}, {y:.1f}, {z:.1f}) mm to be outside its "
-                    "safety limits or its reach",
+                    f"its controller reports ({x:.1f}, {y:.1f}, {z:.1f}) mm as outside its safety "
+                    "limits or its reach",
                 )
 
     def _check_slider(self, so: str) -> None:
-        """Raises ArmFault, which ends with `so`, if the pendant slows the arm down."""
+        """Raise ArmFault, with the consequence `so`, if the speed slider slows the arm down."""
         status = self._status
         if status is not None and status.speed_fraction < _FULL_SPEED:
             raise ArmFault(
                 "arm",
-                f"its speed slider stands at {status.speed_fraction:.0%}, so {so}: set it to "
+                f"its speed slider is at {status.speed_fraction:.0%}, so {so}: set it to "
                 "100 % at the pendant",
             )
 
     def _send(self, run: Run, segment: Segment) -> bool:
-        """Hand one move to the controller; False if a stop came first.
+        """Send one move to the controller; return False if a stop came first.
 
         Raises:
-            ArmFault: it was not taken.
+            ArmFault: it was not accepted.
         """
         self._stream.wait_for(lambda: not self._moves(), BEGIN_S)
         speed = segment.speed_mm_s / MM_PER_M
@@ -413,11 +393,11 @@ class UrArm(ThreadedArm):
             taken = self._call("moveL", to_ur(segment.to), speed, acceleration, True)
             self._moved_ns = time.monotonic_ns()
         if not taken:
-            raise self._fault(self.state(), "did not take a move")
+            raise self._fault(self.state(), "did not accept a move")
         return True
 
     def _follow_path(self, run: Run) -> None:
-        """Wait for each segment to end, and hand over the next one."""
+        """Wait for each segment to end, and send the next one."""
         for index, segment in enumerate(run.path):
             if index and not self._send(run, segment):
                 return
@@ -426,12 +406,12 @@ class UrArm(ThreadedArm):
                 return
             run.finished.append(times)
 
-    def _give_up(self) -> None:
-        if not (self._ask_control_to_stop() and self._wait_still()):
+    def _abort(self) -> None:
+        if not (self._stop_by_control() and self._wait_still()):
             self._end_program()
 
     def _await_segment(self, run: Run, segment: Segment) -> tuple[int, int] | None:
-        """Start and end of the move that was just sent; None if it was stopped."""
+        """Return start and end of the move that was just sent; None if it was stopped."""
 
         def slowed() -> bool:
             return self._status is not None and self._status.speed_fraction < _FULL_SPEED
@@ -442,24 +422,24 @@ class UrArm(ThreadedArm):
 
         begun = self._stream.wait_for(lambda: self._rose_ns is not None or ended(), BEGIN_S)
         if not begun and not self._is_at(segment.to):
-            raise ArmFault("arm", f"took a move and did not begin it within {BEGIN_S:g} s")
-        if not begun:  # a way of no length is over before a packet could say that it runs
+            raise ArmFault("arm", f"accepted a move but did not start it within {BEGIN_S:g} s")
+        if not begun:  # a move of no length ends before a packet can show it running
             now = self.now_ns()
             return now, now
         seconds = distance_mm(self.pose(), segment.to) / segment.speed_mm_s
         if not self._stream.wait_for(ended, 1.5 * seconds + OVERTIME_S):
-            raise ArmFault("arm", f"did not end a move of {seconds:.1f} s in time; it was stopped")
+            raise ArmFault("arm", f"did not finish a {seconds:.1f} s move in time; it was stopped")
         if not self.state().healthy:
-            self._end_program()  # so that nothing goes on when a person unlocks the stop
+            self._end_program()  # so that nothing continues when the stop is unlocked
             return None
         if not run.cancelled:
-            self._check_slider("the move was too slow and was given up")
+            self._check_slider("the move was too slow and was aborted")
         if run.cancelled or self._rose_ns is None or self._fell_ns is None:
             return None
         return (self._rose_ns, self._fell_ns) if self._is_at(segment.to) else None
 
-    def _ask_control_to_stop(self) -> bool:
-        """Return whether the control client took a stop, behind any move on its way to it."""
+    def _stop_by_control(self) -> bool:
+        """Stop over the control client, after any move in progress there; return success."""
         if self._control is None or self._lost is not None:
             return False
         if not self._commanding.acquire(timeout=COMMAND_S):
@@ -474,12 +454,12 @@ class UrArm(ThreadedArm):
         return True
 
     def _end_program(self) -> bool:
-        """End the controller's program by the text ports; whether it said that it did."""
+        """End the controller's program over the text ports; return whether it was confirmed."""
         deceleration = STOP_DECELERATION_MM_S2 / MM_PER_M
         return ports.end_program(self._settings.host, deceleration, PORT_S)
 
     def _wait_still(self) -> bool:
-        """Return whether a packet that was read from now on shows the arm at rest, in time."""
+        """Return whether a packet read from now on shows the arm at rest within `STILL_S`."""
         now_ns = time.monotonic_ns()
 
         def still() -> bool:
@@ -491,8 +471,8 @@ class UrArm(ThreadedArm):
     def _is_still(self) -> bool:
         return self._status is not None and _rests(self._status)
 
-    def _is_still_anew(self) -> bool:
-        """Return whether a new connection, made for this alone, shows the arm at rest in time."""
+    def _is_still_by_new_stream(self) -> bool:
+        """Return whether a new connection shows the arm at rest in time."""
         reader = RtdeReader(self._settings.host, PORT_S, PORT_S)
         end = time.monotonic() + PORT_S + STILL_S
         with contextlib.suppress(RtdeError):
@@ -527,7 +507,7 @@ class UrArm(ThreadedArm):
         except ControlError as error:
             self._end_program()
             stopped = self._lost is None and self._wait_still()
-            how = "it was stopped" if stopped else "it cannot be seen to stand still"
+            how = "it was stopped" if stopped else "it cannot be confirmed at rest"
             raise ArmFault("arm", f"lost its control client; {how}: {error}") from None
 
     def _last(self) -> Sample:
@@ -538,5 +518,5 @@ class UrArm(ThreadedArm):
 
 
 def _rests(status: UrStatus) -> bool:
-    """Return whether a packet shows the arm at rest; a program that was ended clears nothing."""
+    """Return whether a packet shows the arm at rest; an ended program leaves `move_runs` set."""
     return status.speed_mm_s < STILL_MM_S and not (status.move_runs and status.running)

@@ -1,10 +1,10 @@
-"""A fake for a Universal Robots e-Series controller on its three ports.
+"""A fake Universal Robots e-Series controller on its three ports.
 
-30004 RTDE, 29999 dashboard, 30003 scripts; the ports are fixed by the clients, so every robot has
-a loopback address of its own (127.0.0.2, .3, ...). ur_rtde 1.6.5's control, receive and dashboard
-clients take it for a PolyScope 5.11 (tested). Its clock may run faster than the host's.
+30004 RTDE, 29999 dashboard, 30003 scripts. The clients fix these ports, so every robot has its own
+loopback address (127.0.0.2, .3, ...). ur_rtde 1.6.5's control, receive and dashboard clients accept
+it as a PolyScope 5.11 (tested). Its clock may run faster than the host's.
 
-As a process of its own: ``python -m sliplab.rigs.devices.ur.fake 127.0.0.2``.
+To run it in a separate process: ``python -m sliplab.rigs.devices.ur.fake 127.0.0.2``.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _VECTORS = {
     ),
 }  # fmt: skip
 _UNKNOWN, _IN_USE = "NOT_FOUND", "IN_USE"
-"""The controller's answers, in place of a type."""
+"""The controller's error answers in place of a type."""
 _LAYOUT = TYPES | {"VECTOR3D": "3d", "VECTOR6INT32": "6i"}
 _COUNT = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
 
@@ -75,7 +75,7 @@ class Client:
 
     writer: asyncio.StreamWriter
     every: int = 1
-    """One packet in so many controller cycles."""
+    """Controller cycles per packet."""
     streaming: bool = False
     _names: list[str] = field(default_factory=list)
     _kinds: list[str] = field(default_factory=list)
@@ -84,7 +84,7 @@ class Client:
     _recipes: dict[int, list[str]] = field(default_factory=dict)
 
     def ask_outputs(self, body: bytes, cycle_hz: int) -> bytes:
-        """The answer to a request for outputs: recipe 1, or 0 if one is unknown, and types."""
+        """Answer a request for outputs: recipe 1, or 0 if one is unknown, and types."""
         (hz,) = struct.unpack_from(">d", body)
         self._names = [name for name in body[8:].decode().split(",") if name]
         self._kinds, self._readers = [_kind(name) for name in self._names], []
@@ -96,9 +96,9 @@ class Client:
         return b"\x01" + ",".join(self._kinds).encode()
 
     def ask_inputs(self, body: bytes, others: Sequence[Client]) -> bytes:
-        """The answer to a request for inputs.
+        """Answer a request for inputs.
 
-        An input belongs to the client that asked for it first, for as long as it stays.
+        An input belongs to the client that requested it first, until that client disconnects.
         """
         names = [name for name in body.decode().split(",") if name]
         taken = {name for other in others for recipe in other._recipes.values() for name in recipe}
@@ -113,14 +113,14 @@ class Client:
         """Write one packet's inputs into the program."""
         names = self._recipes.get(body[0], [])
         if not all("register" in name for name in names):
-            return  # an external force, which nothing here feels
+            return  # an external force, which is not simulated
         values = struct.unpack(">" + "".join(TYPES[_kind(name)] for name in names), body[1:])
-        # The command last: its parameters must be there when it is seen.
+        # The command last: its parameters must be set when it is read.
         for name, value in sorted(zip(names, values, strict=True), key=_command_last):
             program.write(name, value)
 
     def packet(self, program: UrProgram, t_s: float) -> bytes:
-        """The body of one packet of outputs."""
+        """Build the body of one packet of outputs."""
         if len(self._readers) != len(self._names):
             self._readers = [program.reader(name) for name in self._names]
         flat: list[int | float] = []
@@ -135,7 +135,7 @@ class Client:
 
 
 def send(writer: asyncio.StreamWriter, command: int, body: bytes) -> None:
-    """Send one RTDE package, unless the client has left."""
+    """Send one RTDE package, unless the client has disconnected."""
     if not writer.is_closing():
         writer.write(HEADER.pack(HEADER.size + len(body), command) + body)
 
@@ -158,23 +158,23 @@ def _kind(name: str) -> str:
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 VERSION = (5, 11, 1, 108318)
-"""PolyScope version that it says it is."""
+"""PolyScope version that it reports."""
 JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
 _TICK_S = 0.001
 _STALL_S = 0.02
-"""A fake that was kept from running this long must not blame its client for it."""
+"""Delay of the fake itself above which its watchdog is postponed, s."""
 
 
 class FakeUr(FakeController):
     """One fake robot.
 
     Args:
-        host, motion, rate, clock: as of any `FakeController`.
-        cycle_hz: controller cycles a controller second; 500 on the real one.
+        host, motion, rate, clock: as in `FakeController`.
+        cycle_hz: controller cycles per controller second; 500 on the real controller.
         digital_inputs: levels of the digital inputs by controller time in seconds.
-        faults: what will go wrong.
-        reach_mm: poses further from the base are outside its safety limits.
-        joints_deg: what `actual_q` says.
+        faults: faults to inject.
+        reach_mm: poses farther from the base are outside the safety limits.
+        joints_deg: the values of `actual_q`.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class FakeUr(FakeController):
 
     def start(self) -> None:
         """Open the ports and run. Raises OSError if one of them is taken."""
-        self._thread = LoopThread(f"stand-in {self.host}")
+        self._thread = LoopThread(f"fake {self.host}")
         try:
             self._thread.call(self._listen)
         except OSError:
@@ -212,29 +212,29 @@ class FakeUr(FakeController):
         self._thread.call(self._tick)
 
     def close(self) -> None:
-        """Cut every connection and give the ports back."""
+        """Close every connection and release the ports."""
         if self._thread is not None:
             self._thread.call(self._connections.cut)
             self._thread.close()
             self._thread = None
 
-    def happen(self, kind: Kind) -> None:
-        """Make something go wrong now."""
-        self._inside(lambda: self.program.happen(kind))
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now."""
+        self._inside(lambda: self.program.inject(kind))
 
-    def will(self, fault: Fault) -> None:
-        """Make something go wrong when its stage comes."""
+    def plan(self, fault: Fault) -> None:
+        """Inject a fault when its stage is reached."""
         self._inside(lambda: self.program.faults.add(fault))
 
     def restore_link(self) -> None:
-        """Take connections again after the link was cut or went silent."""
+        """Accept connections again after the link was cut or went silent."""
         assert self._thread is not None
         self._thread.call(self._connections.cut)
         self._silent = self._cut_off = False
         self._thread.call(self._listen)
 
     def restore(self) -> None:
-        """A person has put everything right: power, safety, remote control and link."""
+        """Clear every fault of power, safety, remote control and link, as an operator would."""
         self._inside(lambda: setattr(self.program, "powered", True))
         self.unlock()
         self.set_remote(True)
@@ -242,19 +242,19 @@ class FakeUr(FakeController):
             self.restore_link()
 
     def set_remote(self, on: bool) -> None:
-        """A person turns remote control on (or off, without ending the program)."""
+        """Switch remote control on (or off, without ending the program)."""
         self._inside(lambda: setattr(self.program, "remote", on))
 
     def set_slider(self, fraction: float) -> None:
-        """A person moves the pendant's speed slider to `fraction`, above 0 and up to 1."""
+        """Move the pendant's speed slider to `fraction`, above 0 and up to 1."""
         self._inside(lambda: setattr(self.program, "speed_fraction", fraction))
 
     def hang_program(self, hung: bool) -> None:
-        """The control program says that it runs, and takes no command any more."""
+        """Make the control program report that it runs, but ignore commands."""
         self._inside(lambda: setattr(self.program, "hung", hung))
 
     def unlock(self) -> None:
-        """A person unlocks a protective stop, or releases an emergency or safeguard stop."""
+        """Unlock a protective stop, or release an emergency or safeguard stop, at the pendant."""
         self._inside(lambda: setattr(self.program, "safety", Safety.NORMAL))
 
     def _inside(self, function: Callable[[], None]) -> None:
@@ -281,12 +281,12 @@ class FakeUr(FakeController):
             self._connections.listen(self.host, port, talk)
 
     async def _may_answer(self) -> None:
-        """Returns at once, or never while the controller is silent."""
+        """Return at once, or never while the controller is silent."""
         if self._silent:
             await asyncio.get_running_loop().create_future()
 
     def _tick(self) -> None:
-        """Every controller cycle that is due, each with its own packets."""
+        """Run every controller cycle that is due, each with its own packets."""
         asyncio.get_running_loop().call_later(_TICK_S, self._tick)
         due = int(self.clock.now_s() * self._cycle_hz)
         late_s = (due - self._cycle) / self._cycle_hz
@@ -355,7 +355,7 @@ class FakeUr(FakeController):
                 "Protective stop releasing" if program.unlock() else f"Failed to execute: {request}"
             )
         if request in {"play", "pause", "power on", "power off", "brake release", "shutdown"}:
-            return f"Failed to execute: {request}"  # known there, and not simulated here
+            return f"Failed to execute: {request}"  # exists, but is not simulated
         answers = {
             "get robot model": "UR5",
             "get serial number": "20205500000",
@@ -380,7 +380,7 @@ class FakeUr(FakeController):
 
 
 def _whole_script(text: str) -> str | None:
-    """The first whole script of `text`: a function up to its `end`, or one line."""
+    """Return the first complete script of `text`: a function up to its `end`, or one line."""
     if text.startswith("def "):
         end = text.find("\nend\n")
         return None if end < 0 else text[: end + 5]
@@ -389,10 +389,10 @@ def _whole_script(text: str) -> str | None:
 
 
 def main() -> None:
-    """Run one fake until the process is ended."""
-    parser = argparse.ArgumentParser(description="A fake for a Universal Robots controller.")
-    parser.add_argument("host", help="loopback address of its own, such as 127.0.0.2")
-    parser.add_argument("--rate", type=float, default=1.0, help="controller seconds a second")
+    """Run one fake until the process is terminated."""
+    parser = argparse.ArgumentParser(description="A fake Universal Robots controller.")
+    parser.add_argument("host", help="loopback address to listen on, such as 127.0.0.2")
+    parser.add_argument("--rate", type=float, default=1.0, help="controller seconds per second")
     arguments = parser.parse_args()
     with FakeUr(arguments.host, rate=arguments.rate):
         threading.Event().wait()

@@ -1,9 +1,9 @@
-"""The inside of a fake Universal Robots controller: safety, registers, the control program.
+"""State of a fake Universal Robots controller: safety, registers, the control program.
 
-Facts come from ur_rtde 1.6.5 (`scripts/rtde_control.script` in its source distribution) and the
-RTDE guide of the maker: input_int_register_0 holds a command, output_int_register_0 says 1 ready or
-2 done, output_int_register_2 carries the progress of an asynchronous move (bit 15: running).
-No sockets here; `rigs.devices.ur.fake` carries what this says.
+It follows ur_rtde 1.6.5 (`scripts/rtde_control.script` in its source distribution) and the vendor's
+RTDE guide: input_int_register_0 holds a command, output_int_register_0 is 1 ready or 2 done, and
+output_int_register_2 has the progress of an asynchronous move (bit 15: running). The sockets are in
+`rigs.devices.ur.fake`.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ class Runtime(IntEnum):
 
 
 class UrProgram:
-    """The controller's work in one cycle, and the values that it tells.
+    """The controller's work in one cycle, and the values that it reports.
 
     Args:
-        motion: where the tool centre point is.
-        reach_mm: poses further than this from the base are not within the safety limits.
-        joints_deg: what the joints are said to be; a fake has no joints.
+        motion: motion of the tool centre point.
+        reach_mm: poses farther than this from the base are outside the safety limits.
+        joints_deg: reported joint angles; a fake has no joints.
         digital_inputs: levels of the digital inputs by controller time.
-        cut: what to do for the faults that concern the link.
-        faults: what will go wrong.
-        rate: controller seconds a host second; the watchdog watches the host, in its seconds.
+        cut: called for the faults of the connection.
+        faults: faults to inject.
+        rate: controller seconds per host second; the watchdog counts the host's seconds.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class UrProgram:
         self.tcp = [0.0] * 6
         self.payload_kg = 0.0
         self.uploads = 0
-        self.faults = FaultPlan(faults, self.happen)
+        self.faults = FaultPlan(faults, self.inject)
         self._watchdog_s: float | None = None
         self._written_s = 0.0
         self._executing = False
@@ -89,18 +89,18 @@ class UrProgram:
         self._tcp_at: tuple[float, list[float]] = (math.nan, [])
         self._speed_mm_s = [0.0, 0.0, 0.0]
         self.foreign = False
-        """The program that runs is somebody else's: it reads no register and moves nothing."""
+        """True while another client's program runs, which reads no register and moves nothing."""
         self.hung = False
-        """The program says that it runs and takes no command."""
+        """True to report a running program that ignores commands."""
         self.speed_fraction = 1.0
-        """Position of the pendant's speed slider; moves are slower by it."""
+        """Position of the pendant's speed slider, which scales every move."""
         self.powered = True
         self.clock_shift_s = 0.0
-        """Error of the time in its packets."""
+        """Error of the time in the packets."""
         self.refused: list[str] = []
-        """Requests that it does not simulate."""
+        """Requests that are not simulated."""
         self._leg: tuple[Pose, float, float, float] | None = None
-        """Target, speed and acceleration of the last move, and the slider's place."""
+        """Target, speed and acceleration of the last move, and the slider's position."""
 
     @property
     def program_running(self) -> bool:
@@ -132,7 +132,7 @@ class UrProgram:
             self._command(self.ints_in[0])
 
     def write(self, name: str, value: int | float) -> None:
-        """A client wrote one input register."""
+        """Write one input register."""
         index = int(name.rsplit("_", 1)[1])
         if name.startswith("input_int"):
             self.ints_in[index] = int(value)
@@ -142,11 +142,11 @@ class UrProgram:
             self.doubles_in[index] = float(value)
 
     def postpone_watchdog(self, seconds: float) -> None:
-        """The fake itself stood still for `seconds` of controller time and heard nobody."""
+        """Postpone the watchdog by `seconds`, for which the fake itself was suspended."""
         self._written_s += seconds
 
     def script(self, text: str) -> None:
-        """A whole script came in on the script port: what ran before is ended by it."""
+        """Run a script from the script port; it ends the program that ran before."""
         if not self.remote:
             return
         self.end_program()
@@ -168,14 +168,14 @@ class UrProgram:
             self.refused.append(f"script {text.strip()[:60]!r}")
 
     def end_program(self) -> None:
-        """The program ends; the arm slows down and stays."""
+        """End the program; the arm decelerates to rest."""
         self.runtime, self.foreign = Runtime.STOPPED, False
         self._watchdog_s = self._leg = None
         self._executing = self._blocking = self._asynchronous = False
         self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
 
-    def happen(self, kind: Kind) -> None:
-        """One thing goes wrong now."""
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now."""
         if kind is Kind.EMERGENCY_STOP:
             self.safety = Safety.EMERGENCY_STOP
             self.end_program()
@@ -199,7 +199,7 @@ class UrProgram:
             self._cut(kind)
 
     def _pause(self) -> None:
-        """The arm slows down; a program waits to be resumed, which is not simulated."""
+        """Stop the arm; a program waits to be resumed, which is not simulated."""
         self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
         if self.program_running:
             self.runtime = Runtime.PAUSED
@@ -212,7 +212,7 @@ class UrProgram:
         return was
 
     def value(self, name: str, t_s: float) -> int | float | list[float]:
-        """The value of an RTDE output at `t_s`; what is not modelled is 0."""
+        """Return the value of an RTDE output at `t_s`; 0 where it is not modelled."""
         return self.reader(name)(t_s)
 
     def reader(self, name: str) -> Callable[[float], int | float | list[float]]:
@@ -239,11 +239,11 @@ class UrProgram:
         return known.get(name, lambda _: 0)
 
     def _velocity(self) -> list[float]:
-        """Return the tool centre point's velocity in the last cycle, m/s, without turning."""
+        """Return the tool centre point's linear velocity in the last cycle, m/s."""
         return [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0]
 
     def _tcp(self, t_s: float) -> list[float]:
-        """The tool centre point as RTDE says it; computed once a cycle."""
+        """Return the tool centre point as RTDE reports it; computed once per cycle."""
         if self._tcp_at[0] != t_s:
             self._tcp_at = t_s, to_ur(self.motion.pose(t_s))
         return self._tcp_at[1]
@@ -269,7 +269,7 @@ class UrProgram:
         elif command in {33, 34}:
             self._signal_async(False)
             self._leg = None
-            # stopJ is given in rad/s^2; without joints it is taken for m/s^2
+            # stopJ is given in rad/s^2; without joints it is treated as m/s^2
             self.motion.stop(values[0] * MM_PER_M, self._t)
             self._begin(bool(self.ints_in[1]))
         elif command == 17:
@@ -277,19 +277,19 @@ class UrProgram:
         elif command == 29:
             self.tcp = values[:6]
         elif command == 31:
-            self.happen(Kind.PROTECTIVE_STOP)
+            self.inject(Kind.PROTECTIVE_STOP)
         elif command == 35:
             self._watchdog_s, self._written_s = self._rate / values[0], self._t
         elif command == 36:
             far = distance_mm(from_ur(values[:6]), Pose((0, 0, 0), (0, 0, 0)))
             self.ints_out[1] = int(far <= self._reach_mm)
-        else:  # 255 is the command to end; any other one is not simulated: its program fails
+        else:  # 255 ends the program; other commands are not simulated and make it fail
             if command != 255:
                 self.refused.append(f"command {command}")
             self.end_program()
 
     def _follow_slider(self) -> None:
-        """A move goes on at another speed once the slider has been moved."""
+        """Change the speed of the current move once the slider has been moved."""
         if self._leg is None or self._leg[3] == self.speed_fraction:
             return
         to, speed, acceleration, _ = self._leg

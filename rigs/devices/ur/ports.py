@@ -1,8 +1,8 @@
-"""The two text ports of a Universal Robots controller, with a bound on every wait.
+"""The two text ports of a Universal Robots controller, with a timeout on every wait.
 
-29999 is the dashboard: one line for a request, one for an answer (the maker's dashboard guide for
-e-Series, PolyScope 5). 30003 takes scripts: whatever script comes ends the one that runs. Both
-need no program on the controller, so they are what is left when the control client is lost.
+29999 is the dashboard: one line per request and per answer (the vendor's dashboard guide for
+e-Series, PolyScope 5). 30003 accepts scripts: a new script ends the running one. Neither needs a
+program on the controller, so both remain available when the control client is lost.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 HEALTH_S = 1.0
-"""For each question to the dashboard about the arm's health, s."""
+"""Timeout of each dashboard request about the arm's health, s."""
 _LONGEST_LINE = 10_000
-"""Bytes; an answer has some 100."""
+"""Longest answer, bytes; normal answers have about 100."""
 
 
 class PortError(RuntimeError):
-    """A text port did not take or answer a request in time."""
+    """A text port did not accept or answer a request in time."""
 
 
 def dashboard(host: str, request: str, within_s: float) -> str:
-    """The dashboard's answer to one request, without its newline.
+    """Send one request to the dashboard and return its answer without the newline.
 
     Raises:
         PortError: no connection or no answer within `within_s` seconds.
@@ -41,10 +41,10 @@ def dashboard(host: str, request: str, within_s: float) -> str:
 
 
 def send_script(host: str, script: str, within_s: float) -> None:
-    """Hand a script to the controller, ending the program that runs there.
+    """Send a script to the controller, which ends the program that runs there.
 
     Raises:
-        PortError: it could not be handed over within `within_s` seconds.
+        PortError: it could not be sent within `within_s` seconds.
     """
     try:
         with socket.create_connection((host, SCRIPT_PORT), within_s) as link:
@@ -55,19 +55,19 @@ def send_script(host: str, script: str, within_s: float) -> None:
 
 
 def end_program(host: str, deceleration_m_s2: float, within_s: float) -> bool:
-    """End the controller's program, and any move with it, by one port or the other.
+    """End the controller's program, and any move with it, over one port or the other.
 
     Takes at most twice `within_s`.
 
     Returns:
-        Whether the controller said that it did. A script that was handed over may do it too, but
-        nothing says so: only a pose stream that is still there can show it.
+        whether the controller confirmed it. A script that was sent may end it too, but without a
+        confirmation: only a pose stream can show it.
     """
     try:
         if dashboard(host, "stop", within_s) == "Stopped":
             return True
     except PortError:
-        pass  # the other port may still take a script
+        pass  # the other port may still accept a script
     with contextlib.suppress(PortError):
         send_script(host, f"stopl({deceleration_m_s2:g})\n", within_s)
     return False
@@ -85,12 +85,12 @@ def _line(link: socket.socket, deadline: float) -> str:
             raise ConnectionError("the connection was closed")
         data += more
         if len(data) > _LONGEST_LINE:
-            raise ConnectionError("what comes is no line")
+            raise ConnectionError("the answer is not a line of text")
     return data.decode(errors="replace").strip()
 
 
 def read_health(host: str, notes: tuple[str, ...]) -> DeviceHealth:
-    """Return the report of a UR controller, by its dashboard (e-Series guide, PolyScope 5).
+    """Return the health report of a UR controller from its dashboard (PolyScope 5).
 
     Raises:
         PortError: it does not answer.

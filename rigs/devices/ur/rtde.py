@@ -1,11 +1,11 @@
-"""A reader of the Real-Time Data Exchange of Universal Robots (port 30004), every wait bounded.
+"""A reader of Universal Robots' Real-Time Data Exchange (port 30004) with a timeout on every wait.
 
 The driver commands the arm through ur_rtde but does not read poses through it: ur_rtde 1.6.5 skips
-a packet whenever two have arrived, hands out time and pose in separate calls, reads its
-set-up answers without a deadline, and connects again by itself. This reader keeps every packet
-whole, in order, with the host's time of its reception.
+a packet whenever two have arrived, returns time and pose in separate calls, reads its set-up
+answers without a timeout, and reconnects automatically. This reader keeps every packet complete, in
+order, with the host's time of its reception.
 
-Protocol (the maker's RTDE guide, version 2): big-endian `u16 size, u8 command`, then a body.
+Protocol (the vendor's RTDE guide, version 2): big-endian `u16 size, u8 command`, then a body.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from sliplab.rigs.core.capabilities import ArmState
 PORT = 30004
 HEADER = struct.Struct(">HB")
 TYPES = {"DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q", "VECTOR6D": "6d"}
-"""RTDE's names of the types that are used here, as `struct` writes them."""
-_LAST_LOOK_S = 0.01
+"""Format characters of `struct` by the RTDE names of the types used here."""
+_LAST_READ_S = 0.01
 REQUEST_PROTOCOL_VERSION, SETUP_OUTPUTS, SETUP_INPUTS = 86, 79, 73
 GET_VERSION, START, PAUSE, DATA, TEXT = 118, 83, 80, 85, 77
 _COMMANDS = {
@@ -33,7 +33,7 @@ _COMMANDS = {
 
 
 class RtdeError(RuntimeError):
-    """The exchange could not be set up, or has ended; the text says how."""
+    """The exchange could not be set up, or has ended; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,16 @@ class Packet:
     host_ns: int
     """Host's monotonic clock when its last byte was read."""
     values: tuple[float, ...]
-    """Every number of every output, flat, in the order asked for."""
+    """Every number of every output, flat, in the requested order."""
 
 
 class RtdeReader:
-    """One connection that asks for outputs and then only listens.
+    """One connection that requests outputs and then only receives.
 
     Args:
         host: name or address of the controller.
-        answer_s: how long connecting and each answer may take.
-        silence_s: how long the stream may be silent before it is taken for lost.
+        answer_s: timeout to connect and set up the stream.
+        silence_s: silence after which the stream counts as lost.
     """
 
     def __init__(self, host: str, answer_s: float, silence_s: float) -> None:
@@ -67,7 +67,7 @@ class RtdeReader:
         """Connect and start the stream of the named outputs.
 
         Raises:
-            RtdeError: no connection, no answer in time, or an output that is not known there.
+            RtdeError: no connection, no answer in time, or an output unknown to the controller.
         """
         deadline = time.monotonic() + self._answer_s
         try:
@@ -75,7 +75,7 @@ class RtdeReader:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             body = self._ask(REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2), deadline)
             if body != b"\x01":
-                raise RtdeError("the controller does not speak version 2 of RTDE")
+                raise RtdeError("the controller does not support version 2 of RTDE")
             self.version = struct.unpack(">4I", self._ask(GET_VERSION, b"", deadline)[:16])
             recipe = struct.pack(">d", frequency_hz) + ",".join(names).encode()
             answer = self._ask(SETUP_OUTPUTS, recipe, deadline)
@@ -94,11 +94,11 @@ class RtdeReader:
             raise
 
     def read(self) -> list[Packet]:
-        """Every packet that has come, at least one.
+        """Return every packet received, at least one.
 
         Raises:
             RtdeError: no packet came for `silence_s`, whatever else did; the connection has ended;
-                or what came is not the stream that was asked for.
+                or the data are not the requested stream.
         """
         deadline = time.monotonic() + self._silence_s
         packets: list[Packet] = []
@@ -114,7 +114,7 @@ class RtdeReader:
         return packets
 
     def close(self) -> None:
-        """Give the connection back; safe to call more than once and from another thread."""
+        """Close the connection; safe to call more than once and from another thread."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits in `read`
@@ -130,15 +130,15 @@ class RtdeReader:
             self._more(deadline)
 
     def _values(self, body: bytes) -> tuple[float, ...]:
-        """The numbers of one packet: of the recipe that was agreed on, whole, and finite."""
+        """Unpack the numbers of one packet; checks recipe, size, and that they are finite."""
         if len(body) != 1 + self._layout.size or body[0] != self._recipe:
             raise ConnectionError(
-                f"a packet of {len(body)} bytes of recipe {body[0] if body else 'none'} came; "
-                f"recipe {self._recipe} with {1 + self._layout.size} bytes was agreed on"
+                f"received a packet of {len(body)} bytes of recipe {body[0] if body else 'none'} "
+                f"instead of recipe {self._recipe} with {1 + self._layout.size} bytes"
             )
         values: tuple[float, ...] = self._layout.unpack_from(body, 1)
         if not all(map(math.isfinite, values)):
-            raise ConnectionError("a packet holds a number that is not finite")
+            raise ConnectionError("a packet has a number that is not finite")
         return values
 
     def _message(self) -> tuple[int, bytes] | None:
@@ -157,11 +157,11 @@ class RtdeReader:
         left = deadline - time.monotonic()
         if self._socket is None:
             raise ConnectionError("closed")
-        # A thread that was kept waiting itself still looks once at what has come meanwhile.
+        # A thread that was itself delayed still reads once what has arrived meanwhile.
         if left <= 0 and self._late:
-            raise TimeoutError("timed out; what came was no answer and no packet")
+            raise TimeoutError("timed out; no answer and no packet was received")
         self._late = left <= 0
-        self._socket.settimeout(max(left, _LAST_LOOK_S))
+        self._socket.settimeout(max(left, _LAST_READ_S))
         data = self._socket.recv(65536)
         if not data:
             raise ConnectionError("the controller closed the connection")
@@ -181,13 +181,13 @@ OUTPUTS = (
     "target_speed_fraction",
     "output_int_register_2",
 )
-"""Fields that the driver asks the stream for, in this order."""
+"""Output fields that the driver requests, in this order."""
 _EMERGENCY = 0b1110_0000
 """System, robot and any emergency stop."""
 _PROTECTIVE = 0b111_0001_1100
 """Protective stop, recovery mode, safeguard stop, violation, fault, stopped due to safety."""
 _STOPPED, _PLAYING = 1, 2
-"""Values of runtime_state; 0 stopping, 3 pausing, 4 paused and 5 resuming hold a program too."""
+"""Values of runtime_state; 0 stopping, 3 pausing, 4 paused and 5 resuming have a program too."""
 _MODE_RUNNING = 7
 _MODES = {
     -1: "no controller",
@@ -216,23 +216,23 @@ class UrStatus:
     sync: bool
     """Level of the sync input."""
     stopped: ArmState | None
-    """The safety stop that the arm is in."""
+    """Active safety stop."""
     running: bool
-    """Powered, brakes released, and the control program runs."""
+    """True if powered, with brakes released and the control program running."""
     program: bool
-    """The controller holds a program that has not ended: it plays, is paused, or is about to."""
+    """True if a program has not ended: it is playing, paused, or about to be."""
     playing: bool
-    """A program plays, ours or another."""
+    """True if a program is playing, ours or another."""
     off: str
-    """Reason for which the arm is not on, in the words of its robot mode; empty if it is."""
+    """Robot mode of an arm that is not switched on; empty if it is."""
     speed_fraction: float
     """Position of the pendant's speed slider, 0 to 1."""
     move_runs: bool
-    """The control script says that an asynchronous move runs."""
+    """True if the control script reports a running asynchronous move."""
 
 
 def status_of(values: Sequence[float], sync_input: int) -> UrStatus:
-    """The status in one packet's flat values."""
+    """Extract the status from one packet's flat values."""
     inputs, robot, safety, runtime, mode = (int(value) for value in values[19:24])
     stopped = None
     if safety & _EMERGENCY:

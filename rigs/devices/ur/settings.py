@@ -1,4 +1,4 @@
-"""Settings of a Universal Robots arm as a rig file gives them; cheap to import."""
+"""Settings of a Universal Robots arm, as rig files give them; cheap to import."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from sliplab.rigs.core.arm_settings import BaseArmSettings, Positive
 class UrSettings(BaseArmSettings):
     """A Universal Robots e-Series arm, PolyScope 5.6 to 5.x, in remote control.
 
-    Its ports are fixed by the client and by the controller: 30004 RTDE, 29999 dashboard, 30003
-    scripts. Segments are not blended: the arm comes to rest between two of them, so each is at
-    constant speed between its ramps.
+    Its ports are fixed: 30004 RTDE, 29999 dashboard, 30003 scripts. Segments are not blended: the
+    arm comes to rest between two of them, so each has constant speed between its ramps.
     """
 
     driver: Literal["ur"] = "ur"
     acceleration_mm_s2: Positive = 100.0
-    """At the start and the end of each segment."""
+    """Acceleration at the start and the end of each segment."""
     frequency_hz: Annotated[int, Field(ge=10, le=500)] = 500
-    """Rate of the pose stream; 500 is the controller's own."""
+    """Rate of the pose stream; 500 is the controller's native rate."""
     sync_input: Annotated[int, Field(ge=0, le=17)] = 0
-    """Bit of `actual_digital_input_bits` that the sync line is on (0 to 7: standard inputs)."""
+    """Bit of `actual_digital_input_bits` with the sync line (0 to 7: standard inputs)."""

@@ -98,12 +98,12 @@ def test_a_plane_by_hand_is_found_too(tmp_path: Path) -> None:
 def by_hand(points: dict[str, tuple[float, float, float]]) -> Any:
     """A person who jogs to places in the true plane's coordinates."""
 
-    def jogged(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
+    def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
         return [
             TRUE_PLANE.pose(Position(*points[word.removeprefix("touched ")])) for _, word in prompts
         ]
 
-    return jogged
+    return jog_poses
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def by_hand(points: dict[str, tuple[float, float, float]]) -> Any:
 def test_points_that_make_no_plane_write_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: Any, says: str
 ) -> None:
-    monkeypatch.setattr(teach, "jogged", by_hand(points))
+    monkeypatch.setattr(teach, "jog_poses", by_hand(points))
     with pytest.raises(RigError, match=says):
         teach.teach_plane_by_hand(session(lab(tmp_path)))
 
@@ -289,7 +289,7 @@ def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFi
         (("calibrate", "lens", "--rig", "LAB", "--columns", 60), "3 to 40"),
         (("calibrate", "lens", "--rig", "LAB", "--images", "FOLDER"), "holds no .png"),
         (("calibrate", "board", "--out", "board.svg"), "must end in .pdf or .png"),
-        (("teach", "plane", "--rig", "abacus"), "nor a rig that ships"),
+        (("teach", "plane", "--rig", "abacus"), "not one of the shipped rigs"),
     ],
 )
 def test_wrong_input_is_exit_2_and_moves_nothing(
@@ -337,7 +337,7 @@ def test_a_failed_measurement_is_exit_1_and_writes_nothing(
     path = lab(tmp_path, moved_mm=-6.0)
     before = path.read_text()
     assert run("teach", "plane", "--rig", path, "--yes") == console.FAILED
-    assert "met nothing within the hard limit" in capsys.readouterr().err
+    assert "found no plate within the hard limit" in capsys.readouterr().err
     assert path.read_text() == before
     assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
 
@@ -383,7 +383,7 @@ def test_a_person_who_says_stop_ends_it(
     def stops(*_: object) -> None:
         raise StopRequested
 
-    monkeypatch.setattr(teach, "jogged", stops)
+    monkeypatch.setattr(teach, "jog_poses", stops)
     path = lab(tmp_path)
     assert run("teach", "tool", "--rig", path, "--yes") == console.INTERRUPTED
     assert "stopped" in capsys.readouterr().err

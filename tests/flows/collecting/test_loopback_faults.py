@@ -104,11 +104,11 @@ CASES = [
          "its own watchdog ends a move after 1 s", 1 / WATCHDOG_HZ),
     Case("frame_camera", "unplug", "frame camera: the camera was unplugged", "plug it in",
          0.1 + POLL_S + STOP_S),
-    Case("event_camera", "stall", "event camera: neither event nor pulse", "look at cable",
+    Case("event_camera", "stall", "event camera: sent no event and no pulse", "check cable",
          1.0 + POLL_S + STOP_S),
-    Case("event_camera", "unplug", "event camera: the connection is gone", "look at its cable",
+    Case("event_camera", "unplug", "event camera: the connection is lost", "check its cable",
          POLL_S + STOP_S),
-    Case("sync_box", "reset", "sync box: .*began anew", "start the trial again", POLL_S + STOP_S),
+    Case("sync_box", "reset", "sync box: .*restarted", "start the trial again", POLL_S + STOP_S),
     Case("sync_box", "unplug", "sync box: the connection broke", "Plug it in", POLL_S + STOP_S),
 ]  # fmt: skip
 
@@ -139,7 +139,7 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
             if case.device == "frame_camera":
                 cast("Any", work.rig.frames).device.unplug()
             else:
-                stage.happen(case.device, case.kind)
+                stage.inject(case.device, case.kind)
 
         with once_sliding(stage, happen) as happened:
             with pytest.raises(RigError, match=f"{case.says}.*{case.advises}") as raised:
@@ -227,6 +227,6 @@ def test_a_second_program_gets_no_arm_that_slides(scene: tuple[Loopback, RunRequ
         with once_sliding(stage, take_it) as tried:
             take_next(work)
         _, said = tried.result(SILENCE_S)
-    assert said == "arm: runs somebody's program; end it at the pendant first"
+    assert said == "arm: a program is already running on it; end it at the pendant first"
     assert (work.taken, work.retaken) == (1, 0)
     assert len(campaign.committed()) == len(good) + 1

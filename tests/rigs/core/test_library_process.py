@@ -42,13 +42,13 @@ def test_calls_and_refusals(process: LibraryProcess) -> None:
         process.call("fail", within_s=20.0)
     assert process.call("any", within_s=20.0) == "any"
     process.end()
-    with pytest.raises(LibraryError, match="the echo is gone"):
+    with pytest.raises(LibraryError, match="the echo has exited"):
         process.call("any", within_s=20.0)
     process.end()
 
 
 def test_a_death_says_what_the_library_said_last(process: LibraryProcess) -> None:
-    with pytest.raises(LibraryError, match=r"the echo died \(it said:   what\(\): no . packet\)"):
+    with pytest.raises(LibraryError, match=r"died \(its last output:   what\(\): no . packet\)"):
         process.call("die", within_s=20.0)
     process.close()
 
@@ -57,7 +57,7 @@ def test_a_call_that_is_too_late_ends_the_child(process: LibraryProcess) -> None
     began = time.monotonic()
     with pytest.raises(LibraryError, match=r"late: no answer within 0\.2 s"):
         process.call("late", 60.0, within_s=0.2)
-    with pytest.raises(LibraryError, match="is gone"):
+    with pytest.raises(LibraryError, match="has exited"):
         process.call("any", within_s=20.0)
     assert time.monotonic() - began < 30.0
     process.close()
@@ -66,7 +66,7 @@ def test_a_call_that_is_too_late_ends_the_child(process: LibraryProcess) -> None
 def test_a_computer_that_stood_still_is_no_fault_of_the_child(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0, patient=True)
+    process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0, ignore_suspend=True)
     pipe, now_ns = process._pipe, time.monotonic_ns
     late_ns = [0]
 

@@ -66,7 +66,7 @@ def test_masses_are_read_with_their_unit(said: str, kg: float) -> None:
 @pytest.mark.parametrize("said", ["", "0.2", "0 kg", "-1 kg", "2 lb", "heavy", "1,5 kg"])
 def test_a_mass_that_cannot_be_read_is_refused_before_anybody_is_asked(said: str) -> None:
     asked = Person()
-    with pytest.raises(RigError, match=r"expected such as 0\.205 kg"):
+    with pytest.raises(RigError, match=r"expected a mass such as 0\.205 kg"):
         PersonAtPlate(asked, 0.165).ask("changeover", "Mount it.", said)
     assert asked.asked == []
 

@@ -98,7 +98,7 @@ def test_closing_says_that_the_arm_was_not_seen_to_stand_and_closes_all() -> Non
     notes = watched(rig)
     rig.arm = Unstoppable(rig.arm)
     ended: list[bool] = []
-    rig.ending = (lambda: ended.append(True),)
+    rig.on_close = (lambda: ended.append(True),)
     with pytest.raises(ArmFault, match=Unstoppable.TEXT):
         rig.close()
     closed = [call for call in notes if call.endswith("close")]
@@ -224,7 +224,7 @@ def test_a_plate_that_nobody_has_caught_is_told_of(device: str) -> None:
     assert rig.plate is not None
     mass = plan.mass_kg(plan.trials[0])
     rig.operator.ask("changeover", "Mount the plate.", f"{mass} kg")
-    with pytest.raises(RigError, match=r"does not answer .*\. The plate was let go .* catch it"):
+    with pytest.raises(RigError, match=r"does not answer .*\. The plate was released .* catch it"):
         run(rig, plan, Memory())
 
 

@@ -11,7 +11,7 @@ from sliplab.protocols.program import Position
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
-from sliplab.rigs.core.teaching import Creep, jogged, look, stir, touch
+from sliplab.rigs.core.teaching import Creep, grab_frames, jog_poses, press_in_circles, touch
 from sliplab.rigs.core.touching import RateTouch
 from sliplab.storage.streams import FrameChunk
 from tests.rigs.core.test_rig import after_the_stop, make_rig, watched
@@ -118,7 +118,7 @@ def test_an_arm_that_somebody_else_stops_is_not_blamed_on_the_plane(when: int) -
 
 def test_what_is_met_before_creeping_stops_the_arm() -> None:
     rig = off(make_rig(), -4.0)  # the plate stands 4 mm before where it should be
-    with pytest.raises(RigError, match=r"met something .* before the plane .*--clearance"):
+    with pytest.raises(RigError, match=r"made contact .* before the plane .*--clearance"):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert depth(rig) <= -1.5
     assert rig.arm.state() is ArmState.READY
@@ -186,7 +186,7 @@ def test_markers_that_never_move_end_the_touch_soon_after_the_events() -> None:
 def test_events_that_are_looked_for_elsewhere_are_no_touch() -> None:
     rig = make_rig()
     rig.centre_px = (60.0, 60.0)
-    with pytest.raises(RigError, match="met nothing"):
+    with pytest.raises(RigError, match="found no plate"):
         touch(rig, 0.0, 0.0, QUICK, 1)
 
 
@@ -209,7 +209,7 @@ def test_the_rate_is_that_of_touching_off() -> None:
 
 def test_a_person_jogs_and_confirms() -> None:
     rig = make_rig()
-    poses = jogged(rig, [("", "touched centre"), ("", "touched right"), ("", "touched above")])
+    poses = jog_poses(rig, [("", "touched centre"), ("", "touched right"), ("", "touched above")])
     places = [rig.plate_frame.position(pose.xyz_mm) for pose in poses]
     assert [round(p.x_mm) for p in places] == [0, 12, 0]
     assert all(abs(p.depth_mm) < 0.15 for p in places)
@@ -219,22 +219,22 @@ def test_a_person_who_says_stop_is_heard() -> None:
     rig = make_rig()
     rig.operator.ask = lambda task, prompt, expected: False  # type: ignore[method-assign]
     with pytest.raises(StopRequested):
-        jogged(rig, [("", "touched centre")])
+        jog_poses(rig, [("", "touched centre")])
 
 
 def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose() -> None:
     rig = make_rig()
     rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
     rig.arm.start([type_segment(rig, -20.0)])
-    with pytest.raises(RigError, match="still moves"):
-        jogged(rig, [("", "touched centre")])
+    with pytest.raises(RigError, match="is still moving"):
+        jog_poses(rig, [("", "touched centre")])
     fault = {"kind": "arm_protective_stop", "at_s": 0.1, "since": "trial"}
     rig = make_rig(faults=[fault])
     assert rig.simulation is not None
     rig.simulation.begin_trial(1)
     rig.clock.wait(0.5)
     with pytest.raises(ArmFault, match="protective stop"):
-        jogged(rig, [("", "elsewhere")])
+        jog_poses(rig, [("", "elsewhere")])
 
 
 def type_segment(rig: Rig, depth_mm: float) -> Any:
@@ -247,14 +247,14 @@ def test_looking_gives_frames_and_moves_nothing() -> None:
     rig = make_rig()
     rig.frames.set_region(64, 64)
     notes = watched(rig)
-    chunk = look(rig)
+    chunk = grab_frames(rig)
     assert chunk.images.shape[1:] == (64, 64)
     assert "arm.start" not in notes
 
 
 def test_stirring_shows_the_whole_skin() -> None:
     rig = make_rig()
-    counts = stir(rig, 2.4, 1.0, 2.0, 1)
+    counts = press_in_circles(rig, 2.4, 1.0, 2.0, 1)
     assert counts.shape == (2, 480, 640)
     assert counts.sum(axis=(1, 2)).min() > 10_000
     rows, columns = np.nonzero(counts.sum(axis=0) > 3)
@@ -269,6 +269,6 @@ def test_a_stop_while_stirring_stops_the_arm() -> None:
     rig.should_stop = lambda: next(asked, True)
     notes = watched(rig)
     with pytest.raises(StopRequested):
-        stir(rig, 2.4, 1.0, 2.0, 1)
+        press_in_circles(rig, 2.4, 1.0, 2.0, 1)
     assert notes.index("arm.stop") < notes.index("events.stop")
     assert depth(rig) <= -5.0 + 1e-6

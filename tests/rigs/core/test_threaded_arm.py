@@ -25,7 +25,7 @@ def watch(path: list[Segment], pause_s: float = 0.05) -> list[tuple[float, float
             free_s = t + ramp_s
         if not motion.moving(t) and free_s > 1e8:
             free_s = t + pause_s
-        times = seen.see(round(t * 1e9), motion.pose(t))
+        times = seen.add(round(t * 1e9), motion.pose(t))
         if times is not None:
             found.append((times[0] / 1e9, times[1] / 1e9))
     return found

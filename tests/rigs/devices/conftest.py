@@ -112,6 +112,12 @@ def closed(arm: Arm) -> None:
         arm.close()
 
 
+def reconnect(arm: Arm) -> None:
+    """Close the arm and connect again, as the next command at a rig would."""
+    closed(arm)
+    arm.connect()
+
+
 @pytest.fixture
 def abb_pair() -> Iterator[MakeAbb]:
     """Makes an ABB fake and the driver on it; both are closed after the test."""

@@ -29,7 +29,7 @@ def test_a_universal_robot(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     assert found.notes == ("in remote control", "sync line on digital input 3")
     robot.set_remote(False)
     assert arm.health().notes[0] == "NOT remote control"
-    robot.happen(Kind.SILENCE)
+    robot.inject(Kind.SILENCE)
     with pytest.raises(ArmFault, match="check its power and network"):
         arm.health()
 
@@ -39,7 +39,7 @@ def test_an_abb_by_its_web_services() -> None:
     settings = AbbSettings(host=host, rws_port=8080, egm_bind=host, limits=LIMITS)  # type: ignore[arg-type]
     with FakeAbb(host, 8080, (host, settings.egm_port)) as robot:
         arm = AbbArm(settings)
-        with pytest.raises(ArmFault, match="cannot be asked"):
+        with pytest.raises(ArmFault, match="cannot report its health"):
             arm.health()
         arm.connect()
         try:
@@ -47,9 +47,9 @@ def test_an_abb_by_its_web_services() -> None:
             assert (found.model, found.serial) == ("IRB120 stand-in", "120-000000")
             assert found.firmware == "RobotWare 6.08.00.01"
             assert found.notes[:2] == ("mode AUTO", "controller motoron")
-            assert found.notes[2] == "stopped by its controller 1 s after this computer is gone"
+            assert found.notes[2] == "stopped by its controller 1 s after this computer fails"
             assert found.notes[3].startswith("poses_missing ")
-            robot.happen(Kind.SILENCE)
+            robot.inject(Kind.SILENCE)
             with pytest.raises(ArmFault, match="do not answer"):
                 arm.health()
         finally:

@@ -93,7 +93,7 @@ def test_a_camera_on_usb_is_asked_by_names_that_the_library_has() -> None:
     assert (health.serial, health.firmware) == ("DXA00001", "7, logic 9")
     assert {"link super", "read-out constant 1000"} <= set(health.notes)
     usb.answers["isRunning"] = False
-    with pytest.raises(RigError, match="connection is gone"):
+    with pytest.raises(RigError, match="connection is lost"):
         source.health(DvxplorerSettings())
 
 

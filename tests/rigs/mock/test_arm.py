@@ -62,7 +62,7 @@ def test_the_operator_mounts_a_mass_and_clears_a_stop() -> None:
     assert devices.plate.mass_kg() == 0.245
     assert devices.operator.ask("clean", "Clean the skin.", "")
     assert devices.plate.mass_kg() == 0.245
-    with pytest.raises(RigError, match="expected such as"):
+    with pytest.raises(RigError, match="expected a mass such as"):
         devices.operator.ask("changeover", "Mount the plate.", "heavy")
     assert [asked.task for asked in devices.operator.asked] == ["changeover", "clean", "changeover"]
 

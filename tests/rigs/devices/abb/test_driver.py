@@ -17,7 +17,7 @@ from sliplab.rigs.devices import abb
 from sliplab.rigs.devices.abb import driver
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.rws import REQUEST_S, START_REQUESTS
-from tests.rigs.devices.conftest import EGM_PORT, MakeAbb, abb_settings
+from tests.rigs.devices.conftest import EGM_PORT, MakeAbb, abb_settings, reconnect
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -124,9 +124,9 @@ def test_a_stop_from_outside_ends_the_path(abb_pair: MakeAbb, kind: Kind, state:
     assert arm.progress().finished == ()
     arm.stop()
     if state is not ArmState.READY:
-        fails(arm.recover, 7 * REQUEST_S, state.value)
+        fails(lambda: reconnect(arm), 7 * REQUEST_S, state.value)
         robot.restore()
-        arm.recover()
+        reconnect(arm)
         assert arm.state() is ArmState.READY
 
 
@@ -137,9 +137,9 @@ def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(
     arm, robot = abb_pair(arm={"watchdog_s": None})
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
-    robot.happen(kind)
+    robot.inject(kind)
     lost_s = driver.FAILURES * (driver.MONITOR_S + 2 * REQUEST_S)
-    fails(arm.stop, 4 * REQUEST_S, "cannot be reached to be stopped")
+    fails(arm.stop, 4 * REQUEST_S, "cannot be reached to stop it")
     until(lambda: arm.state() is ArmState.DISCONNECTED, lost_s + BUSY_S)
     assert arm.progress().done
     assert robot.moving()  # nothing on the controller knows
@@ -160,7 +160,7 @@ def test_a_link_lost_while_connecting_or_uploading(
 
 def test_a_link_lost_while_idle(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
-    robot.happen(Kind.LINK_CUT)
+    robot.inject(Kind.LINK_CUT)
     lost_s = driver.FAILURES * (driver.MONITOR_S + 2 * REQUEST_S)
     until(lambda: arm.state() is ArmState.DISCONNECTED, lost_s + BUSY_S)
     fails(lambda: arm.start(SLIDE), REQUEST_S, "check power and network")

@@ -17,7 +17,14 @@ from sliplab.rigs.devices.abb import driver
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.rws import REQUEST_S, WebRefused, WebServices
-from tests.rigs.devices.conftest import EGM_PORT, MakeAbb, abb_settings, egm_message, mm_after_kill
+from tests.rigs.devices.conftest import (
+    EGM_PORT,
+    MakeAbb,
+    abb_settings,
+    egm_message,
+    mm_after_kill,
+    reconnect,
+)
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -64,11 +71,11 @@ def send(sender: str, to: str, data: bytes) -> None:
 def test_a_stop_after_a_lost_link_was_noticed_is_a_fault(abb_pair: MakeAbb, kind: Kind) -> None:
     arm, robot = abb_pair(arm={"watchdog_s": None})
     sliding(arm, robot)
-    robot.happen(kind)
+    robot.inject(kind)
     until(lambda: arm.state() is ArmState.DISCONNECTED, LOST_S)
     fails(arm.stop, 8 * REQUEST_S, "its path of 9 s runs to its end: press its emergency stop")
     assert robot.moving()
-    fails(arm.close, 8 * REQUEST_S, "cannot be reached to be stopped")
+    fails(arm.close, 8 * REQUEST_S, "cannot be reached to stop it")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind((robot.host, EGM_PORT))  # given back all the same
 
@@ -87,9 +94,9 @@ def test_a_path_thread_that_fails_says_so_and_stops_the_arm(
 ) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
-    monkeypatch.setattr(arm, "_why_given_up", lambda: 1 / 0)
+    monkeypatch.setattr(arm, "_abort_reason", lambda: 1 / 0)
     until(lambda: arm._run.done, BUSY_S)
-    fails(arm.progress, 0.0, "its path was given up: ZeroDivisionError")
+    fails(arm.progress, 0.0, "its path was aborted: ZeroDivisionError")
     until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
 
 
@@ -97,22 +104,22 @@ def test_a_path_whose_start_was_not_answered_may_run(abb_pair: MakeAbb) -> None:
     """The controller takes the start and is never heard of again."""
     arm, robot = abb_pair(arm={"watchdog_s": None})
     robot.mute_after_start = True
-    fails(lambda: arm.start(SLIDE), 25 * REQUEST_S, "did not take a path")
+    fails(lambda: arm.start(SLIDE), 25 * REQUEST_S, "did not accept the path")
     assert robot.running
-    fails(arm.stop, 8 * REQUEST_S, "cannot be reached to be stopped")
+    fails(arm.stop, 8 * REQUEST_S, "cannot be reached to stop it")
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_the_controller_stops_the_arm_when_the_link_is_lost(abb_pair: MakeAbb, kind: Kind) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
-    robot.happen(kind)
+    robot.inject(kind)
     until(lambda: robot.watchdog_stops == 1, 1.0 + BUSY_S)
     assert not robot.running
     until(lambda: not robot.moving(), 1.0)
     fails(arm.stop, 8 * REQUEST_S, "its controller stops it 1 s after the last beat")
     robot.restore()
-    arm.recover()
+    reconnect(arm)
     assert arm.state() is ArmState.READY
     arm.stop()
 
@@ -152,7 +159,7 @@ def test_a_stop_for_want_of_beats_is_told(abb_pair: MakeAbb) -> None:
     assert arm._watchdog is not None
     arm._watchdog.pause()
     until(lambda: arm._run.done, 1.0 + BUSY_S)
-    fails(arm.progress, 0.0, "was stopped by its controller's watchdog: no beat")
+    fails(arm.progress, 0.0, "was stopped by its controller's watchdog: no heartbeat")
     arm.start([Segment(at(0.0), 20.0)])  # watched again
     until(lambda: arm.progress().done, 5.0)
     assert len(arm.progress().finished) == 1
@@ -218,20 +225,20 @@ def test_packets_without_time_are_refused(abb_pair: MakeAbb) -> None:
 def test_a_clock_that_falls_back_ends_the_path(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
-    robot.happen(Kind.CLOCK_BACK)
+    robot.inject(Kind.CLOCK_BACK)
     until(lambda: arm.state() is ArmState.DISCONNECTED, BUSY_S)
     until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
     until(lambda: arm._run.done, BUSY_S)
-    fails(arm.progress, 0.0, r"clock went back by .* its path was given up")
-    fails(lambda: arm.start(SLIDE), 0.0, r"clock went back by (4\.9|5\.0)\d+ s")
-    arm.recover()
+    fails(arm.progress, 0.0, r"clock jumped back by .* its path was aborted")
+    fails(lambda: arm.start(SLIDE), 0.0, r"clock jumped back by (4\.9|5\.0)\d+ s")
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
 def test_lost_packets_are_in_the_record(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     before = arm.describe()["poses_missing"]
-    robot.happen(Kind.PACKETS_LOST)
+    robot.inject(Kind.PACKETS_LOST)
     until(lambda: arm.describe()["poses_missing"] >= before + PACKETS_LOST, 1.0 + BUSY_S)
 
 
@@ -241,17 +248,17 @@ def test_lost_packets_are_in_the_record(abb_pair: MakeAbb) -> None:
 def test_a_speed_ratio_below_100_percent_is_refused(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     robot.speed_percent = 50.0
-    fails(lambda: arm.start(SLIDE), 10 * REQUEST_S, "speed ratio stands at 50 %.*100 %")
+    fails(lambda: arm.start(SLIDE), 10 * REQUEST_S, "speed ratio is 50 %.*100 %")
     assert not robot.running
     arm.close()
-    fails(arm.connect, 10 * REQUEST_S, "speed ratio stands at 50 %")
+    fails(arm.connect, 10 * REQUEST_S, "speed ratio is 50 %")
 
 
 def test_a_speed_ratio_changed_in_mid_motion_stops_the_arm(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
     robot.speed_percent = 25.0
-    until(lambda: arm._run.done, driver.LOOK_S + BUSY_S)
+    until(lambda: arm._run.done, driver.STATUS_S + BUSY_S)
     fails(arm.progress, 0.0, "speed ratio set to 25 % while it moved")
     until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
 
@@ -259,9 +266,11 @@ def test_a_speed_ratio_changed_in_mid_motion_stops_the_arm(abb_pair: MakeAbb) ->
 def test_a_program_of_somebody_else_is_neither_run_nor_ended(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair(connected=False)
     robot.pointer = "palletising"
-    fails(arm.connect, 14 * REQUEST_S, "somebody else's program paused in module palletising")
+    fails(arm.connect, 14 * REQUEST_S, "another user.s program paused in module palletising")
     robot.pointer, robot.entry = "motion_program_exec", "main"
-    fails(arm.connect, 14 * REQUEST_S, "task T_ROB1 that begins with main, so that starting it")
+    fails(
+        arm.connect, 14 * REQUEST_S, "task T_ROB1 with the entry routine main, so that starting it"
+    )
     assert not robot.running
     robot.entry = "Motion_Program_Main"
     arm.connect()
@@ -271,8 +280,8 @@ def test_a_program_of_somebody_else_is_neither_run_nor_ended(abb_pair: MakeAbb) 
 def test_motors_that_are_switched_off_end_the_path(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
-    robot.happen(Kind.POWER_OFF)
-    until(lambda: arm.progress().done, driver.LOOK_S + BUSY_S)
+    robot.inject(Kind.POWER_OFF)
+    until(lambda: arm.progress().done, driver.STATUS_S + BUSY_S)
     assert arm.state() is ArmState.NOT_RUNNING
     arm.stop()
 
@@ -283,7 +292,7 @@ def test_motors_that_are_switched_off_end_the_path(abb_pair: MakeAbb) -> None:
 def test_sessions_are_logged_out_of(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     for _ in range(5):
-        arm.recover()
+        reconnect(arm)
     assert robot.sessions <= 3
     arm.close()
     assert robot.sessions == 0

@@ -23,7 +23,7 @@ from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
 from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
-from tests.rigs.devices.conftest import closed, mm_after_kill
+from tests.rigs.devices.conftest import closed, mm_after_kill, reconnect
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -134,27 +134,27 @@ def test_a_move_that_is_not_answered_is_a_fault(
     until(lambda: arm.state() is ArmState.DISCONNECTED, 2.0 + BUSY_S)
     until(lambda: arm.progress().done, 1.0)
     fails(lambda: arm.start(SLIDE), 0.1, "disconnected")
-    fails(arm.stop, 4 * driver.ANSWER_S, "was not seen at rest .* piece of at most 0.25 s may have")
+    fails(arm.stop, 4 * driver.ANSWER_S, "is not confirmed at rest .* moved on for at most 0.25 s")
     robot.restore()
-    arm.recover()
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_connecting_or_idle(pair: MakePair, kind: Kind) -> None:
     arm, robot = pair(connected=False, faults=[Fault(kind, Stage.CONNECTING)])
-    fails(arm.connect, 2 * driver.ANSWER_S, "the server takes one client")
+    fails(arm.connect, 2 * driver.ANSWER_S, "the server accepts one client")
     robot.restore()
     arm.connect()
-    robot.happen(kind)
-    fails(arm.pose, driver.ANSWER_S, "look at it, then connect again")
+    robot.inject(kind)
+    fails(arm.pose, driver.ANSWER_S, "check it, then connect again")
     assert arm.state() is ArmState.DISCONNECTED
 
 
 def test_a_second_client_waits_and_is_told_why(pair: MakePair) -> None:
     arm, robot = pair()
     second = AbbSocketArm(settings(robot.host))
-    fails(second.connect, 2 * driver.ANSWER_S, "the server takes one client")
+    fails(second.connect, 2 * driver.ANSWER_S, "the server accepts one client")
     arm.close()
     second.connect()
     second.close()
@@ -172,7 +172,7 @@ def test_a_lost_link_in_mid_motion_ends_with_its_piece(pair: MakePair) -> None:
     assert distance_mm(cut, robot.pose()) < 40.0 * 0.25 + 1.0
     assert arm.state() is ArmState.DISCONNECTED
     arm.stop()
-    arm.recover()
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
@@ -184,9 +184,9 @@ def test_a_stop_that_nobody_can_confirm_is_a_fault(
     arm, robot = pair()
     arm.start([Segment(at(90.0), 40.0)])
     until(lambda: robot.pose().xyz_mm[1] > 5.0, 5.0)
-    robot.happen(kind)
+    robot.inject(kind)
     for action in (arm.stop, arm.stop, arm.close):
-        fails(action, 2.0 + 4 * driver.ANSWER_S, "was not seen at rest")
+        fails(action, 2.0 + 4 * driver.ANSWER_S, "is not confirmed at rest")
 
 
 KILLED = """
@@ -206,7 +206,7 @@ def test_a_path_thread_that_fails_says_so(pair: MakePair, monkeypatch: pytest.Mo
     monkeypatch.setattr(driver, "between", lambda *_: 1 / 0)
     arm.start(SLIDE)
     until(lambda: arm._run.done, BUSY_S)
-    fails(arm.progress, 0.0, "its path was given up: ZeroDivisionError")
+    fails(arm.progress, 0.0, "its path was aborted: ZeroDivisionError")
     arm.stop()
     assert not robot.moving()
 
@@ -223,7 +223,7 @@ def test_an_arm_stands_a_piece_after_the_program_was_killed(pair: MakePair) -> N
     [
         (struct.pack(">H7f", 1, math.nan, 0, 0, 1, 0, 0, 0), "a number that is not finite"),
         (struct.pack(">H7f", 1, 0, 0, math.inf, 1, 0, 0, 0), "a number that is not finite"),
-        (struct.pack(">H7f", 1, 0, 0, 0, 0, 0, 0, 0), "no rotation"),
+        (struct.pack(">H7f", 1, 0, 0, 0, 0, 0, 0, 0), "norm is not 1"),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "begins with 18516, not 0 or 1"),
         (struct.pack(">H2f", 1, 0, 0), "no answer to POSE"),
     ],
@@ -258,4 +258,4 @@ def test_what_the_server_refuses_is_an_error(pair: MakePair) -> None:
     finally:
         link.close()
     with pytest.raises(ValueError, match="clock back is not simulated"):
-        robot.happen(Kind.CLOCK_BACK)
+        robot.inject(Kind.CLOCK_BACK)

@@ -128,7 +128,7 @@ def test_a_promised_stamp_that_is_missing_ends_the_run(until: Until) -> None:
     device = Device(Result(0, ChunkTimestamp=SimpleNamespace(Value=0)))
     with grabbing(device) as grab:
         until(lambda: grab.fault is not None)
-        assert "says no time" in str(grab.fault)
+        assert "has no time stamp" in str(grab.fault)
 
 
 def test_an_exposure_end_that_comes_late_is_waited_for_and_one_that_never_comes_given_up(

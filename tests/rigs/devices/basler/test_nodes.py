@@ -143,10 +143,10 @@ def test_a_camera_with_a_stored_user_set_grabs_as_the_rig_file_says(user_set: st
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"gain_db": 6.0}, r"Gain = 6\.0: the stand-in simulates Gain 0\.0, not 6\.0"),
-        ({"exposure_us": 1000}, r"the stand-in simulates ExposureTime 2000\.0, not 1000"),
-        ({"trigger": "software"}, "the stand-in simulates TriggerSource Line1 or Line3, not Soft"),
-        ({"trigger": "free run"}, "the stand-in simulates AcquisitionFrameRateEnable False"),
+        ({"gain_db": 6.0}, r"Gain = 6\.0: the fake simulates Gain 0\.0, not 6\.0"),
+        ({"exposure_us": 1000}, r"the fake simulates ExposureTime 2000\.0, not 1000"),
+        ({"trigger": "software"}, "the fake simulates TriggerSource Line1 or Line3, not Soft"),
+        ({"trigger": "free run"}, "the fake simulates AcquisitionFrameRateEnable False"),
         ({"trigger_line": "Line9"}, "trigger_line = Line9: .* triggered by Line1, Line3"),
         ({"user_set": "HighGain"}, "user_set = HighGain: this camera has Default, UserSet1"),
     ],
@@ -162,7 +162,7 @@ def test_a_stand_in_refuses_another_trigger_than_that_of_a_frame() -> None:
         nodes = camera.device.GetNodeMap()
         nodes.GetNode("TriggerSelector").Value = "FrameBurstStart"
         nodes.GetNode("TriggerMode").Value = "On"
-        with pytest.raises(RigError, match="trigger of FrameStart alone, not FrameBurstStart On"):
+        with pytest.raises(RigError, match="only a trigger of FrameStart, not FrameBurstStart On"):
             camera.start()
 
 
@@ -199,9 +199,9 @@ def test_a_rate_that_the_camera_cannot_keep_is_refused_at_the_start() -> None:
     ("settings", "message"),
     [
         ({"exposure_us": 20_000}, "must be at most 10000, the period of rate_hz = 100"),
-        ({"exposure_line": "Line1"}, "is an input already: trigger_line"),
-        ({"exposure_line": "Line2", "sync_line": 2}, "is an input already: sync_line"),
-        ({"sync_line": 1}, "must be another line than trigger_line"),
+        ({"exposure_line": "Line1"}, "is already used as an input: trigger_line"),
+        ({"exposure_line": "Line2", "sync_line": 2}, "is already used as an input: sync_line"),
+        ({"sync_line": 1}, "must differ from trigger_line"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_before_a_camera_is_looked_for(
@@ -223,11 +223,11 @@ def test_a_value_that_a_setting_does_not_have_is_named_with_those_that_it_has() 
 def test_of_several_cameras_one_must_be_named() -> None:
     code = (
         "from sliplab.rigs.devices.basler.fake import emulate; emulate(2); "
-        "from sliplab.rigs.devices.basler.driver import look_for_camera; "
-        "print(look_for_camera('0815-0001').GetSerialNumber()); look_for_camera(None)"
+        "from sliplab.rigs.devices.basler.driver import find_device_info; "
+        "print(find_device_info('0815-0001').GetSerialNumber()); find_device_info(None)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.stdout == "0815-0001\n"
-    assert "there are several: 0815-0000, 0815-0001; name one by serial" in done.stderr
+    assert "found several: 0815-0000, 0815-0001; select one by serial" in done.stderr

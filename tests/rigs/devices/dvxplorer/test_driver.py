@@ -119,7 +119,7 @@ def test_a_stalled_camera_is_noticed_and_may_come_back(until: Until) -> None:
             got += len(camera.read())
             return False
 
-        with pytest.raises(RigError, match=r"neither event nor pulse for \d\.\d s"):
+        with pytest.raises(RigError, match=r"sent no event and no pulse for \d\.\d s"):
             until(read)
         assert got == before
         server.resume()
@@ -138,11 +138,11 @@ def test_a_cut_connection_is_an_error_after_what_came(until: Until) -> None:
         server.close()
         until(lambda: not camera._thread.is_alive())
         assert len(camera.read()) == len(chunk)
-        with pytest.raises(RigError, match="connection is gone"):
+        with pytest.raises(RigError, match="connection is lost"):
             camera.read()
-        with pytest.raises(RigError, match="connection is gone"):
+        with pytest.raises(RigError, match="connection is lost"):
             camera.read_pulses()
-        with pytest.raises(RigError, match="connection is gone"):
+        with pytest.raises(RigError, match="connection is lost"):
             camera.start()
 
 
@@ -230,7 +230,7 @@ def test_a_clock_that_falls_back_ends_the_run(until: Until) -> None:
         batches.events += [store(100, 200), store(150)]
         until(lambda: not batches.events)
         assert camera.read().t_us.tolist() == [100, 200]
-        with pytest.raises(RigError, match="fell back after 200 us"):
+        with pytest.raises(RigError, match="jumped back after 200 us"):
             until(lambda: camera.read() is None)
 
 
@@ -247,7 +247,7 @@ def test_only_rising_edges_are_pulses_and_a_reset_ends_the_run(until: Until) -> 
         until(lambda: camera.counts.other_triggers == 1)
         assert camera.read_pulses().t_ns.tolist() == [10_000]
         batches.triggers.append([dv.Trigger(0, kinds.TIMESTAMP_RESET)])
-        with pytest.raises(RigError, match="began anew"):
+        with pytest.raises(RigError, match="was reset"):
             until(lambda: camera.read_pulses() is None)
 
 
@@ -258,7 +258,7 @@ def test_memory_is_bounded_and_what_does_not_fit_is_counted(until: Until) -> Non
         batches.events += [batch, store(60_000, *range(60_001, 90_000)), store(90_001)]
         until(lambda: camera.counts.overflowed == 30_001)
         assert len(camera.read()) == 50_000
-        with pytest.raises(RigError, match="nobody read"):
+        with pytest.raises(RigError, match="not read in time"):
             camera.read()
 
 
@@ -338,5 +338,5 @@ def test_what_was_left_in_the_camera_is_written_and_read_back() -> None:
 def test_a_threshold_that_the_camera_does_not_take_is_refused() -> None:
     camera, usb = Clamping(), UsbCamera(contrast_on=40)
     configure(camera, usb)
-    with pytest.raises(RigError, match=r"source.contrast_on = 40: the camera took 17"):
+    with pytest.raises(RigError, match=r"source.contrast_on = 40: the camera set 17"):
         check_taken(in_force(camera), usb)

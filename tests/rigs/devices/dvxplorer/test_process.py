@@ -86,12 +86,12 @@ def ports(events: tuple[bytes | None, ...]) -> Iterator[tuple[Port, DvxplorerSet
 @pytest.mark.parametrize(
     ("greeting", "message"),
     [
-        (b"", r"127\.0\.0\.1:\d+: no answer within 2 s; .*sends its header at once"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n", r"no stream of dv-processing: it began with b'HTTP"),
-        (EVENTS[:100], "sent 100 bytes of its header, no more"),
-        (struct.pack("<II", 1 << 30, 24) + b"IOHE", "no stream of dv-processing"),
+        (b"", r"127\.0\.0\.1:\d+: no answer within 2 s; .*sends its header on connecting"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", r"not a dv-processing stream: it began with b'HTTP"),
+        (EVENTS[:100], "sent only 100 bytes of its header"),
+        (struct.pack("<II", 1 << 30, 24) + b"IOHE", "not a dv-processing stream"),
         (EVENTS[:4] + bytes(4) + b"IOHE" + bytes(len(EVENTS) - 12), "AEDAT4"),
-        (None, "hung up after 0 bytes"),
+        (None, "disconnected after 0 bytes"),
     ],
 )
 def test_a_port_that_is_no_camera_is_named(greeting: bytes | None, message: str) -> None:
@@ -157,7 +157,7 @@ def test_bytes_that_are_no_packet_end_the_run_and_not_the_process(
             port.send(data)
             until(lambda: not camera._thread.is_alive())
             assert camera.read().t_us.tolist() == [1000]
-            with pytest.raises(RigError, match=r"dv-processing (died|is gone).*look at what sends"):
+            with pytest.raises(RigError, match=r"(died|has exited).*check the sender"):
                 camera.read()
             with pytest.raises(RigError, match="dv-processing"):
                 camera.start()
@@ -171,7 +171,7 @@ def test_a_packet_that_never_ends_is_silence(until: Until) -> None:
         try:
             camera.start()
             port.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-            with pytest.raises(RigError, match="neither event nor pulse"):
+            with pytest.raises(RigError, match="sent no event and no pulse"):
                 until(lambda: camera.read() is None)
         finally:
             camera.close()
@@ -180,8 +180,8 @@ def test_a_packet_that_never_ends_is_silence(until: Until) -> None:
 @pytest.mark.parametrize(
     ("serial", "message"),
     [
-        (None, "event camera: a DVXplorer was not found; there: none. Look at its cable"),
-        ("DXA00001", "a DVXplorer with serial number DXA00001 was not found; there: none"),
+        (None, "event camera: a DVXplorer was not found; found: none. Check its cable"),
+        ("DXA00001", "a DVXplorer with serial number DXA00001 was not found; found: none"),
     ],
 )
 def test_no_camera_on_usb_is_named(serial: str | None, message: str) -> None:
@@ -201,9 +201,9 @@ def test_the_cameras_that_are_there_are_named(monkeypatch: pytest.MonkeyPatch) -
     all_of_them = "davis 00000008, dvxplorer DXA00001, dvxplorer DXA00002"
     monkeypatch.setattr(dv.io.camera, "discover", lambda: there)
     assert find_camera("DXA00002") is there[2]
-    with pytest.raises(RigError, match=f"number DXA9 was not found; there: {all_of_them}"):
+    with pytest.raises(RigError, match=f"number DXA9 was not found; found: {all_of_them}"):
         find_camera("DXA9")
-    with pytest.raises(RigError, match=f"several: {all_of_them}; name one by source.serial"):
+    with pytest.raises(RigError, match=f"several: {all_of_them}; select one by source.serial"):
         find_camera(None)
     monkeypatch.setattr(dv.io.camera, "discover", lambda: there[:2])
     assert find_camera(None) is there[1]  # not the first one, which is none

@@ -283,7 +283,7 @@ def test_a_reset_is_noticed_and_survived(run: Run, connect: Connect) -> None:
     train(box, 100.0, "lfsr", 30)
     box.start(100.0, SEED)
     board.process.send_signal(signal.SIGUSR1)
-    with pytest.raises(SyncBoxFault, match="began anew"):  # noqa: PT012
+    with pytest.raises(SyncBoxFault, match="restarted"):  # noqa: PT012
         for _ in range(300):
             box.read_pulses()
             threading.Event().wait(0.01)

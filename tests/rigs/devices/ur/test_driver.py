@@ -164,7 +164,7 @@ def test_what_the_guard_forbids_is_never_sent(robot_of: MakeRobot, arm_on: MakeA
 
 def test_the_controllers_own_limits_count_too(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     arm = arm_on(robot_of(reach_mm=510.0))
-    with pytest.raises(RigError, match=r"controller holds \(400.0, 100.0, 400.0\)"):
+    with pytest.raises(RigError, match=r"controller reports \(400.0, 100.0, 400.0\)"):
         arm.start([Segment(at(100.0, 400.0), 10.0)])
 
 
@@ -178,7 +178,7 @@ def test_a_slowed_speed_slider_is_noticed(robot_of: MakeRobot, arm_on: MakeArm) 
     robot = robot_of()
     arm = arm_on(robot)
     robot.program.speed_fraction = 0.5
-    until(lambda: _refuses(arm, "slider stands at 50%"), 2.0)
+    until(lambda: _refuses(arm, "slider is at 50%"), 2.0)
     assert robot.pose() == HOME
 
 

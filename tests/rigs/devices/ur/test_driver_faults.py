@@ -26,9 +26,10 @@ from sliplab.rigs.devices.ur import driver
 from sliplab.rigs.devices.ur import ports as ur_ports
 from sliplab.rigs.devices.ur.control import ControlError, ControlProcess
 from sliplab.rigs.devices.ur.driver import UrArm
+from sliplab.rigs.devices.ur.fake_program import Safety
 from sliplab.rigs.devices.ur.rtde import HEADER, SETUP_INPUTS
 from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
-from tests.rigs.devices.conftest import MakeArm, MakeRobot, ur_settings
+from tests.rigs.devices.conftest import MakeArm, MakeRobot, reconnect, ur_settings
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -78,7 +79,7 @@ def test_a_stop_while_sliding_ends_the_path(
         arm.start(SLIDE)
 
 
-def test_recovering_unlocks_nothing_and_needs_a_person_first(
+def test_connecting_again_unlocks_nothing_and_needs_a_person_first(
     robot_of: MakeRobot, arm_on: MakeArm
 ) -> None:
     robot = robot_of(faults=[Fault(Kind.PROTECTIVE_STOP, Stage.MOVING, after_mm=1.0)])
@@ -86,12 +87,11 @@ def test_recovering_unlocks_nothing_and_needs_a_person_first(
     arm.start(SLIDE)
     until(lambda: arm.progress().done, 5.0)
     with pytest.raises(ArmFault, match="unlock the stop at the pendant"):
-        arm.recover()
-    assert arm.state() is ArmState.PROTECTIVE_STOP
+        reconnect(arm)
+    assert robot.program.safety is Safety.PROTECTIVE_STOP
     robot.unlock()
-    until(lambda: arm.state() is ArmState.NOT_RUNNING, 2.0)
     where = robot.pose()
-    arm.recover()
+    reconnect(arm)
     assert arm.state() is ArmState.READY
     assert distance_mm(robot.pose(), where) < 1e-6  # the interrupted move did not go on
     arm.start([Segment(TARGET, 40.0)])
@@ -107,11 +107,11 @@ def test_a_link_lost_while_sliding(robot_of: MakeRobot, arm_on: MakeArm, kind: K
     until(lambda: robot.pose().xyz_mm[1] >= 1.0, 5.0)
     until(lambda: arm.state() is ArmState.DISCONNECTED, driver.SILENCE_S + BUSY_S)
     until(lambda: arm.progress().done, 2 * driver.PORT_S + BUSY_S)
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
     until(lambda: not robot.moving(), 1 / ur_control.WATCHDOG_HZ + BUSY_S)  # its own watchdog
     where = robot.pose()
     robot.restore_link()
-    arm.recover()
+    reconnect(arm)
     assert arm.state() is ArmState.READY
     assert distance_mm(robot.pose(), where) < 1e-6  # the client did not send the move again
 
@@ -120,12 +120,13 @@ def test_a_link_lost_while_sliding(robot_of: MakeRobot, arm_on: MakeArm, kind: K
 def test_a_link_lost_while_idle(robot_of: MakeRobot, arm_on: MakeArm, kind: Kind) -> None:
     robot = robot_of()
     arm = arm_on(robot)
-    robot.happen(kind)
+    robot.inject(kind)
     until(lambda: arm.state() is ArmState.DISCONNECTED, driver.SILENCE_S + BUSY_S)
     fails(lambda: arm.start(SLIDE), driver.PORT_S, "does not answer")
     arm.stop()  # an arm that stood still needs no stopping
     robot.restore_link()
-    arm.recover()
+    until(lambda: not robot.program.program_running, 1 / ur_control.WATCHDOG_HZ + BUSY_S)
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
@@ -150,11 +151,14 @@ def test_a_link_lost_while_connecting_or_uploading(
     monkeypatch.setattr(ur_control, "START_S", 2.0)
     robot = robot_of(faults=[Fault(kind, stage)])
     arm = arm_on(robot, connected=False)
-    fails(arm.connect, min(within_s, 2.0) + 2 * driver.PORT_S, "check its power|gave no control")
+    fails(arm.connect, min(within_s, 2.0) + 2 * driver.PORT_S, "its power|did not give control")
     assert arm.state() is ArmState.DISCONNECTED
     robot.restore_link()
     monkeypatch.undo()
-    arm.recover()  # the script may have come through: whatever runs is ended first
+    if robot.program.program_running:  # the script came through: a person ends it at the pendant
+        fails(arm.connect, driver.ANSWER_S, "a program is already running on it")
+        robot.inject(Kind.PROGRAM_END)
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
@@ -169,7 +173,7 @@ def test_a_controller_that_takes_commands_and_never_answers(
     assert took >= driver.COMMAND_S
     assert not robot.program.program_running  # it was asked to stop by the dashboard
     robot.hang_program(False)
-    arm.recover()
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
@@ -204,7 +208,7 @@ def test_remote_control_off_is_a_state_of_its_own(robot_of: MakeRobot, arm_on: M
 
 def test_a_stopped_arm_is_not_taken_control_of(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     robot = robot_of()
-    robot.happen(Kind.PROTECTIVE_STOP)
+    robot.inject(Kind.PROTECTIVE_STOP)
     arm = arm_on(robot, connected=False)
     fails(arm.connect, driver.ANSWER_S, "unlock the stop at the pendant")
     assert robot.program.uploads == 0
@@ -217,7 +221,7 @@ def test_a_second_client_is_refused_and_the_first_slides_on(
     first = arm_on(robot)
     first.start([Segment(TARGET, 10.0)])
     second = arm_on(robot, connected=False)
-    fails(second.connect, driver.ANSWER_S, "runs somebody's program")
+    fails(second.connect, driver.ANSWER_S, "a program is already running on it")
     until(lambda: first.progress().done, 5.0)
     assert len(first.progress().finished) == 1
 
@@ -231,7 +235,7 @@ def test_registers_that_are_taken_are_told(robot_of: MakeRobot) -> None:
         taker.sendall(HEADER.pack(HEADER.size + len(body), SETUP_INPUTS) + body)
         assert taker.recv(100)
         arm = UrArm(ur_settings(robot.host))
-        fails(arm.connect, ur_control.START_S, "another program has control of it.*EtherNet/IP")
+        fails(arm.connect, ur_control.START_S, "another client has control of it.*EtherNet/IP")
 
 
 def test_a_bad_call_is_an_error_and_the_client_lives_on(
@@ -259,9 +263,9 @@ def test_somebody_elses_program_is_not_taken_over(
     ur_ports.send_script(robot.host, "def palletise():\n  sleep(1000)\nend\n", 1.0)
     until(lambda: robot.program.foreign, 2.0)
     if paused:
-        robot.happen(Kind.PROGRAM_PAUSED)
+        robot.inject(Kind.PROGRAM_PAUSED)
     arm = arm_on(robot, connected=False)
-    what = "holds somebody's paused program" if paused else "runs somebody's program"
+    what = "a program is already " + ("paused" if paused else "running") + " on it"
     fails(arm.connect, driver.ANSWER_S, f"{what}; end it at the pendant first")
     assert robot.program.foreign
     assert robot.program.program_running
@@ -270,7 +274,7 @@ def test_somebody_elses_program_is_not_taken_over(
 
 def test_an_arm_without_power_is_said_to_have_none(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     robot = robot_of()
-    robot.happen(Kind.POWER_OFF)
+    robot.inject(Kind.POWER_OFF)
     arm = arm_on(robot, connected=False)
     fails(arm.connect, driver.ANSWER_S, r"not switched on \(power off\)")
     robot.restore()
@@ -287,7 +291,7 @@ def test_a_slider_that_is_moved_while_sliding_ends_the_path(
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
     robot.set_slider(0.5)
     until(lambda: arm._run.done, 2.0)
-    fails(arm.progress, 0.0, "slider stands at 50%, so the move was too slow")
+    fails(arm.progress, 0.0, "slider is at 50%, so the move was too slow")
     arm.stop()
     assert not robot.moving()
 
@@ -302,14 +306,15 @@ def test_a_controller_clock_that_falls_back_ends_the_stream(
     if moving:
         arm.start(SLIDE)
         until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
-    robot.happen(Kind.CLOCK_BACK)
+    robot.inject(Kind.CLOCK_BACK)
     until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
     until(lambda: arm.progress().done, 2.0)
     assert arm.progress().finished == ()
     arm.stop()  # by its dashboard, and seen on a new connection
     assert not robot.moving()
-    fails(lambda: arm.start(SLIDE), driver.PORT_S, "clock fell back by 4.9")
-    arm.recover()
+    fails(lambda: arm.start(SLIDE), driver.PORT_S, "clock jumped back by 4.9")
+    until(lambda: not robot.program.program_running, 1 / ur_control.WATCHDOG_HZ + BUSY_S)
+    reconnect(arm)
     assert arm.state() is ArmState.READY
 
 
@@ -320,7 +325,7 @@ def test_a_stream_of_nonsense_is_a_lost_one(robot_of: MakeRobot, arm_on: MakeArm
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
     robot.program.joints_deg[2] = float("nan")
     until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
-    fails(arm.stop, 2 * driver.PORT_S + 2 * driver.STILL_S, "took a stop and cannot be seen")
+    fails(arm.stop, 2 * driver.PORT_S + 2 * driver.STILL_S, "cannot be confirmed at rest")
     assert not robot.moving()
 
 
@@ -328,7 +333,7 @@ def test_packets_that_are_missing_are_counted(robot_of: MakeRobot, arm_on: MakeA
     robot = robot_of()
     arm = arm_on(robot)
     assert arm.describe()["poses_missing"] == 0
-    robot.happen(Kind.PACKETS_LOST)
+    robot.inject(Kind.PACKETS_LOST)
     until(lambda: arm.describe()["poses_missing"] > 0, 2.0)
     assert arm.describe()["poses_missing"] == PACKETS_LOST
     assert arm.state() is ArmState.READY
@@ -342,14 +347,14 @@ def test_a_link_lost_as_the_move_begins_is_no_arm_at_rest(
     arm = arm_on(robot)
     monkeypatch.setattr(arm, "_take", lambda packet: None)  # none of those after the start comes
     arm.start(SLIDE)
-    robot.happen(Kind.LINK_CUT)
+    robot.inject(Kind.LINK_CUT)
     until(lambda: arm.progress().done, 2 * driver.PORT_S + BUSY_S)
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
     arm.close()
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
     robot.restore_link()
-    arm.stop()  # now it is seen to stand still
+    arm.stop()  # now it is confirmed at rest
     assert not robot.moving()
 
 
@@ -375,7 +380,7 @@ def test_a_follower_that_fails_says_why_and_stops_the_arm(
     monkeypatch.setattr(arm, "_is_at", broken)
     arm.start([Segment(Pose((400.0, 1.0, 300.0), HOME.rotvec_deg), 10.0), *SLIDE])
     until(lambda: arm._run.done, 5.0)
-    fails(arm.progress, 0.0, "its path was given up: TypeError")
+    fails(arm.progress, 0.0, "its path was aborted: TypeError")
     assert not robot.moving()
 
 
@@ -385,7 +390,7 @@ def test_a_dashboard_that_sends_no_line_is_given_up() -> None:
     with socket.create_server((host, ur_ports.DASHBOARD_PORT)) as door:
         thread = threading.Thread(target=lambda: _flood(door))
         thread.start()
-        with pytest.raises(ur_ports.PortError, match="no line"):
+        with pytest.raises(ur_ports.PortError, match="not a line of text"):
             ur_ports.dashboard(host, "is in remote control", 5.0)
         thread.join(5.0)
 

@@ -139,7 +139,7 @@ def test_scripts_end_what_runs_and_may_stop_the_arm(robot: FakeUr) -> None:
 
 
 def test_a_silent_controller_takes_connections_and_says_nothing(robot: FakeUr) -> None:
-    robot.happen(Kind.SILENCE)
+    robot.inject(Kind.SILENCE)
     with pytest.raises(ur_ports.PortError):
         ur_ports.dashboard(robot.host, "running", 0.2)
     robot.restore_link()
@@ -207,7 +207,7 @@ def test_outputs_that_it_does_not_know_are_not_found(robot: FakeUr) -> None:
     ],
 )
 def test_it_says_what_state_it_is_in(robot: FakeUr, kind: Kind, safety: str, mode: str) -> None:
-    robot.happen(kind)
+    robot.inject(kind)
     assert ur_ports.dashboard(robot.host, "safetystatus", 1.0) == f"Safetystatus: {safety}"
     assert ur_ports.dashboard(robot.host, "robotmode", 1.0) == f"Robotmode: {mode}"
     ur_ports.send_script(robot.host, "def other():\nend\n", 1.0)
