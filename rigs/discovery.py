@@ -38,5 +38,5 @@ def ping_devices(devices: DeviceSettings) -> dict[str, str | None]:
         except Exception as error:  # a vendor library may raise anything
             found[driver.kind] = str(error) or type(error).__name__
     if devices.sync_box is None:
-        found["sync box"] = "no port is named"
+        found["sync box"] = "the rig file names no port"
     return found

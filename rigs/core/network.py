@@ -16,7 +16,7 @@ def answers(host: str, port: int) -> str | None:
         with socket.create_connection((host, port), ANSWER_S):
             return None
     except OSError as error:
-        return f"{host}:{port}: {error}; look at its power, its cable and the address"
+        return f"{host}:{port}: {error}; check its power, its cable and the address"
 
 
 def arm_lock(settings: BaseArmSettings) -> dict[str, str]:

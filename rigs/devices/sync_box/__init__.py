@@ -17,7 +17,7 @@ def _build(settings: SyncBoxSettings) -> SyncBox:
 
 def _ping(settings: SyncBoxSettings) -> str | None:
     if not os.path.exists(settings.port):
-        return f"there is no {settings.port}; look at its cable, and at /dev/serial/by-id"
+        return f"there is no {settings.port}; check its cable and /dev/serial/by-id"
     if not os.access(settings.port, os.R_OK | os.W_OK):
         return f"{settings.port} may not be opened; add yourself to its group (dialout)"
     return None
