@@ -54,6 +54,9 @@ _MORE_LIKELY, _MORE = 12.0, 1.1
 """By how much and by what share more of the squares a step must explain than a change of drift: of
 a clock that bends smoothly a step explains less than a bend does, of one that jumps 1.5 times as
 much in the median over the places of the jump."""
+_AS_LIKELY = 6.0
+"""A change of drift that explains more of the squares than a step by less than this leaves the step
+a probability of 5 % (19 to 1 is exp(6 / 2)): it is part of what is stated with 95 %."""
 _DOUBT, _DOUBT_AT_END = 4.0, 3.0
 """A step of so many may be one: what it would do is added to the uncertainty."""
 _CLIP = 3.0
@@ -179,7 +182,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         if not step:
             if pieces > min(_MOST_KNOTS, int(inside.sum()) // _PIECE_PULSES - 1):
                 break
-            if found.step > found.knot:
+            if found.step > found.knot or _as_likely(found):
                 # a step may be taken for a change of drift, and hides in the knot from then on
                 mistaken = max(mistaken, abs(found.step_size))
             knots = np.sort(np.append(knots, x[found.knot_at]))
@@ -295,6 +298,11 @@ def _jump(found: _Changes, hidden: float) -> float:
     if found.end**2 > max(STEP_AT_END**2, bent) and abs(found.end_size) > hidden:
         return found.end_size
     return 0.0
+
+
+def _as_likely(found: _Changes) -> bool:
+    """Check that a step large enough for a jump is not ruled out by a change of the drift."""
+    return found.step > STEP and found.step**2 > found.knot**2 - _AS_LIKELY
 
 
 def _doubt(found: _Changes) -> float:

@@ -12,15 +12,11 @@ Times stay int64; floats hold differences only.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
-from itertools import pairwise
 from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from sliplab.analysis.clocks.clock_line import (
     STEP,
@@ -30,7 +26,14 @@ from sliplab.analysis.clocks.clock_line import (
     gained,
     line_within_unit,
 )
-from sliplab.analysis.clocks.pulse_kernels import median, most_off
+from sliplab.analysis.clocks.pulse_kernels import median
+from sliplab.analysis.clocks.pulse_losses import (
+    better_shift,
+    on_ticks,
+    staggered_ends,
+    stray_stretch,
+    unevenness,
+)
 from sliplab.analysis.clocks.pulse_match import (
     MIN_PULSES,
     WIRED,
@@ -44,126 +47,6 @@ from sliplab.storage.clockmap import ClockMap
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-CHANCE = 1e-5
-"""Probability that scattered bad pulses are mistaken for a jump of the clock."""
-BURST = 9
-"""Pulses in a row that may be bad at once for another reason, as when a device is busy."""
-BURST_AT_END = 2
-"""The same at the trains' ends, where nothing later confirms the line. A clock that jumps at
-the last two pulses cannot be distinguished from two late pulses."""
-_WIDTHS = (16, 24, 32, 48, 64, 96, 128)
-_WIDTHS_AT_END = (8, 12, 16, 24, 32)
-_LEAST, _MOST_DEVICE, _MOST_REFERENCE = 0.02, 0.25, 0.4
-"""Shares of bad pulses that are assumed at least and at most: a jump must not confirm itself."""
-_MOST_LOSSY = 0.48
-"""The same where both trains have more bad ones than that, which then is asked of their best
-quarters."""
-
-
-def stray_stretch(
-    predicted: Floats, reference: Floats, i: Ints, j: Ints, slack_ns: float
-) -> str | None:
-    """Describe a stretch of pulses that a fit leaves out; None if there is none.
-
-    Pulses that are lost, late or spurious lie anywhere. A clock that jumps, or begins to drift
-    otherwise, leaves out all that come after: the line is right before and wrong after, and its
-    residuals do not show it. So where both trains have pulses in a row and few of them fit, the fit
-    must be refused.
-
-    In a window of w reference pulses let a be those off the line, and b the device's pulses there
-    that are. Chance makes both large at once with at most P(a >= k) P(b >= k), k = min(a, b).
-
-    Args:
-        predicted: (m,) device pulses on the reference clock by the fitted line, ns, ascending.
-        reference: (n,) reference pulses, ns, ascending.
-        i, j: (k,) indices of pulses that belong together and lie on the line, ascending.
-        slack_ns: how far a pulse on the line may be from it.
-    """
-    bad_device, bad_reference = _share(i), _share(j)
-    if min(bad_device, bad_reference) > _MOST_DEVICE:
-        bad_device, bad_reference = (min(_best_quarter(k), _MOST_LOSSY) for k in (i, j))
-    else:
-        bad_device = min(bad_device, _MOST_DEVICE)
-        bad_reference = min(bad_reference, _MOST_REFERENCE)
-    places = reference.size.bit_length()
-    # between pulses on the line: those that both trains have there, and neither on the line
-    both = np.minimum(_left_out(i, predicted.size), _left_out(j, reference.size))
-    off_line = f"lie off the line, by more than {slack_ns / 1e3:.1f} us"
-    run = int(both[1:-1].max(initial=0))
-    most = max(BURST, _limit(run, bad_device, bad_reference, places))
-    if run > most:
-        return f"{run} pulses in a row {off_line} (at most {most} may)"
-    run = int(max(both[0], both[-1]))
-    most = max(BURST_AT_END, _limit(run, bad_device, bad_reference, 1))
-    if run > most:
-        which = "first" if both[0] == run else "last"
-        return f"the {which} {run} pulses {off_line} (at most {most} may)"
-    fits = np.zeros(reference.size + 1, np.int64)
-    fits[j + 1] = 1
-    fits = np.cumsum(fits)
-    low = np.searchsorted(predicted, reference - slack_ns, side="left")
-    high = np.searchsorted(predicted, reference + slack_ns, side="right")
-    for widths, at_ends, least, log_places in (
-        (_WIDTHS, False, BURST, places), (_WIDTHS_AT_END, True, BURST_AT_END, 1),
-    ):  # fmt: skip
-        for width in widths:
-            if width > reference.size:
-                continue
-            off = most_off(width, fits, low, high, at_ends)
-            most = max(least, _limit(width, bad_device, bad_reference, log_places))
-            if off > most:
-                where = "at one end" if at_ends else "in a row"
-                return f"of {width} pulses {where} {off} {off_line} (at most {most} may)"
-    return None
-
-
-def _left_out(on_line: Ints, size: int) -> Ints:
-    """Count pulses before the first, between two, and after the last that is on the line."""
-    return np.diff(np.concatenate([[-1], on_line, [size]])) - 1
-
-
-def _share(on_line: Ints) -> float:
-    """Share of bad pulses between the first and the last good one, in steps of 2 %, rounded up."""
-    total = int(on_line[-1] - on_line[0]) + 1
-    return max(math.ceil(50 * (1.0 - on_line.size / total)) / 50, _LEAST)
-
-
-def _best_quarter(on_line: Ints) -> float:
-    """The same of the quarter with the fewest, and two standard deviations of it."""
-    first, total = int(on_line[0]), int(on_line[-1] - on_line[0]) + 1
-    edges = [first + k * total // 4 for k in range(5)]
-    there = np.searchsorted(on_line, edges).tolist()
-    quarters = zip(pairwise(there), pairwise(edges), strict=True)
-    bad, count = min((1.0 - (b - a) / max(d - c, 1), d - c) for (a, b), (c, d) in quarters)
-    bad += 2.0 * ((bad * (1.0 - bad) + 1.0 / max(count, 1)) / max(count, 1)) ** 0.5
-    return math.ceil(50 * bad) / 50
-
-
-def unevenness(on_line: Ints) -> float:
-    """Change of the share of pulses on the line from before to after, standard deviations.
-
-    The largest of all times that leave 16 pulses on either side.
-    """
-    total = int(on_line[-1] - on_line[0]) + 1
-    good = np.zeros(total)
-    good[on_line - on_line[0]] = 1.0
-    before, count = np.cumsum(good)[15:-16], np.arange(16, total - 15)
-    if not count.size:
-        return 0.0
-    share = on_line.size / total
-    away = np.abs(before - share * count)
-    chance = np.sqrt(share * (1.0 - share) * count * (total - count) / total)
-    return float((away / np.maximum(chance, 1e-9)).max())
-
-
-@lru_cache(maxsize=4096)
-def _limit(width: int, device: float, reference: float, log_places: int) -> int:
-    """Return how many of `width` pulses may be off by chance, in one of 2**log_places windows."""
-    k = np.arange(width)
-    both = special.bdtrc(k, width, device) * special.bdtrc(k, width, reference)
-    return int((both * 2.0**log_places * 10 > CHANCE).sum())
-
-
 Reason = Literal["too_few_pulses", "ambiguous", "no_match", "drift", "residuals"]
 Rounding = Literal["down", "up", "nearest"]
 
@@ -176,6 +59,12 @@ pulses meet others, stands out only where there are many."""
 MOST_STAGGERED = 8
 """So many pulses may lie before one train begins and behind the end of the other: noise. More mean
 that only a stretch of two trials' codes is the same."""
+STAGGERED_CHANCE = 1e-3
+"""Losses make what one trial's trains have at their ends with this probability at least."""
+JUMP_CHANCE = 1e-3
+"""The same of a part that would fit better some ticks away, where both trains lost many pulses."""
+MOST_SLACK = 1 / 8
+"""Ticks within which a pulse lies on the line; where it is more, nearly all noise lies on ticks."""
 UNEVEN = 3.5
 """Standard deviations between the shares of pulses that fit before and after some time."""
 MIN_EITHER = 0.75
@@ -319,7 +208,7 @@ def fit_clock(
             line = bounded
     _gate_line(line, jitter_ns, max_drift_ppm)
     predicted = _extended(line, x)
-    _gate_staggered(predicted, y, tick)
+    _gate_staggered(predicted, y, tick, 5 * line.sigma)
     inside = line.inside
     i, j = match.device[inside], match.reference[inside]
     stray = stray_stretch(predicted, y, i, j, 5 * line.sigma)
@@ -327,7 +216,7 @@ def fit_clock(
         raise ClockRefused(
             "residuals", f"{stray}: a clock jumped, or its drift changed at once; {UNDISTURBED}"
         )
-    _gate_lossy(i, j)
+    _gate_lossy(i, j, predicted, y, tick, 5 * line.sigma)
     return _fit(match, line, x, y, device_0, reference_0)
 
 
@@ -429,7 +318,7 @@ def _gate_share(x: Floats, y: Floats, match: Match, tick: float) -> None:
         )
 
 
-def _gate_staggered(predicted: Floats, y: Floats, tick: float) -> None:
+def _gate_staggered(predicted: Floats, y: Floats, tick: float, slack_ns: float) -> None:
     """Refuse a device that saw pulses before the box sent any, and none of the last, or so."""
     before, last = np.searchsorted(predicted, (y[0] - tick, y[-1] + tick)).tolist()
     unseen, seen = np.searchsorted(y, (predicted[0] - tick, predicted[-1] + tick)).tolist()
@@ -441,10 +330,26 @@ def _gate_staggered(predicted: Floats, y: Floats, tick: float) -> None:
             f"many at the other (at most {MOST_STAGGERED}): they are of two trials whose codes "
             f"share a stretch; {SAME_TRIAL}",
         )
+    begins, ends = predicted[0] - y[0], predicted[-1] - y[-1]
+    staggered = min(abs(begins), abs(ends)) > tick / 2 and (begins < 0) == (ends < 0)
+    if not staggered or slack_ns > MOST_SLACK * tick:
+        return
+    found = staggered_ends(on_ticks(predicted, y, tick, slack_ns))
+    if found.chance < STAGGERED_CHANCE:
+        raise ClockRefused(
+            "no_match",
+            f"the {found.earlier} has {found.first} pulses on ticks before the {found.later} has "
+            f"any, and the {found.later} {found.last} behind the {found.earlier}'s last: losses "
+            f"explain that with a probability of {found.chance:.1g} (at least "
+            f"{STAGGERED_CHANCE:g} is needed), so they are of two trials whose codes share a "
+            f"stretch; {SAME_TRIAL}",
+        )
 
 
-def _gate_lossy(i: Ints, j: Ints) -> None:
-    """Refuse trains that both lost many pulses and match too little, or better at some time."""
+def _gate_lossy(
+    i: Ints, j: Ints, predicted: Floats, y: Floats, tick: float, slack_ns: float
+) -> None:
+    """Refuse trains that both lost many pulses and match too little, or not equally throughout."""
     shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
     if max(shares) >= MIN_EITHER:
         return
@@ -461,6 +366,16 @@ def _gate_lossy(i: Ints, j: Ints) -> None:
             "no_match",
             f"{said}, and the shares before and after some moment differ by {uneven:.1f} standard "
             f"deviations (at most {UNEVEN:g}): a clock jumped by whole ticks; {UNDISTURBED}",
+        )
+    if slack_ns > MOST_SLACK * tick:
+        return
+    jump, chance = better_shift(on_ticks(predicted, y, tick, slack_ns))
+    if chance < JUMP_CHANCE:
+        raise ClockRefused(
+            "no_match",
+            f"{said}, and on one side of some moment more would {abs(jump)} ticks away, which "
+            f"happens by chance with a probability of {chance:.1g} at most (at least "
+            f"{JUMP_CHANCE:g} is needed): a clock jumped by whole ticks; {UNDISTURBED}",
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock, stray_stretch
+from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock
 from tests.analysis.clocks.test_clocks import TICK_NS, code
 
 Ints = NDArray[np.int64]
@@ -100,26 +100,3 @@ def test_pulses_lost_doubled_and_late_here_and_there_are_no_jump() -> None:
     assert fit is not None
     assert np.abs(fit.map.to_reference(true) - reference).max() <= 3 * fit.uncertainty_ns
     assert (fit.pulses_late, fit.pulses_missed) == (15, 40)
-
-
-def test_stretches_are_told_from_scattered_pulses() -> None:
-    times = np.arange(200) * 1e7
-    every = np.arange(200)
-    assert stray_stretch(times, times, every, every, 1.0) is None
-    for bad, said in (
-        (np.arange(50, 60), "10 pulses in a row lie off the line, by more than 0.0 us (at most 9"),
-        (np.arange(197, 200), "the last 3 pulses lie off the line"),
-        (np.arange(0, 3), "the first 3 pulses lie off the line"),
-        (np.arange(60, 100, 2), "of 24 pulses in a row 12 lie off"),
-        (np.array([186, 188, 191, 194, 197]), "of 16 pulses at one end 5 lie off"),
-    ):
-        left = np.setdiff1d(every, bad)
-        found = stray_stretch(times, times, left, left, 1.0)
-        assert found is not None
-        assert found.startswith(said)
-    for harmless in (np.arange(50, 59), np.arange(198, 200), np.arange(0, 200, 9)[1:-1]):
-        left = np.setdiff1d(every, harmless)
-        assert stray_stretch(times, times, left, left, 1.0) is None
-    # a device that lost a stretch says nothing there, and is not doubted
-    left = np.setdiff1d(every, np.arange(50, 120))
-    assert stray_stretch(times[left], times, np.arange(left.size), left, 1.0) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clock_kinds import HOPELESS, KINDS, faulty_train, tally
-from benchmarks.clocks import DRIFT_PPM
+from benchmarks.clocks import DRIFT_PPM, make_train
 from sliplab.analysis.clocks.clocks import ClockRefused, fit_clock
 from tests.analysis.clocks.test_clock_faults import fitted
 from tests.analysis.clocks.test_clocks import TICK_NS, code
@@ -55,11 +55,38 @@ def test_a_jump_taken_for_a_bend_is_within_the_stated_uncertainty(seed: int) -> 
     assert 5_000 < error <= fit.uncertainty_ns
 
 
+@pytest.mark.parametrize("seed", [2534, 8076, 12596, 18778])
+def test_a_jump_that_a_bend_explains_better_by_chance_is_stated(seed: int) -> None:
+    """A tenth of a short train is so few pulses that a change of drift may explain them better."""
+    made = make_train(
+        np.random.default_rng([11, seed]), seconds=20.0, tick=50_000_000,
+        clock=lambda sent, _: np.where(sent > 0.1 * sent[-1], 2e4, 0.0),
+    )  # fmt: skip
+    fit = fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
+    vouched = (made.true >= fit.first_ns) & (made.true <= fit.last_ns)
+    error = np.abs(fit.map.to_reference(made.true) - made.sent)[vouched].max()
+    assert 12_000 < error <= fit.uncertainty_ns
+
+
+@pytest.mark.parametrize("seed", [2879, 5259, 7373])
+def test_old_codes_that_begin_a_few_ticks_apart_are_two_trials(seed: int) -> None:
+    made = faulty_train(np.random.default_rng([11, seed]), "other_trial_16_bits")
+    with pytest.raises(ClockRefused, match=r"has \d+ pulses on ticks before .* share a stretch"):
+        fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
+
+
+@pytest.mark.parametrize("seed", [19034, 32575])
+def test_a_jump_by_ticks_behind_which_many_pulses_match_by_chance_is_refused(seed: int) -> None:
+    made = faulty_train(np.random.default_rng([11, seed]), "lost_30_and_jump_of_ticks")
+    with pytest.raises(ClockRefused, match=r"more would \d+ ticks away, .* by whole ticks"):
+        fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
+
+
 def test_a_stretch_that_two_trials_share_is_not_enough() -> None:
     """Recordings made with a code of 16 bits: trials were stretches of the same 65,535 ticks."""
     whole = np.flatnonzero(code(8_000, 77)).astype(np.int64) * TICK_NS
     trial = whole[whole < 2_000 * TICK_NS]
-    for ticks in (40, 400, 1_000, -40, -400, -1_000):
+    for ticks in (2, 4, 9, 40, 400, 1_000, -4, -5, -9, -40, -400, -1_000):
         begin = (3_000 + ticks) * TICK_NS
         device = whole[(whole >= begin) & (whole < begin + 2_000 * TICK_NS)] + 10**15
         reference = whole[(whole >= 3_000 * TICK_NS) & (whole < 5_000 * TICK_NS)]
@@ -69,6 +96,9 @@ def test_a_stretch_that_two_trials_share_is_not_enough() -> None:
     # the device saw the trial before as well, or the end of this one alone: that is no doubt
     assert fitted(whole[whole < 5_000 * TICK_NS], trial) is not None
     assert fitted(trial[200:], trial) is not None
+    # nor is noise before the first pulse and a device that was stopped early
+    noise = np.sort(-np.random.default_rng(6).integers(0, 300 * TICK_NS, 8))
+    assert fitted(np.concatenate((noise, trial[:-40])), trial) is not None
 
 
 @pytest.mark.parametrize("pulses", [1, 2])
