@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +23,7 @@ from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
+    from sliplab.analysis.sweeps.detector_grid import Axes
     from sliplab.storage.trials.store import Store
 
 SCENE_OUT = Path("sliplab-tradeoff")
@@ -145,13 +147,35 @@ def tradeoff(
         return
     _refuse(of_scene, "--scene")
     assert detector is not None
-    how = {"samples": samples, "epochs": epochs, "trials": trials, "seeds": seeds}
-    axes = {"length_ms": length, "step_ms": step, "pool_px": pool, "width": width}
-    options = {"full": full, "reviewed": reviewed, "minutes": minutes, "dry_run": dry_run}
-    _detector(detector, out, {**how, "stride_ms": stride}, axes, campaign, options, as_json)
+    size = {
+        "samples": samples, "epochs": epochs, "trials": trials, "seeds": seeds,
+        "stride_ms": stride,
+    }  # fmt: skip
+    _detector(
+        detector, out, size, _axes(length, step, pool, width), campaign,
+        full=full, reviewed=reviewed, minutes=minutes, dry_run=dry_run, as_json=as_json,
+    )  # fmt: skip
 
 
-def _refuse(options: dict[str, Any], other: str) -> None:
+def _axes(
+    length: list[int] | None,
+    step: list[int] | None,
+    pool: list[int] | None,
+    width: list[float] | None,
+) -> Axes:
+    """Return the values of each factor; those that were not given keep their defaults."""
+    from sliplab.analysis.sweeps.detector_grid import Axes
+
+    default = Axes()
+    return Axes(
+        tuple(sorted(set(length or default.length_ms))),
+        tuple(sorted(set(step or default.step_ms))),
+        tuple(sorted(set(pool or default.pool_px))),
+        tuple(sorted(set(width or default.width))),
+    )
+
+
+def _refuse(options: Mapping[str, object], other: str) -> None:
     for name, value in options.items():
         if value not in (None, False):
             raise InputError(name, "", None, f"belongs to {other}")
@@ -182,23 +206,29 @@ def _scene(
 def _detector(
     place: str,
     out: Path | None,
-    how: dict[str, Any],
-    axes: dict[str, Any],
+    size: Mapping[str, int | None],
+    axes: Axes,
     campaign: list[str] | None,
-    options: dict[str, Any],
+    *,
+    full: bool,
+    reviewed: bool,
+    minutes: float | None,
+    dry_run: bool,
     as_json: bool,
 ) -> None:
+    """Run the detector's search; a size that is None keeps its default."""
     folder = located(place)
     store, campaigns = _opened(folder, campaign)
     from sliplab.analysis.report.tradeoff_detector import short_table
-    from sliplab.analysis.sweeps.detector_grid import Axes
     from sliplab.analysis.sweeps.detector_search import SearchSize
     from sliplab.flows.tradeoff_detector import PAGE, tradeoff_detector
 
-    asked = SearchSize(**{name: value for name, value in how.items() if value is not None})
-    given = Axes(**{name: tuple(sorted(set(each))) for name, each in axes.items() if each})
+    sizes = {name: value for name, value in size.items() if value is not None}
     target = folder / "report" if out is None else out
-    result = tradeoff_detector(store, campaigns, target, asked, given, **options)
+    result = tradeoff_detector(
+        store, campaigns, target, SearchSize(**sizes), axes,
+        full, reviewed, minutes, dry_run,
+    )  # fmt: skip
     if as_json:
         console.print_json(result)
         return
