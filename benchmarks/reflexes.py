@@ -18,7 +18,8 @@ from statistics import median
 from typing import Any
 
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.flows.detect import DetectRequest, detect, make_detect_request
+from sliplab.flows.detect import detect
+from sliplab.flows.detecting.request import DetectRequest, make_detect_request
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Step
 from sliplab.rigs.build import build_rig

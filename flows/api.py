@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from sliplab.analysis.networks.training import Fitted
+    from sliplab.flows.steps import StepResult
 
 I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
@@ -280,19 +281,19 @@ class Store:
             for recording in item.recordings():
                 yield Trial(self._store, item.name, recording)
 
-    def sync(self, campaigns: Sequence[str] | None = None) -> dict[str, Any]:
+    def sync(self, campaigns: Sequence[str] | None = None) -> StepResult:
         """Fit every trial's clocks again."""
         return self._run("sync", campaigns)
 
-    def label(self, campaigns: Sequence[str] | None = None) -> dict[str, Any]:
+    def label(self, campaigns: Sequence[str] | None = None) -> StepResult:
         """Find the onsets of every trial."""
         return self._run("label", campaigns)
 
-    def train(self, campaigns: Sequence[str] | None = None) -> dict[str, Any]:
+    def train(self, campaigns: Sequence[str] | None = None) -> StepResult:
         """Train the network on the labelled kinematic trials."""
         return self._run("train", campaigns)
 
-    def evaluate(self, campaigns: Sequence[str] | None = None) -> dict[str, Any]:
+    def evaluate(self, campaigns: Sequence[str] | None = None) -> StepResult:
         """Judge the network on test trials."""
         return self._run("evaluate", campaigns)
 
@@ -316,7 +317,7 @@ class Store:
         """Files of the networks that were trained here."""
         return sorted((self.folder / "models").glob("*.pt"))
 
-    def _run(self, step: str, campaigns: Sequence[str] | None) -> dict[str, Any]:
+    def _run(self, step: str, campaigns: Sequence[str] | None) -> StepResult:
         from sliplab.flows.running import extras, stopping
         from sliplab.flows.steps import run_step
 

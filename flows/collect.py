@@ -7,7 +7,6 @@ trials: on a real rig that is one trial, on a mock rig, where a task costs as mu
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -15,7 +14,7 @@ from prefect.cache_policies import NO_CACHE
 from sliplab.flows.collecting.progress import shown
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
 from sliplab.flows.collecting.session import Session, open_session, refresh
-from sliplab.flows.planning.run_request import RunRequest, check_disk
+from sliplab.flows.planning.run_request import CampaignCounts, RunRequest, check_disk
 from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
@@ -27,6 +26,19 @@ BATCH = 25
 """Most trials in a task."""
 BATCH_S = 5.0
 """After so long a task begins no further trial."""
+
+
+class CollectResult(CampaignCounts):
+    """Numbers of a campaign's trials after a collection, and of what it did.
+
+    Attributes:
+        taken: attempts; retaken: those of a trial that an attempt failed of before.
+        left_out: trials that the request did not want yet.
+    """
+
+    taken: int
+    retaken: int
+    left_out: int
 
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
@@ -42,7 +54,7 @@ def take_trials(session: Opaque[Session], trials: Opaque[list[Trial]]) -> int:
 
 
 @flow(name="collect", validate_parameters=False, persist_result=False)
-def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
+def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
     """Take the trials of a run request that its store lacks."""
     request = run_request.content
     with (
@@ -69,7 +81,7 @@ def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
         }
 
 
-def collect(run_request: RunRequest) -> dict[str, Any]:
+def collect(run_request: RunRequest) -> CollectResult:
     """Run the collection; returns at once when the store lacks nothing that can be taken.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -19,6 +19,7 @@ from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.label import report_states
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
+from sliplab.flows.steps import StepResult
 from sliplab.flows.train import sample_maker
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -36,7 +37,7 @@ def evaluate(
     smoothing: int | None = None,
     cluster: Cluster | None = None,
     reviewed: bool = False,
-) -> dict[str, Any]:
+) -> StepResult:
     """Evaluate if any input or setting changed; also the network that `analysis.also` names.
 
     Args:

@@ -6,14 +6,19 @@ Nothing is written until all of it is there and the ONNX file has given Sinabs' 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from sliplab.analysis.campaigns import collected
-from sliplab.analysis.evaluation.export import CHECKED, export_files
+from sliplab.analysis.evaluation.export import CHECKED, ExportFigures, export_files
 from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.running import console
 from sliplab.storage.files import make_folder, write_bytes, write_text
 from sliplab.storage.trials.store import Store
+
+
+class Exported(ExportFigures):
+    """Figures of an exported network, and the paths of its files."""
+
+    files: list[str]
 
 
 def export_model(
@@ -25,7 +30,7 @@ def export_model(
     *,
     onnx: bool = True,
     checked: int = CHECKED,
-) -> dict[str, Any]:
+) -> Exported:
     """Write ``NAME.onnx``, ``NAME.speck.{json,md,npz}`` and ``NAME.card.{json,md}`` into `out`.
 
     Args:

@@ -19,6 +19,7 @@ from sliplab.analysis.sweeps.runner import Task, sample_trials, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
+from sliplab.flows.steps import StepDone
 from sliplab.storage.schema.sweeps import HoldoutResult
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
@@ -26,6 +27,13 @@ from sliplab.storage.trials.store import Store
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402
 """Seeds of trials and of the skin. They must not be used anywhere else: not in a protocol, a rig, a
 test, or a search. Replace both after looking at single trials of it."""
+
+
+class HoldoutDone(StepDone):
+    """`HeldOut` for the command line."""
+
+    file: str
+    result: Json
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class HeldOut:
     file: Path
     result: HoldoutResult
 
-    def to_json(self) -> Json:
+    def to_json(self) -> HoldoutDone:
         """Return plain data for the command line."""
         result = self.result.to_json()
         return {"step": STEP, "done": self.done, "file": str(self.file), "result": result}

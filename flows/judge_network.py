@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from prefect import flow
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation import networks
-from sliplab.analysis.evaluation.networks import Engines, Judgement, OtherNetwork, network_of
+from sliplab.analysis.evaluation.networks import Engines, Judgement, network_of
 from sliplab.analysis.labels.reviewed import Labels
-from sliplab.analysis.networks.models import (
-    comparison_models,
-    rules_of,
-)
 from sliplab.analysis.trial_work import KeepTrials, Make, TrialWork
 from sliplab.flows.label import report_states
 from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.parallel_map import keep_trials
 from sliplab.flows.running.run_records import timed
-from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import OtherEvaluation
+from sliplab.flows.steps import StepResult
+from sliplab.storage.schema.evaluation import (
+    Accuracy,
+    LatencyByOnset,
+    LeadFigures,
+    OtherEvaluation,
+    Share,
+)
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -40,6 +42,28 @@ def spike_keeper(store: Store, cluster: Cluster | None) -> KeepTrials:
     return keep
 
 
+class NetworkScores(StepResult):
+    """Scores of a model of a file.
+
+    Attributes:
+        model: the network in words.
+        same_as_sinabs: the engine gives the counts of Sinabs.
+        margin: of the rule, in spikes, by campaign.
+        accuracy, interval: of the sample windows.
+        latency_ms: of the slides; lead_ms: of the other experiments, by name.
+    """
+
+    model: str
+    engine: Engines
+    same_as_sinabs: bool
+    simulated: bool
+    margin: dict[str, float]
+    accuracy: Accuracy
+    interval: Share
+    latency_ms: LatencyByOnset
+    lead_ms: dict[str, LeadFigures]
+
+
 def judge_model(
     store: Store,
     campaigns: list[Collected],
@@ -49,7 +73,7 @@ def judge_model(
     smoothing: int | None = None,
     cluster: Cluster | None = None,
     reviewed: bool = False,
-) -> dict[str, Any]:
+) -> NetworkScores:
     """Judge a model of a file on the test trials; return figures for people and programs.
 
     Args:
@@ -61,17 +85,8 @@ def judge_model(
         InputError: the model; the message says what would be right.
         StoreError: a trial has no label yet.
     """
-    network = network_of(model, engine)
-    change: dict[str, Any] = {"margin": margin, "smoothing": smoothing}
-    change = {name: value for name, value in change.items() if value is not None}
-    change |= {"choose": "protocol", "compare": None}
-    rules = {
-        name: Detection.model_validate({**rule.model_dump(), **change})
-        for name, rule in rules_of(campaigns, network.outputs_per_class).items()
-    }
-    labels = Labels(store, reviewed)
-    about = {"preset": None, "seed": None}
-    judgement = Judgement(store, campaigns, labels, network, rules, about)
+    network, labels = network_of(model, engine), Labels(store, reviewed)
+    judgement = networks.file_judgement(labels, campaigns, network, margin, smoothing)
     if network.engine == "fast" and not network.exact:
         console.say(
             f"warning: {network.title}: its weights are off the grid, where the fast engine's "
@@ -88,12 +103,12 @@ def judge_model(
         "engine": network.engine,
         "same_as_sinabs": network.exact or network.engine == "sinabs",
         "simulated": store.simulated,
-        "margin": {name: rule.margin for name, rule in rules.items()},
-        "accuracy": found.windows.accuracy.to_json(),
-        "interval": found.windows.interval.to_json(),
-        "latency_ms": kinematic.latency_ms.to_json(),
+        "margin": {name: rule.margin for name, rule in judgement.rules.items()},
+        "accuracy": found.windows.accuracy,
+        "interval": found.windows.interval,
+        "latency_ms": kinematic.latency_ms,
         "lead_ms": {
-            name: scores.lead_ms.to_json()
+            name: scores.lead_ms
             for name, scores in found.experiments.items()
             if name != "kinematic"
         },
@@ -113,24 +128,8 @@ def evaluate_comparison(
         StoreError: it is missing or stale.
     """
     done = False
-    for model in comparison_models(store, campaigns, reviewed):
-        if not model.fresh:
-            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
-        settings = model.settings
-        own = settings.network.outputs_per_class
-        network = OtherNetwork(
-            f"preset-{settings.preset}", f"preset: {settings.preset}", model.path.read_bytes(),
-            None, settings.windows, own, "fast", exact=True,
-        )  # fmt: skip
-        rules = {
-            item.name: settings.detection.model_copy(
-                update={"false_early_ms": item.settings.detection.false_early_ms}
-            )
-            for item in campaigns
-        }
-        about = {"preset": settings.preset, "seed": model.seed}
-        labels = Labels(store, reviewed)
-        done |= _judge(Judgement(store, campaigns, labels, network, rules, about), cluster)
+    for judgement in networks.comparison_judgements(Labels(store, reviewed), campaigns):
+        done |= _judge(judgement, cluster)
     return done
 
 

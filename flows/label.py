@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.labels import labelling
@@ -19,6 +19,7 @@ from sliplab.analysis.labels.reviewed import Labels, State, label_key
 from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import run_trials
+from sliplab.flows.steps import StepResult
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text
@@ -45,9 +46,7 @@ def _required_labels(campaigns: list[Collected]) -> list[TrialWork]:
     ]
 
 
-def label(
-    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
-) -> dict[str, Any]:
+def label(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> StepResult:
     """Label every trial of `campaigns` that needs it."""
     required = _required_labels(campaigns)
     stale = stale_trials(store, LABELS, required)
@@ -55,7 +54,13 @@ def label(
     return {"step": "label", "done": len(stale), "fresh": len(required) - len(stale)}
 
 
-def report_states(labels: Labels, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
+class Reviewed(TypedDict, total=False):
+    """Review states in a step's result; no key where decisions are not applied."""
+
+    reviewed: dict[State, int]
+
+
+def report_states(labels: Labels, campaigns: list[Collected]) -> Reviewed:
     """Return review states as part of a step's result; warn of decisions that are not applied."""
     states = labels.states(campaigns)
     if states is None:
@@ -100,7 +105,7 @@ def check_required(run_request: RunRequest) -> bool:
     return run_request.rig.simulated and run_request.rig.frame_source == "tracks"
 
 
-def check_labels(run_request: RunRequest, trials: int = CHECKED_TRIALS) -> dict[str, Any]:
+def check_labels(run_request: RunRequest, trials: int = CHECKED_TRIALS) -> StepResult:
     """Take, label and compare what is missing; the figures are kept in the study's store."""
     from sliplab.flows.collect import collect  # a command that only labels needs no rig
 

@@ -7,7 +7,6 @@ Every figure is also written as `report/figures/NAME.svg`, its data as
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from prefect import flow
 
@@ -20,6 +19,7 @@ from sliplab.analysis.report.summary import make_summary
 from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
+from sliplab.flows.steps import StepResult
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.schema.summary import Summary
@@ -29,7 +29,7 @@ from sliplab.storage.trials.store import Store
 SUMMARY = "summary.json"
 
 
-def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+def report(store: Store, campaigns: list[Collected]) -> StepResult:
     """Write the report if anything it shows has changed.
 
     Raises:

@@ -102,7 +102,8 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
         built.close()
     start_ns = next(step.start_ns for step, _ in done.steps if step.phase in MOTION)
     begin_us, end_us = ((t - start_ns) // 1000 for t in done.recorded_ns)
-    events, truth = sink.joined(), done.truth or {}
+    events, truth = sink.joined(), done.truth
+    assert truth is not None, "a simulated rig has a truth"
     t_us = events.t_us - start_ns // 1000
     inside = slice(*np.searchsorted(t_us, (begin_us, end_us)))
 

@@ -4,9 +4,32 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from sliplab.flows.running import console
+
+if TYPE_CHECKING:
+    from sliplab.analysis.labels.reviewed import State
+
+
+class StepDone(TypedDict):
+    """A step's name and the number of results that it made."""
+
+    step: str
+    done: int
+
+
+class StepResult(StepDone):
+    """Numbers of what an analysis step did, as `--json` prints them.
+
+    Attributes:
+        fresh: results that were up to date.
+        reviewed: trials by the state of people's decisions, where these are applied.
+    """
+
+    fresh: int
+    reviewed: NotRequired[dict[State, int]]
+
 
 STEPS = {
     "sync": "sliplab.flows.sync",
@@ -31,11 +54,14 @@ def prepare_store(folder: Path) -> None:
 
 def run_step(
     folder: Path, names: list[str] | None, step: str, dask: str | None = None, **options: Any
-) -> dict[str, Any]:
+) -> StepResult:
     """Run one analysis step on a store.
 
     Args:
         dask: the scheduler whose workers take the trials.
+
+    Returns:
+        the step's result; some have more numbers.
     """
     from sliplab.storage.remote.mirror import open_store
 
@@ -48,9 +74,7 @@ def run_step(
     with connected(dask) as cluster:
         if cluster is not None:
             options["cluster"] = cluster
-        result: dict[str, Any] = getattr(import_module(STEPS[step]), step)(
-            store, campaigns, **options
-        )
+        result: StepResult = getattr(import_module(STEPS[step]), step)(store, campaigns, **options)
     if not result["done"]:
         console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
     return result

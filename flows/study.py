@@ -21,7 +21,7 @@ from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.analysis.sweeps.holdout import STEP
 from sliplab.analysis.sweeps.sensitivity import in_all
-from sliplab.flows.collect import collect
+from sliplab.flows.collect import CollectResult, collect
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.generalise import SKINS, measure_generalisation
 from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
@@ -29,13 +29,13 @@ from sliplab.flows.holdout import measure_holdout
 from sliplab.flows.label import check_labels, check_required, label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
+from sliplab.flows.steps import StepDone
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.sync import sync
 from sliplab.flows.tradeoff_detector import tradeoff_detector
 from sliplab.flows.tradeoff_scene import tradeoff_scene
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
-from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
@@ -47,8 +47,8 @@ SIZE, AXES = SearchSize(), Axes()
 class Outcome:
     """Results of every step of a study, and their times."""
 
-    collected: list[Json]
-    steps: list[Json]
+    collected: list[CollectResult]
+    steps: list[StepDone]
     rows: list[Row]
 
 
@@ -67,14 +67,15 @@ def study(
     check = check if check_required(run_requests[0]) else 0
     holdout = holdout if planned.slides and planned.slides[0].simulated else 0
     ledger = Ledger(store.folder, planned.expected(check, more, holdout))
-    taken, steps = [], []
+    taken: list[CollectResult] = []
+    steps: list[StepDone] = []
     for run_request in run_requests:
         with ledger.step(f"collect {run_request.campaign}", "trials taken") as on_done:
             taken.append(collect(run_request))
             on_done(taken[-1]["taken"])
     campaigns = collected(store, [run_request.campaign for run_request in run_requests])
 
-    def run(name: str, unit: str, work: Callable[[], Json]) -> None:
+    def run(name: str, unit: str, work: Callable[[], StepDone]) -> None:
         with ledger.step(name, unit) as on_done:
             steps.append(work())
             on_done(steps[-1]["done"])
@@ -115,7 +116,9 @@ def searches(run_requests: Sequence[RunRequest]) -> list[Search]:
     return study_plan(run_requests).searches(SKINS, len(names))
 
 
-def run_search(name: str, store: Store, campaigns: list[Collected], names: Sequence[str]) -> Json:
+def run_search(
+    name: str, store: Store, campaigns: list[Collected], names: Sequence[str]
+) -> StepDone:
     """Do what is missing of a search; ``done`` of the result counts it.
 
     Args:

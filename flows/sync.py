@@ -10,16 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.clocks.refit import fit_again, sync_key
 from sliplab.analysis.report.clock_page import render
-from sliplab.analysis.report.clock_trials import TrialClocks, campaign_clocks, read_trials
+from sliplab.analysis.report.clock_trials import (
+    CampaignClocks,
+    TrialClocks,
+    campaign_clocks,
+    read_trials,
+)
 from sliplab.analysis.report.clocks import PAGE
 from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import run_trials
+from sliplab.flows.steps import StepResult
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import SYNC, Store
@@ -35,9 +41,21 @@ COLUMNS = (
 together; of events, their own."""
 
 
-def sync(
-    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
-) -> dict[str, Any]:
+class SyncDone(StepResult):
+    """Numbers of what `sync` did, and each campaign's clocks.
+
+    Attributes:
+        changed: trials whose clocks are others than those of the record.
+        page: path of the page.
+    """
+
+    changed: int
+    simulated: bool
+    page: str
+    campaigns: dict[str, CampaignClocks]
+
+
+def sync(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> SyncDone:
     """Fit what is stale, and write the page if anything on it has changed."""
     required = [
         TrialWork(recording, item.name, sync_key(recording))
@@ -62,10 +80,10 @@ def sync(
         "step": SYNC,
         "done": len(stale),
         "fresh": len(required) - len(stale),
-        "changed": sum(known.changed for known in found.values()),
+        "changed": sum(known["changed"] for known in found.values()),
         "simulated": store.simulated,
         "page": str(page),
-        "campaigns": {name: known.to_json() for name, known in found.items()},
+        "campaigns": found,
     }
 
 
@@ -87,7 +105,7 @@ def _write_page(
     return path
 
 
-def tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+def tables(result: SyncDone) -> list[tuple[str, list[list[str]]]]:
     """Return for each campaign a title, and rows under `COLUMNS`, of a result of `sync`."""
     found = []
     simulated = " (simulated)" if result["simulated"] else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -21,6 +21,7 @@ from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.parallel_map import each_trial
 from sliplab.flows.running.run_records import timed
+from sliplab.flows.steps import StepResult
 from sliplab.flows.ui.train_view import training_progress
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes, write_json
@@ -97,7 +98,7 @@ def train(
     campaigns: list[Collected],
     cluster: Cluster | None = None,
     reviewed: bool = False,
-) -> dict[str, Any]:
+) -> StepResult:
     """Train what is missing or stale.
 
     Args:

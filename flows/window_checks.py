@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +17,7 @@ from sliplab.analysis.networks.models import (
     wanted_models,
 )
 from sliplab.analysis.networks.window_checks import (
+    Chance,
     CheckFailed,
     check_chance,
     check_permutations,
@@ -28,12 +27,10 @@ from sliplab.analysis.networks.window_checks import (
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.running import console
 from sliplab.flows.running.run_records import timed
+from sliplab.flows.steps import StepResult
 from sliplab.storage.schema.evaluation import BaselineResult
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
-
-if TYPE_CHECKING:
-    pass
 
 SPLITS = ("train", "validation", "test")
 CHECKED_EPOCHS = 3
@@ -42,9 +39,26 @@ CHECKED_WINDOWS = 2000
 """Number of test windows that are checked, evenly spread over all."""
 
 
+class BaselinesDone(StepResult):
+    """Numbers of what `window_baselines` did; `argmax` accuracy by method."""
+
+    argmax: dict[str, float | None]
+
+
+class ChecksDone(StepResult):
+    """Numbers of what `window_checks` did.
+
+    Attributes:
+        orders: of the classes that were tried; shuffled: accuracies on shuffled labels.
+    """
+
+    orders: int
+    shuffled: Chance
+
+
 def window_baselines(
     store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> dict[str, Any]:
+) -> BaselinesDone:
     """Train and keep every baseline that is missing or stale.
 
     Args:
@@ -70,9 +84,7 @@ def window_baselines(
     }
 
 
-def window_checks(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> dict[str, Any]:
+def window_checks(store: Store, campaigns: list[Collected], reviewed: bool = False) -> ChecksDone:
     """Check permuted classes, shuffled labels, and that no trial is in two parts of the split.
 
     Raises:
@@ -103,4 +115,4 @@ def window_checks(
         check_chance(chance)
     except (CheckFailed, ValueError) as error:
         raise StoreError(f"{store.folder}: {error}") from None
-    return {"step": "checks", "done": 2, "fresh": 0, "orders": orders, "shuffled": asdict(chance)}
+    return {"step": "checks", "done": 2, "fresh": 0, "orders": orders, "shuffled": chance}

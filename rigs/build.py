@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings, PlaneSettings
 from sliplab.rigs.core.capabilities import (
@@ -12,6 +12,7 @@ from sliplab.rigs.core.capabilities import (
     Plate,
     Pose,
     RigError,
+    Truth,
 )
 from sliplab.rigs.core.host_clock import HostClock
 from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
@@ -45,7 +46,7 @@ class _MockSimulation:
         """Return the sink of the recording in this world."""
         return self._devices.sink(sink)
 
-    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
         """Return the ground truth of a trial, counted from these times."""
         clock = self._devices.world.clocks.arm
         hold_ns = None if hold_arm_ns is None else int(clock.to_device(hold_arm_ns))

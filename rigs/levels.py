@@ -8,7 +8,7 @@ and without a simulation; `sliplab tradeoff --scene` measures the same on window
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -95,7 +95,19 @@ def at_level(rig: RigFile, name: str) -> RigFile:
     return rig.model_copy(update={"mock": rig.scene.model_copy(update={"scene": scene})})
 
 
-def slip_expected(rig: RigFile, plan: Plan) -> dict[str, Any] | None:
+class SlipExpected(TypedDict):
+    """The slip to expect in a plan's slides: least and most, in seconds.
+
+    Attributes:
+        first_slip_s: after the start of the slide; incipient_s: duration of incipient slip.
+    """
+
+    simulated: bool
+    first_slip_s: list[float]
+    incipient_s: list[float]
+
+
+def slip_expected(rig: RigFile, plan: Plan) -> SlipExpected | None:
     """Return the range of the first slip and of the duration of incipient slip over all slides.
 
     Times are from the start of the slide. None for a real rig or a plan without slides. Closed

@@ -20,7 +20,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +61,24 @@ class Decision:
     decided_ns: int = field(compare=False)
 
 
+class DecisionJson(TypedDict):
+    """`TimedDecision` as one line of the decisions' file."""
+
+    window: int
+    start_us: int
+    end_us: int
+    trial_s: float
+    phase: str
+    state: str
+    onset: str | None
+    counts: list[int]
+    smoothed: list[float]
+    events: int
+    by_event: bool
+    latency_ms: float | None
+    compute_ms: float
+
+
 @dataclass(frozen=True)
 class TimedDecision:
     """A decision and its times.
@@ -84,7 +102,7 @@ class TimedDecision:
         """The valid class by name, or `UNDECIDED`."""
         return state_name(self.decision.valid_class)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> DecisionJson:
         """Return it as one line of the decisions' file."""
         made = self.decision
         return {

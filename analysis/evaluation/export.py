@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,18 @@ from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import json_text, sha256
+from sliplab.storage.schema.evaluation import Accuracy
+from sliplab.storage.schema.export import (
+    CardCampaign,
+    CardData,
+    CountChange,
+    Latencies,
+    ModelCard,
+    ModelFile,
+    Quantisation,
+    QuantisedLayer,
+    SpeckDescription,
+)
 from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -80,9 +92,9 @@ class _Source:
         return rules[training_campaigns(self.campaigns)[0].name].margin
 
     @property
-    def about(self) -> dict[str, str]:
+    def about(self) -> ModelFile:
         """Description of the model in every exported file."""
-        return {"file": self.path.name, "sha256": self.sha256}
+        return ModelFile(file=self.path.name, sha256=self.sha256)
 
 
 def _weights_file(whole: Quantised) -> bytes:
@@ -120,7 +132,8 @@ def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[byte
 
     windows = source.fitted.windows
     about = {
-        **source.about,
+        "file": source.about.file,
+        "sha256": source.about.sha256,
         "classes": ",".join(metrics.CLASSES),
         "windows": windows.model_dump_json(),
         "simulated": str(source.simulated).lower(),
@@ -138,9 +151,9 @@ def _speck(
     source: _Source,
     whole: Quantised,
     seen: SampleSet,
-    real: dict[str, Any],
-    chip: dict[str, Any],
-) -> dict[str, Any]:
+    real: Latencies,
+    chip: Latencies,
+) -> SpeckDescription:
     """The description of the network on the chip."""
     fitted = source.fitted
     net = training.restore(fitted)
@@ -149,40 +162,38 @@ def _speck(
     counts = training.engine(fitted).counts(seen.windows)
     rounding = whole.rounding(net)
     layers = {
-        name: {
-            "scale": whole.scales[name],
-            "threshold": whole.thresholds[spiking],
-            "rounding": rounding[name],
-            "potential": list(ran.potentials[spiking]),
-            "saturated": ran.saturated[spiking],
-        }
+        name: QuantisedLayer(
+            scale=whole.scales[name],
+            threshold=whole.thresholds[spiking],
+            rounding=rounding[name],
+            potential=ran.potentials[spiking],
+            saturated=ran.saturated[spiking],
+        )
         for name, spiking in zip(WEIGHTED, SPIKING, strict=True)
     }
     accuracy = {
-        name: metrics.accuracy(each, seen.y, margin).to_json()
+        name: metrics.accuracy(each, seen.y, margin)
         for name, each in (("real", counts), ("whole", ran.counts))
     }
-    return {
-        "format": SPECK_FORMAT,
-        "simulated": source.simulated,
-        "model": source.about,
-        "fit": speck_fit(fitted.network, fitted.windows).as_json(),
-        "quantisation": {
-            "layers": layers,
-            "change": compare(counts, ran.counts, margin),
-            "accuracy": accuracy,
-        },
-        "detection": {"real": real, "whole": chip},
-    }
+    return SpeckDescription(
+        format=SPECK_FORMAT,
+        simulated=source.simulated,
+        model=source.about,
+        fit=speck_fit(fitted.network, fitted.windows).document(),
+        quantisation=Quantisation(
+            layers=layers, change=compare(counts, ran.counts, margin), accuracy=accuracy
+        ),
+        detection={"real": real, "whole": chip},
+    )
 
 
 def _card(
     source: _Source,
     samples: dict[str, SampleSet],
     seen: SampleSet,
-    detection: dict[str, Any],
+    detection: Latencies,
     made_from_these: bool,
-) -> dict[str, Any]:
+) -> ModelCard:
     net, engine = training.restore(source.fitted), training.engine(source.fitted)
     kinematic = training_campaigns(source.campaigns)
     splits = {
@@ -194,31 +205,50 @@ def _card(
         for split, part in samples.items()
         if len(part)
     }
-    campaigns = [
-        {
-            "name": item.name,
-            "experiment": item.experiment,
-            "protocol": item.plan.protocol.name,
-            "collection_hash": item.plan.collection_hash,
-            "analysis_hash": item.plan.analysis_hash,
-            "rig": item.info["rig"],
-            "simulated": item.info["simulated"],
-            "trials": {split: sum(1 for _ in item.of_split(split)) for split in SPLITS},
-        }
+    campaigns = (
+        CardCampaign(
+            name=item.name,
+            experiment=item.experiment,
+            protocol=item.plan.protocol.name,
+            collection_hash=item.plan.collection_hash,
+            analysis_hash=item.plan.analysis_hash,
+            rig=str(item.info["rig"]),
+            simulated=bool(item.info["simulated"]),
+            trials={split: sum(1 for _ in item.of_split(split)) for split in SPLITS},
+        )
         for item in source.campaigns
-    ]
-    data = {
-        "store": source.store.folder.resolve().name,
-        "simulated": source.simulated,
-        "made_from_these_data": made_from_these,
-        "campaigns": campaigns,
-    }
+    )
+    data = CardData(
+        store=source.store.folder.resolve().name,
+        simulated=source.simulated,
+        made_from_these_data=made_from_these,
+        campaigns=tuple(campaigns),
+    )
     versions = {name: version(name) for name in PACKAGES}
     margin = source.margin
     return model_card(
         source.fitted, source.about, data, splits, activity(net, seen.x), detection, versions,
         margin,
     )  # fmt: skip
+
+
+class ExportFigures(TypedDict):
+    """Figures of an exported network.
+
+    Attributes:
+        onnx_windows_equal: windows on which the ONNX file gave Sinabs' counts.
+        change, accuracy: see `storage.schema.export.Quantisation`.
+        synaptic_operations: of all layers, a window.
+    """
+
+    simulated: bool
+    onnx_windows_equal: int
+    speck_fits: bool
+    problems: list[str]
+    change: CountChange
+    accuracy: dict[str, Accuracy]
+    synaptic_operations: float
+    warnings: list[str]
 
 
 def export_files(
@@ -228,7 +258,7 @@ def export_files(
     campaigns: list[Collected],
     checked: int | None,
     advance: Callable[[str], None],
-) -> tuple[dict[str, bytes | str], dict[str, Any]]:
+) -> tuple[dict[str, bytes | str], ExportFigures]:
     """Make the files of a model, and say of the result what matters.
 
     Args:
@@ -261,21 +291,21 @@ def export_files(
     real, chip = latencies(campaigns, source.labels, fitted, whole, lambda: advance("test trials"))
     speck = _speck(source, whole, seen, real, chip)
     files |= {
-        ".speck.json": json_text(speck),
+        ".speck.json": json_text(speck.to_json()),
         ".speck.md": speck_markdown(speck),
         ".speck.npz": _weights_file(whole),
     }
     advance("speck")
     card = _card(source, samples, seen, real, made_from_these)
-    files |= {".card.json": json_text(card), ".card.md": card_markdown(card)}
+    files |= {".card.json": json_text(card.to_json()), ".card.md": card_markdown(card)}
     advance("card")
     return files, {
         "simulated": source.simulated,
         "onnx_windows_equal": checks,
-        "speck_fits": speck["fit"]["fits"],
-        "problems": speck["fit"]["problems"],
-        "change": speck["quantisation"]["change"],
-        "accuracy": speck["quantisation"]["accuracy"],
-        "synaptic_operations": card["activity"]["synaptic_operations"]["all"],
-        "warnings": card["warnings"],
+        "speck_fits": speck.fit.fits,
+        "problems": list(speck.fit.problems),
+        "change": speck.quantisation.change,
+        "accuracy": speck.quantisation.accuracy,
+        "synaptic_operations": card.activity.synaptic_operations["all"],
+        "warnings": list(card.warnings),
     }

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.external_model import Description, ExternalModel, load_external
-from sliplab.analysis.networks.models import training_settings
+from sliplab.analysis.networks.models import comparison_models, rules_of, training_settings
 from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
@@ -140,6 +140,13 @@ def _described(path: Path, engine: Engines | None) -> OtherNetwork:
     )  # fmt: skip
 
 
+class About(TypedDict):
+    """Origin of a network: preset and seed of a training; None where a file brought it."""
+
+    preset: str | None
+    seed: int | None
+
+
 @dataclass(frozen=True)
 class Judgement:
     """A network, trials and rules to judge it by, found before anything is computed."""
@@ -149,7 +156,7 @@ class Judgement:
     labels: Labels
     network: OtherNetwork
     rules: dict[str, Detection]
-    about: Json
+    about: About
 
     @property
     def data_key(self) -> str:
@@ -196,6 +203,54 @@ class Judgement:
         step = _counts_step(network)
         if stale := stale_trials(self.store, step, work):
             keep(step, stale, _count)
+
+
+def file_judgement(
+    labels: Labels,
+    campaigns: list[Collected],
+    network: OtherNetwork,
+    margin: float | None = None,
+    smoothing: int | None = None,
+) -> Judgement:
+    """Return a network of a file with the protocols' rules, in spikes of its own outputs.
+
+    Args:
+        margin, smoothing: instead of the protocols' own.
+    """
+    change = {"margin": margin, "smoothing": smoothing, "choose": "protocol"}
+    change = {name: value for name, value in change.items() if value is not None}
+    rules = {
+        name: Detection.model_validate({**rule.model_dump(), **change, "compare": None})
+        for name, rule in rules_of(campaigns, network.outputs_per_class).items()
+    }
+    about = About(preset=None, seed=None)
+    return Judgement(labels.store, campaigns, labels, network, rules, about)
+
+
+def comparison_judgements(labels: Labels, campaigns: list[Collected]) -> list[Judgement]:
+    """Return the networks that `analysis.also` asks for, each with its preset's rule.
+
+    Raises:
+        StoreError: a network is missing or stale.
+    """
+    found = []
+    for model in comparison_models(labels.store, campaigns, labels.reviewed):
+        if not model.fresh:
+            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
+        settings = model.settings
+        network = OtherNetwork(
+            f"preset-{settings.preset}", f"preset: {settings.preset}", model.path.read_bytes(),
+            None, settings.windows, settings.network.outputs_per_class, "fast", exact=True,
+        )  # fmt: skip
+        rules = {
+            item.name: settings.detection.model_copy(
+                update={"false_early_ms": item.settings.detection.false_early_ms}
+            )
+            for item in campaigns
+        }
+        about = About(preset=settings.preset, seed=model.seed)
+        found.append(Judgement(labels.store, campaigns, labels, network, rules, about))
+    return found
 
 
 def data_key(labels: Labels, campaigns: list[Collected]) -> str:

@@ -29,7 +29,8 @@ from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import ExperimentScores, TrialScore
+from sliplab.storage.schema.evaluation import ExperimentScores, TrialLatency, TrialScore
+from sliplab.storage.schema.export import ExperimentLatency, Latencies
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.sweeps import HoldoutScores
 from sliplab.storage.trials.recording import Recording
@@ -85,17 +86,13 @@ def summaries(rows: Sequence[TrialScore]) -> dict[str, ExperimentScores]:
     return result
 
 
-Latency = dict[str, Any]
-"""For each experiment ``trials`` with both onsets, and ``latency_ms`` of `summarise_latency`."""
-
-
 def latencies(
     campaigns: list[Collected],
     labels: Labels,
     fitted: Fitted,
     whole: Quantised,
     on_trial: Callable[[], None] = lambda: None,
-) -> tuple[Latency, Latency]:
+) -> tuple[Latencies, Latencies]:
     """Latency over the test trials of `campaigns`, as trained and with the whole numbers.
 
     Args:
@@ -103,7 +100,7 @@ def latencies(
     """
     rules = rules_of(campaigns, fitted.network.outputs_per_class)
     fast, chip = training.engine(fitted), quantised_net(fitted, whole)
-    found: tuple[dict[str, list[Any]], ...] = ({}, {})
+    found: tuple[dict[str, list[TrialLatency]], ...] = ({}, {})
     for item in campaigns:
         rule = rules[item.name]
         for _, recording in item.of_split("test"):
@@ -121,9 +118,9 @@ def latencies(
     return real, chips
 
 
-def _summary(rows: dict[str, list[Any]]) -> Latency:
+def _summary(rows: dict[str, list[TrialLatency]]) -> Latencies:
     return {
-        experiment: {"trials": len(each), "latency_ms": summarise_latency(each).to_json()}
+        experiment: ExperimentLatency(trials=len(each), latency_ms=summarise_latency(each))
         for experiment, each in rows.items()
     }
 

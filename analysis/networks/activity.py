@@ -15,6 +15,7 @@ import torch
 from torch import nn
 
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED, reset_states
+from sliplab.storage.schema.export import WindowCost
 
 
 @dataclass(frozen=True)
@@ -36,17 +37,17 @@ class Activity:
     operations: dict[str, float]
     dense: dict[str, int]
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain data, with totals."""
+    def cost(self) -> WindowCost:
+        """Return the document of it, with totals."""
         total, dense = sum(self.operations.values()), sum(self.dense.values())
-        return {
-            "windows": self.windows,
-            "events_a_window": self.events,
-            "rates": self.rates,
-            "synaptic_operations": {**self.operations, "all": total},
-            "dense_multiply_adds": {**self.dense, "all": dense},
-            "share_of_dense": total / dense,
-        }
+        return WindowCost(
+            windows=self.windows,
+            events_a_window=self.events,
+            rates=self.rates,
+            synaptic_operations={**self.operations, "all": total},
+            dense_multiply_adds={**self.dense, "all": dense},
+            share_of_dense=total / dense,
+        )
 
 
 def activity(net: nn.Sequential, x: npt.NDArray[np.uint8], batch: int = 64) -> Activity:

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.metrics.classification import CLASSES, class_balance, score
+from sliplab.analysis.metrics.classification import CLASSES, score
 from sliplab.analysis.networks.activity import Activity
 from sliplab.analysis.networks.training import Fitted
+from sliplab.storage.schema.export import (
+    CardData,
+    CardModel,
+    Latencies,
+    ModelCard,
+    ModelFile,
+    SplitFigures,
+)
 
 FORMAT = "sliplab-model-card-1"
 FEW_TRIALS = 10
@@ -29,65 +36,60 @@ class SplitResult:
 
 def model_card(
     fitted: Fitted,
-    file: Mapping[str, Any],
-    data: Mapping[str, Any],
+    file: ModelFile,
+    data: CardData,
     splits: Mapping[str, SplitResult],
     spikes: Activity,
-    detection: Mapping[str, Any],
+    detection: Latencies,
     versions: Mapping[str, str],
     margin: float,
-) -> dict[str, Any]:
-    """The card as JSON data.
+) -> ModelCard:
+    """Return the card.
 
     Args:
-        file: name and checksum of the model file.
-        data: where the samples are from: ``simulated``, ``made_from_these_data``, ``campaigns``.
+        data: where the samples are from.
         splits: results by split.
         spikes: over the windows of the test split.
-        detection: latency by experiment, over whole test trials.
+        detection: over whole test trials.
         margin: of the margin accuracy, mean spikes.
     """
-    record = fitted.chosen
     figures = {
-        name: {
-            "trials": part.trials,
-            "samples": len(part.labels),
-            "balance": class_balance(part.labels),
-            **score(part.counts, part.labels, margin).to_json(),
-        }
+        name: SplitFigures(
+            trials=part.trials,
+            samples=len(part.labels),
+            **dict(score(part.counts, part.labels, margin)),
+        )
         for name, part in splits.items()
     }
-    return {
-        "format": FORMAT,
-        "simulated": data["simulated"],
-        "model": {
-            **file,
-            "seed": fitted.seed,
-            "parameters": int(sum(w.numel() for w in fitted.state_dict.values())),
-            "network": fitted.network.model_dump(mode="json"),
-            "windows": fitted.windows.model_dump(mode="json"),
-            "training": fitted.training.model_dump(mode="json"),
-            "epochs": len(fitted.history),
-            "chosen_epoch": fitted.chosen_epoch,
-            "rates_in_training": dict(record.rates),
-        },
-        "data": dict(data),
-        "figures": figures,
-        "margin": margin,
-        "activity": spikes.as_json(),
-        "detection": dict(detection),
-        "versions": dict(versions),
-        "warnings": _warnings(fitted, data, splits),
-    }
+    return ModelCard(
+        format=FORMAT,
+        simulated=data.simulated,
+        model=CardModel(
+            **dict(file),
+            seed=fitted.seed,
+            parameters=int(sum(w.numel() for w in fitted.state_dict.values())),
+            network=fitted.network,
+            windows=fitted.windows,
+            training=fitted.training,
+            epochs=len(fitted.history),
+            chosen_epoch=fitted.chosen_epoch,
+            rates_in_training=dict(fitted.chosen.rates),
+        ),
+        data=data,
+        figures=figures,
+        margin=margin,
+        activity=spikes.cost(),
+        detection=detection,
+        versions=dict(versions),
+        warnings=_warnings(fitted, data, splits),
+    )
 
 
-def _warnings(
-    fitted: Fitted, data: Mapping[str, Any], splits: Mapping[str, SplitResult]
-) -> list[str]:
+def _warnings(fitted: Fitted, data: CardData, splits: Mapping[str, SplitResult]) -> tuple[str, ...]:
     found = list(fitted.warnings)
-    if data["simulated"]:
+    if data.simulated:
         found.append("the data are simulated: the figures say nothing about a real sensor")
-    if not data["made_from_these_data"]:
+    if not data.made_from_these_data:
         found.append(
             "the store's data and settings are not those that the model was trained on: "
             "its figures for 'train' and 'validation' may be those of unseen data, and its figures "
@@ -97,79 +99,86 @@ def _warnings(
     if test is None or test.trials < FEW_TRIALS:
         trials = 0 if test is None else test.trials
         found.append(f"only {trials} test trials of the training campaigns")
-    return found
+    return tuple(found)
 
 
-def card_markdown(card: Mapping[str, Any]) -> str:
+def card_markdown(card: ModelCard) -> str:
     """Return the card as Markdown."""
-    model, data, simulated = card["model"], card["data"], card["simulated"]
-    said = " (simulated)" if simulated else ""
-    text = [f"# {model['file']}{said}", ""]
+    model, data = card.model, card.data
+    said = " (simulated)" if card.simulated else ""
+    text = [f"# {model.file}{said}", ""]
     text.append(
-        f"Spiking network, {model['parameters']:,} weights, seed {model['seed']}, epoch "
-        f"{model['chosen_epoch']} of {model['epochs']}. SHA-256 `{model['sha256']}`."
+        f"Spiking network, {model.parameters:,} weights, seed {model.seed}, epoch "
+        f"{model.chosen_epoch} of {model.epochs}. SHA-256 `{model.sha256}`."
     )
-    if card["warnings"]:
-        text += ["", "## Warnings", "", *(f"- {warning}" for warning in card["warnings"])]
+    if card.warnings:
+        text += ["", "## Warnings", "", *(f"- {warning}" for warning in card.warnings)]
     text += ["", f"## Data{said}", ""]
     text += table(
         ["campaign", "experiment", "collection", "analysis", "rig", "train", "validation", "test"],
         [
             [
-                item["name"], item["experiment"], f"`{item['collection_hash'][:12]}`",
-                f"`{item['analysis_hash'][:12]}`", item["rig"],
-                *(item["trials"].get(split, 0) for split in ("train", "validation", "test")),
+                item.name, item.experiment, f"`{item.collection_hash[:12]}`",
+                f"`{item.analysis_hash[:12]}`", item.rig,
+                *(item.trials.get(split, 0) for split in ("train", "validation", "test")),
             ]
-            for item in data["campaigns"]
+            for item in data.campaigns
         ],
     )  # fmt: skip
     text += ["", f"## Accuracy over windows{said}", ""]
     names = [name.replace("_", " ") for name in CLASSES]
     text += table(
-        ["split", "trials", "windows", "strict", f"margin {card['margin']:g}", "argmax"]
+        ["split", "trials", "windows", "strict", f"margin {card.margin:g}", "argmax"]
         + [f"recall {name}" for name in names],
         [
-            [split, part["trials"], part["samples"]]
-            + [percent(part["accuracy"][kind]) for kind in ("strict", "margin", "argmax")]
-            + [percent(part["recall"][name]) for name in CLASSES]
-            for split, part in card["figures"].items()
+            [
+                split,
+                part.trials,
+                part.samples,
+                percent(part.accuracy.strict),
+                percent(part.accuracy.margin),
+                percent(part.accuracy.argmax),
+                *(percent(part.recall[name]) for name in CLASSES),
+            ]
+            for split, part in card.figures.items()
         ],
     )
     text += ["", "Strict: only a unique winner counts. Argmax shares ties."]
     text += ["", f"## Detection over whole test trials{said}", ""]
-    text += latency_table(card["detection"])
-    spikes = card["activity"]
+    text += latency_table(card.detection)
+    spikes = card.activity
     text += ["", f"## Spikes and operations a window{said}", ""]
     text += table(
         ["layer", "spikes per neuron and step", "synaptic operations", "multiply-adds if dense"],
         [
             [f"{weighted} + {spiking}", f"{rate:.4f}", f"{operations:,.0f}", f"{dense:,}"]
             for (spiking, rate), (weighted, operations), dense in zip(
-                spikes["rates"].items(),
-                list(spikes["synaptic_operations"].items())[:-1],
-                list(spikes["dense_multiply_adds"].values())[:-1],
+                spikes.rates.items(),
+                list(spikes.synaptic_operations.items())[:-1],
+                list(spikes.dense_multiply_adds.values())[:-1],
                 strict=True,
             )
         ],
     )
     text += [
         "",
-        f"All: {spikes['synaptic_operations']['all']:,.0f} synaptic operations, "
-        f"{percent(spikes['share_of_dense'])} of the dense ones; "
-        f"{spikes['events_a_window']:.0f} events a window.",
+        f"All: {spikes.synaptic_operations['all']:,.0f} synaptic operations, "
+        f"{percent(spikes.share_of_dense)} of the dense ones; "
+        f"{spikes.events_a_window:.0f} events a window.",
     ]
-    text += ["", "## Versions", "", ", ".join(f"{k} {v}" for k, v in card["versions"].items())]
+    text += ["", "## Versions", "", ", ".join(f"{k} {v}" for k, v in card.versions.items())]
     return "\n".join(text) + "\n"
 
 
-def latency_table(detection: Mapping[str, Any]) -> list[str]:
+def latency_table(detection: Latencies) -> list[str]:
     """Latency by experiment and onset."""
     rows: list[list[object]] = []
     for experiment, found in detection.items():
-        for onset, values in found["latency_ms"].items():
-            times = [ms(values[name]) for name in ("mean", "median", "max")]
-            lost = [values[name] for name in ("missed", "late", "false_early")]
-            rows.append([experiment, onset, found["trials"], *times, *lost])
+        both = found.latency_ms
+        for onset, values in (("incipient", both.incipient), ("gross", both.gross)):
+            times = (ms(values.mean), ms(values.median), ms(values.max))
+            lost = (values.missed, values.late, values.false_early)
+            rows.append([experiment, onset, found.trials, *times, *lost])
     columns = ["experiment", "onset", "trials", "mean ms", "median ms", "most ms"]
     return table([*columns, "missed", "late", "false early"], rows)
 

@@ -35,6 +35,7 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.speck import STATE_BITS, WEIGHT_BITS
 from sliplab.analysis.networks.training import Fitted
+from sliplab.storage.schema.export import CountChange
 
 LOWEST = np.float32(-(1 << STATE_BITS - 1))
 HIGHEST = np.float32((1 << STATE_BITS - 1) - 1)
@@ -191,25 +192,24 @@ def _fire(current: Any, threshold: Any, lowest: Any, highest: Any, ends: Any) ->
     return cut
 
 
-def compare(real: Counts, whole: Counts, margin: float) -> dict[str, Any]:
+def compare(real: Counts, whole: Counts, margin: float) -> CountChange:
     """Compare spike counts `real` with `whole`, both int64 (n, 3).
 
-    Returns:
-        shares of windows with equal counts, with the same class (unique winner or none) and with
-        the same class by the margin; mean and largest change of a count; n.
+    Raises:
+        ValueError: no windows, or not the same number of them.
     """
     n = len(real)
     if real.shape != whole.shape or not n:
         raise ValueError(f"counts of the shapes {real.shape} and {whole.shape}; expected as many")
     change = np.abs(real - whole)
-    return {
-        "windows": n,
-        "equal_counts": float((change == 0).all(axis=1).mean()),
-        "equal_class": float((winners(real) == winners(whole)).mean()),
-        "equal_class_by_margin": float((winners(real, margin) == winners(whole, margin)).mean()),
-        "mean_change": float(change.mean()),
-        "largest_change": int(change.max()),
-    }
+    return CountChange(
+        windows=n,
+        equal_counts=float((change == 0).all(axis=1).mean()),
+        equal_class=float((winners(real) == winners(whole)).mean()),
+        equal_class_by_margin=float((winners(real, margin) == winners(whole, margin)).mean()),
+        mean_change=float(change.mean()),
+        largest_change=int(change.max()),
+    )
 
 
 def _numbers(net: nn.Sequential, layer: str) -> npt.NDArray[np.float64]:

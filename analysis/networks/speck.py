@@ -13,13 +13,18 @@ A fully connected layer is mapped as a convolution whose kernel covers its whole
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.model_card import latency_table, percent, table
 from sliplab.protocols.settings import Network, Windows
+from sliplab.storage.schema.export import (
+    ChipCore,
+    ChipFit,
+    ChipLimits,
+    PlacedLayer,
+    SpeckDescription,
+)
 
 KI = 1024
 
@@ -126,39 +131,40 @@ class SpeckFit:
         """True if the whole network fits on one chip."""
         return not self.problems
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain data: limits, layers with their cores, problems."""
+    def document(self) -> ChipFit:
+        """Return the document of it: limits, layers with their cores, problems."""
         by_number = {core.number: core for core in CORES}
         layers = []
         for place, layer in enumerate(self.layers):
             number = self.cores.get(layer.name)
             following = self.layers[place + 1 : place + 2]
+            core = None if number is None else by_number[number]
             layers.append(
-                {
+                PlacedLayer(
                     **asdict(layer),
-                    "core": number,
-                    "core_kernel_words": None if number is None else by_number[number].kernel_words,
-                    "core_neuron_words": None if number is None else by_number[number].neuron_words,
-                    "destinations": [self.cores[next_.name] for next_ in following if self.cores],
-                }
+                    core=number,
+                    core_kernel_words=None if core is None else core.kernel_words,
+                    core_neuron_words=None if core is None else core.neuron_words,
+                    destinations=tuple(self.cores[next_.name] for next_ in following if self.cores),
+                )
             )
-        return {
-            "fits": self.fits,
-            "problems": list(self.problems),
-            "layers": layers,
-            "limits": {
-                "cores": [asdict(core) for core in CORES],
-                "kernel": MOST_KERNEL,
-                "features": MOST_FEATURES,
-                "input_side": MOST_INPUT,
-                "output_side": MOST_OUTPUT,
-                "padding": MOST_PADDING,
-                "strides": list(STRIDES),
-                "destinations_of_a_core": DESTINATIONS,
-                "weight_bits": WEIGHT_BITS,
-                "state_bits": STATE_BITS,
-            },
-        }
+        return ChipFit(
+            fits=self.fits,
+            problems=self.problems,
+            layers=tuple(layers),
+            limits=ChipLimits(
+                cores=tuple(ChipCore(**asdict(core)) for core in CORES),
+                kernel=MOST_KERNEL,
+                features=MOST_FEATURES,
+                input_side=MOST_INPUT,
+                output_side=MOST_OUTPUT,
+                padding=MOST_PADDING,
+                strides=STRIDES,
+                destinations_of_a_core=DESTINATIONS,
+                weight_bits=WEIGHT_BITS,
+                state_bits=STATE_BITS,
+            ),
+        )
 
 
 def speck_fit(network: Network, windows: Windows) -> SpeckFit:
@@ -234,29 +240,29 @@ NOT_SHOWN = (
 )
 
 
-def speck_markdown(found: Mapping[str, Any]) -> str:
+def speck_markdown(found: SpeckDescription) -> str:
     """Write the content of ``*.speck.json`` as a page."""
-    fit, whole = found["fit"], found["quantisation"]
-    said = " (simulated)" if found["simulated"] else ""
-    text = [f"# {found['model']['file']} on a Speck", ""]
-    if fit["fits"]:
+    fit, whole = found.fit, found.quantisation
+    said = " (simulated)" if found.simulated else ""
+    text = [f"# {found.model.file} on a Speck", ""]
+    if fit.fits:
         text.append("It fits: one core a layer.")
     else:
-        text += ["**It does not fit:**", "", *(f"- {problem}" for problem in fit["problems"])]
+        text += ["**It does not fit:**", "", *(f"- {problem}" for problem in fit.problems)]
     text += ["", "## Memory (words of the chip, rounded up as it rounds)", ""]
     text += table(
         ["layer", "core", "kernel memory", "of", "neuron memory", "of", "fan-in", "fan-out",
          "sends to"],
         [
             [
-                f"{layer['name']} {layer['in_channels']}x{layer['in_side']}² → "
-                f"{layer['out_channels']}x{layer['out_side']}², kernel {layer['kernel']}",
-                _or_dash(layer["core"]), _words(layer["kernel_words"]),
-                _words(layer["core_kernel_words"]), _words(layer["neuron_words"]),
-                _words(layer["core_neuron_words"]), layer["fan_in"], layer["fan_out"],
-                ", ".join(map(str, layer["destinations"])) or "output",
+                f"{layer.name} {layer.in_channels}x{layer.in_side}² → "
+                f"{layer.out_channels}x{layer.out_side}², kernel {layer.kernel}",
+                _or_dash(layer.core), _words(layer.kernel_words),
+                _words(layer.core_kernel_words), _words(layer.neuron_words),
+                _words(layer.core_neuron_words), layer.fan_in, layer.fan_out,
+                ", ".join(map(str, layer.destinations)) or "output",
             ]
-            for layer in fit["layers"]
+            for layer in fit.layers
         ],
     )  # fmt: skip
     text += ["", "## 8-bit weights", ""]
@@ -264,34 +270,35 @@ def speck_markdown(found: Mapping[str, Any]) -> str:
         ["layer", "scale", "threshold", "rounding (RMS)", "lowest potential", "highest", "cut off"],
         [
             [
-                name, f"{layer['scale']:g}", layer["threshold"], f"{layer['rounding']:.2%}",
-                f"{layer['potential'][0]:,.0f}", f"{layer['potential'][1]:,.0f}",
-                f"{layer['saturated']:.3%}",
+                name, f"{layer.scale:g}", layer.threshold, f"{layer.rounding:.2%}",
+                f"{layer.potential[0]:,.0f}", f"{layer.potential[1]:,.0f}",
+                f"{layer.saturated:.3%}",
             ]
-            for name, layer in whole["layers"].items()
+            for name, layer in whole.layers.items()
         ],
     )  # fmt: skip
-    change = whole["change"]
+    change = whole.change
+    real, chip = whole.accuracy["real"], whole.accuracy["whole"]
     text += [
         "",
-        f"A potential holds 16 bits and is cut off beyond. Over {change['windows']} windows"
-        f"{said}: equal spike counts in {percent(change['equal_counts'])}, the same class in "
-        f"{percent(change['equal_class'])}, the same class by the margin in "
-        f"{percent(change['equal_class_by_margin'])}; a count changes by "
-        f"{change['mean_change']:.2f} on average and {change['largest_change']} at most.",
+        f"A potential holds 16 bits and is cut off beyond. Over {change.windows} windows"
+        f"{said}: equal spike counts in {percent(change.equal_counts)}, the same class in "
+        f"{percent(change.equal_class)}, the same class by the margin in "
+        f"{percent(change.equal_class_by_margin)}; a count changes by "
+        f"{change.mean_change:.2f} on average and {change.largest_change} at most.",
         "",
         *table(
             [f"accuracy{said}", "as trained", "8 bits"],
             [
-                [kind, percent(whole["accuracy"]["real"][kind]),
-                 percent(whole["accuracy"]["whole"][kind])]
-                for kind in ("strict", "margin", "argmax")
+                ["strict", percent(real.strict), percent(chip.strict)],
+                ["margin", percent(real.margin), percent(chip.margin)],
+                ["argmax", percent(real.argmax), percent(chip.argmax)],
             ],
         ),
         "", f"## Detection latency as trained{said}", "",
-        *latency_table(found["detection"]["real"]),
+        *latency_table(found.detection["real"]),
         "", f"## Detection latency with 8 bits{said}", "",
-        *latency_table(found["detection"]["whole"]),
+        *latency_table(found.detection["whole"]),
         "", "## What this does not show", "", *(f"- {line}" for line in NOT_SHOWN),
     ]  # fmt: skip
     return "\n".join(text) + "\n"

@@ -203,13 +203,14 @@ def _by_campaign(shown: _Shown) -> Table:
     rows = []
     for campaign, trials in shown.campaigns.items():
         known = campaign_clocks(trials)
-        for name, device in known.devices.items():
-            least, most = device.drift_ppm
+        for name, device in known["devices"].items():
+            uncertainty = device["uncertainty_us"]
+            least, most = device["drift_ppm"]
             rows.append([
-                campaign, name, device.grade, device.kind,
-                number(device.uncertainty_us["median"]), number(device.uncertainty_us["worst"]),
-                " or ".join(f"{gate:g}" for gate in device.gates_us) or "–",
-                f"{least:.2f} to {most:.2f}", str(device.trials), str(known.changed),
+                campaign, name, device["grade"], device["kind"],
+                number(uncertainty["median"]), number(uncertainty["worst"]),
+                " or ".join(f"{gate:g}" for gate in device["gates_us"]) or "–",
+                f"{least:.2f} to {most:.2f}", str(device["trials"]), str(known["changed"]),
             ])  # fmt: skip
     columns = (
         "campaign", "device", "grade", "uncertainty is", "median (µs)", "worst (µs)", "gate (µs)",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -140,8 +140,7 @@ def _device(clocks: Clocks, gates: Mapping[str, Gate], name: str) -> DeviceClock
     )
 
 
-@dataclass(frozen=True)
-class DeviceNumbers:
+class DeviceNumbers(TypedDict):
     """One device in all trials of a campaign that have it.
 
     Attributes:
@@ -153,25 +152,24 @@ class DeviceNumbers:
     grade: str
     kind: str
     trials: int
-    uncertainty_us: Mapping[str, float]
-    gates_us: Sequence[float]
-    drift_ppm: Sequence[float]
-    pulses: Mapping[str, int] | None
+    uncertainty_us: dict[str, float]
+    gates_us: list[float]
+    drift_ppm: list[float]
+    pulses: dict[str, int] | None
 
 
-@dataclass(frozen=True)
-class CampaignClocks:
-    """A campaign's clocks: the number of trials fitted again now, and the results."""
+class CampaignClocks(TypedDict):
+    """Clocks of a campaign in the result of `sliplab sync`.
+
+    Attributes:
+        refitted: trials that were fitted again now.
+    """
 
     refitted: int
     trials: int
     changed: int
     refused: int
-    devices: Mapping[str, DeviceNumbers]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        return asdict(self)
+    devices: dict[str, DeviceNumbers]
 
 
 def campaign_clocks(trials: Sequence[TrialClocks], refitted: int = 0) -> CampaignClocks:

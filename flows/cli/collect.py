@@ -127,7 +127,7 @@ def collect(
         from sliplab.flows.planning.campaign_trials import print_excluded
 
         print_excluded(result["causes"])
-        result = {key: value for key, value in result.items() if key != "causes"}
-    finish(result, f"collected into {store}", as_json)
+    shown = {key: value for key, value in result.items() if as_json or key != "causes"}
+    finish(shown, f"collected into {store}", as_json)
     if result["missing"] > result["left_out"]:
         raise typer.Exit(console.FAILED)

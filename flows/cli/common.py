@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -67,7 +68,7 @@ def step(place: str, names: list[str] | None, as_json: bool, step: str, **option
     finish(run_step(located(place), names, step, **options), f"{step} {place}", as_json)
 
 
-def finish(result: dict[str, Any], title: str, as_json: bool) -> None:
+def finish(result: Mapping[str, object], title: str, as_json: bool) -> None:
     """Print a command's result, as one JSON object or for a person."""
     if as_json:
         console.print_json(result)

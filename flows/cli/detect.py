@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sliplab.flows.cli.common import EnableOption, JsonOption, RigOption
 from sliplab.flows.running import console
+
+if TYPE_CHECKING:
+    from sliplab.flows.detect import DetectSummary
+    from sliplab.flows.detecting.sink import Times
 
 app = typer.Typer()
 
@@ -69,7 +73,7 @@ def detect(
 ) -> None:
     """Detect slip live on a rig's event stream. Ctrl-C stops the arm at once."""
     from sliplab.flows.detect import detect as run
-    from sliplab.flows.detect import make_detect_request
+    from sliplab.flows.detecting.request import make_detect_request
 
     order = make_detect_request(
         rig,
@@ -95,11 +99,11 @@ def detect(
         raise typer.Exit(console.INTERRUPTED)
 
 
-def _shown(result: dict[str, Any]) -> dict[str, Any]:
+def _shown(result: DetectSummary) -> dict[str, str | None]:
     """Format the summary in a few lines."""
     latency, compute, losses = result["latency_ms"], result["compute_ms"], result["losses"]
     clock = "virtual" if result["virtual_time"] else "real"
-    found = {
+    found: dict[str, str | None] = {
         "windows": f"{result['windows']} ({result['quiet_windows']} without events)",
         "states": ", ".join(f"{name} {count}" for name, count in result["states"].items()),
         f"last event to decision, ms ({clock} time)": _spread(latency),
@@ -121,7 +125,7 @@ def _shown(result: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _spread(values: dict[str, Any]) -> str | None:
-    if not values["n"]:
+def _spread(times: Times) -> str | None:
+    if not times["n"]:
         return None
-    return f"median {values['median']:.2f}, 99 % {values['p99']:.2f}, most {values['max']:.2f}"
+    return f"median {times['median']:.2f}, 99 % {times['p99']:.2f}, most {times['max']:.2f}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,9 @@ from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, 
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
+
+if TYPE_CHECKING:
+    from sliplab.flows.export_model import Exported
 
 app = typer.Typer()
 
@@ -135,7 +138,7 @@ def export_model(
     as_json: JsonOption = False,
 ) -> None:
     """Export a network as ONNX, with its resource use on a Speck chip and a model card."""
-    from sliplab.flows.detect import load_model
+    from sliplab.flows.detecting.request import load_model
     from sliplab.storage.remote.mirror import open_store
 
     if out.exists() and not out.is_dir():
@@ -158,16 +161,16 @@ def export_model(
         console.print_pairs(f"exported to {out}{simulated}", _model_pairs(result))
 
 
-def _model_pairs(result: dict[str, Any]) -> dict[str, Any]:
+def _model_pairs(result: Exported) -> dict[str, str]:
     change, accuracy = result["change"], result["accuracy"]
     checked = result["onnx_windows_equal"]
     return {
         "files": ", ".join(Path(file).name for file in result["files"]),
         "onnx": f"{checked} of {checked} windows as in Sinabs" if checked else "not written",
         "speck": "fits, one core a layer" if result["speck_fits"] else "does not fit",
-        "8 bits: equal counts": f"{change['equal_counts']:.1%} of {change['windows']} windows",
-        "8 bits: equal class": f"{change['equal_class']:.1%}",
-        "strict accuracy": f"{accuracy['real']['strict']:.1%}, with 8 bits "
-        f"{accuracy['whole']['strict']:.1%}",
+        "8 bits: equal counts": f"{change.equal_counts:.1%} of {change.windows} windows",
+        "8 bits: equal class": f"{change.equal_class:.1%}",
+        "strict accuracy": f"{accuracy['real'].strict:.1%}, with 8 bits "
+        f"{accuracy['whole'].strict:.1%}",
         "synaptic operations a window": f"{result['synaptic_operations']:,.0f}",
     }

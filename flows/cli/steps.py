@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -20,6 +20,10 @@ from sliplab.flows.cli.common import (
 from sliplab.flows.running import console
 from sliplab.flows.steps import run_step
 from sliplab.protocols.errors import InputError
+
+if TYPE_CHECKING:
+    from sliplab.flows.judge_network import NetworkScores
+    from sliplab.flows.sync import SyncDone
 
 app = typer.Typer()
 
@@ -44,7 +48,7 @@ def sync(
     as_json: JsonOption = False,
 ) -> None:
     """Refit the clocks of every trial and write report/sync.html."""
-    result = run_step(located(store), campaign, "sync", dask)
+    result = cast("SyncDone", run_step(located(store), campaign, "sync", dask))
     if as_json:
         console.print_json(result)
         return
@@ -130,48 +134,47 @@ def evaluate(
             if chosen:
                 raise InputError(name, "", None, "is for the store's own network")
         options |= {"model": model, "engine": None if engine is None else engine.value}
-        result = run_step(folder, campaign, "judge_model", dask, **options)
+        scores = cast("NetworkScores", run_step(folder, campaign, "judge_model", dask, **options))
         if as_json:
-            console.print_json(result)
+            console.print_json(scores)
         else:
-            simulated = " (simulated)" if result["simulated"] else ""
-            console.print_pairs(f"{result['model']} on {store}{simulated}", _model_scores(result))
+            simulated = " (simulated)" if scores["simulated"] else ""
+            console.print_pairs(f"{scores['model']} on {store}{simulated}", _model_scores(scores))
         return
-    result = run_step(folder, campaign, "evaluate", dask, **options)
+    done: dict[str, object] = {**run_step(folder, campaign, "evaluate", dask, **options)}
     more = {"window_baselines": baselines, "window_checks": checks}
     for name, chosen in more.items():
         if chosen:
-            result[name] = run_step(folder, campaign, name, reviewed=reviewed)
-    finish(result, f"evaluate {store}", as_json)
+            done[name] = run_step(folder, campaign, name, reviewed=reviewed)
+    finish(done, f"evaluate {store}", as_json)
 
 
-def _model_scores(result: dict[str, Any]) -> dict[str, Any]:
+def _model_scores(result: NetworkScores) -> dict[str, str | int]:
     """Format the scores of a model in a few lines."""
     accuracy, interval = result["accuracy"], result["interval"]
     sure = ""
-    if interval["low"] is not None:
-        sure = (
-            f" ({interval['low']:.1%} to {interval['high']:.1%} over {interval['trials']} trials)"
-        )
-    shown = {"windows": accuracy["n"], "engine": result["engine"]}
-    if not result["same_as_sinabs"]:
-        shown["engine"] += "; a few counts may differ from Sinabs'"
-    if accuracy["n"]:
+    if interval.low is not None and interval.high is not None:
+        sure = f" ({interval.low:.1%} to {interval.high:.1%} over {interval.trials} trials)"
+    differ = "" if result["same_as_sinabs"] else "; a few counts may differ from Sinabs'"
+    shown: dict[str, str | int] = {
+        "windows": accuracy.n, "engine": f"{result['engine']}{differ}",
+    }  # fmt: skip
+    if accuracy.n:
         shown |= {
-            "strict accuracy": f"{accuracy['strict']:.1%}{sure}",
-            "argmax accuracy": f"{accuracy['argmax']:.1%}",
-            "margin accuracy": f"{accuracy['margin']:.1%}",
+            "strict accuracy": f"{accuracy.strict:.1%}{sure}",
+            "argmax accuracy": f"{accuracy.argmax:.1%}",
+            "margin accuracy": f"{accuracy.margin:.1%}",
         }
-    for name, found in result["latency_ms"].items():
-        if found["median"] is not None:
-            out = (
-                f"{found[key]} {key.replace('_', ' ')}" for key in ("missed", "late", "false_early")
+    latency = result["latency_ms"]
+    for name, found in (("incipient", latency.incipient), ("gross", latency.gross)):
+        if found.median is not None:
+            shown[f"{name} latency"] = (
+                f"median {found.median:.0f} ms of {found.n}; {found.missed} missed, "
+                f"{found.late} late, {found.false_early} false early"
             )
-            missed = ", ".join(out)
-            shown[f"{name} latency"] = f"median {found['median']:.0f} ms of {found['n']}; {missed}"
-    for name, found in result["lead_ms"].items():
-        if found["median"] is not None:
-            shown[f"{name} lead"] = f"median {found['median']:.0f} ms of {found['n']}"
+    for name, lead in result["lead_ms"].items():
+        if lead.median is not None:
+            shown[f"{name} lead"] = f"median {lead.median:.0f} ms of {lead.n}"
     return shown
 
 
@@ -191,7 +194,7 @@ def report(
         from sliplab.analysis.report.against import load_other
 
         load_other(against)  # wrong input fails before anything is made
-    result = run_step(folder, campaign, "report")
+    done: dict[str, object] = {**run_step(folder, campaign, "report")}
     if against is not None:
         from sliplab.analysis.report.against import short_table
         from sliplab.flows import report as reports
@@ -199,10 +202,10 @@ def report(
 
         compared, page = reports.against(open_store(folder), against)
         if as_json:
-            result["against"] = {**compared.to_json(), "page": str(page)}
+            done["against"] = {**compared.to_json(), "page": str(page)}
         else:
             title = "Two reports" + (" (simulated)" if any(compared.simulated) else "")
             console.print_table(title, *short_table(compared.figures))
             console.show(f"Page: {page}")
-    finish(result, f"report {store}", as_json)
+    finish(done, f"report {store}", as_json)
     console.say(f"report: {folder / 'report' / 'index.html'}")

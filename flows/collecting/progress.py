@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 from uuid import UUID
 
-from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.planning.run_request import CampaignCounts, RunRequest
 from sliplab.flows.running import console, orchestration, stopping
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_text
@@ -286,7 +286,7 @@ class _Page:
         )
 
 
-def outcome_rows(counts: Json, here: Counter[str]) -> list[Json]:
+def outcome_rows(counts: CampaignCounts, here: Counter[str]) -> list[Json]:
     """Return the table of trials by outcome: in this run, and in the whole campaign."""
     return [
         {"outcome": "planned", "this run": "", "campaign": counts["planned"]},

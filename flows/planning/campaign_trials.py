@@ -6,7 +6,8 @@ retaken. `sliplab again` makes it pending.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TypedDict
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import console
@@ -23,17 +24,34 @@ def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
     return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
 
 
+class ExcludedTrial(TypedDict):
+    """A trial that no collection takes.
+
+    Attributes:
+        attempts: that failed.
+        by: the person who skipped it, None if its gates rejected it; when: likewise.
+    """
+
+    trial: str
+    cause: str
+    attempts: int
+    by: str | None
+    when: str | None
+
+
+class StoreExcludedTrial(ExcludedTrial):
+    """An excluded trial with the name of its campaign."""
+
+    campaign: str
+
+
 def excluded_trials(
     plan: Plan, campaign: Campaign, committed: set[str] | None = None
-) -> list[dict[str, Any]]:
+) -> list[ExcludedTrial]:
     """Return trials of the plan that no collection takes, in its order, each with its cause.
 
     Args:
         committed: the committed trials, if they are known already.
-
-    Returns:
-        For each ``trial``: ``cause``, ``attempts`` that failed, ``by`` (the person who skipped it,
-        None if its gates rejected it), ``when``.
     """
     done = campaign.committed() if committed is None else committed
     by_person, failed = skipped(campaign), campaign.failed_attempts()
@@ -42,7 +60,7 @@ def excluded_trials(
     for item in campaign.quarantined():
         if str(item["cause"]).startswith("gate") and FORGIVEN not in item:
             causes.setdefault(item["trial"], []).append(str(item["cause"]))
-    found = []
+    found: list[ExcludedTrial] = []
     for trial in plan:
         if trial.id in done:
             continue
@@ -63,14 +81,14 @@ def excluded_trials(
 
 def all_excluded(
     store: Store, unreadable: list[str], committed: dict[str, set[str]] | None = None
-) -> list[dict[str, Any]]:
-    """List the excluded trials of all campaigns, each with its ``campaign``.
+) -> list[StoreExcludedTrial]:
+    """List the excluded trials of all campaigns.
 
     Args:
         unreadable: gets a line for every campaign that cannot be read.
         committed: committed trials by campaign, if they are known already.
     """
-    found = []
+    found: list[StoreExcludedTrial] = []
     for campaign in store.campaigns():
         try:
             if IMPORTED in campaign.info:  # it has no plan
@@ -84,7 +102,7 @@ def all_excluded(
     return found
 
 
-def print_excluded(excluded: list[dict[str, Any]]) -> None:
+def print_excluded(excluded: Sequence[ExcludedTrial]) -> None:
     """Print the excluded trials as a table, if there are any."""
     if not excluded:
         return

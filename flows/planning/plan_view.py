@@ -3,14 +3,62 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from sliplab.flows.running import console
 from sliplab.protocols import Plan
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
-    from sliplab.rigs.levels import Choice
+    from sliplab.rigs.levels import Choice, SlipExpected
     from sliplab.rigs.rig_file import RigFile
+
+
+class SceneJson(TypedDict):
+    """`Scene` as part of a plan's JSON."""
+
+    level: str
+    reason: str
+    expected: SlipExpected | None
+
+
+class TaskJson(TypedDict):
+    """A task before a trial."""
+
+    kind: str
+    by_person: bool
+    prompt: str
+
+
+class TrialRow(TypedDict):
+    """One trial of a plan; `condition` by factor, with units; `seconds` of motion."""
+
+    index: int
+    id: str
+    role: str
+    block: int
+    repetition: int
+    condition: dict[str, str]
+    split: str | None
+    seconds: float
+    before: list[TaskJson]
+
+
+class PlanJson(TypedDict):
+    """A plan as `sliplab plan --json` prints it.
+
+    Attributes:
+        bytes: None without a rig; scene: None but on a simulated rig.
+        stretches: first and last trial of each stretch without a person.
+    """
+
+    protocol: str
+    trials: list[TrialRow]
+    count: int
+    seconds: float
+    bytes: int | None
+    scene: SceneJson | None
+    stretches: list[tuple[int, int]]
+    warnings: list[str]
 
 
 @dataclass(frozen=True)
@@ -22,9 +70,9 @@ class Scene:
     """
 
     choice: Choice
-    expected: dict[str, Any] | None
+    expected: SlipExpected | None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> SceneJson:
         """Return it as part of the plan's JSON."""
         return {
             "level": self.choice.name,
@@ -36,11 +84,10 @@ class Scene:
         """Return titles and values to print."""
         pairs = {"physics": f"{self.choice.name}: {self.choice.reason}"}
         if self.expected is not None:
-            for key, title in (
-                ("first_slip_s", "first slip after the start (s)"),
-                ("incipient_s", "incipient slip lasts (s)"),
+            for title, (low, high) in (
+                ("first slip after the start (s)", self.expected["first_slip_s"]),
+                ("incipient slip lasts (s)", self.expected["incipient_s"]),
             ):
-                low, high = self.expected[key]
                 pairs[title] = f"{low:.2f} to {high:.2f} (simulated, friction taken as even)"
         return pairs
 
@@ -53,9 +100,9 @@ def scene_of(rig: RigFile, plan: Plan) -> Scene | None:
     return None if choice is None else Scene(choice, slip_expected(rig, plan))
 
 
-def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str, Any]:
+def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> PlanJson:
     """Return the plan as one JSON object; `needed` is its bytes, None without a rig."""
-    rows = [
+    rows: list[TrialRow] = [
         {
             "index": trial.index,
             "id": trial.id,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, check_disk, make_request, missing_bytes
@@ -248,9 +248,13 @@ def _message(error: RigError) -> str:
     return str(error).removeprefix(f"{error.device}: ")
 
 
-def checks_json(found: list[Check]) -> dict[str, Any]:
+class Checks(TypedDict):
+    """Checks as `sliplab check --json` prints them."""
+
+    passed: bool
+    checks: list[Check]
+
+
+def checks_json(found: list[Check]) -> Checks:
     """Return the checks as one JSON object."""
-    return {
-        "passed": all(item.passed for item in found),
-        "checks": [vars(item) for item in found],
-    }
+    return {"passed": all(item.passed for item in found), "checks": found}

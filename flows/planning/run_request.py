@@ -9,9 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
+from sliplab.flows.planning.campaign_trials import (
+    ExcludedTrial,
+    excluded_trials,
+    pending_trials,
+)
 from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.shown import shown
@@ -32,6 +36,24 @@ class SessionMetadata:
     temperature_c: float | None = None
     humidity_percent: float | None = None
     note: str = ""
+
+
+class CampaignCounts(TypedDict):
+    """Numbers of a campaign's trials; planned = committed + missing.
+
+    Attributes:
+        quarantined: attempts, of all trials.
+        set_aside: ids of the excluded trials; causes: the same with their causes.
+    """
+
+    campaign: str
+    planned: int
+    committed: int
+    quarantined: int
+    set_aside: list[str]
+    causes: list[ExcludedTrial]
+    missing: int
+    simulated: bool
 
 
 @dataclass(frozen=True)
@@ -62,7 +84,7 @@ class RunRequest:
         pending = pending_trials(self.plan, campaign)
         return [t for t in pending if self.only is None or t.id in self.only][: self.most]
 
-    def counts(self, campaign: Campaign) -> dict[str, Any]:
+    def counts(self, campaign: Campaign) -> CampaignCounts:
         """Count what the campaign holds now; planned = committed + missing."""
         planned = {trial.id for trial in self.plan}
         committed = campaign.committed() & planned

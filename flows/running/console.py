@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from rich.box import SIMPLE, SIMPLE_HEAD
@@ -94,10 +95,25 @@ def print_error(named: Mapping[str, str | None], exit_code: int) -> None:
         print_json({"error": {**shown, "exit_code": exit_code}})
 
 
+def plain(value: Any) -> Any:
+    """Return a typed value of a result as plain data: its fields, or of a document its keys.
+
+    Raises:
+        TypeError: it is neither a dataclass nor a part of a document.
+    """
+    from sliplab.storage.schema.document import Part  # a command without results loads no models
+
+    if isinstance(value, Part):
+        return value.to_json()
+    if is_dataclass(value) and not isinstance(value, type):
+        return {each.name: getattr(value, each.name) for each in fields(value)}
+    raise TypeError(f"{type(value).__name__} has no form in JSON")
+
+
 def print_json(data: Any) -> None:
-    """The one JSON object of a command."""
+    """Print the one JSON object of a command; `plain` gives the form of typed values in it."""
     global _printed
-    text = json.dumps(data, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(data, default=plain, allow_nan=False, ensure_ascii=False)
     text = CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
     _printed = True
     sys.stdout.write(text + "\n")

@@ -11,7 +11,7 @@ from datetime import datetime
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from prefect import flow
 
@@ -108,9 +108,12 @@ def until_of(wanted: OnRig, run: Any) -> float | None:
     return end.timestamp()
 
 
+Done = TypeVar("Done")
+
+
 def when_free(
-    run_request: RunRequest, patience_s: float, work: Callable[[], dict[str, Any]], run: Any
-) -> dict[str, Any]:
+    run_request: RunRequest, patience_s: float, work: Callable[[], Done], run: Any
+) -> Done:
     """Do `work` as soon as no other program holds the store or the rig.
 
     Raises:
@@ -277,14 +280,11 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
     files = study_protocols(wanted.pilot, wanted.extra)
     run_requests = [_run_request(here, wanted, file, run, enable=on) for file, on in files.items()]
     check_disk(run_requests)
-    done: dict[str, Any] = {}
-
-    def work() -> dict[str, Any]:
-        outcome = whole(run_requests, LABELS_CHECKED)
-        done.update({step["step"]: step["done"] for step in outcome.steps})
-        return {"taken": sum(item["taken"] for item in outcome.collected)}
-
-    taken = when_free(run_requests[0], wanted.patience_min * 60, work, run)["taken"]
+    work = partial(whole, run_requests, LABELS_CHECKED)
+    outcome = when_free(run_requests[0], wanted.patience_min * 60, work, run)
+    taken = sum(item["taken"] for item in outcome.collected)
+    # of steps of one name, the last
+    done = {step["step"]: step["done"] for step in outcome.steps}
     return f"{taken} trials taken; " + ", ".join(f"{name}: {n} done" for name, n in done.items())
 
 

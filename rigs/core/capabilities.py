@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal, NotRequired, Protocol, TypedDict, runtime_checkable
 
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Code
@@ -310,6 +310,54 @@ class Operator(Protocol):
         """
 
 
+class TrueOnsets(TypedDict):
+    """True onsets of a simulated trial, counted from a reference time; ns of the sync box.
+
+    Attributes:
+        incipient_ns: the first of `per_papilla_ns`; gross_ns: the centre's.
+        per_papilla_ns: when each marker's displacement relative to the plate exceeded the
+            threshold; None where it did not.
+        first_slip_ns: the first of `slip_per_papilla_ns`.
+        slip_per_papilla_ns: when each tip physically began to slide; None where it did not.
+    """
+
+    reference_ns: int
+    incipient_ns: int | None
+    gross_ns: int | None
+    per_papilla_ns: list[int | None]
+    first_slip_ns: int | None
+    slip_per_papilla_ns: list[int | None]
+
+
+class TrueOnsetsFromHold(TrueOnsets):
+    """True onsets counted from the start of the recorded hold.
+
+    Attributes:
+        hold_slip_mm: movement of each marker in the hold.
+    """
+
+    hold_slip_mm: list[float]
+
+
+class Truth(TrueOnsets):
+    """Truth of a simulated trial, which labels are checked against.
+
+    Attributes:
+        simulated: true.
+        level: of physics.
+        threshold_mm: displacement of a marker that counts as slip.
+        from_hold: the same from the start of the hold, where that was wanted.
+        clocks: pairs of a device's clock and the sync box's, ns, by device; absent from
+            a simulation server.
+    """
+
+    simulated: bool
+    level: str
+    threshold_mm: float
+    from_hold: NotRequired[TrueOnsetsFromHold]
+    clocks: NotRequired[dict[str, list[list[int]]]]
+
+
 @runtime_checkable
 class Simulation(Protocol):
     """The world behind a simulated rig; a real rig has none."""
@@ -320,8 +368,8 @@ class Simulation(Protocol):
     def sink(self, sink: Sink) -> Sink:
         """Wrap `sink` in this world's storage faults, such as a full disk."""
 
-    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """Return the ground truth of the trial that just ran (JSON), times in ns of the sync box.
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
+        """Return the ground truth of the trial that just ran, times in ns of the sync box.
 
         Args:
             reference_arm_ns: arm controller time from which displacements are measured.

@@ -29,6 +29,7 @@ from sliplab.rigs.core.capabilities import (
     Segment,
     Simulation,
     SyncBox,
+    Truth,
 )
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pulse_code import SEEDS
@@ -56,7 +57,7 @@ class TrialRun:
     steps: tuple[tuple[StepTimes, bool], ...]
     """Each step's times, and True for a recorded step."""
     zero_mm: float
-    truth: Json | None
+    truth: Truth | None
     path: tuple[PathSegment, ...] = ()
     """Commanded segments of the recorded steps."""
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
-from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError, Truth
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.streams import FrameChunk, Sink
@@ -101,9 +101,9 @@ class Loopback:
         """Return `sink` itself, because the disk is real."""
         return sink
 
-    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
         """Return the ground truth of a trial, counted from these arm controller times."""
-        found: dict[str, Any] = self._ask("truth", reference_arm_ns, hold_arm_ns)
+        found: Truth = self._ask("truth", reference_arm_ns, hold_arm_ns)
         return found
 
     # -- Plate and Operator ----------------------------------------------------------------

@@ -12,14 +12,13 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
-from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, Truth
 from sliplab.rigs.core.driver import ArmScene
 from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
@@ -191,7 +190,7 @@ class SimulationServer:
         self._sent.clear()
         self._stamps_us.clear()
 
-    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
         """Return the ground truth of a trial, counted from these arm controller times.
 
         See `rigs.mock.truth.truth_of`.

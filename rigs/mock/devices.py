@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
 from sliplab.protocols.timing import Timing
-from sliplab.rigs.core.capabilities import ArmFault, RigError
+from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
 from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull
@@ -98,7 +98,7 @@ class MockDevices:
 
     def truth(
         self, reference_true_ns: int, hold_true_ns: int | None = None, threshold_px: float = 2.0
-    ) -> dict[str, Any]:
+    ) -> Truth:
         """Return the ground truth since `reference_true_ns`, and the true clock readings.
 
         See `truth_of` and `clocks_of` in `rigs.mock.truth`.

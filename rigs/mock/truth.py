@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from sliplab.protocols.timing import FrameGrade
-from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError, TrueOnsets, Truth
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.world import World
 from sliplab.storage.clockmap import IDENTITY, ClockMap
@@ -27,7 +26,7 @@ def truth_of(
     reference_true_ns: int,
     threshold_px: float = 2.0,
     hold_true_ns: int | None = None,
-) -> dict[str, Any]:
+) -> Truth:
     """Onsets after the start of the slide or retraction, on the sync box's clock.
 
     Args:
@@ -38,25 +37,25 @@ def truth_of(
         hold_true_ns: start of the recorded hold, where it is wanted from there too.
 
     Returns:
-        JSON, times in ns or None: `per_papilla_ns`, when each marker's displacement relative to
-        the plate exceeded the threshold; `incipient_ns`, the first of them; `gross_ns`, the
-        centre's; `first_slip_ns` and `slip_per_papilla_ns`, when tips physically began to slide;
-        `reference_ns`; `threshold_mm`; `level` of physics; and `simulated`, which is true.
-        With `hold_true_ns` also `from_hold`: the same times and reference, everything counted
-        from the start of the hold, and `hold_slip_mm`, how far each marker moved in the hold.
-        Markers' displacements are taken as linear between the rows; the onsets of sliding are
-        located within them.
+        the truth without its `clocks`; with `hold_true_ns` also `from_hold`. Markers' displacements
+        are taken as linear between the rows; the onsets of sliding are located within them.
 
     Raises:
         RigError: a reference is older than the history that is kept (minutes).
     """
     world.advance()
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm
-    found = {
+    onsets = _counted_from(world, box, reference_true_ns, threshold_mm)
+    found: Truth = {
         "simulated": True,
         "level": world.settings.scene.level,
         "threshold_mm": threshold_mm,
-        **_counted_from(world, box, reference_true_ns, threshold_mm),
+        "reference_ns": onsets["reference_ns"],
+        "incipient_ns": onsets["incipient_ns"],
+        "gross_ns": onsets["gross_ns"],
+        "per_papilla_ns": onsets["per_papilla_ns"],
+        "first_slip_ns": onsets["first_slip_ns"],
+        "slip_per_papilla_ns": onsets["slip_per_papilla_ns"],
     }
     if hold_true_ns is not None:
         found["from_hold"] = {
@@ -76,7 +75,7 @@ def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
 
 def _counted_from(
     world: World, box: ClockMap, reference_true_ns: int, threshold_mm: float
-) -> dict[str, Any]:
+) -> TrueOnsets:
     """Onsets after a true time, displacements from where the tips were then; see `truth_of`."""
     history = world.physics.track
     if reference_true_ns < history.begin_ns:

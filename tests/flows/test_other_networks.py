@@ -141,8 +141,8 @@ def test_the_kernels_say_where_they_may_differ(store: Store, tmp_path: Path) -> 
 def test_a_model_of_this_program_is_judged_as_in_its_store(store: Store) -> None:
     own = Derived.of(store, "evaluation").read("evaluation")
     found = judge_model(store, collected(store), store.folder / "models" / "seed0.pt")
-    assert found["accuracy"] == own["windows"]["accuracy"]
-    assert found["interval"] == own["windows"]["interval"]
+    assert found["accuracy"].to_json() == own["windows"]["accuracy"]
+    assert found["interval"].to_json() == own["windows"]["interval"]
     assert Derived.of(store, STEP).read("model-seed0")["trials"] == own["trials"]
 
 

@@ -412,7 +412,7 @@ def test_the_model_goes_out_as_what_it_is(
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
     from sliplab.analysis.evaluation.export import ExportFailed
     from sliplab.analysis.networks import onnx_file
-    from sliplab.flows.detect import load_model
+    from sliplab.flows.detecting.request import load_model
     from sliplab.flows.export_model import export_model
 
     store = store_of(ran)

@@ -31,6 +31,7 @@ from sliplab.analysis.networks.quantised import LOWEST, chip_run, compare, quant
 from sliplab.analysis.networks.speck import CORES, KI, speck_fit
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.storage.schema.export import CardCampaign, CardData, ModelFile
 from tests.analysis.networks.test_spiking import FULL, SMALL, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -228,7 +229,7 @@ def test_what_cannot_be_quantised_is_refused() -> None:
 def test_changes_are_counted() -> None:
     real = np.array([[5, 0, 0], [5, 0, 0], [1, 1, 0], [0, 4, 3]])
     whole = np.array([[5, 0, 0], [4, 3, 0], [1, 1, 0], [0, 3, 4]])
-    assert compare(real, whole, 2.0) == {
+    assert compare(real, whole, 2.0).to_json() == {
         "windows": 4, "equal_counts": 0.5, "equal_class": 0.75, "equal_class_by_margin": 0.75,
         "mean_change": 6 / 12, "largest_change": 3,
     }  # fmt: skip
@@ -278,8 +279,8 @@ def test_synaptic_operations_are_counted_one_by_one() -> None:
     assert found.events == pytest.approx(x.sum() / 3)
     for name in SPIKING:
         assert found.rates[name] == pytest.approx(spikes[name].mean())
-    told = found.as_json()
-    assert told["synaptic_operations"]["all"] == pytest.approx(sum(found.operations.values()))
+    told = found.cost()
+    assert told.synaptic_operations["all"] == pytest.approx(sum(found.operations.values()))
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -287,20 +288,22 @@ def test_a_card_says_where_the_data_are_from(simulated: bool) -> None:
     one = fitted()
     counts = np.array([[5, 0, 0], [0, 5, 0], [0, 0, 5], [1, 1, 0]])
     part = SplitResult(counts, np.array([0, 1, 2, 2]), 4)
-    data = {
-        "store": "s", "simulated": simulated, "made_from_these_data": False,
-        "campaigns": [
-            {"name": "c", "experiment": "kinematic", "collection_hash": "a" * 64,
-             "analysis_hash": "b" * 64, "rig": "r", "trials": {"train": 2, "test": 4}}
-        ],
-    }  # fmt: skip
+    campaign = CardCampaign(
+        name="c", experiment="kinematic", protocol="p", collection_hash="a" * 64,
+        analysis_hash="b" * 64, rig="r", simulated=simulated, trials={"train": 2, "test": 4},
+    )  # fmt: skip
+    data = CardData(
+        store="s", simulated=simulated, made_from_these_data=False, campaigns=(campaign,)
+    )
     card = model_card(
-        one, {"file": "m.pt", "sha256": "c" * 64}, data, {"test": part},
+        one, ModelFile(file="m.pt", sha256="c" * 64), data, {"test": part},
         activity(build(SMALL, TINY, 0), sparse(2, TINY, 0, 0.2)), {}, {"torch": "1"}, 2.0,
     )  # fmt: skip
-    assert json.loads(json.dumps(card, allow_nan=False)) == card
-    assert card["figures"]["test"]["accuracy"]["strict"] == 0.75
-    assert card["figures"]["test"]["recall"]["gross"] == 0.5
+    told = card.to_json()
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert told["model"]["network"] == SMALL.model_dump(mode="json")  # the defaults too
+    assert told["figures"]["test"]["accuracy"]["strict"] == 0.75
+    assert told["figures"]["test"]["recall"]["gross"] == 0.5
     page = card_markdown(card)
     assert ("simulated" in page) == simulated
     assert "not those that the model was trained on" in page

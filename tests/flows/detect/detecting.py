@@ -13,7 +13,7 @@ from sliplab.analysis.detectors.live import Counting
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
-from sliplab.flows.detect import DetectRequest, make_detect_request
+from sliplab.flows.detecting.request import DetectRequest, make_detect_request
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig

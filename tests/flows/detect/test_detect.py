@@ -16,7 +16,8 @@ from sliplab.analysis.networks.training import predict_counts
 from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.detect import detect, make_detect_request
+from sliplab.flows.detect import detect
+from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection

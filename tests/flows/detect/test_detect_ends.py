@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sliplab.flows.detect import choose_trial, detect, make_detect_request
+from sliplab.flows.detect import detect
+from sliplab.flows.detecting.request import choose_trial, make_detect_request
 from sliplab.protocols import InputError, load_plan
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, StopRequested

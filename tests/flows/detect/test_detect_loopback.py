@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.detect import detect, make_detect_request
+from sliplab.flows.detect import detect
+from sliplab.flows.detecting.request import make_detect_request
 from sliplab.rigs.build import loopback_rig
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from sliplab.flows.running import console
+from sliplab.storage.schema.evaluation import Share
 
 
 class Clock:
@@ -116,3 +118,19 @@ def test_data_are_neither_control_codes_nor_markup(capsys: pytest.CaptureFixture
     for steers in "\x1b\x07\x9b\u202e":
         assert steers not in shown
         assert steers not in written
+
+
+def test_typed_values_are_printed_by_their_fields(capsys: pytest.CaptureFixture[str]) -> None:
+    @dataclass(frozen=True)
+    class Inner:
+        name: str
+        share: Share
+
+    given = Share(share=0.5, low=None, high=None, n=2, trials=1)
+    console.print_json({"step": "x", "inner": [Inner("a", given)]})
+    assert capsys.readouterr().out == (
+        '{"step": "x", "inner": [{"name": "a", "share": '
+        '{"share": 0.5, "low": null, "high": null, "n": 2, "trials": 1}}]}\n'
+    )
+    with pytest.raises(TypeError, match="object has no form in JSON"):
+        console.print_json({"step": object()})

@@ -1,0 +1,193 @@
+"""A requested live detection: rig, model, motion and reflex, checked before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.training import Fitted
+from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.program import Move, Program
+from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.rigs.core.reacting import ACTING, Reflex
+from sliplab.rigs.levels import with_level
+from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
+from sliplab.storage.files import sha256
+
+POLL_S = 0.005
+"""Period of reading the streams, s."""
+SHOWN = 6
+"""Conditions that a message names."""
+
+
+@dataclass(frozen=True)
+class DetectRequest:
+    """A requested live detection, checked by `make_detect_request`.
+
+    Attributes:
+        plan, trial: the motion that is made; None where the rig is only listened to.
+        seconds: how long to listen; None until somebody ends it.
+    """
+
+    rig: RigFile
+    model: Path
+    model_sha256: str
+    fitted: Fitted
+    detection: Detection
+    plan: Plan | None = None
+    trial: Trial | None = None
+    reflex: Reflex | None = None
+    seconds: float | None = None
+    stride_ms: float | None = None
+    poll_s: float = POLL_S
+
+    @property
+    def simulated(self) -> str:
+        """``simulated `` before a number of a simulated rig."""
+        return "simulated " if self.rig.simulated else ""
+
+
+def make_detect_request(
+    rig: Path,
+    model: Path,
+    *,
+    protocol: Path | None = None,
+    trial: str | None = None,
+    enable: tuple[str, ...] = (),
+    reflex: str | None = None,
+    hold_s: float = 1.0,
+    seconds: float | None = None,
+    stride_ms: float | None = None,
+    margin: float | None = None,
+    smoothing: int | None = None,
+    poll_s: float = POLL_S,
+) -> DetectRequest:
+    """Read and check everything that can be known before anything moves.
+
+    Raises:
+        InputError: rig, model, protocol, trial or reflex; the message says what would be right.
+    """
+    file, _ = load_rig_file(rig)
+    fitted = load_model(model)
+    given = (("margin", margin), ("smoothing", smoothing))
+    change = {name: value for name, value in given if value is not None}
+    if stride_ms is not None and not 0 < stride_ms <= fitted.windows.length_ms:
+        right = f"must be over 0 and at most the window's {fitted.windows.length_ms} ms"
+        raise InputError("--stride", "", f"{stride_ms:g} ms", right)
+    requested = partial(
+        DetectRequest, model=model, model_sha256=sha256(model), fitted=fitted,
+        stride_ms=stride_ms, poll_s=poll_s,
+    )  # fmt: skip
+    if protocol is None:
+        for name, text in (("--trial", trial), ("--reflex", reflex)):
+            if text is not None:
+                right = "needs --protocol: without one the arm is not moved, only listened to"
+                raise InputError(name, "", text, right)
+        if seconds is None and file.in_virtual_time:
+            right = f"is needed on {file.name}: its time is virtual and would never end"
+            raise InputError("--seconds", "", None, right)
+        return requested(
+            rig=file,
+            detection=_detection(AnalysisSettings(network=fitted.network), fitted, change),
+            seconds=seconds,
+        )
+    if seconds is not None:
+        right = "belongs to listening; a trial lasts as long as its motion"
+        raise InputError("--seconds", "", seconds, right)
+    plan = load_plan(protocol, enable)
+    check_plan(file, plan, str(rig))
+    if plan.protocol.collection.plate is not None and not file.has_plate:
+        raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
+    chosen = choose_trial(plan, trial)
+    return requested(
+        rig=with_level(file, plan) if file.simulated else file,
+        detection=_detection(plan.protocol.analysis, fitted, change),
+        plan=plan,
+        trial=chosen,
+        reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
+    )
+
+
+def load_model(path: Path) -> Fitted:
+    """Load a model file. Raises InputError if it is none."""
+    try:
+        return model_file.load(path)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        text = str(error).removeprefix(f"{path}: ")
+        raise InputError(path, "", None, text) from None
+
+
+def choose_trial(plan: Plan, condition: str | None) -> Trial:
+    """Find the first trial of a condition, which may omit the repetition and single levels.
+
+    Args:
+        condition: as in a trial's id: ``depth=2.4mm,direction=0deg``, in any order.
+
+    Raises:
+        InputError: no trial has it, or trials of several conditions do.
+    """
+    parts = {part.strip() for part in (condition or "").split(",") if part.strip()}
+    measured = [trial for trial in plan if trial.role == "measured"]
+    found = [trial for trial in measured if parts <= set(trial.id.split(","))]
+    conditions = list(dict.fromkeys(trial.condition for trial in found))
+    if len(conditions) == 1:
+        return found[0]
+    firsts = {trial.condition: trial.id.rpartition(",r=")[0] for trial in found or measured}
+    names = [*firsts.values()][:SHOWN]
+    more = f" and {len(firsts) - SHOWN} more" if len(firsts) > SHOWN else ""
+    what = "fits several conditions" if found else "fits no trial"
+    if condition is None:
+        what = "is needed: which of the protocol's conditions"
+    raise InputError("--trial", "", condition, f"{what}: {'; '.join(names)}{more}")
+
+
+def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: float) -> Reflex:
+    """Parse ``stop`` or ``press:MM``, and check it against the limits of protocol and rig.
+
+    Raises:
+        InputError: another word, no motion that it could cut short, or a depth over a limit.
+    """
+    program = plan.program(trial)
+    if not any(isinstance(step, Move) and step.phase in ACTING for step in program.steps):
+        raise InputError("--reflex", "", text, "the trial has no slide or retraction to cut short")
+    limits = plan.protocol.collection.limits
+    deepest = min(float(limits.depth), float(file.limits.depth))
+    kind, _, value = text.partition(":")
+    if text == "stop":
+        return Reflex("stop", deepest, hold_s=hold_s)
+    try:
+        press_mm = float(value.removesuffix("mm")) if kind == "press" else float("nan")
+    except ValueError:
+        press_mm = float("nan")
+    if not 0 < press_mm < float("inf"):
+        raise InputError("--reflex", "", text, "must be 'stop' or 'press:MM', such as press:0.4")
+    # a retraction gets shallower all the way, and what presses on is cut off at the limit
+    depth = _shallowest_mm(program)
+    if depth + press_mm > deepest + 1e-9:
+        origin = "the protocol's" if deepest == float(limits.depth) else f"the rig {file.name}'s"
+        raise InputError(
+            "--reflex",
+            "",
+            text,
+            f"would reach {depth + press_mm:g} mm; {origin} limits.depth is {deepest:g} mm, and "
+            f"the trial's motion ends at {depth:g} mm: at most press:{deepest - depth:g}",
+        )
+    speeds = [s.speed_mm_s for s in program.steps if isinstance(s, Move) and s.phase == "press"]
+    return Reflex("press", deepest, press_mm, speeds[0], hold_s)
+
+
+def _shallowest_mm(program: Program) -> float:
+    """Return the least depth at which a reflex may have to press on."""
+    moves = (step for step in program.steps if isinstance(step, Move) and step.phase in ACTING)
+    return min(step.to.depth_mm for step in moves)
+
+
+def _detection(said: AnalysisSettings, fitted: Fitted, change: Mapping[str, float]) -> Detection:
+    network = fitted.network
+    rule = said.rule_for(network.outputs_per_class, network.margin)
+    return Detection.model_validate({**rule.model_dump(), **change})

@@ -1,0 +1,172 @@
+"""A rig's streams as they are read, fed to the detector: decisions, their times, and a summary.
+
+Latency is counted from a window's last event to its decision. Its first part, until the event was
+read, runs on the rig's clock (virtual on the mock rig); its second part, until the decision, on
+the real one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import TypedDict
+
+import numpy as np
+
+from sliplab.analysis.detectors.live import (
+    UNDECIDED,
+    Decision,
+    DecisionJson,
+    FreshestArrival,
+    LiveDetector,
+    TimedDecision,
+)
+from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
+from sliplab.rigs.core.capabilities import Clock
+from sliplab.rigs.core.reacting import SlipDetected
+from sliplab.storage.streams import EventChunk, NullSink, PulseChunk
+
+PATIENCE_US = 200_000
+"""A window without an event after it is judged so long after its end, by the camera's clock as it
+is known here: what was sent before must have arrived by then."""
+KEPT = 100_000
+"""Latencies that are kept for the summary: the last 55 minutes of 30 ms windows."""
+
+
+class Times(TypedDict):
+    """Median, 95 %, 99 % and maximum of n measured times, ms; None without any."""
+
+    median: float | None
+    p95: float | None
+    p99: float | None
+    max: float | None
+    n: int
+
+
+class DetectNumbers(TypedDict):
+    """Numbers of a detector's windows and of their times.
+
+    Attributes:
+        quiet_windows: windows without an event.
+        states: windows by detected class.
+        onsets: the first decision of each kind of slip.
+        latency_ms: from a window's last event to its decision.
+        compute_ms: from the read of the events to the decision.
+        losses: as `analysis.detectors.live.Losses`.
+    """
+
+    events: int
+    windows: int
+    quiet_windows: int
+    states: dict[str, int]
+    onsets: dict[str, DecisionJson | None]
+    latency_ms: Times
+    compute_ms: Times
+    losses: dict[str, int]
+
+
+class DetectSink(NullSink):
+    """A `rigs.core.reacting.Watcher` that feeds a detector.
+
+    Args:
+        clock: the rig's, by which arrivals are dated.
+        on_decision: called with each decision as soon as it is made.
+        every_poll: called each time that the streams were read.
+    """
+
+    def __init__(
+        self,
+        detector: LiveDetector,
+        clock: Clock,
+        on_decision: Callable[[TimedDecision], None],
+        every_poll: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.detector, self.armed, self.phase = detector, False, ""
+        self._clock, self._on_decision, self._every_poll = clock, on_decision, every_poll
+        self._camera = FreshestArrival()
+        self._latency: deque[float] = deque(maxlen=KEPT)
+        self._compute: deque[float] = deque(maxlen=KEPT)
+        self._states: Counter[str] = Counter()
+        self.events = self.quiet = 0
+        self.onsets: dict[str, DecisionJson] = {}
+
+    def step(self, phase: str, acting: bool) -> None:
+        """Note that a step of the motion begins."""
+        self.phase = phase
+
+    def add_events(self, chunk: EventChunk) -> None:
+        """Feed events to the detector.
+
+        Raises:
+            SlipDetected: incipient slip was detected while `armed`; the whole read is reported.
+            ClockFellBack: the camera's clock is another one.
+        """
+        here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
+        if len(chunk):
+            self.events += len(chunk)
+            self._camera.observe(int(chunk.t_us.max()), here_ns)
+        self._report(self.detector.push(chunk), here_ns, began_ns)
+
+    def add_event_pulses(self, chunk: PulseChunk) -> None:
+        """Advance the detector to the camera's time, which pulses show without events.
+
+        Raises:
+            SlipDetected: as `add_events`.
+        """
+        here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
+        if len(chunk):
+            self._camera.observe(int(chunk.t_ns.max()) // 1000, here_ns)
+        now_us = self._camera.camera_us(here_ns)
+        if now_us is not None:
+            # the first time that is known begins the windows; from then on events may be late
+            late_us = 0 if self.detector.now_us is None else PATIENCE_US
+            self._report(self.detector.advance(now_us - late_us), here_ns, began_ns)
+        self._every_poll()
+
+    def _report(self, made: list[Decision], here_ns: int, began_ns: int) -> None:
+        slip = False
+        for decision in made:
+            compute_ms = (decision.decided_ns - began_ns) / 1e6
+            latency_ms = None
+            if decision.last_event_us is not None:
+                sent_ns = self._camera.host_ns(decision.last_event_us)
+                assert sent_ns is not None
+                latency_ms = (here_ns - sent_ns) / 1e6 + compute_ms
+                self._latency.append(latency_ms)
+            self.quiet += decision.events == 0
+            self._compute.append(compute_ms)
+            origin_us = self.detector.origin_us
+            assert origin_us is not None
+            timed = TimedDecision(
+                decision, (decision.end_us - origin_us) / 1e6, self.phase, latency_ms, compute_ms
+            )
+            self._states[timed.state] += 1
+            if decision.onset is not None:
+                self.onsets[decision.onset] = timed.as_json()
+            slip |= decision.valid_class == INCIPIENT
+            self._on_decision(timed)
+        if slip and self.armed:
+            self.armed = False
+            raise SlipDetected
+
+    def summary(self) -> DetectNumbers:
+        """Return the numbers of events, windows, states and latencies, and the onsets."""
+        return {
+            "events": self.events,
+            "windows": sum(self._states.values()),
+            "quiet_windows": self.quiet,
+            "states": {name: self._states[name] for name in (*CLASSES, UNDECIDED)},
+            "onsets": {name: self.onsets.get(name) for name in CLASSES[1:]},
+            "latency_ms": _spread(self._latency),
+            "compute_ms": _spread(self._compute),
+            "losses": vars(self.detector.losses),
+        }
+
+
+def _spread(values: deque[float]) -> Times:
+    """Summarise measured times, ms."""
+    if not values:
+        return {"median": None, "p95": None, "p99": None, "max": None, "n": 0}
+    median, p95, p99, most = np.percentile(np.array(values), [50, 95, 99, 100]).tolist()
+    return {"median": median, "p95": p95, "p99": p99, "max": most, "n": len(values)}
