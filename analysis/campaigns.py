@@ -9,7 +9,7 @@ from functools import cached_property
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import IMPORTED, Campaign, Store, StoreError
+from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Collected:
         return self.campaign.name
 
     @cached_property
-    def info(self) -> dict[str, object]:
+    def info(self) -> CampaignInfo:
         """The campaign's own document, `campaign.json`."""
         return self.campaign.info
 

@@ -38,9 +38,13 @@ def other_request(
     if protocol is not None:
         file = folder / f"{item.name}.protocol.yaml"
         _write_changed(item.campaign.protocol_file, "protocol", protocol, file)
-    enabled: Any = item.info.get("enabled", ())
     return make_request(
-        file, rig, folder / "store", enable=tuple(enabled), campaign=item.name, most=most
+        file,
+        rig,
+        folder / "store",
+        enable=tuple(item.info.get("enabled", ())),
+        campaign=item.name,
+        most=most,
     )
 
 

@@ -212,8 +212,8 @@ def _card(
             protocol=item.plan.protocol.name,
             collection_hash=item.plan.collection_hash,
             analysis_hash=item.plan.analysis_hash,
-            rig=str(item.info["rig"]),
-            simulated=bool(item.info["simulated"]),
+            rig=item.info["rig"],
+            simulated=item.info["simulated"],
             trials={split: sum(1 for _ in item.of_split(split)) for split in SPLITS},
         )
         for item in source.campaigns

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from sliplab.analysis.report.figures.clocks import (
 from sliplab.analysis.report.page import Figure, Number, Table, number, render_page
 from sliplab.storage.schema.trial import DEVICES, Gate, TrialRecord
 from sliplab.storage.trials.checksums import RECORD
+from sliplab.storage.trials.store import QuarantineEntry
 
 WORST = 10
 """Number of worst trials that are shown."""
@@ -270,7 +270,7 @@ def _quarantined(campaigns: Sequence[Collected]) -> Table:
     return Table(("trial", "campaign", "attempt", "why it was set aside"), rows)
 
 
-def _reason(folder: Path, known: dict[str, Any]) -> str:
+def _reason(folder: Path, known: QuarantineEntry) -> str:
     """Return why, as far as clocks go; empty where it was something else."""
     if "gate: " not in str(known["cause"]) or not (folder / RECORD).exists():
         return ""

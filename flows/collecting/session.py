@@ -16,7 +16,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -49,7 +49,7 @@ from sliplab.storage.schema.trial import (
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import Request
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, SessionRecord, Store
 from sliplab.storage.trials.writer import TrialWriter
 
 PAUSE_LIMIT_S = 12 * 3600.0
@@ -135,13 +135,16 @@ def clean_up(store: Store) -> None:
         sweep_temporary(folder)
 
 
-def _session_record(run_request: RunRequest) -> dict[str, Any]:
+def _session_record(run_request: RunRequest) -> SessionRecord:
     """Return the metadata of one session at the rig, as the store keeps it."""
     began = datetime.now(UTC)
-    skin = run_request.rig.skin
+    skin, metadata = run_request.rig.skin, run_request.metadata
     return {
         "began": began.isoformat(timespec="seconds"),
-        **asdict(run_request.metadata),
+        "operator": metadata.operator,
+        "temperature_c": metadata.temperature_c,
+        "humidity_percent": metadata.humidity_percent,
+        "note": metadata.note,
         "rig": run_request.rig.name,
         "sensor": run_request.rig.sensor,
         "skin": skin.serial,

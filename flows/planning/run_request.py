@@ -22,7 +22,7 @@ from sliplab.protocols.shown import shown
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from sliplab.storage.trials.store import IMPORTED, Campaign, Store, StoreError
+from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 MOST_CHANGES = 12
 _MISSING = object()
@@ -225,7 +225,7 @@ def _shown_value(value: Any, key: str) -> str:
 def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
     """Write the campaign's description; the protocol's analysis and levels may have changed."""
     campaign = store.campaign(run_request.campaign)
-    info = {
+    info: CampaignInfo = {
         "name": run_request.campaign,
         "protocol": run_request.plan.protocol.name,
         "experiment": run_request.plan.protocol.collection.experiment,

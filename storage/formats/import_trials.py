@@ -48,7 +48,7 @@ from sliplab.storage.schema.trial import (
     TrialRecord,
 )
 from sliplab.storage.streams import EventChunk, Json, PulseChunk
-from sliplab.storage.trials.store import IMPORTED, Campaign, Store
+from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
 from sliplab.storage.trials.writer import TrialWriter
 
 Reader = Callable[[Path, str], ForeignTrial]
@@ -130,7 +130,9 @@ def import_trials(
 
 def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) -> None:
     about = {"from": origin.name, "format": kind, "when": now()}
-    info = {"name": campaign.name, "simulated": trial.simulated, IMPORTED: about}
+    info: CampaignInfo = {
+        "name": campaign.name, "simulated": trial.simulated, IMPORTED: about
+    }  # fmt: skip
     text = f"# Imported: there is no protocol.\nimported: {json_text(kind).strip()}\n"
     campaign.update(info, text, text.replace("protocol", "rig file"))
 

@@ -23,6 +23,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final, NotRequired, TypedDict, cast
 
 from sliplab.storage.errors import NoStore, StoreError, masked, translated_disk_errors
 from sliplab.storage.files import (
@@ -51,7 +52,7 @@ SYNC = "sync"
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
-IMPORTED = "imported"
+IMPORTED: Final = "imported"
 """Key of a campaign's description: where its trials come from, if they were imported."""
 AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that a person wants anew; mark of a failed attempt that counts no
@@ -61,6 +62,66 @@ _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
 
 def _holds(path: Path, data: bytes) -> bool:
     return path.is_file() and not path.is_symlink() and path.read_bytes() == data
+
+
+class CampaignInfo(TypedDict):
+    """Description of a campaign, `campaign.json`.
+
+    A collected campaign has all keys but `imported`; an imported one has that, and neither
+    protocol nor rig.
+
+    Attributes:
+        protocol: name of it; experiment: its kind.
+        collection_hash: of the protocol's `collection:` section; rig_hash: of the rig file.
+        enabled: optional levels that are switched on, as ``factor=level``.
+        scene_level: of physics; None on a real rig.
+        imported: where the trials come from.
+    """
+
+    name: str
+    simulated: bool
+    protocol: NotRequired[str]
+    experiment: NotRequired[str]
+    collection_hash: NotRequired[str]
+    rig: NotRequired[str]
+    rig_hash: NotRequired[str]
+    enabled: NotRequired[list[str]]
+    scene_level: NotRequired[str | None]
+    imported: NotRequired[Json]
+
+
+class QuarantineEntry(TypedDict):
+    """An attempt in quarantine.
+
+    Attributes:
+        cause: ``interrupted``, or what is wrong with it.
+        folder: its name in the quarantine.
+        attempt: number of the attempt at the trial, of a complete one.
+        forgiven: who made the attempt count no longer; asked: who wanted the trial anew.
+    """
+
+    cause: str
+    trial: str
+    folder: str
+    attempt: NotRequired[int]
+    forgiven: NotRequired[Json]
+    asked: NotRequired[Json]
+
+
+class SessionRecord(TypedDict):
+    """Who stood at the rig, with what, for one session."""
+
+    began: str
+    operator: str
+    temperature_c: float | None
+    humidity_percent: float | None
+    note: str
+    rig: str
+    sensor: str
+    skin: str
+    calibration: Json
+    skin_age_days: int | None
+    simulated: bool
 
 
 @dataclass(frozen=True)
@@ -80,7 +141,7 @@ class Campaign:
         return self.folder.name
 
     @property
-    def info(self) -> Json:
+    def info(self) -> CampaignInfo:
         """The content of `campaign.json`.
 
         Raises:
@@ -96,7 +157,7 @@ class Campaign:
                 f"{error}; it is damaged: put it back from a copy, or move {self.folder} away "
                 "and collect anew"
             ) from None
-        return found
+        return cast("CampaignInfo", found)
 
     @property
     def begun(self) -> bool:
@@ -108,7 +169,7 @@ class Campaign:
         """The copy of the protocol this campaign runs by."""
         return self.folder / PROTOCOL
 
-    def update(self, info: Json, protocol_text: str, rig_text: str) -> None:
+    def update(self, info: CampaignInfo, protocol_text: str, rig_text: str) -> None:
         """Write the campaign's description and its copies of protocol and rig file.
 
         Only what changed is written. While it is, there are no checksums: a description without
@@ -206,9 +267,9 @@ class Campaign:
             number += 1
         return path
 
-    def quarantined(self) -> list[Json]:
+    def quarantined(self) -> list[QuarantineEntry]:
         """Return cause, trial and folder of everything in quarantine."""
-        causes = []
+        causes: list[QuarantineEntry] = []
         for path in self._folders("quarantine"):
             try:
                 known = read_json(path / CAUSE)
@@ -216,7 +277,8 @@ class Campaign:
                 known = {}
             known.setdefault("cause", "unknown")
             trial_id = path.name.rpartition(".")[0]
-            causes.append({**known, "trial": trial_id, "folder": path.name})
+            entry = {**known, "trial": trial_id, "folder": path.name}
+            causes.append(cast("QuarantineEntry", entry))
         return causes
 
     def failed_attempts(self) -> dict[str, int]:
@@ -229,14 +291,14 @@ class Campaign:
         """Count the complete attempts at each trial that were not kept: each has its own seed."""
         return self._count(lambda item: str(item["cause"]).startswith(("gate", AGAIN)))
 
-    def _count(self, wanted: Callable[[Json], bool]) -> dict[str, int]:
+    def _count(self, wanted: Callable[[QuarantineEntry], bool]) -> dict[str, int]:
         counts: dict[str, int] = {}
         for item in self.quarantined():
             if wanted(item):
                 counts[item["trial"]] = counts.get(item["trial"], 0) + 1
         return counts
 
-    def add_bench_record(self, data: Json) -> None:
+    def add_bench_record(self, data: SessionRecord) -> None:
         """Keep who stood at the rig, with what, for one session."""
         folder = self.folder / "bench"
         make_folder(self.inside(folder))
