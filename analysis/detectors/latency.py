@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -163,7 +163,19 @@ def _ms(difference_ns: int) -> float:
     return int(difference_ns) / 1e6
 
 
-def _describe(values: Sequence[float | None]) -> dict[str, Any]:
+class Statistics(TypedDict):
+    """Statistics of n values; None where one cannot be computed."""
+
+    mean: float | None
+    std: float | None
+    median: float | None
+    p95: float | None
+    min: float | None
+    max: float | None
+    n: int
+
+
+def _describe(values: Sequence[float | None]) -> Statistics:
     """Statistics of the values that are there; None where one cannot be computed.
 
     ``std`` is the sample standard deviation (divisor n - 1), so it needs two values; percentiles
@@ -172,8 +184,7 @@ def _describe(values: Sequence[float | None]) -> dict[str, Any]:
     there = np.array([v for v in values if v is not None], np.float64)
     n = len(there)
     if n == 0:
-        names = ("mean", "std", "median", "p95", "min", "max")
-        return {**dict.fromkeys(names), "n": 0}
+        return Statistics(mean=None, std=None, median=None, p95=None, min=None, max=None, n=0)
     return {
         "mean": float(there.mean()),
         "std": float(there.std(ddof=1)) if n > 1 else None,

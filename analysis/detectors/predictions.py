@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from sliplab.analysis.detectors.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.networks import model_file, training
@@ -21,7 +19,8 @@ from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.protocols.settings import Detection, Windows
-from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.derived import Arrays, Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
@@ -68,9 +67,7 @@ def count_spikes(
     return len(work)
 
 
-def _count(
-    recording: Recording, counting: _Counting
-) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+def _count(recording: Recording, counting: _Counting) -> tuple[Json, Arrays]:
     """Spike counts of all windows of a trial."""
     if counting.threads is not None:
         training.limit_threads(counting.threads)
@@ -168,14 +165,12 @@ def predict_trials(
     return made
 
 
-def predictions(store: Store, request: PredictionRequest) -> dict[str, npt.NDArray[Any]]:
+def predictions(store: Store, request: PredictionRequest) -> Arrays:
     """Return ``counts`` int64 (n, 3), ``events`` int64 (n,) and ``end_ns`` int64 (n,)."""
     return Derived.of(store, request.step, request.campaign).arrays(request.recording.folder.name)
 
 
-def _infer(
-    recording: Recording, inference: _Inference
-) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+def _infer(recording: Recording, inference: _Inference) -> tuple[Json, Arrays]:
     if inference.threads is not None:
         training.limit_threads(inference.threads)
     fitted = _fitted(inference.model)
@@ -184,9 +179,7 @@ def _infer(
     )
 
 
-def _stateless(
-    recording: Recording, inference: _Inference, fitted: training.Fitted
-) -> dict[str, npt.NDArray[Any]]:
+def _stateless(recording: Recording, inference: _Inference, fitted: training.Fitted) -> Arrays:
     """Run inference with states reset at every window."""
     length_ns = inference.windows.length_ms * 1_000_000
     starts = strided_windows(
@@ -200,9 +193,7 @@ def _stateless(
     }
 
 
-def _stateful(
-    recording: Recording, inference: _Inference, fitted: training.Fitted
-) -> dict[str, npt.NDArray[Any]]:
+def _stateful(recording: Recording, inference: _Inference, fitted: training.Fitted) -> Arrays:
     """Run inference once through the trial; windows are trailing sums of its spikes."""
     windows = inference.windows
     x, ends = dataset.trial_windows(recording, windows)
@@ -224,9 +215,7 @@ def _fitted(model: bytes) -> training.Fitted:
     return model_file.parse(model, "the model")
 
 
-def trial_counts(
-    store: Store, campaign: str, trial_id: str, settings: Detection
-) -> dict[str, npt.NDArray[Any]]:
+def trial_counts(store: Store, campaign: str, trial_id: str, settings: Detection) -> Arrays:
     """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
     step = COUNTS if settings.stride_ms is None else predictions_step(settings.stride_ms)
     return Derived.of(store, step, campaign).arrays(trial_id)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.predictions import (
@@ -76,8 +75,8 @@ def make_job(
     model = choose_model(models)
     settings = training_settings(campaigns)
     windows = settings.windows.model_dump(mode="json")
-    change: dict[str, Any] = {"margin": margin, "smoothing": smoothing}
-    change = {name: value for name, value in change.items() if value is not None}
+    given = (("margin", margin), ("smoothing", smoothing))
+    change: dict[str, float | str] = {name: value for name, value in given if value is not None}
     if change:
         change["choose"] = "protocol"
     rules = rules_of(campaigns, settings.network.outputs_per_class)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -36,14 +36,14 @@ from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows
 from sliplab.storage.schema.evaluation import OtherEvaluation, OtherWindowScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
-from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.derived import Arrays, Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
 STEP = "other_networks"
 VERSION = 1
 Engines = Literal["fast", "sinabs"]
-Json = dict[str, Any]
 I64 = npt.NDArray[np.int64]
 
 
@@ -285,7 +285,7 @@ def _counts_step(network: OtherNetwork) -> str:
     return f"counts-{network.name}"
 
 
-def _count(recording: Recording, judging: _Judging) -> tuple[Json, dict[str, npt.NDArray[Any]]]:
+def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
     """Spikes of the windows of a trial, one after the other, and of those that are samples."""
     network = judging.network
     if judging.threads is not None:

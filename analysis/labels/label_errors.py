@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from sliplab.storage.schema.evaluation import (
     RuleErrors,
 )
 from sliplab.storage.schema.label import KINDS, LABELS, Kind, Rule, TrialLabel
+from sliplab.storage.schema.summary import Hold
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -81,7 +81,7 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
     )
 
 
-def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Hold]:
     """Slips in the hold by campaign, and how far apart onsets from its two ends are.
 
     For each campaign `trials`; `slipped`, how many moved by more than `limit_px` (the protocol's
@@ -105,13 +105,13 @@ def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
                 start, end = ((label.references or {})[at].at_ns(kind) for at in REFERENCES)
                 if start is not None and end is not None:
                     apart[kind].append((end - start) / 1e6)
-        found[item.name] = {
-            "trials": len(known),
-            "slipped": sum(limit is not None and px > limit for px in most),
-            "limit_px": limit,
-            "most_px": max(most),
-            "apart_ms": by_onset(apart).to_json(),
-        }
+        found[item.name] = Hold(
+            trials=len(known),
+            slipped=sum(limit is not None and px > limit for px in most),
+            limit_px=limit,
+            most_px=max(most),
+            apart_ms=by_onset(apart),
+        )
     return found
 
 

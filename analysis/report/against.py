@@ -27,9 +27,10 @@ from sliplab.analysis.report.figures.intervals import differences
 from sliplab.analysis.report.page import Figure, Number, Table, render_page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
+from sliplab.storage.schema.evaluation import Share
 from sliplab.storage.schema.summary import Kinematic, Summary, TrialOutcome
+from sliplab.storage.streams import Json
 
-Json = dict[str, Any]
 Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]
 
 PAGE = "against.html"
@@ -170,7 +171,7 @@ def _settings(here: Summary, there: Summary) -> list[Setting]:
     return rows
 
 
-def _flat(value: Any, name: str) -> dict[str, Any]:
+def _flat(value: object, name: str) -> dict[str, object]:
     """Return the leaves of mappings in each other by dotted names."""
     if not isinstance(value, dict):
         return {name: value}
@@ -194,7 +195,7 @@ def _windows(here: Summary, there: Summary) -> list[Change]:
     paired = _strict(ours, theirs) if _same_collection(here, there, "kinematic") else None
     if paired is not None:
         found.append(paired)
-    spans: list[dict[str, Any]] = [
+    spans: list[dict[str, Share]] = [
         {"strict": part.interval, **part.window_intervals} for part in (ours, theirs)
     ]
     names = {
@@ -206,10 +207,15 @@ def _windows(here: Summary, there: Summary) -> list[Change]:
     for key, name in names.items():
         if key == "strict" and paired is not None:
             continue
-        rows = [part[key] for part in spans if key in part and part[key].low is not None]
-        if len(rows) == len(spans):
-            noise = math.hypot(*((row.high - row.low) / 2 for row in rows))
-            mine, other = (float(row.share) for row in rows)
+        rows = [part[key] for part in spans if key in part]
+        known = [
+            (row.share, row.low, row.high)
+            for row in rows
+            if row.share is not None and row.low is not None and row.high is not None
+        ]
+        if len(known) == len(spans):
+            noise = math.hypot(*((high - low) / 2 for _, low, high in known))
+            mine, other = (float(share) for share, _, _ in known)
             title = f"{name}, the chosen network" if by_seeds else name
             found.append(_around(title, mine, other, noise, "intervals"))
     return found

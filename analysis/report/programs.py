@@ -25,9 +25,9 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.sweeps import GeneralisationResults, NotTrained
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
-Json = dict[str, Any]
 DocumentT = TypeVar("DocumentT", bound=Document)
 
 FILES = {

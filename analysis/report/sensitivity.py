@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from sliplab.analysis.report.figures.intervals import Changed, ChangePanel, lowered_and_raised
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
@@ -12,8 +12,7 @@ from sliplab.analysis.report.programs import parse_program, shape_checked
 from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, NAMES
 from sliplab.analysis.sweeps.study_sensitivity import FIGURES, UNITS, changes, figures
 from sliplab.storage.schema.sweeps import SensitivityResults
-
-Json = dict[str, Any]
+from sliplab.storage.streams import Json
 
 DRAWN = ("strict", "incipient_ms", "gravity_lead_ms", "disturbance_lead_ms")
 Side = Mapping[str, Mapping[str, Changed]]

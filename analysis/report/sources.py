@@ -14,7 +14,7 @@ from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
 from sliplab.analysis.networks.models import training_settings
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
-from sliplab.analysis.report.programs import Json, read_programs
+from sliplab.analysis.report.programs import read_programs
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import (
     Evaluation,
@@ -23,6 +23,8 @@ from sliplab.storage.schema.evaluation import (
     TrainedBaseline,
     WindowIntervals,
 )
+from sliplab.storage.schema.summary import Hold
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
@@ -57,7 +59,7 @@ class Sources:
     baselines: Mapping[str, TrainedBaseline]
     window_intervals: WindowIntervals | None
     label_check: LabelCheck | None
-    holds: Mapping[str, Json]
+    holds: Mapping[str, Hold]
     planned_bytes: Mapping[str, int]
     step_seconds: Mapping[str, float]
     programs: Mapping[str, Json]

@@ -30,8 +30,7 @@ from sliplab.storage.schema.summary import (
     TrialOutcome,
 )
 from sliplab.storage.schema.sweeps import HoldoutResult
-
-Json = dict[str, Any]
+from sliplab.storage.streams import Json
 
 _PACKAGES = (
     "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",

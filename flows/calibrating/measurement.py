@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -33,8 +32,8 @@ ANNOUNCEMENT = (
 class Finding:
     """The result of a measurement: keys of the rig file to set and to remove, and figures."""
 
-    changes: dict[str, Any]
-    figures: dict[str, Any]
+    changes: Mapping[str, object]
+    figures: Mapping[str, object]
     remove: tuple[str, ...] = ()
 
 
@@ -48,6 +47,13 @@ class PlannedMove:
     from_mm: float
     to_mm: float
     speed_mm_s: float
+
+
+@dataclass(frozen=True)
+class AnnouncedMove(PlannedMove):
+    """A planned motion with its deepest point in the arm's base frame, mm."""
+
+    base_mm: list[float]
 
 
 @dataclass
@@ -143,7 +149,7 @@ class Measurement:
         )  # fmt: skip
         self._report(finding, written.path, written.kept)
 
-    def _rows(self, moves: Sequence[PlannedMove]) -> list[dict[str, Any]]:
+    def _rows(self, moves: Sequence[PlannedMove]) -> list[AnnouncedMove]:
         plane = self.file.calibration.contact_plane
         frame = PlateFrame.taught((plane.centre, plane.right, plane.above))
         if self.what == "crop":
@@ -151,7 +157,7 @@ class Measurement:
         rows = []
         for move in moves:
             base = frame.pose(Position(move.x_mm, move.y_mm, move.to_mm)).xyz_mm
-            rows.append({**vars(move), "base_mm": [round(v, 3) for v in base]})
+            rows.append(AnnouncedMove(**vars(move), base_mm=[round(v, 3) for v in base]))
         return rows
 
     def _announce(self, moves: Sequence[PlannedMove], who: str) -> None:
@@ -159,9 +165,9 @@ class Measurement:
         console.say(f"{self.what} of rig {self.file.name}{simulated}: {who or ANNOUNCEMENT}")
         for row in self._rows(moves):
             console.say(
-                f"  {row['what']}: at ({row['x_mm']:.1f}, {row['y_mm']:.1f}) mm of the plate, "
-                f"depth {row['from_mm']:+.2f} to at most {row['to_mm']:+.2f} mm at "
-                f"{row['speed_mm_s']:g} mm/s; the deepest point is {row['base_mm']} mm in the "
+                f"  {row.what}: at ({row.x_mm:.1f}, {row.y_mm:.1f}) mm of the plate, "
+                f"depth {row.from_mm:+.2f} to at most {row.to_mm:+.2f} mm at "
+                f"{row.speed_mm_s:g} mm/s; the deepest point is {row.base_mm} mm in the "
                 "arm's base frame"
             )
 
@@ -175,7 +181,7 @@ class Measurement:
             return
         columns = ["what", "x, mm", "y, mm", "from depth, mm", "to at most, mm", "speed, mm/s",
                    "deepest in base, mm"]  # fmt: skip
-        table = [[*list(row.values())[:-1], _cell(row["base_mm"])] for row in rows]
+        table = [[*list(vars(row).values())[:-1], _cell(row.base_mm)] for row in rows]
         title = f"{self.what} of rig {self.file.name}: nothing moved (dry run)"
         console.print_table(title, columns, table)
         console.say(who or ANNOUNCEMENT)

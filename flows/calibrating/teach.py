@@ -7,7 +7,6 @@ is a failure like any other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -205,8 +204,8 @@ def teach_zero(
                 bar.advance(1, f"by {method} {depths[method][-1]:+.3f} mm")
     events = np.array(depths["events"])
     zero, residual = float(events.mean()), float(np.ptp(events)) / 2
-    entry: dict[str, Any] = {"zero": mm(zero), "by_events": mm(zero)}
-    figures: dict[str, Any] = {
+    entry: dict[str, object] = {"zero": mm(zero), "by_events": mm(zero)}
+    figures: dict[str, object] = {
         "zero_mm": zero,
         "by_events_mm": events.tolist(),
         "by_markers_mm": None,

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
-from typing import Any
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, store_lock
@@ -334,14 +333,7 @@ class Session:
         """Return the trial's record: all that follows from protocol, seed and versions."""
         recorded = run.recorded_ns
         first, last = run.steps[0][0], run.steps[-1][0]
-        given: dict[str, Any] = {}
-        if described := self.rig.describe():
-            given["devices"] = described
-        if run.truth is not None:
-            given["simulation_truth"] = run.truth
-        if found.streams:
-            given["streams"] = self._streams(found)
-        return TrialRecord(
+        record = TrialRecord(
             format=TrialRecord.FORMAT,
             trial=trial.id,
             campaign=self.campaign.name,
@@ -370,8 +362,13 @@ class Session:
                 for step, kept in run.steps
             ),
             geometry=self._geometry(frame_px),
-            **given,
         )
+        known = {
+            "devices": self.rig.describe(),
+            "simulation_truth": run.truth,
+            "streams": self._streams(found),
+        }
+        return record.model_copy(update={name: value for name, value in known.items() if value})
 
     def _streams(self, found: Assessment) -> dict[str, StreamRecord]:
         """Return the named streams, that of the force sensor with its axes."""
@@ -382,16 +379,16 @@ class Session:
         return streams
 
     def _geometry(self, frame_px: tuple[int, int] | None) -> Geometry:
-        given: dict[str, Any] = {}
-        if (centre := self.rig_file.calibration.centre_px) is not None:
-            given["event_centre_px"] = centre
-        return Geometry(
+        geometry = Geometry(
             event_px=(self.rig.events.width, self.rig.events.height),
             frame_px=frame_px,
             px_per_mm=self.rig_file.frame_camera.scale_px_per_mm,
             skin_mm=tuple(self.rig_file.skin.layout_mm()),
             centre=0,
-            **given,
+        )
+        centre = self.rig_file.calibration.centre_px
+        return (
+            geometry if centre is None else geometry.model_copy(update={"event_centre_px": centre})
         )
 
     def _provenance(self, started: datetime) -> Provenance:

@@ -198,11 +198,13 @@ def _ask_all(client: Any, question: Callable[[Any], None], about: Any, todo: str
             raise ClusterError(f"worker {worker}: {_short(answer)}; {todo}")
 
 
-def _run(client: Any, question: Callable[[Any], None], about: Any) -> dict[str, Any]:
-    """Run a function on each worker; return its result or the exception that it raised."""
+def _run(
+    client: Any, question: Callable[[Any], None], about: Any
+) -> dict[str, BaseException | None]:
+    """Ask each worker; return None by worker, or the exception that the question raised there."""
     try:
         # as `client.run`, which knows no limit
-        answers: dict[str, Any] = client.sync(
+        answers: dict[str, BaseException | None] = client.sync(
             client._run, in_thread, question, about, on_error="return", callback_timeout=ANSWER_S
         )
     except (OSError, TimeoutError) as error:

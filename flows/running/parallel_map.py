@@ -29,7 +29,7 @@ from sliplab.storage.remote.mirror import open_for_trial, place_of
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.trial import SyncResult
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -217,7 +217,7 @@ def keep_trials(
     """Do the work of `run_trials` inside a flow that runs already."""
     with console.bar(f"{title} (trials)", len(work)) as bar:
 
-        def keep(number: int, result: tuple[Json | Document, dict[str, Any]]) -> None:
+        def keep(number: int, result: tuple[Json | Document, Arrays]) -> None:
             item = work[number]
             name = item.recording.folder.name
             Derived.of(store, step, item.campaign).write(name, item.key, *result)

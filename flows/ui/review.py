@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
 from sliplab.storage.streams import F64, I64, U8
 from sliplab.storage.trials import review
-from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import Decision, Onsets, Verdict
 from sliplab.storage.trials.store import IMPORTED, Store
@@ -350,7 +350,7 @@ def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
     recording = item.campaign.recording(row.trial)
     derived = Derived.of(store, LABELS, item.name)
     label: TrialLabel | None = None
-    arrays: dict[str, Any] = {}
+    arrays: Arrays = {}
     if row.label != "missing":
         label, arrays = derived.load(row.trial, TrialLabel), derived.arrays(row.trial)
     frame_ns = np.asarray(arrays.get("frame_ns", recording.frame_times()), np.int64)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from bokeh.models import (
     ColumnDataSource,
     CustomJS,
@@ -263,7 +264,7 @@ def _rounded(time_s: float) -> int:
     return round(time_s * 1e9 / _RESOLUTION_NS) * _RESOLUTION_NS
 
 
-def _crossings(shown: ShownTrial) -> dict[str, Any]:
+def _crossings(shown: ShownTrial) -> dict[str, npt.NDArray[np.float64]]:
     """Return when each marker slips by the label, with its interval where the label has one."""
     label = shown.label
     times = np.asarray(() if label is None else label.per_marker_ns, np.float64)

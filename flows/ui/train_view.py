@@ -31,7 +31,7 @@ class TrainingProgress:
 
     def __init__(self, model: Model, bar: Any, simulated: bool) -> None:
         self._model, self._bar, self._simulated = model, bar, simulated
-        self._records: list[dict[str, Any]] = []
+        self._records: list[dict[str, float]] = []
         self._best: EpochRecord | None = None
         self._artifact: Any = None
 

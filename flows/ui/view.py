@@ -43,7 +43,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import I64, EventChunk
 from sliplab.storage.trials import review
-from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
@@ -322,7 +322,7 @@ def _count_images(to: _Columns, size: tuple[int, int], events: EventChunk, time_
         to.send("events/counts", np.array([edge], np.int64), columns, "event_pictures")
 
 
-def _frames(to: _Columns, subject: Subject, arrays: dict[str, Any]) -> None:
+def _frames(to: _Columns, subject: Subject, arrays: Arrays) -> None:
     recording = subject.recording
     if recording.frame_source == "none":
         return
@@ -398,18 +398,20 @@ def _pulses(to: _Columns, subject: Subject) -> None:
 
 def _onsets(to: _Columns, subject: Subject, label: TrialLabel | None, key: str) -> None:
     recording = subject.recording
-    known: dict[str, Any] = {"label": {} if label is None else dict(label)}
+    known: dict[str, tuple[int | None, int | None]] = {
+        "label": (None, None) if label is None else (label.incipient_ns, label.gross_ns)
+    }
     decision = review.last(subject.store, subject.item.name, subject.trial)
     if decision is not None and state_of(decision, key) in {"accepted", "adjusted"}:
-        known["review"] = vars(decision.new)
+        known["review"] = (decision.new.incipient_ns, decision.new.gross_ns)
     truth = recording.simulation_truth()
     if truth is not None:
-        known["truth_simulated"] = truth
+        known["truth_simulated"] = (truth.get("incipient_ns"), truth.get("gross_ns"))
     start, _ = recorded_span(recording)
     times, texts = [], []
     for name, onsets in known.items():
-        found = {kind: onsets.get(f"{kind}_ns") for kind in ("incipient", "gross")}
-        there = [(t, kind) for kind, t in found.items() if t is not None]
+        both = zip(("incipient", "gross"), onsets, strict=True)
+        there = [(t, kind) for kind, t in both if t is not None]
         curve = np.array([start, *(t for t, _ in there)], np.int64)
         to.scalars(f"onsets/{name}", curve, [0, *(1 + (k == "gross") for _, k in there)])
         to.once(f"onsets/{name}", to.rr.SeriesLines(names=name.replace("_", " ")))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -163,7 +162,7 @@ def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
     in every label are missing, and integers stay integers.
     """
     kept = Derived.of(store, LABELS, campaign)
-    rows: list[dict[str, Any]] = []
+    rows: list[Json] = []
     for trial in trials:
         try:
             found = kept.read(trial)
@@ -173,8 +172,8 @@ def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
     return pd.DataFrame(rows).convert_dtypes()
 
 
-def _flat(data: dict[str, Any], before: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def _flat(data: Json, before: str) -> Json:
+    flat: Json = {}
     for key, value in data.items():
         if isinstance(value, dict):
             flat |= _flat(value, f"{before}{key}.")

@@ -15,7 +15,6 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -400,7 +399,7 @@ def _check_exported(item: Json, path: Path) -> None:
 
 def _as_exported(trial: ForeignTrial, item: Json, simulated: bool) -> ForeignTrial:
     """Return a trial with what the manifest states of it."""
-    about: dict[str, Any] = {**trial.about, "exported": item.get("record", {})}
+    about = {**trial.about, "exported": item.get("record", {})}
     return replace(
         trial,
         condition=dict(item["condition"]),

@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import condition_columns
 from sliplab.storage.files import make_folder, write_bytes
-from sliplab.storage.streams import I64, Json
+from sliplab.storage.streams import I64
 from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
@@ -138,7 +138,7 @@ class _Part:
             old = known.sync()
             self.sync = {name: _sync_key(campaign, name) for name in listing.names}
             self.kept = {n: at for n, at in self.kept.items() if self.sync[n] == old[at]}
-        self.fresh: dict[str, dict[str, Any]] = {}
+        self.fresh: dict[str, Row] = {}
         self.changed = len(self.kept) != high - low or not same_clocks
 
     def look(self, strict: bool) -> list[str]:
@@ -170,7 +170,7 @@ class _Part:
 def _rebuilt(store: Store, parts: list[_Part], known: _Known, began_ns: int) -> pd.DataFrame:
     """Return the table from the index and the rows that were read, and write it as the index."""
     old_rows, old_sync = known.rows(), known.sync()
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     sync: list[str] = []
     keys: list[Any] = []
     new = _Known(pd.DataFrame())
@@ -192,7 +192,11 @@ def _rebuilt(store: Store, parts: list[_Part], known: _Known, began_ns: int) -> 
     return table
 
 
-def _row(campaign: str, recording: Recording) -> dict[str, Any]:
+Row = dict[str, str | int | float | None]
+"""A trial of the catalogue: its cells by column."""
+
+
+def _row(campaign: str, recording: Recording) -> Row:
     record, uncertainty_ns = recording.record, recording.clocks.against_events_ns("events")
     return {
         "campaign": campaign,
@@ -263,7 +267,7 @@ class _Known:
     """By campaign: its first row, the one after its last, and its stamp of refitted clocks."""
     data: bytes = b""
 
-    def rows(self) -> list[Json]:
+    def rows(self) -> list[Row]:
         """Return the rows that the table was made of."""
         return [json.loads(each) for each in self._column(_ROW)]
 
@@ -320,7 +324,7 @@ def _parse(data: bytes) -> _Known | None:
 
 
 def _write_index(
-    store: Store, table: pd.DataFrame, rows: list[Json], sync: list[str], known: _Known
+    store: Store, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Known
 ) -> None:
     """Write the index, where it can be written and reads again as it is."""
     frame = table.copy()

@@ -22,6 +22,8 @@ from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
+Arrays = dict[str, npt.NDArray[Any]]
+"""Arrays of a result by name."""
 DocumentT = TypeVar("DocumentT", bound=Document)
 
 
@@ -71,14 +73,12 @@ class Derived:
         """Return whether `name` was made with `key`."""
         return self.key(name) == key
 
-    def write(
-        self, name: str, key: str, data: Json | Part, arrays: dict[str, Any] | None = None
-    ) -> None:
+    def write(self, name: str, key: str, data: Json | Part, arrays: Arrays | None = None) -> None:
         """Keep a result; the JSON with its key is written last and decides."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if arrays is not None:
             buffer = io.BytesIO()
-            np.savez_compressed(buffer, **arrays)
+            np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]  # no array is numpy's option
             write_bytes(self.arrays_path(name), buffer.getvalue())
         plain = data.to_json() if isinstance(data, Part) else data
         write_json(self.folder / f"{safe_name(name)}.json", {**plain, "key": key})
@@ -104,7 +104,7 @@ class Derived:
         """Return the path of a result's arrays."""
         return self.folder / f"{safe_name(name)}.npz"
 
-    def arrays(self, name: str) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self, name: str) -> Arrays:
         """Return a result's arrays."""
         with np.load(self.arrays_path(name), allow_pickle=False) as file:
             return {key: file[key] for key in file.files}

@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
+from matplotlib.artist import Artist
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from sliplab.analysis.report.figures.style import (
@@ -171,7 +172,7 @@ def over_trials(
         figure, grid = plt.subplots(
             len(panels), 1, figsize=(7.6, 1.8 * len(panels) + 1.3), sharex=True, squeeze=False
         )
-        handles: dict[str, Any] = {}
+        handles: dict[str, Artist] = {}
         for axes, panel in zip(grid[:, 0], panels, strict=True):
             _panel(axes, panel)
             for first in list(campaigns.values())[1:]:
