@@ -41,12 +41,12 @@ def test_slips_in_the_hold_are_counted_and_their_size_told(tmp_path: Path) -> No
     for trial, known in zip(made.ids, labels, strict=False):  # the fifth is as labels were
         derived.write(trial, made.keys[trial], known)
     found = holds_compared(made.store, [made.item])[NAME]
-    assert (found["trials"], found["slipped"], found["limit_px"]) == (4, 1, 1.0)
-    assert found["most_px"] == 7.5
-    assert found["apart_ms"]["incipient"] == {
+    assert (found.trials, found.slipped, found.limit_px) == (4, 1, 1.0)
+    assert found.most_px == 7.5
+    assert found.apart_ms.incipient.to_json() == {
         "n": 3, "median": 10.0, "median_abs": 10.0, "max_abs": 1780.0
     }  # fmt: skip
-    assert found["apart_ms"]["gross"]["max_abs"] == 0.0
+    assert found.apart_ms.gross.max_abs == 0.0
 
 
 def test_labels_from_before_say_nothing_of_the_hold(tmp_path: Path) -> None:
