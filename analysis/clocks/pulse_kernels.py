@@ -338,3 +338,32 @@ def most_off(width, fits, low, high, at_ends):  # type: ignore[no-untyped-def]
         if there <= 1.5 * width:
             most = max(most, min(width, there) - (fits[first + width] - fits[first]))
     return most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def best_shift(there, at, most):  # type: ignore[no-untyped-def]
+    """Of pulses up to one, or behind one: how many more have a partner some ticks away, at most.
+
+    Args:
+        there: (n,) whether the other train has a pulse on each tick.
+        at: (m,) ticks of the pulses, rising, from `most` to n - 1 - `most`.
+        most: the largest shift that is tried, either way, ticks.
+
+    Returns:
+        the shift, and by how many more pulses it explains that part than none does; of equally good
+        ones the first, from -`most` on.
+    """
+    best, found = 0, 0
+    for shift in range(-most, most + 1):
+        if shift == 0:
+            continue
+        more = least = 0
+        high = 0
+        for j in range(at.size):
+            more += int(there[at[j] + shift]) - int(there[at[j]])
+            high = max(high, more)
+            least = min(least, more)
+        high = max(high, more - least)
+        if high > best:
+            best, found = high, shift
+    return found, best

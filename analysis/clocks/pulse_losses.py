@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from sliplab.analysis.clocks.pulse_kernels import most_off
+from sliplab.analysis.clocks.pulse_kernels import best_shift, most_off
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -262,9 +262,7 @@ def better_shift(trains: TickTrains) -> tuple[int, float]:
     if share <= density:
         return 0, 1.0
     more_likely = math.log(share * (1.0 - density) / (density * (1.0 - share)))
-    shifts = np.concatenate([np.arange(-JUMP_TICKS, 0), np.arange(1, JUMP_TICKS + 1)])
-    sums = np.cumsum(there[at + shifts[:, None]] - here, axis=1, dtype=np.int32)
-    # of all pulses up to one, and of all behind one
-    best = np.maximum(sums.max(axis=1), sums[:, -1] - sums.min(axis=1))
-    which = int(best.argmax())
-    return int(shifts[which]), min(2 * shifts.size * math.exp(-more_likely * best[which]), 1.0)
+    jump, more = best_shift(there, at, JUMP_TICKS)
+    # either side of the pulse at which it jumped
+    ways = 4 * JUMP_TICKS
+    return int(jump), min(ways * math.exp(-more_likely * more), 1.0)

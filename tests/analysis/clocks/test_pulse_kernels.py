@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sliplab.analysis.clocks.pulse_kernels import (
+    best_shift,
     changes,
     fullest,
     largest_sizes,
@@ -188,3 +189,25 @@ def test_most_off_looks_at_every_window(at_ends: bool) -> None:
             if there <= 1.5 * width:
                 off.append(min(width, there) - (fits[first + width] - fits[first]))
         assert most_off(width, fits, low, high, at_ends) == max(off)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.floats(0.1, 0.9))
+def test_the_best_shift_is_that_of_all_parts_that_begin_or_end_a_train(
+    seed: int, most: int, share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    there = (rng.random(40) < share).astype(np.int8)
+    at = np.flatnonzero(rng.random(40 - 2 * most) < 0.6) + most
+    explained = {
+        shift: max(
+            int((there[part + shift] - there[part]).sum())
+            for cut in range(at.size + 1)
+            for part in (at[:cut], at[cut:])
+        )
+        for shift in range(-most, most + 1)
+        if shift != 0
+    }
+    found, more = best_shift(there, at, most)
+    assert more == max(0, *explained.values())
+    if more > 0:
+        assert found == next(shift for shift, value in explained.items() if value == more)
