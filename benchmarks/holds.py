@@ -44,17 +44,13 @@ class Candidate:
         file = ROOT / "protocols" / "gravity.yaml"
         data = yaml.safe_load(file.read_text("utf-8"))
         collection = data["collection"]
-        for phase in collection["motion"]:
-            if phase["phase"] == "press":
-                phase["depth"] = f"{self.depth} mm"
-            elif phase["phase"] == "retract":
-                phase["distance"] = f"{self.depth + 0.2:.2f} mm"
-            elif phase.get("action") == "release":
-                phase["duration"] = f"{self.release} s"
-            elif "settle" in phase:
-                phase["settle"] = f"{self.settle} s"
-            elif phase["phase"] == "hold":
-                phase["duration"] = f"{self.rest} s"
+        collection["motion"] |= {
+            "depth": f"{self.depth} mm",
+            "distance": f"{self.depth + 0.2:.2f} mm",
+            "let_go": f"{self.release} s",
+            "settle": f"{self.settle} s",
+            "rest": f"{self.rest} s",
+        }
         return make_plan(Protocol.model_validate(data), str(file))
 
 

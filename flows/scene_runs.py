@@ -26,7 +26,7 @@ from sliplab.analysis.sweeps.scene_tradeoff import (
     variants,
 )
 from sliplab.protocols import Plan, Trial
-from sliplab.protocols.program import Move
+from sliplab.protocols.program import ACTING, Move
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
 from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
@@ -35,7 +35,7 @@ from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
 from sliplab.storage.streams import EventChunk, NullSink
 
-MOTION = frozenset({"slide", "retract"})
+MOTION = frozenset(ACTING)
 PERFECT = Clocks(
     arm_ppm=0, event_camera_ppm=0, frame_camera_ppm=0, sync_box_ppm=0, offset_h=0,
     pulse_jitter_us=0, frame_jitter_us=0,

@@ -14,7 +14,7 @@ from itertools import pairwise
 from sliplab.protocols.factors import Factor, unknown_factor
 from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.motion import check_reference_limits
-from sliplab.protocols.phases import PlateMotion, Retract, Slide
+from sliplab.protocols.phases import PlateMotion
 from sliplab.protocols.quantity import canonical, check_size
 from sliplab.protocols.settings import Split
 from sliplab.protocols.split import check_split
@@ -105,7 +105,7 @@ def _check_plate(collection: Collection) -> None:
                 )
             places[phase.action] = index
     falls = collection.experiment != "kinematic"
-    acting = next(i for i, phase in enumerate(motion) if isinstance(phase, Slide | Retract))
+    acting = collection.acting[0]
 
     def wanted(action: str, text: str) -> None:
         if action not in places:

@@ -31,6 +31,7 @@ from sliplab.protocols.factors import (
 from sliplab.protocols.phases import Phase
 from sliplab.protocols.quantity import FactorRef
 from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.templates import expand, templates
 from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -55,6 +56,27 @@ def _check_names(factors: Iterable[str], section: str) -> None:
             )
 
 
+def _or_template(schema: dict[str, Any]) -> None:
+    """Let the schema of a motion be a list of phases, or a template with its parameters."""
+    phases = {key: schema.pop(key) for key in ("type", "items") if key in schema}
+    parts = [
+        {
+            "type": "object",
+            "properties": {
+                "template": {"const": name},
+                **{key: {"type": "string"} for key in template.parameters},
+            },
+            "required": [
+                "template", *(key for key, each in template.parameters.items()
+                              if each.default is None),
+            ],
+            "additionalProperties": False,
+        }
+        for name, template in templates().items()
+    ]  # fmt: skip
+    schema["anyOf"] = [phases, *parts]
+
+
 class Collection(StrictModel):
     """The `collection:` section: it alone decides whether a campaign may go on."""
 
@@ -73,11 +95,19 @@ class Collection(StrictModel):
     order: Literal["shuffled", "listed"] = "shuffled"
     references: References | None = None
     plate: PlateSetup | None = None
-    motion: tuple[Phase, ...]
+    motion: tuple[Phase, ...] = Field(json_schema_extra=_or_template)
+    """The phases of a trial in order; or a template and its parameters."""
     recording: Recording
     limits: Limits
     gates: Gates = Gates()
     maintenance: Maintenance = Maintenance()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _template_written_out(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "motion" not in data:
+            return data
+        return {**data, "motion": expand(data["motion"])}
 
     @model_validator(mode="before")
     @classmethod
@@ -113,6 +143,16 @@ class Collection(StrictModel):
     def all_factors(self) -> dict[str, Factor]:
         """Factors and context by name, in the order in which a condition has them."""
         return {**self.factors, **self.context}
+
+    @property
+    def acting(self) -> tuple[int, ...]:
+        """Places in the motion of the phases in which the sensor moves in contact."""
+        names = [phase.phase for phase in self.motion]
+        press, release = names.index("press"), names.index("release")
+        return tuple(
+            index for index, name in enumerate(names)
+            if name in {"slide", "retract"} or (name == "move" and press < index < release)
+        )  # fmt: skip
 
     def key_of(self, name: str) -> str:
         """The key of a factor or of context: ``collection.context.skin``."""
@@ -175,7 +215,6 @@ class Collection(StrictModel):
 
     def _check_motion(self) -> None:
         names = [phase.phase for phase in self.motion]
-        acting = [index for index, name in enumerate(names) if name in {"slide", "retract"}]
 
         def fail(expected: str, value: object = None) -> None:
             raise KeyedError("collection.motion", value or " -> ".join(names) or [], expected)
@@ -187,10 +226,11 @@ class Collection(StrictModel):
         for name in ("approach", "press", "release", "return"):
             if names.count(name) != 1:
                 fail(f"must hold the phase '{name}' exactly once")
-        if len(acting) != 1:
-            fail("must hold exactly one 'slide' or 'retract'")
+        acting = self.acting
+        if not acting:
+            fail("must hold a 'slide' or 'retract', or a 'move' between press and release")
         if "hold" not in names[: acting[0]]:
-            fail("must hold still ('hold') before the slide or retraction: recording begins there")
+            fail("must hold still ('hold') before it moves in contact: recording begins there")
         ordered = [name for name in names if name in {"approach", "press", "release", "return"}]
         if ordered != ["approach", "press", "release", "return"]:
             fail("must have approach, press, release and return in this order")

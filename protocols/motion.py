@@ -17,12 +17,14 @@ from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.phases import (
     Approach,
     Hold,
+    Place,
     PlateMotion,
     Press,
     Release,
     Retract,
     Return,
     Slide,
+    Travel,
 )
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
 from sliplab.protocols.quantity import FactorRef, canonical, check_least
@@ -48,19 +50,18 @@ def build_program(collection: Collection, condition: Condition) -> Program:
     the end of that motion. A slide is centred on the plate; a disturbance goes to the side
     (right is +x) during the whole retraction, on one straight path.
     """
-    motion = collection.motion
-    acting = next(i for i, phase in enumerate(motion) if isinstance(phase, (Slide, Retract)))
-    holds = [i for i, phase in enumerate(motion) if isinstance(phase, Hold) and i < acting]
+    motion, acting = collection.motion, collection.acting
+    holds = [i for i, phase in enumerate(motion) if isinstance(phase, Hold) and i < acting[0]]
     approach = next(phase for phase in motion if isinstance(phase, Approach))
     home = Position(0.0, 0.0, -_value(approach.clearance, condition))
     start_xy = (0.0, 0.0)
-    if isinstance(motion[acting], Slide):
-        half = _half_slide(motion[acting], condition)
+    if isinstance(motion[acting[0]], Slide):
+        half = _half_slide(motion[acting[0]], condition)
         start_xy = (-half[0], -half[1])
     steps: list[Step] = []
     at = home
     for index, phase in enumerate(motion):
-        recorded = holds[-1] <= index <= acting
+        recorded = holds[-1] <= index <= acting[-1]
         if isinstance(phase, Approach):
             at = Position(*start_xy, -_value(phase.clearance, condition))
             steps.append(Move("approach", at, _value(phase.speed, condition)))
@@ -70,7 +71,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
         elif isinstance(phase, Hold):
             settle = _value(phase.settle, condition)
             if settle:
-                steps.append(Dwell("settle", settle))
+                steps.append(Dwell("settle", settle, recorded and index > holds[-1]))
             steps.append(Dwell("hold", _value(phase.duration, condition), recorded))
         elif isinstance(phase, Slide):
             half = _half_slide(phase, condition)
@@ -85,6 +86,10 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             steps.append(
                 PlateStep("plate", phase.action, _value(phase.duration, condition), recorded)
             )
+        elif isinstance(phase, Travel):
+            at = _place(phase, at, condition)
+            name = "move" if index in acting else "travel"
+            steps.append(Move(name, at, _value(phase.speed, condition), recorded))
         elif isinstance(phase, Release):
             at = Position(at.x_mm, at.y_mm, -_value(phase.clearance, condition))
             steps.append(Move("release", at, _value(phase.speed, condition)))
@@ -92,6 +97,24 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             at = Position(0.0, 0.0, home.depth_mm)
             steps.append(Move("return", at, _value(phase.speed, condition)))
     return Program(home, tuple(steps))
+
+
+def _place(phase: Travel, at: Position, condition: Condition) -> Position:
+    """Where a move from `at` ends."""
+    absolute = phase.to is not None
+    place = phase.to if phase.to is not None else phase.by
+
+    def coordinate(field: Decimal | FactorRef | None, here: float) -> float:
+        if field is None:
+            return here
+        value = _value(field, condition)
+        return value if absolute else here + value
+
+    assert place is not None
+    return Position(
+        coordinate(place.x, at.x_mm), coordinate(place.y, at.y_mm),
+        coordinate(place.depth, at.depth_mm),
+    )  # fmt: skip
 
 
 def _half_slide(phase: Any, condition: Condition) -> tuple[float, float]:
@@ -166,7 +189,7 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
     _check_levels(collection, written)
     for index, phase in enumerate(collection.motion):
         base = f"collection.motion[{index}]"
-        if isinstance(phase, (Approach, Press, Slide, Retract, Release, Return)):
+        if not isinstance(phase, (Hold, PlateMotion)):
             at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
             at_most(phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
@@ -175,6 +198,8 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
         if isinstance(phase, Slide):
             at_most(phase.distance, f"{base}.distance", Decimal(10_000), "workspace", "mm")
             _check_slide(phase, base, levels, limits)
+        if isinstance(phase, Travel) and phase.to is not None:
+            _check_place(phase.to, f"{base}.to", levels, limits)
         if isinstance(phase, Retract):
             at_most(phase.distance, f"{base}.distance", Decimal(10_000), "clearance", "mm")
             _check_retract(phase, base, levels, limits)
@@ -214,6 +239,41 @@ def _inside(x: float, y: float, limits: Any) -> str | None:
                 f"reaches {name} = {value:.3f} mm, outside collection.limits.workspace.{name} = "
                 f"{canonical(axis.low)} to {canonical(axis.high)} mm"
             )
+    return None
+
+
+def _check_place(place: Place, base: str, levels: Levels, limits: Any) -> None:
+    for name in ("x", "y", "depth"):
+        field = getattr(place, name)
+        for value, where in () if field is None else levels(field, f"{base}.{name}"):
+            x, y, depth = (float(value) if name == axis else 0.0 for axis in ("x", "y", "depth"))
+            if broken := _outside(Position(x, y, depth), limits):
+                raise KeyedError(where, f"{canonical(value)} mm", broken)
+
+
+def _outside(place: Position, limits: Any) -> str | None:
+    if place.depth_mm > float(limits.depth) + 1e-9:
+        return (
+            f"reaches a depth of {place.depth_mm:.3f} mm, over collection.limits.depth = "
+            f"{canonical(limits.depth)} mm"
+        )
+    if -place.depth_mm > float(limits.clearance) + 1e-9:
+        return (
+            f"reaches a clearance of {-place.depth_mm:.3f} mm, over collection.limits.clearance = "
+            f"{canonical(limits.clearance)} mm"
+        )
+    return _inside(place.x_mm, place.y_mm, limits)
+
+
+def path_fault(collection: Collection, program: Program) -> str | None:
+    """Return how a program with moves breaks the limits on its way; None if it does not.
+
+    Phases other than a move are held against the limits one by one, which names the level.
+    """
+    if any(isinstance(phase, Travel) for phase in collection.motion):
+        for step in program.steps:
+            if isinstance(step, Move) and (broken := _outside(step.to, collection.limits)):
+                return broken
     return None
 
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 from decimal import Decimal
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
+from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, model_validator
 
 from sliplab.protocols.quantity import (
     REF_SCHEMA,
+    AnyMillimetresOrRef,
     DegreesOrRef,
     FactorRef,
     MillimetresOrRef,
@@ -94,6 +95,41 @@ class PlateMotion(StrictModel):
     duration: SecondsOrRef = Decimal(0)
 
 
+class Place(StrictModel):
+    """A place in plate coordinates, or a way; what is left out stays as it is."""
+
+    x: AnyMillimetresOrRef | None = None
+    """To the right, along the plate."""
+    y: AnyMillimetresOrRef | None = None
+    """Up, along the plate."""
+    depth: AnyMillimetresOrRef | None = None
+    """Into the plate: the indentation of the highest papilla, negative clear of the plate."""
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> Place:
+        if self.x is None and self.y is None and self.depth is None:
+            raise ValueError("is empty; give x, y or depth")
+        return self
+
+
+class Travel(StrictModel):
+    """A straight move to a place, or by a way from where the sensor is.
+
+    Between press and release it is a motion in contact: recorded, and slip is looked for in it.
+    """
+
+    phase: Literal["move"]
+    to: Place | None = None
+    by: Place | None = None
+    speed: SpeedOrRef
+
+    @model_validator(mode="after")
+    def _one(self) -> Travel:
+        if (self.to is None) == (self.by is None):
+            raise ValueError("must have either 'to' or 'by'")
+        return self
+
+
 class Release(StrictModel):
     """Out along the normal until clear of the plate."""
 
@@ -109,9 +145,9 @@ class Return(StrictModel):
     speed: SpeedOrRef
 
 
-_PHASES = ("approach", "press", "hold", "slide", "retract", "plate", "release", "return")
+_PHASES = ("approach", "press", "hold", "slide", "retract", "plate", "move", "release", "return")
 register_tags(*_PHASES)
 Phase = Annotated[
-    Approach | Press | Hold | Slide | Retract | PlateMotion | Release | Return,
+    Approach | Press | Hold | Slide | Retract | PlateMotion | Travel | Release | Return,
     Field(discriminator="phase"),
 ]

@@ -22,13 +22,14 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.factors import Level, unknown_factor
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.model import Protocol
-from sliplab.protocols.motion import build_program, check_limits
+from sliplab.protocols.motion import build_program, check_limits, path_fault
 from sliplab.protocols.program import Dwell, Program
 from sliplab.protocols.quantity import FactorRef, canonical, parse, to_decimal
 from sliplab.protocols.shipped import protocol_path
 from sliplab.protocols.split import assign, check_split
+from sliplab.protocols.templates import in_terms_of_template
 from sliplab.protocols.units import file_text
-from sliplab.protocols.yaml_file import KeyedError, load
+from sliplab.protocols.yaml_file import KeyedError, parse_yaml, read_text, validate
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -285,13 +286,17 @@ def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -
         InputError: anything wrong, with file, key, value and what would be right.
     """
     path = path if stored else protocol_path(path)
-    protocol = load(Protocol, path, "protocol")
-    if not stored:
-        try:
-            check_consistency(protocol)
-        except KeyedError as error:
-            raise InputError(path, error.key, error.value, str(error)) from None
-    return make_plan(protocol, str(path), enable)
+    document = parse_yaml(read_text(path, "protocol"), path)
+    try:
+        protocol = validate(Protocol, document, path)
+        if not stored:
+            try:
+                check_consistency(protocol)
+            except KeyedError as error:
+                raise InputError(path, error.key, error.value, str(error)) from None
+        return make_plan(protocol, str(path), enable)
+    except InputError as error:
+        raise in_terms_of_template(error, document) from None
 
 
 def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan:
@@ -315,6 +320,8 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
                 f"gives ids of {len(trial.id)} characters; a folder's name has {MAX_ID} at most: "
                 "shorten names of factors or levels",
             )
+        if broken := path_fault(protocol.collection, plan.program(trial)):
+            raise InputError(file, "collection.motion", trial.id, f"the motion of it {broken}")
         if plan.seconds(trial) > limit:
             raise InputError(
                 file,

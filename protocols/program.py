@@ -12,6 +12,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+ACTING = ("slide", "retract", "move")
+"""Phases of a program in which the sensor moves in contact and slip is looked for."""
 PlateAction = Literal["raise", "release", "catch"]
 
 

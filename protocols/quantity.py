@@ -245,6 +245,7 @@ PositivePixels: Any = _quantity("px", "0", True, ref=False)
 PositivePercent: Any = _quantity("percent", "0", True, ref=False)
 # The same, or a factor's name after a dollar sign.
 MillimetresOrRef: Any = _quantity("mm", "0", True, ref=True)
+AnyMillimetresOrRef: Any = _quantity("mm", None, False, ref=True)
 SpeedOrRef: Any = _quantity("mm/s", "0", True, ref=True)
 SecondsOrRef: Any = _quantity("s", "0", False, ref=True)
 PositiveSecondsOrRef: Any = _quantity("s", "0", True, ref=True)

@@ -133,7 +133,7 @@ def _phases(
         start, end = recorded_span(recording)
         edges = [start, label.incipient_ns, label.gross_ns, end]
         there = trial == k
-        moving |= there & (middle >= recording.step(recording.motion_phase)[0])
+        moving |= there & (middle >= recording.motion_ns[0])
         for phase, (begin, over) in enumerate(itertools.pairwise(edges)):
             if begin is not None and over is not None and over > begin:
                 ours = there & (test.y == phase)

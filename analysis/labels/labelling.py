@@ -217,7 +217,7 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
         ValueError: the trial has neither video nor tracks, or its markers cannot be distinguished.
     """
     frame_ns = recording.frame_times()
-    motion_ns = recording.step(recording.motion_phase)
+    motion_ns = recording.motion_ns
     timing = recording.record.timing
     return label_places(
         places_of(recording),

@@ -226,7 +226,7 @@ def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
             continue
         known = labels.key(trial.id) is not None
         onset = labels.load(trial.id, TrialLabel).incipient_ns if known else None
-        begin = recording.step(recording.motion_phase)[0]
+        begin = recording.motion_ns[0]
         found.append(
             ReferenceTrial(
                 trial=trial.id,

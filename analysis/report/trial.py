@@ -108,7 +108,7 @@ def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSe
     start, end = dataset.recorded_span(recording)
     event_s, cell = _events(item, recording, start)
     onsets = example.onsets_s()
-    motion_s = (recording.step(recording.motion_phase)[0] - start) / 1e9
+    motion_s = (recording.motion_ns[0] - start) / 1e9
     frame_s = (arrays["frame_ns"] - start) / 1e9
     svg = figures.trial_overview(
         frame_s, displacement_px, event_s, cell - 0.5, onsets, motion_s,

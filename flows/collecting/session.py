@@ -29,6 +29,7 @@ from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun
@@ -547,8 +548,8 @@ class TrialGate:
 
 def _motion(run: TrialRun) -> Motion:
     """Return what the assessment needs to know of a trial's motion."""
-    moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
-    return Motion(run.recorded_ns, (moving.start_ns, moving.end_ns), run.path)
+    moving = [step for step, _ in run.steps if step.phase in ACTING]
+    return Motion(run.recorded_ns, (moving[0].start_ns, moving[-1].end_ns), run.path)
 
 
 @cache

@@ -10,9 +10,9 @@ from pathlib import Path
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
 from sliplab.protocols import InputError, Plan, Trial, load_plan
-from sliplab.protocols.program import Move, Program
+from sliplab.protocols.program import ACTING, Move, Program
 from sliplab.protocols.settings import AnalysisSettings, Detection
-from sliplab.rigs.core.reacting import ACTING, Reflex
+from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.levels import with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
 from sliplab.storage.files import sha256
@@ -154,7 +154,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
     """
     program = plan.program(trial)
     if not any(isinstance(step, Move) and step.phase in ACTING for step in program.steps):
-        raise InputError("--reflex", "", text, "the trial has no slide or retraction to cut short")
+        raise InputError("--reflex", "", text, "the trial has no motion in contact to cut short")
     limits = plan.protocol.collection.limits
     deepest = min(float(limits.depth), float(file.limits.depth))
     kind, _, value = text.partition(":")

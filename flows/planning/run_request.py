@@ -19,6 +19,7 @@ from sliplab.flows.planning.campaign_trials import (
 from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.shown import shown
+from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
@@ -236,7 +237,8 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
         "scene_level": run_request.rig.scene.scene.level if run_request.rig.simulated else None,
         "enabled": list(run_request.enable),
     }
-    protocol_text = read_text(Path(run_request.plan.file), "protocol")
+    file = run_request.plan.file
+    protocol_text = written_out(read_text(Path(file), "protocol"), file)
     campaign.update(info, protocol_text, mask_secrets(run_request.rig_text))
     return campaign
 

@@ -360,7 +360,7 @@ def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
         tracks = recording.tracks()
         places, plate = tracks.markers_px, tracks.plate_px
     start, end = recorded_span(recording)
-    motion = recording.step(recording.motion_phase)
+    motion = recording.motion_ns
     rate_s, rate = event_rate(recording, start, end)
     return ShownTrial(
         row, item, recording, label, frame_ns, moved,

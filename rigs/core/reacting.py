@@ -1,7 +1,7 @@
 """One trial's motion with a reflex: when slip is detected, the arm stops, or presses deeper.
 
 `Rig.run_trial` records trials; here nothing is recorded. The watcher that reads the events triggers
-the reflex by raising `SlipDetected` while the arm slides or retracts. The arm is stopped before
+the reflex by raising `SlipDetected` while the arm moves in contact. The arm is stopped before
 anything else. A failure ends as in any trial: the arm is stopped, and moved clear if healthy.
 """
 
@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
-from sliplab.protocols.program import Move, Position, Program, Step, step_seconds
+from sliplab.protocols.program import ACTING, Move, Position, Program, Step, step_seconds
 from sliplab.rigs.core.capabilities import ArmFault
 from sliplab.rigs.core.rig import Rig, arm_fault
 from sliplab.storage.streams import Sink
 
-ACTING = ("slide", "retract")
-"""Phases in which a reflex may act."""
 REST_S = 2.0
 """Timeout for a stopped arm to come to rest, s."""
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
-from sliplab.protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
+from sliplab.protocols.program import ACTING, Move, PlateStep, Position, Program, Step, step_seconds
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import (
     Arm,
@@ -192,7 +192,7 @@ class Rig:
                 if recording and not step.recorded:
                     self.stop_streams(sink, frame_px is not None)
                     recording = False
-                if step.phase in {"slide", "retract"}:
+                if step.phase in ACTING and not reference:
                     reference = self.arm.now_ns()
                 times = self.take_step(index, step, at, sink if recording else None)
                 steps.append((times, step.recorded))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.protocols.program import ACTING
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
@@ -326,9 +327,23 @@ class Recording:
 
     @property
     def motion_phase(self) -> str:
-        """``slide`` or ``retract``: the phase in which slip is looked for."""
+        """The phase in which slip is first looked for: ``slide``, ``retract`` or ``move``."""
         phases = {step.phase for step in self.record.steps}
-        return "slide" if "slide" in phases else "retract"
+        return next((phase for phase in ACTING if phase in phases), "retract")
+
+    @property
+    def motion_ns(self) -> tuple[int, int]:
+        """Start of the first and end of the last phase in which slip is looked for, ns.
+
+        Raises:
+            KeyError: the motion has none.
+        """
+        clock = self.clock("arm")
+        there = [step for step in self.record.steps if step.phase in ACTING]
+        several = [step for step in there if step.recorded] if len(there) > 1 else []
+        if not several:
+            return self.step(self.motion_phase)
+        return clock.to_reference(several[0].start_ns), clock.to_reference(several[-1].end_ns)
 
     @property
     def simulated(self) -> bool:

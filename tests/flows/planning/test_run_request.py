@@ -113,8 +113,8 @@ def test_hashes_of_protocols_that_shipped_before_stay(tmp_path: Path) -> None:
     for name, expected in known.items():
         data = yaml.safe_load((ROOT / "protocols" / f"{name}.yaml").read_text())
         collection = data["collection"]
-        collection["motion"][2]["depth"] = "3.4 mm"
-        collection["motion"][6]["distance"] = collection["limits"]["depth"] = "3.6 mm"
+        collection["motion"] |= {"depth": "3.4 mm", "distance": "3.6 mm"}
+        collection["limits"]["depth"] = "3.6 mm"
         del collection["gates"]["hold_slip"]
         assert load_plan(write(tmp_path / f"{name}.yaml", data)).collection_hash == expected
 
