@@ -56,6 +56,20 @@ class Collected:
         there = self.campaign.committed()
         return [(t, self.campaign.recording(t.id)) for t in self.plan if t.id in there]
 
+    def need(self, stream: str, use: str) -> None:
+        """See that trials were recorded with a stream.
+
+        Args:
+            stream: ``events`` or ``frames``.
+            use: what it is needed for, such as ``labels are made of them``.
+
+        Raises:
+            StoreError: the first trial has none, so its rig has no such camera.
+        """
+        for _, recording in self.trials[:1]:
+            if getattr(recording.record.counts, stream) == 0:
+                raise StoreError(f"campaign '{self.name}' was recorded without {stream}; {use}")
+
     def of_split(self, split: str) -> Iterator[tuple[Trial, Recording]]:
         """Committed trials of one part of the split."""
         return ((trial, recording) for trial, recording in self.trials if trial.split == split)
@@ -98,6 +112,8 @@ def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
     found = [item for item in campaigns if item.experiment == "kinematic"]
     if not found:
         raise StoreError("no kinematic campaign to train on; collect one first")
+    for item in found:
+        item.need("events", "the network is trained on windows of them")
     for other in found[1:]:
         if other.settings.windows != found[0].settings.windows:
             raise InputError(

@@ -101,12 +101,14 @@ def assess(
     timing: Timing,
     rate_hz: int,
     mid_exposure_ns: int | None,
+    with_events: bool = True,
 ) -> Assessment:
     """Fit the clocks of a sealed trial and apply the protocol's gates.
 
     Args:
         timing: how the rig's devices are timed.
         mid_exposure_ns: from a frame's trigger to its time; None without a video.
+        with_events: events were recorded.
     """
     with StreamReader(folder / DATA) as reader:
         streams = streams_of(reader, mid_exposure_ns)
@@ -117,15 +119,17 @@ def assess(
             name: StreamRecord(kind=kind, rows=reader.stream_counts()[name]["t"])
             for name, kind in reader.streams().items()
         }
-    sync = synchronise(streams, timing, rate_hz)
-    results = _sync_gates(sync, gates, timing, motion.recorded_ns, mid_exposure_ns is not None)
+    sync = synchronise(streams, timing, rate_hz, with_events=with_events)
+    there = {"events": with_events, "arm": True, "frames": mid_exposure_ns is not None}
+    devices = [*(name for name, recorded in there.items() if recorded), *sorted(sync.streams)]
+    results = _sync_gates(sync, gates, timing, motion.recorded_ns, devices)
     if mid_exposure_ns is not None:
         lost = _frames_lost(streams.frame_number, motion.recorded_ns, rate_hz)
         results["frames_lost"] = _gate(lost, gates.frames_lost)
-    results["event_gap_s"] = _gate(
-        _event_gap(event_us, sync, motion.moving_ns), float(gates.event_gap)
-    )
-    results["event_burst"] = _gate(_event_burst(event_us), gates.event_burst)
+    if with_events:
+        gap_s = _event_gap(event_us, sync, motion.moving_ns)
+        results["event_gap_s"] = _gate(gap_s, float(gates.event_gap))
+        results["event_burst"] = _gate(_event_burst(event_us), gates.event_burst)
     if gates.hold_slip is not None and tracks:
         slip = _hold_slip_px(streams.frame_ns, tracks, sync, motion.moving_ns[0])
         results["hold_slip_px"] = _gate(slip, float(gates.hold_slip))
@@ -149,12 +153,16 @@ def hold_rate(recording: Recording) -> float:
 
 
 def _sync_gates(
-    sync: TrialSync, gates: Gates, timing: Timing, recorded_ns: tuple[int, int], video: bool
+    sync: TrialSync,
+    gates: Gates,
+    timing: Timing,
+    recorded_ns: tuple[int, int],
+    devices: Sequence[str],
 ) -> dict[str, Gate]:
     """Check that every device has a clock map, good for its grade and all of the recording."""
     limits = gates.sync_uncertainty
     results: dict[str, Gate] = {}
-    for device in (*("events", "arm", "frames")[: 3 if video else 2], *sorted(sync.streams)):
+    for device in devices:
         name = f"sync_uncertainty_{device}_s"
         known = sync.devices.get(device)
         if known is None:
@@ -162,7 +170,7 @@ def _sync_gates(
             continue
         grade = "digital input" if device == "events" else known.grade
         grade = timing.arm if grade == "arm clock" else grade
-        # a latency is a difference: both maps count
+        # a latency is a difference: both maps count, where there are events
         both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
         value = (known.uncertainty_ns if both is None else both) / 1e9
         limit = limits.limit_s(grade)

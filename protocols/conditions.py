@@ -39,8 +39,9 @@ class Recording(StrictModel):
     @field_validator("streams")
     @classmethod
     def _needed(cls, streams: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(streams)) != len(streams) or "events" not in streams or "poses" not in streams:
-            raise ValueError("must hold 'events' and 'poses', and may hold 'frames', none twice")
+        seen = {"events", "frames"} & set(streams)
+        if len(set(streams)) != len(streams) or not seen or "poses" not in streams:
+            raise ValueError("must hold 'poses', and 'events' or 'frames' or both, none twice")
         return streams
 
 

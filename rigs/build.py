@@ -75,8 +75,8 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         name=file.name,
         clock=devices.clock,
         arm=devices.arm,
-        events=devices.events,
-        frames=devices.frames,
+        event_camera=devices.events if "events" in file.cameras else None,
+        frame_camera=devices.frames if "frames" in file.cameras else None,
         sync=devices.sync,
         operator=devices.operator,
         plate_frame=taught_frame(file),
@@ -163,17 +163,20 @@ def _driven_rig(
     """
     assert devices.sync_box is not None
     with ExitStack() as undo:
-        frames = _frame_camera(file, devices, shown)
-        undo.callback(frames.close)
-        _check_grade(file, frames)
-        events = devices.event_camera_driver.build(devices.event_camera)
-        undo.callback(events.close)
+        frames = events = None
+        if "frames" in file.cameras:
+            frames = _frame_camera(file, devices, shown)
+            undo.callback(frames.close)
+            _check_grade(file, frames)
+        if "events" in file.cameras:
+            events = devices.event_camera_driver.build(devices.event_camera)
+            undo.callback(events.close)
         rig = Rig(
             name=file.name,
             clock=HostClock(),
             arm=devices.arm_driver.build(calibrated_arm(file, devices)),
-            events=events,
-            frames=frames,
+            event_camera=events,
+            frame_camera=frames,
             sync=devices.sync_box_driver.build(devices.sync_box),
             operator=operator,
             plate_frame=taught_frame(file),

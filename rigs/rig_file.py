@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
@@ -31,6 +31,8 @@ from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 
+CAMERAS = {"events": "event camera", "frames": "frame camera"}
+"""Streams by name in rig files and protocols, and the devices that give them."""
 SCALE_ERROR = 0.005
 """Largest relative error of a measured scale."""
 
@@ -113,6 +115,8 @@ class RigFile(StrictModel):
     calibration: Calibration
     limits: RigLimits
     skin: Skin
+    cameras: tuple[Literal["events", "frames"], ...] = ("events", "frames")
+    """Cameras that the rig has: `events` in the sensor, `frames` through the plate."""
     frame_camera: FrameCameraSpec
     estimates: Estimates
     timing: Timing = Timing()
@@ -121,6 +125,13 @@ class RigFile(StrictModel):
     """Drivers of the devices; not for `mock`."""
     mock: MockSettings | None = None
     """The simulated scene and devices; not for `devices`."""
+
+    @field_validator("cameras")
+    @classmethod
+    def _one_at_least(cls, cameras: tuple[str, ...]) -> tuple[str, ...]:
+        if not cameras or len(set(cameras)) != len(cameras):
+            raise ValueError("must hold 'events' or 'frames' or both, none twice")
+        return cameras
 
     @model_validator(mode="after")
     def _has_its_sections(self) -> RigFile:
@@ -136,12 +147,25 @@ class RigFile(StrictModel):
                 raise KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
         if self.driver == "devices" and self.devices is not None and self.devices.sync_box is None:
             raise KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
+        if self.devices is not None:
+            for name, words in CAMERAS.items():
+                key = words.replace(" ", "_")
+                named = getattr(self.devices, key) is not None
+                if not named and name in self.cameras:
+                    raise KeyedError(f"devices.{key}", None, "is missing")
+                if named and name not in self.cameras:
+                    text = f"must be null: the rig has no {words} (cameras)"
+                    raise KeyedError(f"devices.{key}", "...", text)
         return self
 
     @model_validator(mode="after")
     def _loopback_can_show_it(self) -> RigFile:
         if self.driver != "loopback" or self.mock is None or self.devices is None:
             return self
+        if set(self.cameras) != set(CAMERAS):
+            text = "must hold events and frames: a loopback rig has both cameras"
+            raise KeyedError("cameras", list(self.cameras), text)
+        assert self.devices.frame_camera is not None
         exposure_us = self.mock.frame_camera.exposure_us
         for key, value, right in (
             (
@@ -235,11 +259,16 @@ class RigFile(StrictModel):
     def frame_px(self, plan: Plan) -> tuple[int, int] | None:
         """Return width and height of the recorded region in px, multiples of 16; None: no video."""
         recording = plan.protocol.collection.recording
-        if "frames" not in recording.streams:
+        if "frames" not in recording.streams or "frames" not in self.cameras:
             return None
         scale = self.frame_camera.scale_px_per_mm
         sides = (float(recording.region.width), float(recording.region.height))
         return tuple(max(16, round(side * scale / 16) * 16) for side in sides)  # type: ignore[return-value]
+
+    def with_events(self, plan: Plan) -> bool:
+        """Return whether events are recorded."""
+        both = set(self.cameras) & set(plan.protocol.collection.recording.streams)
+        return "events" in both
 
 
 def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
@@ -304,14 +333,28 @@ def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
         return
     for name in ("devices", "mock"):
         section = getattr(rig, name)
-        if section is not None and section.frame_camera.exposure_us * rate > 1e6:
+        camera = None if section is None else section.frame_camera
+        if camera is not None and camera.exposure_us * rate > 1e6:
             raise InputError(
                 file,
                 f"{name}.frame_camera.exposure_us",
-                f"{section.frame_camera.exposure_us:g}",
+                f"{camera.exposure_us:g}",
                 f"must be at most {1e6 / rate:g}, the period of {plan.file}'s sync_rate: "
                 "every tick triggers a frame",
             )
+
+
+def _check_cameras(rig: RigFile, plan: Plan) -> None:
+    """Hold the streams that a protocol names against the rig; it need not name any."""
+    recording = plan.protocol.collection.recording
+    if "streams" not in recording.model_fields_set:
+        return
+    for name, words in CAMERAS.items():
+        if name in recording.streams and name not in rig.cameras:
+            text = (
+                f"the rig {rig.name} has no {words}; leave out 'streams' to record what a rig has"
+            )
+            raise InputError(plan.file, "collection.recording.streams", name, text)
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
@@ -331,6 +374,7 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
                 f"must be at most {most_us:g}, a quarter of a tick of {plan.file}'s sync_rate: "
                 "pulses could not be distinguished",
             )
+    _check_cameras(rig, plan)
     _check_exposure(rig, plan, file)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):

@@ -203,21 +203,25 @@ def synchronise_recording(recording: Recording) -> TrialSync:
         raise StoreError(f"{recording.folder}: timing: is missing; its clocks cannot be fitted")
     with recording.open() as reader:
         streams = streams_of(reader, timing.mid_exposure_ns)
-    return synchronise(streams, timing.rig, timing.rate_hz)
+    with_events = recording.record.geometry.event_px is not None
+    return synchronise(streams, timing.rig, timing.rate_hz, with_events=with_events)
 
 
-def synchronise(streams: SyncStreams, timing: Timing, rate_hz: float) -> TrialSync:
+def synchronise(
+    streams: SyncStreams, timing: Timing, rate_hz: float, *, with_events: bool = True
+) -> TrialSync:
     """Fit every device of a trial by the means that its rig has.
 
     Args:
         rate_hz: ticks of the box a second.
+        with_events: an event camera was recorded.
     """
     found = TrialSync(timing.code, {}, {}, {}, frozenset(streams.wrenches))
     events, arm = timing.event_camera, timing.arm_controller
     pulses = _Pulses(streams.sync_pulses, timing, rate_hz, found)
-    _try(
-        found, "events", lambda: pulses.fit("events", streams.event_pulses, events, "trigger input")
-    )
+    if with_events:
+        stamps = streams.event_pulses
+        _try(found, "events", lambda: pulses.fit("events", stamps, events, "trigger input"))
     if timing.arm == "digital input":
         _try(found, "arm", lambda: pulses.fit("arm", streams.arm_pulses, arm, timing.arm))
     else:

@@ -180,10 +180,11 @@ def _arm(file: RigFile) -> str:
 
 def _cameras(file: RigFile) -> str:
     if file.devices is None:
-        return f"simulated, {file.frame_source}"
+        words = {"events": "events", "frames": file.frame_source}
+        return f"simulated, {', '.join(words[name] for name in file.cameras)}"
     suffix = " (fakes)" if file.simulated else ""
-    cameras = file.devices.event_camera_driver, file.devices.frame_camera_driver
-    return f"{', '.join(camera.title for camera in cameras)}{suffix}"
+    cameras = [driver.title for driver, _ in file.devices.drivers() if "camera" in driver.kind]
+    return f"{', '.join(cameras)}{suffix}"
 
 
 class By(StrEnum):

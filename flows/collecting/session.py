@@ -238,7 +238,7 @@ class Session:
                 warm_up.presses,
             )
             self._warm = True
-        if maintenance.rezero is not None:
+        if maintenance.rezero is not None and self.rig.event_camera is not None:
             slot = self.plan.rezero_task(trial).slot
             if slot != self._zero_slot:
                 seed = hash_integer(self.plan.protocol.collection.seed, "rezero", slot)
@@ -279,13 +279,16 @@ class Session:
         collection = self.plan.protocol.collection
         rate_hz = collection.recording.sync_rate
         frame_px = self.rig_file.frame_px(self.plan)
+        with_events = self.rig_file.with_events(self.plan)
         mid_exposure_ns = None if frame_px is None else self.rig.frames.mid_exposure_ns
         spool = self.rig_file.frame_camera.spool
         writer = self.campaign.begin(trial.id, frame_px, rate_hz, spool=spool)
         started = datetime.now(UTC)
         try:
             seed = hash_integer(trial.seed, number)
-            run = self.rig.run_trial(self.plan.program(trial), writer, seed, frame_px, rate_hz)
+            run = self.rig.run_trial(
+                self.plan.program(trial), writer, seed, frame_px, rate_hz, with_events
+            )
             found = assess(
                 writer.seal(),
                 _motion(run),
@@ -293,6 +296,7 @@ class Session:
                 self.rig.timing,
                 rate_hz,
                 mid_exposure_ns,
+                with_events=with_events,
             )
             record = self._record(trial, number, run, found, frame_px)
             provenance = self._provenance(started)
@@ -380,8 +384,9 @@ class Session:
         return streams
 
     def _geometry(self, frame_px: tuple[int, int] | None) -> Geometry:
+        with_events = self.rig_file.with_events(self.plan)
         geometry = Geometry(
-            event_px=(self.rig.events.width, self.rig.events.height),
+            event_px=(self.rig.events.width, self.rig.events.height) if with_events else None,
             frame_px=frame_px,
             px_per_mm=self.rig_file.frame_camera.scale_px_per_mm,
             skin_mm=tuple(self.rig_file.skin.layout_mm()),

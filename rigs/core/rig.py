@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 from sliplab.protocols.program import ACTING, Move, PlateStep, Position, Program, Step, step_seconds
 from sliplab.protocols.timing import Timing
@@ -73,6 +74,7 @@ class Rig:
     """Arm, cameras, sync box and the other parts that a trial needs.
 
     Attributes:
+        event_camera, frame_camera: None on a rig without one; a rig has one of them at least.
         poll_s: period at which streams are read and stop requests checked.
         timing: signals that reach each device, which decide what else must be read.
         touch_mm: depth of the centre papilla when touching off detects it.
@@ -87,8 +89,8 @@ class Rig:
     name: str
     clock: Clock
     arm: Arm
-    events: EventCamera
-    frames: FrameCamera
+    event_camera: EventCamera | None
+    frame_camera: FrameCamera | None
     sync: SyncBox
     operator: Operator
     plate_frame: PlateFrame
@@ -102,10 +104,31 @@ class Rig:
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     on_close: tuple[Callable[[], None], ...] = ()
+    _streaming: EventCamera | None = field(default=None, init=False)
+    """The event camera while it is recorded."""
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _plate_uncaught: bool = field(default=False, init=False)
     """True while the plate is released and not caught: it hangs on the sensor, or falls."""
+
+    @property
+    def events(self) -> EventCamera:
+        """The event camera. Raises RigError on a rig that has none."""
+        if self.event_camera is None:
+            raise RigError("event camera", f"the rig {self.name} has none")
+        return self.event_camera
+
+    @property
+    def frames(self) -> FrameCamera:
+        """The frame camera. Raises RigError on a rig that has none."""
+        if self.frame_camera is None:
+            raise RigError("frame camera", f"the rig {self.name} has none")
+        return self.frame_camera
+
+    def _devices(self) -> list[Any]:
+        """Return arm, cameras, sync box and sensor, as far as the rig has them, the arm first."""
+        found = (self.arm, self.event_camera, self.frame_camera, self.sync, self.force)
+        return [device for device in found if device is not None]
 
     def connect(self) -> None:
         """Connect sync box, arm and force sensor; cameras connect on construction.
@@ -131,10 +154,9 @@ class Rig:
         try:
             fault = self._stop_arm()
         finally:
-            for device in (self.arm, self.events, self.frames, self.sync, self.force):
+            for device in self._devices():
                 with suppress(Exception):
-                    if device is not None:
-                        device.close()
+                    device.close()
             for end in self.on_close:
                 end()
         before = sys.exception()
@@ -148,16 +170,18 @@ class Rig:
         Raises:
             RigError: a device does not answer.
         """
-        devices = (self.arm, self.events, self.frames, self.sync, self.force)
-        return [device.health() for device in devices if device and hasattr(device, "health")]
+        return [device.health() for device in self._devices() if hasattr(device, "health")]
 
     def describe(self) -> dict[str, Json]:
         """Return settings, counts and losses of the trial that just ran, by device."""
         described = {}
-        cameras = ("event_camera", self.events), ("frame_camera", self.frames)
-        for name, device in (("arm", self.arm), *cameras, ("force_sensor", self.force)):
-            if device is not None and hasattr(device, "describe"):
-                described[name] = device.describe()
+        devices = {
+            "arm": self.arm, "event_camera": self.event_camera, "frame_camera": self.frame_camera,
+            "force_sensor": self.force,
+        }  # fmt: skip
+        for name, device in devices.items():
+            if (describe := getattr(device, "describe", None)) is not None:
+                described[name] = describe()
         losses = getattr(self.sync, "losses", None)
         if losses is not None:
             described["sync_box"] = {"losses": vars(losses)}
@@ -170,8 +194,13 @@ class Rig:
         seed: int,
         frame_px: tuple[int, int] | None,
         rate_hz: int,
+        with_events: bool = True,
     ) -> TrialRun:
         """Run one trial; the streams of its recorded steps go to `sink`.
+
+        Args:
+            frame_px: region of the frames that are recorded; None records none.
+            with_events: record events, where the rig has an event camera.
 
         Raises:
             StopRequested: `should_stop` became true; the arm is stopped and clear.
@@ -187,7 +216,7 @@ class Rig:
             at, recording, reference = program.home, False, 0
             for index, step in enumerate(program.steps):
                 if step.recorded and not recording:
-                    self.start_streams(seed, rate_hz, frame_px is not None)
+                    self.start_streams(seed, rate_hz, frame_px is not None, with_events)
                     recording = True
                 if recording and not step.recorded:
                     self.stop_streams(sink, frame_px is not None)
@@ -250,7 +279,8 @@ class Rig:
         if self.simulation is not None:
             self.simulation.begin_trial(0)
         with ExitStack() as stopping:
-            stopping.callback(self.events.stop)
+            if self.event_camera is not None:
+                stopping.callback(self.event_camera.stop)
             stopping.callback(self.sync.stop)
             if self.force is not None:
                 stopping.callback(self.force.stop)
@@ -341,11 +371,15 @@ class Rig:
             if self.should_stop():
                 raise StopRequested
 
-    def start_streams(self, seed: int, rate_hz: int, with_frames: bool) -> None:
+    def start_streams(
+        self, seed: int, rate_hz: int, with_frames: bool, with_events: bool = True
+    ) -> None:
         """Start the streams; earlier data are discarded. Raises RigError."""
         self.arm.read_poses()
         self.arm.read_pulses()
-        self.events.start()
+        self._streaming = self.event_camera if with_events else None
+        if self._streaming is not None:
+            self._streaming.start()
         if self.force is not None:
             self.force.start()
         free_running = with_frames and self.timing.frames == "exposure line"
@@ -365,8 +399,9 @@ class Rig:
             self.frames.stop()
         self.sync.stop()
         self.wait(self.tail_s, sink)
-        self.events.stop()
-        sink.add_event_pulses(self.events.read_pulses())
+        if self._streaming is not None:
+            self._streaming.stop()
+            sink.add_event_pulses(self._streaming.read_pulses())
         if self.force is not None:
             self.force.stop()
             sink.add_stream(FORCE, self.force.read())
@@ -375,18 +410,20 @@ class Rig:
             sink.add_frames(self.frames.read())
 
     def _drain(self, sink: Sink) -> None:
-        sink.add_events(self.events.read())
-        sink.add_event_pulses(self.events.read_pulses())
+        if self._streaming is not None:
+            sink.add_events(self._streaming.read())
+            sink.add_event_pulses(self._streaming.read_pulses())
         sink.add_poses(self.arm.read_poses())
         sink.add_arm_pulses(self.arm.read_pulses())
         sink.add_sync_pulses(self.sync.read_pulses())
-        sink.add_frames(self.frames.read())
+        if self.frame_camera is not None:
+            sink.add_frames(self.frame_camera.read())
         if self.timing.frames == "exposure line":
             sink.add_exposures(self.sync.read_exposures())
         if self.timing.reads_clocks:
             sink.add_box_reads(self.sync.read_clock())
-        if self.timing.frames == "device time stamps":
-            sink.add_frame_camera_reads(self.frames.read_clock())
+        if self.timing.frames == "device time stamps" and self.frame_camera is not None:
+            sink.add_frame_camera_reads(self.frame_camera.read_clock())
         if self.force is not None:
             sink.add_stream(FORCE, self.force.read())
 
@@ -426,10 +463,9 @@ class Rig:
             try:
                 fault = self._stop_arm() or self._retract(clear)
             finally:
-                for device in (self.events, self.frames, self.sync, self.force):
+                for device in self._devices()[1:]:
                     with suppress(Exception):
-                        if device is not None:
-                            device.stop()
+                        device.stop()
             self._reported = str(fault or "")
             if fault is not None and str(fault) != str(error):
                 if isinstance(error, RigError) and error.device == "arm":

@@ -84,10 +84,12 @@ class DeviceSettings(StrictModel):
     """The `devices:` section of a rig file."""
 
     arm: Annotated[BaseArmSettings, _OfKind("arm")]
-    event_camera: Annotated[DriverSettings, _OfKind("event camera", "dvxplorer")] = Field(
+    event_camera: Annotated[DriverSettings, _OfKind("event camera", "dvxplorer")] | None = Field(
         default={"driver": "dvxplorer"}, validate_default=True
     )
-    frame_camera: Annotated[FrameCameraSettings, _OfKind("frame camera", "basler")]
+    """null where the rig's `cameras` has no `events`."""
+    frame_camera: Annotated[FrameCameraSettings, _OfKind("frame camera", "basler")] | None = None
+    """Left out where the rig's `cameras` has no `frames`."""
     sync_box: Annotated[DriverSettings, _OfKind("sync box", "sync_box")] | None = None
     """Needed by a real rig; a loopback rig brings its own."""
     plate: OperatedPlate | None = None
@@ -110,6 +112,7 @@ class DeviceSettings(StrictModel):
     @property
     def event_camera_driver(self) -> EventCameraDriver[Any]:
         """The driver of the event camera."""
+        assert self.event_camera is not None
         found = find_driver(self.event_camera.driver, "event camera")
         assert isinstance(found, EventCameraDriver)
         return found
@@ -117,6 +120,7 @@ class DeviceSettings(StrictModel):
     @property
     def frame_camera_driver(self) -> FrameCameraDriver[Any]:
         """The driver of the frame camera."""
+        assert self.frame_camera is not None
         found = find_driver(self.frame_camera.driver, "frame camera")
         assert isinstance(found, FrameCameraDriver)
         return found

@@ -270,7 +270,8 @@ class TrialRecord(Document):
             DocumentError, NewerFormat: as `load`.
         """
         found = super().parse(data, path)
-        if found.quality.passed and found.clocks.events is None:
+        seen = found.geometry.event_px is not None or found.geometry.frame_px is None
+        if found.quality.passed and seen and found.clocks.events is None:
             raise DocumentError(f"{path}: clocks.events: is missing")
         return found
 

@@ -155,7 +155,7 @@ class Recording:
             # a trial that was taken anew under this id has nothing to do with it
             if found.raw != self.raw_checksum or found.clocks is None:
                 return None
-            if found.clocks.events is None:
+            if found.clocks.events is None and self.record.clocks.events is not None:
                 raise DocumentError(f"{self.sync_file}: clocks.events: is missing")
         except NewerFormat as error:
             raise StoreError(str(error)) from None

@@ -195,8 +195,9 @@ class Journal:
 def watched(rig: Rig) -> list[str]:
     """Replace the rig's devices by journals; returns the notes."""
     notes: list[str] = []
-    for name in ("arm", "events", "frames", "sync"):
-        setattr(rig, name, Journal(name, getattr(rig, name), notes))
+    for name in ("arm", "event_camera", "frame_camera", "sync"):
+        said = {"event_camera": "events", "frame_camera": "frames"}.get(name, name)
+        setattr(rig, name, Journal(said, getattr(rig, name), notes))
     return notes
 
 
