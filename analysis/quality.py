@@ -1,7 +1,7 @@
 """Quality of a recorded trial: clocks fitted, losses counted, motion checked, gates applied.
 
-Runs on the sealed files of a trial before it is committed, so that a doubtful trial is taken again
-while the rig still stands there. The motion is checked from the stored poses, across the path and
+Runs on the sealed files of a trial before it is committed, so that a bad trial is retaken
+while the rig is still in place. The motion is checked from the stored poses, across the path and
 along it, so the check is the same for every arm: it finds a controller that slows a move down and
 still reports it as done.
 """

@@ -1,7 +1,7 @@
-"""The program's entry: runs the command line, maps faults to messages and exit codes.
+"""Entry point of the program: runs the command line, maps errors to messages and exit codes.
 
-Next to nothing is loaded before `main`: what fails while the rest is loaded, for
-want of memory or of open files, is said in one line as well.
+Almost nothing is imported before `main`, so that import failures for lack of
+memory or open files are reported in one line as well.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The public interface of `import sliplab`: stores, trials as arrays, and each step as a call.
+"""The public interface of `import sliplab`: stores, trials as arrays, and the analysis steps.
 
 A trial's arrays share one time line: int64 nanoseconds of the trial's sync box. Raw device times
 stay in the store (`storage.trials.recording.Recording`), for those who need them.
@@ -159,7 +159,7 @@ class Trial:
     def _check_video(self) -> None:
         if not self.recording.has_video:
             raise StoreError(
-                f"{self.recording.folder}: holds no video; its camera handed over "
+                f"{self.recording.folder}: has no video; its camera provided "
                 f"{self.recording.frame_source}"
             )
 
@@ -258,7 +258,7 @@ class Store:
             campaign: needed where several campaigns have a trial of this id.
 
         Raises:
-            StoreError: there is none, or more than one.
+            StoreError: it does not exist, or more than one.
         """
         found = [
             item
@@ -270,7 +270,7 @@ class Store:
             raise StoreError(
                 f"{self.folder}: trial {trial_id}: is in several campaigns ({where}): name one"
                 if found
-                else f"{self.folder}: trial {trial_id}: there is none of this id"
+                else f"{self.folder}: trial {trial_id}: no such trial"
                 + ("" if campaign is None else f" in campaign {campaign}")
             )
         return Trial(self._store, found[0].name, found[0].recording(trial_id))
@@ -310,7 +310,7 @@ class Store:
         """
         path = self.folder / "report" / "summary.json"
         if not path.exists():
-            raise StoreError(f"{path}: is not there; run `Store.report` first")
+            raise StoreError(f"{path}: does not exist; run `Store.report` first")
         return read_json(path)
 
     def models(self) -> list[Path]:
@@ -379,7 +379,7 @@ def open_store(place: str | Path) -> Store:
         place: its folder, or the URL of a pushed one (``s3://lab/one``).
 
     Raises:
-        StoreError: there is none, it is damaged, or a newer version wrote it.
+        StoreError: it does not exist, it is damaged, or a newer version wrote it.
     """
     from sliplab.storage.remote import mirror
     from sliplab.storage.remote.objects import is_url
@@ -394,7 +394,7 @@ def load_model(path: str | Path) -> Model:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no model, or is damaged.
+        ValueError: it is not a model, or is damaged.
         ModuleNotFoundError: the extra ``learn`` is not installed.
     """
     from sliplab.flows.running import extras
@@ -440,7 +440,7 @@ def collect(
     Raises:
         InputError: protocol or rig is wrong, or the rig cannot take the protocol.
         StoreError: the store cannot be used.
-        CampaignStopped: collection cannot go on; the message says why.
+        CampaignStopped: collection cannot continue; the message says why.
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
     from sliplab.flows.planning.run_request import make_request

@@ -1,7 +1,7 @@
-"""Collection: takes the trials that the store lacks, on one rig, under one protocol.
+"""Collection of the missing trials of one protocol on one rig.
 
-The truth about what is done is the store. Prefect sees a flow a campaign and a task a batch of
-trials: on a real rig that is one trial, on a mock rig, where a task costs as much as one, many.
+The store is the only record of progress. Prefect sees one flow per campaign and one task per batch
+of trials: one trial on a real rig, many on a mock rig, where a task costs as much as a trial.
 """
 
 from __future__ import annotations

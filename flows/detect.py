@@ -1,7 +1,7 @@
 """`sliplab detect`: a trained network on a rig's running event stream.
 
-Without a protocol the arm stands and is only listened to. With one, a trial's motion is made (and
-nothing of it is kept), and a reflex may cut it short. Whatever ends it, the arm is stopped first.
+Without a protocol the arm does not move. With one, a trial's motion is executed (nothing is
+stored), and a reflex may interrupt it. However it ends, the arm is stopped first.
 
 `flows.detecting` has what is asked for and the sink that feeds the detector.
 """
@@ -187,7 +187,7 @@ def _lines(out: Path | None) -> Iterator[Callable[[TimedDecision], None]]:
         yield lambda timed: None
         return
     if not out.parent.is_dir():
-        raise InputError("--out", "", out, "must be a file in a folder that is there")
+        raise InputError("--out", "", out, "must be a file in an existing folder")
     with translated_disk_errors(out.parent, RigError), out.open("w", encoding="utf-8") as file:
 
         def write(timed: TimedDecision) -> None:

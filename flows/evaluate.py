@@ -1,4 +1,4 @@
-"""Evaluation of the trained network on trials it has never seen."""
+"""Evaluation of the trained network on test trials."""
 
 from __future__ import annotations
 

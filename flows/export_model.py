@@ -1,6 +1,6 @@
-"""`sliplab export-model`: a trained network as ONNX, on a Speck, and with a card.
+"""`sliplab export-model`: export of a trained network as ONNX and for a Speck, with a model card.
 
-Nothing is written until all of it is there and the ONNX file has given Sinabs' spike counts.
+Nothing is written until everything is complete and the ONNX file reproduces Sinabs' spike counts.
 """
 
 from __future__ import annotations

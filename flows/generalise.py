@@ -1,4 +1,4 @@
-"""`sliplab generalise`: the network on levels that it never saw, and on skins it never touched.
+"""`sliplab generalise`: accuracy on levels left out of training and on other simulated skins.
 
 For a level of a factor a network is trained without its trials and tested on them. For other
 skins, which differ by the scatter of their making (`mock.scene.skin.seed`), some of the same trials
@@ -34,7 +34,7 @@ from sliplab.storage.trials.store import Store
 SKIN_SEEDS = 101
 """Seed of the first other skin."""
 SKINS, TRIALS = 5, 36
-"""Other skins, and trials on each, unless others are asked for."""
+"""Other skins, and trials on each, unless others are requested."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def measure_generalisation(
     count = skins if skins is not None else SKINS if store.simulated else 0
     if count:
         if not store.simulated:
-            raise InputError("--skins", "", 1, "must be 0: only a simulated rig has other skins")
+            raise InputError("--skins", "", 1, "must be 0: only simulated rigs have other skins")
         model = choose_model(wanted_models(store, work.campaigns))
         tasks += [skin_task(work, model, SKIN_SEEDS + number, trials) for number in range(count)]
     sweep = task_sweep(tasks, work.results)

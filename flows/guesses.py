@@ -1,7 +1,7 @@
 """`sliplab guesses`: sensitivity of a study's figures to assumed parameters of the scene.
 
 Some of a study's test trials are repeated on the same simulated rig with one parameter 20 %
-lower, then 20 % higher. They are labelled anew and judged by the study's own network and detection
+lower, then 20 % higher. They are relabelled and evaluated by the study's own network and detection
 settings. Each setting is a small store, deleted once its figures are kept; so the sweep may be
 stopped anywhere, and resumes.
 """

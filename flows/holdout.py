@@ -1,9 +1,9 @@
-"""`sliplab holdout`: figures of a campaign that nothing was chosen by, once a release.
+"""`sliplab holdout`: figures of a campaign that is used for no selection, once per release.
 
-Test trials of a study judge every change of the program, so the changes that stayed are those that
-test trials liked: after some years they choose the design, a little. The trials here have a seed
+Every change of the program is evaluated on a study's test trials, so the design slowly overfits to
+them. The trials here have a seed
 and a skin of the simulated rig that stand nowhere else. The study's own network and detection
-settings are judged on them, as they are, once with each version of the program; each time stands in
+settings are evaluated on them, as they are, once with each version of the program; each time is in
 the ledger next to the figures, so that a reader sees how often somebody looked.
 """
 

@@ -1,4 +1,4 @@
-"""Other networks on the store's test trials: the preset that `also` names, and models of files."""
+"""Evaluation of other networks on the test trials: the preset in `also`, and model files."""
 
 from __future__ import annotations
 

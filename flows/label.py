@@ -1,8 +1,8 @@
-"""Labelling: onsets of every committed trial whose label is missing or stale, and a check of them.
+"""Labelling of every committed trial whose label is missing or stale, and a check with video.
 
-A study on a rig that provides tracks instead of video sees labels, but not what finding the
-markers does to them. So some of its trials, the first of its shuffled order, are taken once more
-on the same rig with its camera at the level `video`, into a store of their own inside the study's,
+Labels from marker tracks do not include the error of finding the markers in a
+video. So some of a study's trials, the first of its shuffled order, are repeated
+on the same rig with its camera at the level `video`, into a separate store inside the study's,
 and their labels are compared with the simulation's truth.
 """
 

@@ -151,7 +151,7 @@ def _run(built: Rig, plan: Plan, trial: Trial, seed: int, sink: _Memory) -> Tria
 def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:
     """Return first slip and the centre's (or the plate's fall) at level L0.
 
-    None where there is no closed form: a retraction that also goes sideways.
+    None if there is no closed form: a retraction that also goes sideways.
     """
     start = perf_counter()
     slides = slides_of(replace(plan, trials=(trial,)))

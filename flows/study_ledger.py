@@ -126,7 +126,7 @@ def _in_words(done: int, unit: str) -> str:
 
 
 def read(folder: Path) -> list[Row]:
-    """Return the steps of a study as last written; none where there is no study."""
+    """Return the steps of a study as last written; none if there is no study."""
     path = folder / FILE
     if not path.exists():
         return []

@@ -1,8 +1,8 @@
 """`sliplab sync`: fit the clocks of every committed trial again, and show how good they are.
 
 A trial's clocks are fitted when it is taken, by the program of that day. When fitting has improved
-since, this step makes them again from the raw streams. The record stays as it was committed; where
-the new clocks differ they stand among the derived results, every later step reads them there, and
+since, this step makes them again from the raw streams. The record stays as committed; where
+the new clocks differ they are among the derived results, every later step reads them there, and
 its results become stale exactly then.
 """
 

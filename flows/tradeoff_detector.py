@@ -32,7 +32,7 @@ def detector_search(
     full: bool = False,
     reviewed: bool = False,
 ) -> DetectorSearch:
-    """Return the search that is asked for; nothing is computed yet.
+    """Return the search that is requested; nothing is computed yet.
 
     Args:
         full: every value of the factors with every other.
@@ -63,7 +63,7 @@ def tradeoff_detector(
     Args:
         full: every value of the factors with every other.
         reviewed: people's decisions are applied to the labels.
-        minutes: no run is begun after so many; the page is of the kept ones then.
+        minutes: no run is started after so many; the page is of the kept ones then.
         dry_run: only say what there is to do, and how long it would take.
 
     Returns:
@@ -71,7 +71,7 @@ def tradeoff_detector(
         `estimated_s`.
 
     Raises:
-        InputError: a value that no network can have, or a `folder` that is no folder.
+        InputError: a value that no network can have, or a `folder` that is not a folder.
         StoreError: trials or labels are missing.
     """
     if folder.exists() and not folder.is_dir():

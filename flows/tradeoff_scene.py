@@ -57,7 +57,7 @@ def tradeoff_scene(
 
     Raises:
         InputError: anything wrong with the protocol or the rig file, a rig that is real, or a
-            `folder` that is no folder.
+            `folder` that is not a folder.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("--out", "", str(folder), "must be a folder")

@@ -133,7 +133,7 @@ def _check_device(item: Collected) -> None:
             item.campaign.protocol_file,
             "analysis.training.device",
             device,
-            f"there is none here; must be one of {', '.join(there)}",
+            f"not available here; must be one of {', '.join(there)}",
         )
 
 

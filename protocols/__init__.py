@@ -1,4 +1,4 @@
-"""Protocol files, read, checked and expanded into plans."""
+"""Protocol files: reading, validation and expansion into plans."""
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol

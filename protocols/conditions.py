@@ -98,8 +98,8 @@ class Gates(StrictModel):
     """Largest deviation of the speed from the commanded one, anywhere along the path."""
     hold_slip: PositivePixels | None = None
     """Largest motion of a papilla's marker in the recorded hold, on a plate that slides relative to
-    the plate; looked at where the rig hands over tracks. Videos are only tracked by `label`, which
-    doubts the trial by `analysis.labelling.hold_slip_px`. Left out, it is not looked at."""
+    the plate; looked at where the rig provides tracks. Videos are only tracked by `label`, which
+    doubts the trial by `analysis.labelling.hold_slip_px`. Left out, it is ignored."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """Retakes of a trial before it is quarantined for good."""
     reference: ReferenceGate | None = None

@@ -1,8 +1,8 @@
-"""Rules over several keys that came after the first campaigns.
+"""Validation rules over several keys, introduced after the first campaigns.
 
-They refuse what is allowed key by key and surely not meant: a name of no factor, one direction
-twice, a plate that nobody catches. Copies of protocols in stores are not held to them, for their
-trials were taken and stay usable (docs/decisions/0069).
+They reject combinations that are valid key by key but surely unintended: an unknown factor, one
+direction twice, a plate that is never caught. They do not apply to the copies of protocols in
+stores, so that collected trials stay usable (docs/decisions/0069).
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def _check_held_out(split: Split) -> None:
                 raise KeyedError(key, "[]", "must name at least one level")
             for index, level in enumerate(levels):
                 if level in levels[:index]:
-                    raise KeyedError(f"{key}[{index}]", level, "is held out twice")
+                    raise KeyedError(f"{key}[{index}]", level, "is listed twice as held out")
                 if part == "validation_levels" and level in split.test_levels.get(name, ()):
-                    raise KeyedError(key, level, "is held out for the test already")
+                    raise KeyedError(key, level, "is already held out for testing")
 
 
 def _check_directions(collection: Collection) -> None:
@@ -101,7 +101,9 @@ def _check_plate(collection: Collection) -> None:
         if isinstance(phase, PlateMotion):
             if phase.action in places:
                 raise KeyedError(
-                    f"collection.motion[{index}].action", phase.action, "stands twice in the motion"
+                    f"collection.motion[{index}].action",
+                    phase.action,
+                    "appears twice in the motion",
                 )
             places[phase.action] = index
     falls = collection.experiment != "kinematic"
@@ -117,8 +119,8 @@ def _check_plate(collection: Collection) -> None:
     if falls:
         wanted("release", f"a {collection.experiment} protocol must release the plate")
     if "release" in places:
-        wanted("raise", "must raise the plate before its release")
-        wanted("catch", "the plate is released and is never caught")
+        wanted("raise", "must raise the plate before releasing it")
+        wanted("catch", "the plate is released but never caught")
     order = [name for name in ("raise", "release", "catch") if name in places]
     for before, after in pairwise(order):
         if places[after] < places[before]:

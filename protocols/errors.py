@@ -1,4 +1,4 @@
-"""The one error a person sees when what they wrote is wrong.
+"""The error of invalid input.
 
 Every input file of the project (protocols, rig files) and every bad option ends in an
 `InputError`: it names the file, the key, the value, and what would be right. The command line
@@ -13,7 +13,7 @@ from sliplab.protocols.shown import MASK, printable, shown, shown_key
 
 
 class InputError(ValueError):
-    """Wrong input, said so that it can be mended without reading any code.
+    """Invalid input, described so that the user can correct it without reading any code.
 
     Attributes:
         file: the file the input came from, or a command-line option's name.

@@ -53,7 +53,7 @@ class Range(StrictModel):
         if self.step <= 0:
             raise ValueError(f"step = {canonical(self.step)} must be more than 0")
         if self.stop < self.start:
-            raise ValueError("'to' must not be below 'from'")
+            raise ValueError("'to' must be at least 'from'")
         if (self.stop - self.start) % self.step:
             raise ValueError(
                 f"from {canonical(self.start)} to {canonical(self.stop)} is not a whole number "
@@ -81,7 +81,7 @@ def _level(raw: object) -> Level:
             if re.fullmatch(r"[+-]?[\d.]+([eE][+-]?\d+)?", raw):
                 raise ValueError(f"reads as text; write {canonical(to_decimal(raw))}")
             raise ValueError(
-                "must be a number (the unit stands once, in 'unit') or a word of letters, "
+                "must be a number (its unit belongs in 'unit') or a word of letters, "
                 "digits, '_' and '-'"
             )
         return raw
@@ -201,10 +201,10 @@ class Factor(StrictModel):
     @model_validator(mode="after")
     def _levels(self) -> Factor:
         if (self.values is None) == (self.range is None):
-            raise ValueError("must have either 'values' or 'range'")
+            raise ValueError("must have exactly one of 'values' and 'range'")
         levels = self.levels()
         if not levels:
-            raise ValueError("has no levels; give at least one")
+            raise ValueError("is empty; give at least one level")
         seen: set[Level] = set()
         for level in (*levels, *self.optional):
             if level in seen:

@@ -1,7 +1,7 @@
 """Frozen models of a protocol file's `collection:` section.
 
-Everything that decides what is measured stands here, and nothing that decides what it is made to
-mean (that is `protocols.settings`). Quantities are decimals in the canonical unit of their kind
+They define the measurement; the analysis settings are in `protocols.settings`.
+Quantities are decimals in the canonical unit of their kind
 (mm, mm/s, deg, s, kg, percent, px), whatever unit the file used.
 """
 
@@ -78,7 +78,7 @@ def _or_template(schema: dict[str, Any]) -> None:
 
 
 class Collection(StrictModel):
-    """The `collection:` section: it alone decides whether a campaign may go on."""
+    """The `collection:` section: it alone decides whether a campaign may continue."""
 
     experiment: Literal["kinematic", "gravity", "disturbance"]
     seed: Annotated[int, Field(ge=0, lt=2**63)]
@@ -177,7 +177,7 @@ class Collection(StrictModel):
         return self
 
     def bindings(self) -> list[tuple[str, FactorRef]]:
-        """Each ``$name`` of motion and plate, with the key that it stands at."""
+        """Each ``$name`` of motion and plate, with the key at which it occurs."""
         return [
             *_references_in(self.motion, "collection.motion"),
             *_references_in(self.plate, "collection.plate"),
@@ -189,21 +189,23 @@ class Collection(StrictModel):
                 raise KeyedError(
                     "collection.gates.reference",
                     None,
-                    "compares reference trials, and the protocol has none: add references",
+                    "needs reference trials, and the protocol defines none: add references",
                 )
             return
         given = self.references.condition
         for name, factor in self.all_factors.items():
             key = f"collection.references.condition.{name}"
             if name not in given:
-                raise KeyedError(key, None, "is missing: a reference trial has every factor")
+                raise KeyedError(
+                    key, None, "is missing: a reference trial must give a level for every factor"
+                )
             if isinstance(given[name], str) == (factor.unit is not None):
                 raise KeyedError(key, given[name], f"must be a level in '{factor.unit or 'words'}'")
             if factor.changeover == "person":
                 raise KeyedError(
                     key,
                     given[name],
-                    "a reference trial cannot ask for a changeover; leave references out",
+                    "a reference trial cannot require a changeover; remove references",
                 )
         for name in given:
             if name not in self.all_factors:
@@ -233,14 +235,14 @@ class Collection(StrictModel):
             fail("must hold still ('hold') before it moves in contact: recording begins there")
         ordered = [name for name in names if name in {"approach", "press", "release", "return"}]
         if ordered != ["approach", "press", "release", "return"]:
-            fail("must have approach, press, release and return in this order")
+            fail("must have approach, press, release and return, in this order")
         press, release = names.index("press"), names.index("release")
         if not all(press < index < release for index in acting):
             fail("must slide or retract between press and release")
         if any(names.index("approach") > i for i, name in enumerate(names) if name == "hold"):
-            fail("cannot hold before the approach")
+            fail("cannot have a hold before the approach")
         if ("plate" in names) != (self.plate is not None):
-            fail("phases 'plate' and the section 'plate' belong together")
+            fail("a phase 'plate' and the section 'plate' require each other")
         references = self.bindings()
         used = {str(ref) for _, ref in references}
         for key, ref in references:
@@ -269,7 +271,7 @@ class Collection(StrictModel):
 
 
 def _references_in(part: Any, key: str) -> list[tuple[str, FactorRef]]:
-    """Each reference to a factor in `part`, with the key that it stands at."""
+    """Each reference to a factor in `part`, with the key at which it occurs."""
     if isinstance(part, FactorRef):
         return [(key, part)]
     inner: list[tuple[str, Any]] = []

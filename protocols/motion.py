@@ -1,7 +1,7 @@
 """From the phases of a protocol and one trial's condition to a motion program.
 
-Also where a protocol's motion is held against its own limits, level by level, so that a message
-can name the level that breaks a limit rather than the trial that would have.
+A protocol's motion is also checked against its own limits here, level by level, so that a message
+can name the level that violates a limit instead of a trial.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
                 raise KeyedError(
                     where,
                     f"{canonical(value)} {unit}",
-                    f"is over collection.limits.{name} = {canonical(limit)} {unit}",
+                    f"exceeds collection.limits.{name} = {canonical(limit)} {unit}",
                 )
 
     _check_levels(collection, written)
@@ -217,11 +217,11 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
 
 
 def _check_levels(collection: Collection, written: Mapping[str, list[tuple[Level, str]]]) -> None:
-    """Hold every level against the fields that it stands in: a number, and in their range."""
+    """Check every level against the fields that use it: a number, and in their range."""
     for key, ref in collection.bindings():
         for level, where in written[ref.factor] if ref.unit is not None else ():
             if isinstance(level, str):
-                raise KeyedError(where, level, f"is a word where a number in {ref.unit} belongs")
+                raise KeyedError(where, level, f"is text, expected a number in {ref.unit} belongs")
             try:
                 check_least(level, str(ref.unit), ref.low, ref.strict)
             except ValueError as error:

@@ -1,6 +1,6 @@
-"""The phases that a trial's motion is made of, and nothing about their order.
+"""The phases of a trial's motion, without rules about their order.
 
-Every number in a phase may be a factor: ``$name``, whose level in the trial at hand stands there.
+Every number in a phase may be a factor: ``$name`` is replaced by its level in the current trial.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ class Task:
 def condition_columns(condition: Mapping[str, str]) -> dict[str, float | str]:
     """A condition's levels by the names of table columns.
 
-    A level with a unit is a number, and the unit stands in the column's name: ``depth_mm``, or
+    A level with a unit is a number, and the unit is in the column's name: ``depth_mm``, or
     ``speed_mm_per_s`` where the unit has a slash.
 
     Args:
@@ -157,14 +157,14 @@ class Plan:
         return {name: factors[name].text(level) for name, level in trial.condition}
 
     def level_texts(self, field: Decimal | FactorRef, unit: str) -> tuple[str, ...]:
-        """A phase's field in words (``2.8 mm``): its one value, or the levels of its factor."""
+        """A phase's field as text (``2.8 mm``): its one value, or the levels of its factor."""
         if not isinstance(field, FactorRef):
             return (f"{field} {unit}",)
         factor = self.protocol.collection.all_factors[field.factor]
         return tuple(factor.text(level) for level in self.enabled[field.factor])
 
     def mass_kg(self, trial: Trial) -> float | None:
-        """Mass of the sliding plate in this trial; None where there is none."""
+        """Mass of the sliding plate in this trial; None if there is none."""
         plate = self.protocol.collection.plate
         if plate is None:
             return None
@@ -219,7 +219,7 @@ class Plan:
         need = windows.length_ms * samples.per_class / 1000
         preset = self.protocol.analysis.preset is not None
         found = [
-            f"analysis.{each.key}: {here} goes before the {each.value} of the preset"
+            f"analysis.{each.key}: {here} overrides {each.value} of the preset"
             for each, here in (self.protocol.analysis.overrides if preset else ())
         ]
         hold = min(
@@ -348,7 +348,7 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
         if level not in (*factor.levels(), *factor.optional):
             optional = ", ".join(factor.text(item) for item in factor.optional) or "none"
             raise InputError(
-                "--enable", name, raw, f"is not an optional level; optional are: {optional}"
+                "--enable", name, raw, f"is not an optional level; optional levels: {optional}"
             )
         if level not in levels[name]:
             levels[name] = (*levels[name], level)

@@ -1,8 +1,8 @@
-"""Presets of the `analysis:` section: one word for the numbers of a published experiment.
+"""Presets of the `analysis:` section: named settings of a published experiment.
 
 ``preset: paper`` is the network, the training and the rule of Lu et al., "A Neuromorphic Incipient
-Slip Detection System using Papillae Morphology". Not all that a program needs is published: each
-value says whether it is.
+Slip Detection System using Papillae Morphology". Not every required value is published: each
+one states its source.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ COMPARED = ("network", "training", "detection")
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     """`analysis:` with the values of its preset for the keys that it does not say itself.
 
-    A section that is no mapping stays as it is, for whoever checks it.
+    A section that is not a mapping stays unchanged, for whoever checks it.
     """
     found = dict(data)
     for each in PAPER if data.get("preset") == "paper" else ():

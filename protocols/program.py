@@ -1,4 +1,4 @@
-"""The motion program of one trial: what a planned trial tells a rig to do, step by step.
+"""The motion program of one trial: the steps that a rig executes.
 
 Coordinates are the plate's: `x` to the right and `y` up along the contact surface, origin at the
 plate's centre, `depth` the indentation of the highest papilla tip (positive pressed in, negative

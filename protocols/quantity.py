@@ -1,4 +1,4 @@
-"""Physical quantities as exact decimals in one unit a kind.
+"""Physical quantities as exact decimals, in one unit per kind.
 
 A protocol's numbers become trial ids, so they must be the same on every machine and for every
 way of writing them: ``2.4 mm``, ``2.40 mm`` and ``0.24 cm`` are one level. They are therefore
@@ -37,7 +37,7 @@ _DECIMALS = 40
 
 
 def canonical(value: Decimal) -> str:
-    """`value` as the one decimal string that stands for it: no exponent, no trailing zeros."""
+    """`value` as the one decimal string that represents it: no exponent, no trailing zeros."""
     text = format(value.normalize(), "f")
     return "0" if text in {"-0", "0"} else text
 
@@ -61,7 +61,7 @@ def to_decimal(raw: object) -> Decimal:
     if value.copy_abs() > _LARGEST:  # abs() fails for 1e1000000
         raise ValueError("must be at most 1e9 in size")
     exponent = value.as_tuple().exponent
-    if isinstance(exponent, int) and exponent < -_DECIMALS:  # all of them stand in ids
+    if isinstance(exponent, int) and exponent < -_DECIMALS:  # all of them are in ids
         raise ValueError(f"must have at most {_DECIMALS} decimals")
     return value
 
@@ -130,7 +130,7 @@ def check_least(value: Decimal, unit: str, low: Decimal | None, strict: bool) ->
 
 @dataclass(frozen=True)
 class FactorRef:
-    """``$depth`` in a motion phase: the level of that factor in the trial at hand.
+    """``$depth`` in a motion phase: the level of that factor in the current trial.
 
     Attributes:
         unit: what its levels must be in, canonical; None for words.
@@ -162,7 +162,7 @@ REF_SCHEMA: dict[str, Any] = {
     "type": "string",
     "pattern": r"^\$[a-z][a-z0-9_]*$",
     "patternErrorMessage": "must be a factor's name after '$', such as $depth",
-    "description": "The level of this factor in the trial at hand, such as $depth.",
+    "description": "The trial's level of this factor, such as $depth.",
 }
 
 
@@ -255,7 +255,7 @@ PercentOrRef: Any = _quantity("percent", "0", False, ref=True)
 
 
 def level_order(text: str) -> tuple[float, str]:
-    """Key that sorts levels in words (``2.4 mm``) by their number, and those without one last."""
+    """Key that sorts levels as text (``2.4 mm``) by their number, and those without one last."""
     try:
         return float(text.split()[0]), ""
     except (ValueError, IndexError):

@@ -1,7 +1,7 @@
-"""The `analysis:` section of a protocol: what stored data are made to mean.
+"""The `analysis:` section of a protocol: settings of the analysis of stored data.
 
-It is hashed apart from the collection: nothing in here can make collected data unusable. Each
-model is handed whole to the step that uses it, and that step is stale when its model changes.
+It is hashed separately from the collection: no change here can make collected data unusable. Each
+model is passed as a whole to the step that uses it, and that step is stale when its model changes.
 """
 
 from __future__ import annotations
@@ -102,9 +102,7 @@ class Split(StrictModel):
                 "train, validation and test must add up to 1",
             )
         if self.method == "leave_conditions_out" and not self.test_levels:
-            raise KeyedError(
-                "analysis.split.test_levels", {}, "must name the levels that are held out"
-            )
+            raise KeyedError("analysis.split.test_levels", {}, "must list the held-out levels")
         return self
 
 
@@ -116,7 +114,7 @@ class Network(StrictModel):
     hidden: int = Field(default=32, ge=1, le=1024)
     outputs_per_class: int = Field(default=4, ge=1, le=64)
     """Output neurons of each class, whose spikes are counted together: with one, as in the paper,
-    a window of 30 steps has 31 counts to tell classes apart by, and more ties."""
+    a window of 30 steps has 31 counts to distinguish classes by, and more ties."""
     biases: bool = True
     """Biases in the full layers: without them nothing can say "no events" (docs/network.md)."""
     conv1_kernel: Literal[1, 3, 5, 7] = 5
@@ -173,7 +171,7 @@ class Training(StrictModel):
     @classmethod
     def _some(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         if not seeds or len(set(seeds)) != len(seeds) or min(seeds) < 0:
-            raise ValueError("must hold at least one seed, none negative, none twice")
+            raise ValueError("must be a non-empty list of distinct seeds of 0 or more")
         return seeds
 
 
@@ -194,7 +192,7 @@ class Comparison(StrictModel):
     @classmethod
     def _shares(cls, rates: tuple[Annotated[float, Field(le=1)], ...]) -> tuple[float, ...]:
         if not rates or list(rates) != sorted(set(rates)) or not 0 <= rates[0] <= rates[-1] < 1:
-            raise ValueError("must be ascending shares from 0 to below 1, at least one")
+            raise ValueError("must be a non-empty ascending list of shares from 0 to below 1")
         return rates
 
 
@@ -227,7 +225,7 @@ class Detection(StrictModel):
     @classmethod
     def _grid(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if not values or list(values) != sorted(set(values)) or values[0] < 0:
-            raise ValueError("must ascend, hold at least one value and none below 0")
+            raise ValueError("must be a non-empty ascending list of values of 0 or more")
         return values
 
     @field_validator("smoothing_grid")
@@ -242,7 +240,7 @@ class AnalysisSettings(StrictModel):
     """The whole `analysis:` section."""
 
     preset: Literal["paper"] | None = None
-    """``paper``: network, training and rule of the paper (docs/network.md). Keys that stand beside
+    """``paper``: network, training and rule of the paper (docs/network.md). Keys that are beside
     it go before its values."""
     also: Literal["paper"] | None = None
     """A preset whose network is trained and judged as well, on the same windows and labels, with
@@ -329,8 +327,8 @@ class AnalysisSettings(StrictModel):
     def rule_for(self, outputs_per_class: float, margin: float) -> Detection:
         """The rule of detection here, in the spikes that another network gives.
 
-        Gravity trials are judged by the network of the kinematic campaign. A margin that is said
-        here is a lead by so many spikes of as many neurons as stand here.
+        Gravity trials are evaluated by the network of the kinematic campaign. A margin that is said
+        here is a lead by so many spikes of as many neurons as are here.
 
         Args:
             outputs_per_class: of the network; it may have fewer of one class than of another.

@@ -36,5 +36,5 @@ def protocol_path(given: Path) -> Path:
     """
     if (found := find_shipped(given, known := shipped_protocols())) is not None:
         return found
-    text = f"no such file, nor a protocol that ships with SlipLab: {', '.join(known)}"
+    text = f"no such file, and no built-in protocol of this name; built-in: {', '.join(known)}"
     raise InputError(str(given), "", None, text)

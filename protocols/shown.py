@@ -1,8 +1,8 @@
-"""Text as it may be shown to a person: values as YAML writes them, no secrets, no control codes.
+"""Sanitised text for display: values as YAML writes them, no secrets, no control codes.
 
-A message quotes what a file says. The file may hold a password, or bytes that steer a terminal
-(``ESC ]0;...`` sets its title, an override of direction shows text backwards); neither is
-passed on.
+A message quotes the content of a file. The file may contain a password, or bytes that control a
+terminal (``ESC ]0;...`` sets its title, an override of direction shows text backwards); neither is
+shown.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def shown(value: object, key: str = "") -> str:
     """A value in one line of at most 200 characters, as YAML would write it.
 
     Args:
-        key: where it stands; values of secret keys are masked, at any depth.
+        key: its location; values of secret keys are masked, at any depth.
     """
     text = printable(" ".join(_yaml(value, key).split()))
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

@@ -91,7 +91,7 @@ def check_split(split: Split, factors: Mapping[str, Factor]) -> Split:
                     except ValueError as error:
                         raise KeyedError(key, level, str(error)) from None
                 if text not in known:
-                    raise KeyedError(key, level, f"is no level of it; there are {sorted(known)}")
+                    raise KeyedError(key, level, f"is not one of its levels: {sorted(known)}")
                 texts.append(text)
             fixed[part][name] = tuple(texts)
     return split.model_copy(update=fixed)

@@ -89,7 +89,7 @@ class Timing(StrictModel):
     """Of a force sensor; left out, the rig has none, or it is `host time` with its defaults."""
 
     def start_marker_ns(self, rate_hz: float) -> float | None:
-        """From a regular train's first pulse to its second, ns; None where there is a code."""
+        """From a regular train's first pulse to its second, ns; None if there is a code."""
         return MARKER_TICKS * 1e9 / rate_hz if self.code == "regular" else None
 
     @property

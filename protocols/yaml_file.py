@@ -1,8 +1,8 @@
-"""Reading one YAML file into a checked model, or saying exactly what is wrong with it.
+"""Reading of a YAML file into a validated model, with exact error messages.
 
-YAML has more in it than an experiment needs and some of it is dangerous: aliases that expand to
+YAML has more features than an experiment needs, and some are dangerous: aliases that expand to
 gigabytes, floats that lose their decimal text, keys given twice where the last silently wins.
-This loader takes the part that a protocol needs: mappings, lists, text, and numbers that keep
+This loader supports the subset that a protocol needs: mappings, lists, text, and numbers that keep
 their decimal digits.
 """
 
@@ -33,7 +33,7 @@ MAX_DEPTH = 32
 class StrictModel(BaseModel):
     """Base of every model read from a file: frozen, and an unknown key is an error.
 
-    Numbers are finite, and neither switches nor days: ``yes`` is not 1, and 5 is no day of 1970.
+    Numbers are finite, and neither switches nor days: ``yes`` is not 1, and 5 is not a day of 1970.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -46,7 +46,7 @@ class StrictModel(BaseModel):
             if bool not in leaves and leaves & _NUMBERS:
                 _refuse_switch(value, f".{name}")
             if date in leaves and (isinstance(value, int | float | Decimal) or _is_number(value)):
-                raise KeyedError(f".{name}", value, "must be a day, such as 2026-11-23")
+                raise KeyedError(f".{name}", value, "must be a date, such as 2026-11-23")
         return data
 
 
@@ -132,7 +132,7 @@ class _Builder:
         self._loader, self._path = loader, path
 
     def build(self, node: Any, key: str) -> Any:
-        """The data of a node; `key` is where it stands."""
+        """The data of a node; `key` is its location."""
         if isinstance(node, yaml.MappingNode) and node.tag == f"{_TAG}map":
             return self._mapping(node, key)
         if isinstance(node, yaml.SequenceNode) and node.tag == f"{_TAG}seq":
@@ -146,7 +146,7 @@ class _Builder:
         before: Any = None
         for key_node, value_node in node.value:
             if key_node.tag == f"{_TAG}merge":
-                text = "cannot be read: '<<' takes over nothing here, write the keys out"
+                text = "cannot be read: merge keys ('<<') are not supported; write the keys out"
                 raise self._wrong(key_node, f"{key}.<<" if key else "<<", None, text)
             if _is_rest(key_node, value_node, before):
                 last, number = before[0].value, f"{before[1].value},{key_node.value}"
@@ -155,7 +155,7 @@ class _Builder:
             name = self._name(key_node, key)
             inner = f"{key}.{name}" if key else name
             if name in found:
-                raise self._wrong(key_node, inner, None, "cannot be read: the key stands twice")
+                raise self._wrong(key_node, inner, None, "cannot be read: duplicate key")
             found[name] = self.build(value_node, inner)
             before = key_node, value_node
         return found
@@ -164,7 +164,7 @@ class _Builder:
         is_text = isinstance(node, yaml.ScalarNode) and node.tag in {f"{_TAG}str", f"{_TAG}value"}
         name = node.value if is_text else None
         if name is None:
-            text = "cannot be read: a key must be text; quote it if it is meant"
+            text = "cannot be read: a key must be text; quote it if intended"
             if node.tag == _ALIAS or not node.tag.startswith(_TAG):
                 text = _unread(node.tag)
             written = node.value if isinstance(node, yaml.ScalarNode) else None
@@ -192,7 +192,7 @@ class _Builder:
         except (ValueError, ArithmeticError, LookupError, AttributeError):
             pass
         if kind == "timestamp":
-            expected = "is no day of the calendar; write one like 2026-02-28"
+            expected = "is not a valid date; write one like 2026-02-28"
         elif kind in {"int", "float"} and ":" in text:
             expected = "reads as a base-60 number; quote it or write it out"
         elif kind in {"int", "float", "bool"}:
@@ -214,8 +214,10 @@ _SECRET = "cannot be read as text; quote it"
 
 def _unread(tag: str) -> str:
     if tag == _ALIAS:
-        return "cannot be read: aliases are not read here, write it out"
-    return f"cannot be read: the tag {tag.replace(_TAG, '!!')} is not read here, write the value"
+        return "cannot be read: aliases are not supported; write the value out"
+    return (
+        f"cannot be read: the tag {tag.replace(_TAG, '!!')} is not supported; write the plain value"
+    )
 
 
 def _problem(error: yaml.MarkedYAMLError, text: str) -> str:
@@ -245,7 +247,9 @@ def read_text(path: Path, what: str) -> str:
     try:
         with open(path, "rb", opener=_at_once) as handle:
             if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
-                raise InputError(path, "", None, f"is no plain file; give the path of a {what}")
+                raise InputError(
+                    path, "", None, f"is not a regular file; give the path of a {what}"
+                )
             data = handle.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise InputError(path, "", None, f"no such file; give the path of a {what}") from None
@@ -254,7 +258,9 @@ def read_text(path: Path, what: str) -> str:
     except OSError as error:
         raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
     if len(data) > MAX_BYTES:
-        raise InputError(path, "", None, f"is over {MAX_BYTES} bytes; a {what} is a few kB")
+        raise InputError(
+            path, "", None, f"is over {MAX_BYTES} bytes; a {what} normally has a few kB"
+        )
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -293,12 +299,12 @@ def parse_yaml(text: str, path: str | Path) -> Document:
         raise InputError(path, "", None, f"is not YAML: {error}") from None
     if not isinstance(data, dict):
         found = "nothing" if data is None else f"a {type(data).__name__}"
-        raise InputError(path, "", None, f"holds {found} where a mapping (key: value) belongs")
+        raise InputError(path, "", None, f"holds {found} instead of a mapping (key: value)")
     return Document(data, builder.written)
 
 
 def mask_secrets(text: str) -> str:
-    """YAML text with the values of secret keys masked, at any depth; the rest stays as it is."""
+    """YAML text with the values of secret keys masked, at any depth; the rest stays unchanged."""
     loader = _Loader(text)
     try:
         root = loader.get_single_node()
@@ -430,7 +436,7 @@ _EXPECTED = {
 class KeyedError(ValueError):
     """A fault found by looking at several keys together, blamed on one of them.
 
-    Its key is a whole one, or begins with ``.`` or ``[`` and goes on from the model or field that
+    Its key is a whole one, or begins with ``.`` or ``[`` and continues from the model or field that
     raises it.
     """
 
@@ -462,7 +468,7 @@ def register_tags(*names: str) -> None:
 
 
 def register_tags_of(key: str, *names: str) -> None:
-    """The same for a union that is no list: its tags stand behind its key."""
+    """The same for a union that is not a list: its tags stand behind its key."""
     _TAGS_OF[key] = names
 
 

@@ -1,4 +1,4 @@
-"""Errors of a store and of its disk, in words, and what must not stand in any of them."""
+"""Errors of a store and of its disk, with secrets masked in their messages."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sliplab.protocols.shown import MASK, is_secret, password_in, without_passwo
 
 _FAULTS = {
     errno.ENOSPC: "is full",
-    errno.EDQUOT: "has no room left for this user (quota)",
-    errno.EFBIG: "takes no larger file (see ulimit -f)",
+    errno.EDQUOT: "has no space left for this user (quota)",
+    errno.EFBIG: "does not allow a larger file (see ulimit -f)",
     errno.EROFS: "is read-only",
-    errno.EACCES: "may not be written to by this user",
-    errno.EPERM: "may not be written to by this user",
+    errno.EACCES: "is not writable for this user",
+    errno.EPERM: "is not writable for this user",
     errno.EIO: "reports errors; it may be failing",
     errno.ENXIO: "is gone",
     errno.ENODEV: "is gone",
@@ -28,7 +28,7 @@ _FAULTS = {
 _OWN_FAULTS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
 _IN_WORDS = re.compile(r"errno = (\d+)")
 _SHORTEST = 8
-"""A shorter value is a switch, or stands in many a word."""
+"""A shorter value is a switch, or is in many a word."""
 
 
 class StoreError(RuntimeError):
@@ -54,7 +54,7 @@ class NoStore(InputError, StoreError):
 def disk_fault(error: BaseException | None) -> str | None:
     """Return the fault of the disk that `error` or its cause states, such as ``is full``.
 
-    HDF5 states some of them in words only.
+    HDF5 states some of them as text only.
     """
     while error is not None:
         number = error.errno if isinstance(error, OSError) else None
@@ -82,7 +82,7 @@ def disk_error(folder: Path, error: BaseException) -> StoreError | None:
     fault = disk_fault(error)
     if fault is None:
         return None
-    todo = "see to that"
+    todo = "fix this"
     if disk_full(error):
         there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         fault += f" ({shutil.disk_usage(there).free / 1e9:.1f} GB free)"

@@ -1,11 +1,11 @@
-"""Writing of files so that after a crash each one is complete or absent.
+"""Atomic file writes: after a crash each file is complete or absent.
 
-Every write in the project goes through here: a temporary file beside the target, flushed to the
-disk, then renamed over it, then the folder flushed too. In a folder that becomes visible by a
-rename of its own, files are only flushed.
+Every write in the project goes through here: a temporary file in the target's folder is flushed to
+the disk and renamed over the target, then the folder is flushed as well. In a folder that becomes
+visible by its own rename, files are only flushed.
 
-A killed program may leave a temporary file. Its name says whose it is (`.NAME.PID.tmp`), so that
-`sweep_temporary` takes away what nobody will finish.
+A killed program may leave a temporary file. Its name contains the process (`.NAME.PID.tmp`), so
+that `sweep_temporary` can delete the files of dead processes.
 """
 
 from __future__ import annotations
@@ -232,19 +232,19 @@ def read_json(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
     if not isinstance(data, dict):
-        raise ValueError(f"{path}: holds no JSON object")
+        raise ValueError(f"{path}: does not contain a JSON object")
     return data
 
 
 def _no_number(text: str) -> None:
-    raise ValueError(f"{text} is no number of JSON")
+    raise ValueError(f"{text} is not a JSON number")
 
 
 def _finite(text: str) -> float:
     """Digits that are beyond every float would become an infinity, which no JSON file may hold."""
     value = float(text)
     if math.isinf(value):
-        raise ValueError(f"{text} is beyond what a number may be")
+        raise ValueError(f"{text} is out of range for a number")
     return value
 
 
@@ -274,7 +274,5 @@ def inside(path: Path, store: Path) -> Path:
         StoreError: one does.
     """
     if not path.resolve().is_relative_to(store.resolve()):
-        raise StoreError(
-            f"{path}: a link leads out of the store; put a folder of its own in its place"
-        )
+        raise StoreError(f"{path}: a link points out of the store; replace it by a real folder")
     return path

@@ -1,4 +1,4 @@
-"""Identity of a process: its number and its start, since numbers are used again."""
+"""Identity of a process: its pid and start time, since pids are reused."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def named(who: Json) -> str:
     Another user may have written it: nothing in it reaches a terminal that is no plain text.
     """
     if "pid" not in who:
-        return "a program that did not say its name"
+        return "an unknown program"
     who = {key: _printable(value) for key, value in who.items()}
     text = f"pid {who['pid']}"
     for word, key in (("of", "user"), ("on", "host")):

@@ -1,4 +1,4 @@
-"""Streams of devices, chunk by chunk: plain arrays with raw device times.
+"""Chunks of device streams: plain arrays with raw device times.
 
 A chunk is the unit that flows from a device through the rig into the recording being written.
 Nothing here converts a time: raw device times are kept as they came, and clock maps are added

@@ -1,7 +1,7 @@
 """All detectors at equal rates of false early detections: the report's comparison.
 
-They learn from training trials, their levels are set on validation trials, to the same number of
-false early detections, and they are judged on test trials. Nothing is ever chosen by a test trial.
+Detectors are fitted on training trials, their thresholds are set on validation trials to the same
+number of false early detections, and they are evaluated on test trials, which select nothing.
 The numbers are small, a percent of 130 trials is one of them, so each rate stands with its exact
 interval.
 """

@@ -1,16 +1,16 @@
 """The detector on a running stream: events in as they come, one decision out for each window.
 
 Events are counted into the windows that are open when they arrive, so nothing of the past is kept
-or binned again, and a window is judged by the very functions that judge a stored trial: the same
+or binned again, and a window is evaluated by the very functions that judge a stored trial: the same
 events give the same windows, counts and decisions. What a stream does that a file does not
 (silence, events out of order, events too late, a clock that leaps) has one outcome each:
 
 - A window ends when an event at or after its end has come, or when `advance` says that the
-  camera's clock is past it; so a quiet scene is judged too.
+  camera's clock is past it; so a quiet scene is evaluated too.
 - Events out of order count where they belong while their window is open.
-- An event of a window that is judged already is left out and counted as late; nothing is revised.
+- An event of an already evaluated window is dropped and counted as late; nothing is revised.
 - Time that leaps ahead by more than `gap_us` is a gap: the open windows are given up, the sliding
-  window begins anew, and the gap is counted.
+  window restarts, and the gap is counted.
 - Time that falls back by more than `back_us` is another clock: `ClockFellBack`.
 """
 

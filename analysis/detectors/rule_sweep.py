@@ -220,7 +220,7 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
     is taken: the result says the numbers.
 
     Args:
-        settings: grid, bound and tolerance; its own smoothing and margin are not looked at.
+        settings: grid, bound and tolerance; its own smoothing and margin are ignored.
         split: where the trials are from.
 
     Raises:

@@ -105,7 +105,7 @@ def evaluation_of(store: Store) -> Evaluation:
     """Return the store's evaluation.
 
     Raises:
-        StoreError: there is none, or another version of the program made it.
+        StoreError: it does not exist, or another version of the program made it.
     """
     kept = Derived.of(store, STEP)
     if kept.key(NAME) is None:

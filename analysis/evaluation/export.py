@@ -87,7 +87,7 @@ class _Source:
 
     @property
     def margin(self) -> float:
-        """The lead by which windows are judged, in spikes of this network."""
+        """The lead by which windows are evaluated, in spikes of this network."""
         rules = rules_of(self.campaigns, self.fitted.network.outputs_per_class)
         return rules[training_campaigns(self.campaigns)[0].name].margin
 
@@ -262,7 +262,7 @@ def export_files(
     """Make the files of a model, and say of the result what matters.
 
     Args:
-        checked: windows that the ONNX file is held against Sinabs on; None for no such file.
+        checked: windows that the ONNX file is compared with Sinabs on; None for no such file.
         advance: hears of each part that is done; 4 parts and each test trial.
 
     Returns:

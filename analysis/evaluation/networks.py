@@ -1,6 +1,6 @@
 """Other networks on the store's test trials: the preset that `also` names, and models of files.
 
-They are judged by the very functions that judge the store's own network, on the same windows and
+They are evaluated by the very functions that judge the store's own network, on the same windows and
 trials, and by the rule in spikes of their own outputs.
 """
 
@@ -175,7 +175,7 @@ class Judgement:
 
     @property
     def fresh(self) -> bool:
-        """True where nothing changed since it was judged."""
+        """True where nothing changed since it was evaluated."""
         return Derived.of(self.store, STEP).fresh(self.network.name, self.key)
 
     def count(self, keep: KeepTrials, threads: int | None = None) -> None:

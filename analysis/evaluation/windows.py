@@ -63,7 +63,7 @@ def score_windows(
     Args:
         models: of all seeds, the chosen one among them.
         key: the evaluation's, under which the counts are kept.
-        margin: the lead in spikes by which windows and trials are judged alike.
+        margin: the lead in spikes by which windows and trials are evaluated alike.
     """
     settings = training_settings(campaigns)
     fitted = model_file.load(chosen.path)

@@ -34,7 +34,7 @@ class CameraShift:
     """Motion of the camera.
 
     Attributes:
-        px: (n, 2) common shift, 0 where there is none.
+        px: (n, 2) common shift, 0 if there is none.
         unsure: (n,) bool, True where it moved and too little stood still to say by how much.
     """
 

@@ -1,4 +1,4 @@
-"""Reasons why an onset is ambiguous although a rule gives one, in words.
+"""Reasons why an onset is ambiguous although a rule gives one, as text.
 
 A label is what everything downstream is measured against: a wrong one costs more than a missing
 one. An onset is in doubt where a marker that could have changed it was out of sight, where its
@@ -28,7 +28,7 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Doubts:
-    """Reasons why a trial's onsets are ambiguous, in words; None where an onset is known."""
+    """Reasons why a trial's onsets are ambiguous, as text; None where an onset is known."""
 
     incipient: str | None
     gross: str | None

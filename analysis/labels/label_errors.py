@@ -165,6 +165,6 @@ def _cases(
 
 
 def read_check(store: Store) -> LabelCheck | None:
-    """Return the figures of the last check; None where there was none."""
+    """Return the figures of the last check; None if there is none."""
     kept = Derived.of(store, CHECK)
     return kept.load(CHECK, LabelCheck) if kept.key(CHECK) is not None else None

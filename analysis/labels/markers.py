@@ -167,7 +167,7 @@ class MarkerTracker:
         self._area[:] = area
         self._measured[:, DARK], self._measured[:, BRIGHT] = dark, bright
         self._state[:] = np.where(seen, WHOLE, LOST)
-        # measured as in every later frame, so that the first is no step
+        # measured as in every later frame, so that the first is not a step
         self._look(frame, seen, 0.5)
         whole = self._state == WHOLE
         usual = float(np.median(self._measured[whole, AREA])) if whole.any() else area

@@ -115,8 +115,8 @@ def paper_onsets(
         frame_ns: (n,) int64, the frames' times on the trial's time line, strictly increasing.
         displacement: (n, m) pixels, NaN where unknown (never a slip).
         centre: index of the centre marker.
-        settings: `threshold_px`; a displacement equal to it is no slip.
-        not_before_ns: frames earlier than this are not looked at.
+        settings: `threshold_px`; a displacement equal to it is not a slip.
+        not_before_ns: frames earlier than this are ignored.
 
     Raises:
         ValueError: shapes that do not fit, times out of order, or no such marker.

@@ -15,7 +15,7 @@ from sliplab.storage.trials.recording import Recording
 F64 = npt.NDArray[np.float64]
 
 SURE_PX = 0.25
-"""A place with a larger standard deviation is no measurement: it could be a part of a slip."""
+"""A place with a larger standard deviation is not a measurement: it could be a part of a slip."""
 TRACKS_PX, TRACKS_PLATE_PX = 0.006, 0.04
 """Standard deviations assumed for tracks that a camera provides without them."""
 

@@ -84,7 +84,7 @@ class Labels:
         return label.model_copy(update={**vars(decision.new), "doubts": doubts})
 
     def states(self, campaigns: list[Collected]) -> dict[State, int] | None:
-        """Count the trials of each state; None where no decision is asked for."""
+        """Count the trials of each state; None where no decision is requested."""
         if not self.reviewed:
             return None
         found = dict.fromkeys(STATES, 0)

@@ -1,1 +1,1 @@
-"""Intervals over trials, paired differences, Pareto fronts, how far two scenes are apart."""
+"""Intervals over trials, paired differences, Pareto fronts, accuracy of groups of windows."""

@@ -39,7 +39,7 @@ def check(counts: Counts, labels: Labels) -> tuple[Counts, IntArray]:
 
 
 def check_labels(labels: Labels) -> IntArray:
-    """Labels as int64, or a ValueError if one is no class."""
+    """Labels as int64, or a ValueError if one is not a class."""
     labels = np.asarray(labels)
     if labels.ndim != 1 or (labels.size and not np.issubdtype(labels.dtype, np.integer)):
         raise ValueError(f"labels are {labels.dtype} {labels.shape}; expected integers (n,)")
@@ -97,7 +97,7 @@ def confusion(counts: Counts, labels: Labels) -> IntArray:
 
 
 def class_balance(labels: Labels) -> dict[str, float | None]:
-    """Share of each class among the labels; None where there are no labels."""
+    """Share of each class among the labels; None if there are no labels."""
     labels = check_labels(labels)
     each = np.bincount(labels, minlength=len(CLASSES))
     return {name: _share(each[k], len(labels)) for k, name in enumerate(CLASSES)}
@@ -112,7 +112,7 @@ def score(counts: Counts, labels: Labels, margin: float = 0.0) -> Classification
         margin: spikes by which a winner must lead for the margin accuracy; any lead by default.
 
     Raises:
-        ValueError: shapes that do not fit, a label that is no class, a count not finite.
+        ValueError: shapes that do not fit, a label that is not a class, a count not finite.
     """
     table = confusion(counts, labels)
     return Classification(

@@ -1,8 +1,8 @@
-"""Intervals of figures over trials, 95 %, that hold with three trials as with a thousand.
+"""Confidence intervals of figures over trials, 95 %, valid for three trials as for a thousand.
 
-What varies from trial to trial is what the next trials will vary by, so trials are counted and not
-windows. A handful of them says little of its own spread: drawing six trials again gives intervals
-that hold the truth in 86 of 100 cases. So means have Student's t, shares the same on log odds,
+The unit of variation is the trial, so trials are counted and not windows. A few trials give a poor
+estimate of their own spread: bootstrapping six trials gives intervals that cover the truth in 86 of
+100 cases. So means have Student's t, shares the same on log odds,
 medians and percentiles the ranks of the values, and counts the exact binomial one. Of two sets of
 the same trials each trial's difference is taken, so that what they have in common drops out.
 
@@ -214,7 +214,7 @@ def _ratio(sums: FloatArray, sizes: FloatArray) -> tuple[float, FloatArray]:
 def _half(parts: FloatArray) -> float:
     """Half of Student's interval of a figure that n trials move by `parts`; 0 below two trials.
 
-    What rounding leaves of trials that are all equal is no spread.
+    What rounding leaves of trials that are all equal is not a spread.
     """
     n = len(parts)
     if n < _FEWEST or np.abs(parts).max() <= 1e-12 * max(1.0, float(np.abs(parts).sum())):

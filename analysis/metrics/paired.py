@@ -1,8 +1,8 @@
 """Test whether two settings differ by more than their seeds do.
 
-Each seed gives both settings the same first draw and order of samples, so what they differ by is
-taken seed by seed and its spread is that of the difference. It says nothing of other trials: all
-seeds are judged on the same ones.
+Each seed gives both settings the same initial weights and order of samples, so differences are
+paired by seed. They say nothing about other trials: all
+seeds are evaluated on the same ones.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Difference:
 
     @property
     def significant(self) -> bool | None:
-        """Significance: the interval excludes zero; None where there is no interval."""
+        """Significance: the interval excludes zero; None if there is no interval."""
         if self.low is None or self.high is None:
             return None
         return self.low > 0 or self.high < 0

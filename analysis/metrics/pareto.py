@@ -1,7 +1,7 @@
 """The Pareto front: rows that no other row dominates.
 
 Exact, by comparing. Rows in the order of their first objective can only be beaten by rows before
-them, and whoever is beaten at all is beaten by a row of the front; so each row is held against the
+them, and whoever is beaten at all is beaten by a row of the front; so each row is compared with the
 front so far and no other.
 """
 

@@ -26,7 +26,7 @@ from sliplab.storage.schema.evaluation import Share, Tenth, TrialWindows
 FloatArray = npt.NDArray[np.float64]
 
 TrialName = tuple[str, str, dict[str, str]]
-"""Campaign, trial id, and levels by factor in words."""
+"""Campaign, trial id, and levels by factor as text."""
 TENTHS = 10
 """Parts of a phase."""
 
@@ -87,7 +87,7 @@ def by_factor(
     Args:
         hits: (n,), 0..1.
         trial: integer (n,).
-        levels: of each trial, its level of each factor in words; levels come out in the order in
+        levels: of each trial, its level of each factor as text; levels come out in the order in
             which they are first seen here.
     """
     found: dict[str, dict[str, Share]] = {}

@@ -1,4 +1,4 @@
-"""Ordinary small networks on the same windows: what giving up spikes would reach, and cost.
+"""Baselines: small conventional networks on the same windows, without spikes.
 
 Three of them, each with a few ten thousand weights like the spiking network: convolutions on the
 summed frame (where), convolutions on the volume of steps (where and when), and a gated recurrent

@@ -1,9 +1,9 @@
-"""Simple methods on the same samples, so that the network's accuracy means something.
+"""Simple baselines on the same samples, as a reference for the network's accuracy.
 
-Event rate alone tells much about slip. The report compares three with the network: the commonest
-class, two thresholds on the number of events, and a logistic regression on it. They take a second
-and are always there. Where the events are tells more: a logistic regression on the events of each
-cell, gradient boosting on the counts of cells and steps, and ordinary networks
+Event rate alone is informative about slip. The report always compares three baselines with the
+network: the majority class, two thresholds on the number of events, and a logistic regression on
+it. They take a second. The positions of the events add information: a logistic regression on the
+events of each cell, gradient boosting on the counts of cells and steps, and ordinary networks
 (`networks.baseline_nets`) take minutes.
 """
 
@@ -58,7 +58,7 @@ def evaluate_baselines(
         train_y, test_y: classes, integer (n,), 0..2.
 
     Raises:
-        ValueError: no training samples, lengths that differ, a label that is no class.
+        ValueError: no training samples, lengths that differ, a label that is not a class.
     """
     train_y, test_y = check_labels(train_y), check_labels(test_y)
     if len(train_x) != len(train_y) or len(test_x) != len(test_y):
@@ -248,7 +248,7 @@ def boosted(
     """Fit on training samples, stop by validation samples, vote on test samples.
 
     Returns:
-        probabilities (n, 3), and what was fitted in words and numbers.
+        probabilities (n, 3), and what was fitted as text and numbers.
 
     Raises:
         ValueError: a class is missing among the training samples.

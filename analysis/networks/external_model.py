@@ -1,6 +1,6 @@
-"""A spiking network that was made elsewhere: a state_dict, and a description of its layers.
+"""External spiking networks: a state_dict and a description of its layers.
 
-Sinabs itself computes it, so that its counts are those that its makers see. The event-driven
+Sinabs itself computes them, so that the counts are those that their authors see. The event-driven
 kernels may take its place where the layers are those of `networks.network`; on weights off the
 grid (`networks.network.on_grid`) they add in another order than Sinabs, and a potential that
 ends at its threshold may fall on either side of it.

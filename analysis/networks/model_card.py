@@ -190,10 +190,10 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]
 
 
 def percent(share: float | None) -> str:
-    """``94.3 %``; a dash where there is none."""
+    """``94.3 %``; a dash if there is none."""
     return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def ms(value: float | None) -> str:
-    """Milliseconds; a dash where there are none."""
+    """Milliseconds; a dash if there are none."""
     return "-" if value is None else f"{value:.0f}"

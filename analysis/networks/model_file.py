@@ -1,4 +1,4 @@
-"""A trained network as a file: whole or not at all, equal bytes for equal models, no code."""
+"""Model file of a trained network: atomic, byte for byte reproducible, without code."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def load(path: Path) -> Fitted:
     """Read a model file that `save` wrote. Nothing in it is executed.
 
     Raises:
-        OSError: there is none, or it cannot be read.
+        OSError: it does not exist, or it cannot be read.
         ValueError: it is not a model file, is damaged, or its weights do not fit its settings.
     """
     return parse(path.read_bytes(), str(path))

@@ -1,4 +1,4 @@
-"""The trained models of a store: their inputs, and the one that is evaluated."""
+"""Trained models of a store: their inputs, and the selection of the evaluated one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Model:
         """The model file's document.
 
         Raises:
-            OSError: there is none.
+            OSError: it does not exist.
             DocumentError, NewerFormat: it cannot be read.
         """
         return TrainedModel.load(self.info_path)
@@ -51,7 +51,7 @@ class Model:
 
     @property
     def curves_path(self) -> Path:
-        """The training curves, drawn anew after each epoch."""
+        """The training curves, redrawn after each epoch."""
         return self.path.with_suffix(".svg")
 
     @property

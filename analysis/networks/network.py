@@ -1,6 +1,6 @@
-"""The spiking network, written down in Sinabs: this is what "the network" means.
+"""Reference definition of the spiking network, in Sinabs.
 
-Everything faster (`analysis.networks.spiking`) is held to the spike counts that this file gives.
+The fast kernels (`analysis.networks.spiking`) must reproduce its spike counts.
 Sinabs' defaults are not the paper's neuron: an IAF there may fire many times a step and keeps what
 is above the threshold, while the paper's fires once and is reset. Nothing here touches Sinabs' chip
 back end, because that imports a vendor package which installs things when it is imported.
@@ -52,7 +52,7 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
     torch's default draw times ``settings.weight_scale``; hidden neurons' biases are drawn from
     `FIRST_BIAS`, outputs begin at `FIRST_DRIVE`, and convolutions have no biases
     (docs/decisions/0054, 0056, 0059); with ``settings.biases`` off no layer has. torch's global
-    random state is left as it was.
+    random state is unchanged.
 
     Args:
         settings: channels, kernels, hidden neurons, outputs, weight scale.

@@ -1,10 +1,10 @@
-"""A trained network as an ONNX file: the whole of it, neurons and time too, held to Sinabs' counts.
+"""Export of a trained network as ONNX, including neurons and time, verified against Sinabs.
 
-The graph takes windows as this program bins them (uint8, n at a time) and gives output spikes. It
-is written by hand, because what has to be in it is small: one `Scan` over the time steps, whose
+The graph takes windows as binned by this program (uint8, n at a time) and returns output spikes. It
+is written by hand, because it is small: one `Scan` over the time steps, whose
 body is the two convolutions, the two fully connected layers and four integrate-and-fire neurons.
 Another runtime adds in another order, so a current may differ in its last bit, and a spike with it:
-`check_onnx` holds real windows against Sinabs, and nothing is exported that differs in one count.
+`check_onnx` compares real windows with Sinabs, and a network is not exported if any count differs.
 
 `onnx` writes and `onnxruntime` runs it; both are the optional extra ``onnx``.
 """

@@ -1,4 +1,4 @@
-"""The network in the chip's numbers: 8-bit weights, whole thresholds, and what that changes.
+"""Quantisation of the network for the chip: 8-bit weights, integer thresholds, and the effect.
 
 Each layer has one scale. It is the largest whole number that keeps the layer's weights and biases
 within 8 bits, and because the threshold is 1 it is the threshold too: exactly, without rounding.

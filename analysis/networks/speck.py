@@ -1,7 +1,7 @@
 """Check whether the network fits a Speck (DynapCNN) chip, layer by layer, without the chip.
 
 The vendor's compiler lives in a package that this program never imports (docs/decisions/0009), so
-the rules stand here as a table with their sources:
+the rules are here as a table with their sources:
 
 - cores and their memories: Sinabs 3.1.3, "Available Network Architecture" (its documentation,
   speck/faqs/available_network_arch) and the table in its `validate_memory_speck.py`;

@@ -1,9 +1,9 @@
-"""The same network, many times faster than step by step: spike counts equal to Sinabs' own.
+"""Fast event-driven inference of the network, with spike counts equal to Sinabs' own.
 
-`networks.network` says what the network is; here its weights are packed for the event-driven
-kernels. Equality is not luck: trained weights lie on a grid (`networks.network.on_grid`), so
-every current is exact in float32 in whatever order it is summed, and a neuron's potential is summed
-in the one order that there is, that of time.
+`networks.network` defines the network; here its weights are packed for the event-driven kernels.
+The counts are exactly equal: trained weights lie on a grid (`networks.network.on_grid`), so every
+current is exact in float32 in whatever order it is summed, and a neuron's potential is summed in
+the one order that there is, that of time.
 """
 
 from __future__ import annotations
@@ -284,7 +284,7 @@ def neuron(net: nn.Sequential) -> tuple[np.float32, np.float32, np.float32]:
     """Threshold, width and scale of a network's neurons.
 
     Raises:
-        TypeError: they are not the paper's, or not all alike.
+        TypeError: they are not the paper's, or not all the same.
     """
     found = {_constants(name, _layer(net, name)) for name in SPIKING}
     if len(found) > 1:

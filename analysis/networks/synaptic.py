@@ -44,7 +44,7 @@ def fan_out(trainer: Trainer, cells: int) -> list[I64]:
     """Synapses of each place that can fire, for each weighted layer, as the kernels number places.
 
     For the first layer places are input cells (channel, row, column), for the others neurons of
-    the layer below in its plane; zero where there is no neuron.
+    the layer below in its plane; zero if there is no neuron.
     """
     (c1, channels, k1, _), (c2, _, k2, _), (hidden, _), (outputs, _) = trainer.layout.shapes
     near, far = reached(cells, k1, 1), reached(cells, k2, 2)

@@ -243,10 +243,10 @@ class Fitted:
 
     Attributes:
         state_dict: weights of the chosen epoch, by name; no neuron states.
-        network, windows, training, seed: what was asked for.
+        network, windows, training, seed: what was requested.
         history: one record an epoch.
         chosen_epoch: the epoch the weights are from.
-        warnings: in words, what is wrong with the chosen network; empty when nothing is.
+        warnings: as text, what is wrong with the chosen network; empty when nothing is.
         epoch_seconds: wall time of each epoch. Kept apart from the records and not saved, so
             that the same training gives the same file.
     """
@@ -288,7 +288,7 @@ def fit(
     validation loss; the earlier one stays. Training ends after ``training.epochs`` or when
     ``training.patience`` epochs in a row were no better. It uses as many threads as torch may.
 
-    A window without any event gets what the biases alone give; where that is no spike, or a tie,
+    A window without any event gets what the biases alone give; where that is not a spike, or a tie,
     it is wrong by strict accuracy.
 
     Args:
@@ -302,7 +302,7 @@ def fit(
             there and ends with the same bits. Records of earlier epochs are reported again.
 
     Raises:
-        ValueError: no samples, shapes that do not fit, a label that is no class, a state of
+        ValueError: no samples, shapes that do not fit, a label that is not a class, a state of
             another training.
     """
     run = Run(network, windows, training, seed)

@@ -1,4 +1,4 @@
-"""Checks that fail when the figures cannot be trusted, each by a fact that must hold.
+"""Sanity checks of the figures, each based on an invariant.
 
 Permuted classes: which class is called 0 is a convention, so renaming classes in the network's
 outputs and in the labels must change no figure (a silent network once looked 96 % right by its

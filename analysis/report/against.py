@@ -1,9 +1,9 @@
-"""Two reports compared: what changed, whether it is noise, and the page about it.
+"""Comparison of two reports: differences, their significance, and the page.
 
-A figure that differs says nothing by itself: another seed, or other trials, would have changed it
-as well. So each difference is compared with what chance alone would do. Where networks of several
-seeds were trained that is the spread between them; else that between trials, one by one in
-both reports where both judged the same. Both summaries hold all that is needed.
+A difference alone says nothing: another seed, or other trials, would have changed the figure
+as well. So each difference is compared with its expected random variation: the spread between seeds
+if several were trained, otherwise that between trials, paired if both reports evaluated the same
+trials. Both summaries contain all inputs.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def load_other(place: Path) -> Summary:
         place: a store that has one, or a ``summary.json``.
 
     Raises:
-        InputError: there is none, or it is none of this version.
+        InputError: it does not exist, or it is none of this version.
     """
     path = place.joinpath(*SUMMARY) if place.is_dir() else place
     try:

@@ -1,4 +1,4 @@
-"""Campaigns in the report: what was collected, how good it is over time, and wear of the skin."""
+"""Campaigns in the report: collected trials, their quality over time, and wear of the skin."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CollectedSection(Content):
     """Committed trials compared with the plans.
 
     Attributes:
-        source: what was kept of the outside camera, in words.
+        source: what was kept of the outside camera, as text.
         grids: trials by the first two factors of each campaign, with its name and theirs.
     """
 
@@ -70,7 +70,7 @@ def collected_section(campaigns: Sequence[Collected], summary: Summary) -> Colle
 
 
 def tracks_words(simulated: bool) -> str:
-    """Return tracks in words that nobody mistakes for a video."""
+    """Return tracks as text that nobody mistakes for a video."""
     if simulated:
         return "simulated tracks of the markers (no video was drawn)"
     return "the camera's own tracks of the markers (no video was kept)"
@@ -118,7 +118,7 @@ class QualitySection(Content):
     """Event rate, gates and retakes over each campaign, and its reference trials.
 
     Attributes:
-        wear: campaign, figure in words, and its trend.
+        wear: campaign, figure as text, and its trend.
         over: campaign and its trials one by one; references: the same of its reference trials.
         gates: campaign and the worst trial of each gate; causes: the same of its quarantine.
     """

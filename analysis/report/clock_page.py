@@ -1,7 +1,7 @@
-"""The page about clocks, `report/sync.html`: how good every trial's time line is, and why.
+"""The clock page, `report/sync.html`: the accuracy of every trial's time line.
 
-A latency is a difference of two clocks. This page shows what is left over after fitting them, so
-that a device that drifts, misses pulses or stamps badly is seen over a campaign, not in one trial.
+A latency is a difference of two clocks. This page shows the residuals of their fits, so
+that a device that drifts, misses pulses or has bad time stamps is visible over a whole campaign.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ def _doubtful(shown: _Shown) -> Table:
 
 
 def _quarantined(campaigns: Sequence[Collected]) -> Table:
-    """List attempts that were quarantined because of a clock, with the reason in words."""
+    """List attempts that were quarantined because of a clock, with the reason as text."""
     rows = []
     for item in campaigns:
         for known in item.campaign.quarantined():

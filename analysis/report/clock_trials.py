@@ -75,7 +75,7 @@ class TrialClocks:
 
     @property
     def doubt(self) -> str:
-        """Reason to reject this committed trial by today's gates, in words; empty if none."""
+        """Reason to reject this committed trial by today's gates, as text; empty if none."""
         found = [
             f"{device} cannot be fitted again ({reason}); the record's clock is in use"
             for device, reason in self.refused.items()

@@ -23,7 +23,7 @@ def frames_grade(sync: Sync) -> str:
 
 
 def frames_uncertainty(sync: Sync) -> str:
-    """Return the worst trial's uncertainty of events against frames, in words."""
+    """Return the worst trial's uncertainty of events against frames, as text."""
     worst = sync.worst_against_events_us
     return number(worst.get("frames", worst.get("arm")), 1, "µs")
 
@@ -34,7 +34,7 @@ def unwired(sync: Sync) -> bool:
 
 
 def latency_note(sync: Sync) -> str:
-    """Return what stands under every table of latencies: the grade, and how far off it may be."""
+    """Return what is under every table of latencies: the grade, and how far off it may be."""
     note = (
         f"Frames: {frames_grade(sync)}; events against them within {frames_uncertainty(sync)}, "
         "worst trial."

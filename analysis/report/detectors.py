@@ -66,7 +66,7 @@ class DetectorSection(Content):
 def detector_section(
     compared: DetectorComparison | None, *, simulated: bool
 ) -> DetectorSection | None:
-    """Show the comparison; None where there is none."""
+    """Show the comparison; None if there is none."""
     if compared is None:
         return None
     entries = [(WORDS[entry.name], entry) for entry in compared.detectors]

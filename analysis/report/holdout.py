@@ -1,4 +1,4 @@
-"""The hold-out campaign in the report, compared with test trials; nothing was chosen by it."""
+"""The hold-out campaign in the report, compared with test trials; it was used for no selection."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class LatencySection(Content):
         by: the factors by which the figures have rows.
         late: onset, number and range in ms of detections after their event.
         choices: how smoothing and margin were chosen.
-        trends: by time, in words.
+        trends: by time, as text.
         clock_note: under figures; nothing where it cannot be seen in them.
     """
 
@@ -129,7 +129,7 @@ def latency_section(
 
 
 def choice_note(chosen_by: str) -> str:
-    """Return how smoothing and margin were chosen, in words; nothing where the protocol says it."""
+    """Return how smoothing and margin were chosen, as text; nothing where the protocol says it."""
     if chosen_by == "validation":
         return "Smoothing and margin were chosen by validation trials."
     if chosen_by == "test":

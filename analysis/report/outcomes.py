@@ -1,7 +1,7 @@
-"""Outcomes of trials: each is in one place, and all of them add up to the plan.
+"""Outcomes of trials: every trial has exactly one, and they add up to the plan.
 
-A mean over detected trials says nothing of those that were not. So every trial of the plan that is
-there to be judged is counted once: not taken, taken after the evaluation, without onsets in its
+A mean over detected trials says nothing about the others. So every trial of the plan that is
+meant for evaluation is counted once: not taken, taken after the evaluation, without onsets in its
 label, false early, missed, detected late (when gross slip had begun), or detected first.
 """
 
@@ -166,7 +166,7 @@ _FAILED = ("missed", "false_early", "late", "without_onsets")
 
 @dataclass(frozen=True)
 class FailureSection(Content):
-    """Trials that were missed, late, false early or cannot be judged.
+    """Trials that were missed, late, false early or cannot be evaluated.
 
     Attributes:
         causes: what went wrong, and in how many trials.
@@ -209,7 +209,7 @@ def failure_section(folder: Path, trials: Sequence[TrialOutcome]) -> FailureSect
 
 
 def _wrong(row: TrialOutcome) -> list[str]:
-    """Return the causes for which a trial failed, in words that trials share."""
+    """Return the causes for which a trial failed, as text that trials share."""
     if row.outcome == "without_onsets":
         return ["no onset in the label, cannot be judged"]
     found = [f"incipient {WORDS[row.outcome]}"] if row.outcome in _FAILED else []

@@ -1,6 +1,6 @@
-"""Pages: what their sections show, and one self-contained HTML file of it.
+"""Pages: their sections, rendered to one self-contained HTML file.
 
-Each section has a template in `templates/sections` that holds its words. Python hands it values: a
+The text of each section is a template in `templates/sections`. Its values come from a
 dataclass that names the template; its figures are also written to the page's folder.
 """
 
@@ -123,7 +123,7 @@ def render_section(content: Content, *, simulated: bool) -> tuple[str, Markup]:
 
 
 def write_figures(folder: Path, sections: Sequence[Content], *, simulated: bool) -> None:
-    """Write each named figure and its data as files of their own; those of an older page go.
+    """Write each named figure and its data as separate files; those of an older page go.
 
     Raises:
         ValueError: two figures of one name.
@@ -162,7 +162,7 @@ def csv_text(data: Mapping[str, Sequence[object]], *, simulated: bool) -> str:
 
 
 def number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
-    """Return a number for people: fixed digits, a dash where there is none."""
+    """Return a number for people: fixed digits, a dash if there is none."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
     text = str(value) if isinstance(value, int) else f"{value:.{digits}f}"

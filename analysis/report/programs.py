@@ -1,7 +1,7 @@
-"""Results of other programs in the report, which takes up those that stand in the store.
+"""Results of other commands in the report, if they exist in the store.
 
-They take minutes to hours, so the report never makes them: it shows what is there, and says how to
-make what is not. None of them is checked for being fresh; what they were made of is theirs to say.
+They take minutes to hours, so the report never computes them: it shows existing results, and names
+the command for missing ones. It does not check whether they are up to date.
 """
 
 from __future__ import annotations

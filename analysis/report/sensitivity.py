@@ -1,4 +1,4 @@
-"""Assumed parameters of the scene in the report: what the study's figures owe to each."""
+"""Sensitivity of the study's figures to assumed scene parameters, in the report."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def sensitivity_section(found: Json | None, command: str) -> SensitivitySection:
     """Show how figures change with each parameter.
 
     Args:
-        found: results of `sliplab guesses`; None where there are none.
+        found: results of `sliplab guesses`; None if there are none.
 
     Raises:
         StoreError: they are of another shape.
@@ -110,7 +110,7 @@ def _changed(
 
 
 def _at(key: str, base: float | None, found: Changed | None) -> str:
-    """Return a changed figure in words."""
+    """Return a changed figure as text."""
     if found is None or found.change is None or base is None:
         return _value(key, None, unit=False)
     return _value(key, base + found.change / _scale(key), unit=False)

@@ -1,4 +1,4 @@
-"""The report's numbers, `report/summary.json`, put together from what earlier steps kept."""
+"""The report's numbers, `report/summary.json`, assembled from the results of earlier steps."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
 
 
 def _in_words(value: Any) -> str:
-    """Return a setting's value in words."""
+    """Return a setting's value as text."""
     match value:
         case bool():
             return "yes" if value else "no"

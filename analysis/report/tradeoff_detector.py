@@ -252,7 +252,7 @@ def seed_range(values: Sequence[float | None], scale: float) -> tuple[float, flo
 
 
 def spread(values: Sequence[float | None], scale: float, digits: int) -> str:
-    """Return mean, lowest and highest in words; of one seed its value."""
+    """Return mean, lowest and highest as text; of one seed its value."""
     found = seed_range(values, scale)
     if found is None:
         return "–"
@@ -261,7 +261,7 @@ def spread(values: Sequence[float | None], scale: float, digits: int) -> str:
 
 
 def format_difference(difference: Mapping[str, Any], scale: float, unit: str) -> str:
-    """Return a difference, its interval, and its significance over seeds, in words."""
+    """Return a difference, its interval, and its significance over seeds, as text."""
     if difference["mean"] is None:
         return "–"
     text = f"{scale * difference['mean']:+.1f}".replace("-", "−")

@@ -51,7 +51,7 @@ class Example:
 
     @property
     def condition(self) -> str:
-        """The trial's condition in words."""
+        """The trial's condition as text."""
         return ", ".join(f"{name} {text}" for name, text in self.row.condition.items())
 
     def onsets_s(self) -> list[float | None]:
@@ -88,7 +88,7 @@ class TrialSection(Content):
 
     Attributes:
         rates: positive events a second by phase.
-        tracks: the tracks in a video's place, in words; nothing where there is a video.
+        tracks: the tracks in a video's place, as text; nothing where there is a video.
         paper: the event rate that the paper shows.
     """
 
@@ -169,7 +169,7 @@ class OutputSection(Content):
     """The same trial's raw and smoothed outputs.
 
     Attributes:
-        choice: how the settings were chosen, in words.
+        choice: how the settings were chosen, as text.
     """
 
     template: ClassVar[str] = "outputs.html"

@@ -39,7 +39,7 @@ METHODS = {
     "cnn_volume": "ordinary convolutions on space and time",
     "gru": "gated recurrent unit over the steps",
 }
-"""Other methods in words, by name."""
+"""Other methods as text, by name."""
 WORST = 10
 """Trials that are listed with their errors."""
 
@@ -222,7 +222,7 @@ class LeadSection(Content):
 
 
 def lead_section(kinematic: Kinematic, *, simulated: bool) -> LeadSection | None:
-    """Draw the share right by lead; None where there are no windows."""
+    """Draw the share right by lead; None if there are no windows."""
     if not kinematic.reliability:
         return None
     headings = {

@@ -37,7 +37,7 @@ class Setting:
 
     @property
     def title(self) -> str:
-        """The setting in words."""
+        """The setting as text."""
         return f"{self.length_ms} ms in {self.step_ms} ms, {self.pool_px} px, ×{self.width:g}"
 
     @property

@@ -1,4 +1,4 @@
-"""Rows of the detector's search: one detector a row, a figure of each seed, the Pareto front.
+"""Rows of the detector sweep: one detector per row, figures by seed, the Pareto front.
 
 A row is a network's setting, a precision, a stride and a rule. The rule is the paper's pair of
 smoothing and margin, or a pair that validation trials of all seeds together choose. Test trials

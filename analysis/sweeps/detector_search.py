@@ -1,4 +1,4 @@
-"""The detector's search: networks of a grid of settings, trained, counted over trials, measured.
+"""The detector sweep: networks of a grid of settings, trained, run over trials and scored.
 
 A run is a setting and a seed. Window length, step, pooling and width need a training each; stride,
 precision, smoothing and margin are read off the same network, so spikes are counted once over whole
@@ -65,7 +65,7 @@ class SearchSize:
         samples: training windows of each network; the same number of test windows at most, and a
             quarter of it to choose epochs by.
         epochs: of each training at most; the protocol's other settings stay.
-        trials: validation and test trials of each kind that detections are judged on, at most.
+        trials: validation and test trials of each kind that detections are evaluated on, at most.
         seeds: trainings of each setting.
         stride_ms: the finest stride.
     """
@@ -214,7 +214,7 @@ class Run:
 
     @property
     def title(self) -> str:
-        """The run in words."""
+        """The run as text."""
         return f"{self.setting.title}, seed {self.seed}"
 
 

@@ -58,7 +58,7 @@ class TrialSamples:
 
     Attributes:
         ids: of the trials.
-        conditions: level by factor of each trial, in words.
+        conditions: level by factor of each trial, as text.
     """
 
     samples: SampleSet

@@ -1,4 +1,4 @@
-"""One runner for all sweeps: points in order, each measured once, kept at once, and gone on with.
+"""Runner of all sweeps: points in order, each measured once and stored at once; resumable.
 
 A point is a setting with the name that its result is kept under and the key of all that the result
 depends on. Which points are pending is asked of what is kept, so a sweep may be stopped anywhere,
@@ -41,7 +41,7 @@ class Point(Protocol):
 
     @property
     def title(self) -> str:
-        """The setting in words."""
+        """The setting as text."""
 
 
 class Results(Protocol):
@@ -152,7 +152,7 @@ class Sweep(Generic[P]):
 
         Args:
             expected: what `expected` returned.
-            over: asked before each point; no other is begun once it returns True.
+            over: asked before each point; no other is started once it returns True.
             begin: called before each point with its number, from 1, and how many there are.
         """
         pending = self.pending

@@ -1,6 +1,6 @@
 """Difference of two simulated recordings of a trial, in quantities that an experiment uses.
 
-A scene can be made dearer at will: more physics, shorter steps, smoother paths. The gain is
+A scene can be made arbitrarily expensive: more physics, shorter steps, smoother paths. The gain is
 measured by onsets, times of events, labels of windows and the network's own samples; two seeds of
 the same scene say which difference is small. Pure functions of recordings.
 """
@@ -74,7 +74,7 @@ class Matched:
     first: I64
     second: I64
     unmatched: float | None
-    """Share of the events of both that have no partner; None where there are no events."""
+    """Share of the events of both that have no partner; None if there are no events."""
 
 
 def match_events(a: EventChunk, b: EventChunk) -> Matched:

@@ -202,7 +202,7 @@ def table_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]
         if row["step_ms"] is not None:
             title += f" {row['step_ms']} ms {row['path']}"
         if row["family"] == "cubic" and row["step_ms"] == result["rig_step_ms"]:
-            continue  # the same run stands among the levels
+            continue  # the same run is among the levels
         rows.append((title, row))
     seed = {"rows_per_s": None, "wall_s": None, "error": result["seeds"]}
     return [*rows, ("another seed", seed)]

@@ -1,1 +1,1 @@
-"""Windows of events: how they are cut, stored and chosen."""
+"""Windows of events: binning, storage and selection."""

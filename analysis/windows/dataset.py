@@ -1,4 +1,4 @@
-"""Make samples of labelled recordings: windows chosen by the 50/50/50 rule and binned."""
+"""Samples of labelled recordings: windows selected by the 50/50/50 rule and binned."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class SampleSet:
 
     @property
     def x(self) -> npt.NDArray[np.uint8]:
-        """The counts, dense: 12 kB a sample of the paper's, made anew at each call."""
+        """The counts, dense: 12 kB a sample of the paper's, rebuilt at each call."""
         return self.windows.dense()
 
     @staticmethod
@@ -91,8 +91,8 @@ class SampleSet:
         """Open the file that `save` wrote; pages are read when they are used.
 
         Raises:
-            OSError: there is none, or it cannot be read.
-            ValueError: it is no such file, or cut short.
+            OSError: it does not exist, or it cannot be read.
+            ValueError: it is no such file, or truncated.
         """
         arrays = map_arrays(path)
         try:

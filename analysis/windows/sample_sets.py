@@ -1,7 +1,7 @@
-"""The samples of a part of the split: made once, kept in a file that maps into memory.
+"""Cached samples of a part of the split, in a memory-mapped file.
 
-Training, evaluation and every other seed read the same file; it is made again when a label, a
-recording or a setting changed.
+Training, evaluation and every other seed read the same file; it is rebuilt when a label, a
+recording or a setting changes.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def by_id(trials: list[TrialRef]) -> dict[TrialId, TrialRef]:
 
 
 def several(campaigns: list[Collected]) -> list[str]:
-    """Return an extra input for the key of a result that tells windows apart by their trial.
+    """Return an extra input for the key of a result that distinguishes windows by their trial.
 
     Empty for one campaign: only with several was a window ever given to the wrong trial.
     """

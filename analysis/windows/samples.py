@@ -1,9 +1,9 @@
-"""Choose the windows of a trial that become samples, and their classes.
+"""Selection of a trial's sample windows and their classes.
 
-The paper takes 50 windows a class from every trial, and how they are placed decides what the
+The paper takes 50 windows per class from every trial, and their positions determine what the
 network can learn: no slip just before the first slip, where it is hardest; gross slip just after
-the centre let go; incipient slip anywhere between. The choice is a pure function of the onsets and
-a seed, so that a data set can be made again from its protocol alone.
+the centre slipped; incipient slip anywhere between. The selection is a pure function of the onsets
+and a seed, so that a data set can be reproduced from its protocol alone.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Teaching and calibrating a rig: what is measured is asked for, checked, and written down."""
+"""Teaching and calibrating a rig: measurements, their checks, and the entries in the rig file."""

@@ -46,9 +46,7 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
             raise StopRequested
         pictures.append(grab_frames(rig).images[-1])
         if not pictures[-1].size:
-            raise RigError(
-                "frame camera", "hands over tracks and no pictures: take a rig with `video`"
-            )
+            raise RigError("frame camera", "provides tracks and no images: use a rig with `video`")
         console.say(f"picture {number + 1} of {views} taken")
     rig.operator.ask("board", "take the board away", "away")
     return pictures
@@ -64,12 +62,12 @@ def read_pictures(folder: Path) -> list[npt.NDArray[np.uint8]]:
 
     paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in {".png", ".jpg", ".tif"})
     if not paths:
-        raise InputError("--images", "", str(folder), "holds no .png, .jpg or .tif")
+        raise InputError("--images", "", str(folder), "contains no .png, .jpg or .tif")
     pictures = []
     for path in paths:
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if picture is None:
-            raise InputError("--images", "", str(path), "is no picture that can be read")
+            raise InputError("--images", "", str(path), "is not a readable image")
         pictures.append(picture)
     return pictures
 
@@ -84,7 +82,7 @@ def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today:
 
     sizes = {picture.shape for picture in pictures}
     if len(sizes) != 1:
-        raise RigError("frame camera", f"pictures of several sizes: {sorted(sizes)}")
+        raise RigError("frame camera", f"images of different sizes: {sorted(sizes)}")
     height, width = next(iter(sizes))
     views = []
     with console.bar("pictures", len(pictures)) as bar:

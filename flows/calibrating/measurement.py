@@ -139,7 +139,7 @@ class Measurement:
                     rig.connect()
                 finding = measure(CalibrationSession(self.file, rig, today))
             except StopRequested:
-                console.say("stopped: the arm stands still, nothing was written")
+                console.say("stopped: the arm is at rest, nothing was written")
                 raise KeyboardInterrupt from None
             finally:
                 rig.close()
@@ -200,9 +200,9 @@ class Measurement:
         console.print_pairs(f"{self.what} of rig {self.file.name}{simulated}", shown)
         console.say(f"written to {path}: {', '.join(finding.changes)}")
         for key in removed:
-            console.say(f"removed {key}: it belonged to what was there before")
+            console.say(f"removed {key}: it belonged to the previous calibration")
         if kept is not None:
-            console.say(f"the old file is {kept}")
+            console.say(f"the old file is kept as {kept}")
 
     def _had(self, key: str) -> bool:
         return getattr(self.file.calibration, key.rpartition(".")[2], None) is not None
@@ -210,8 +210,8 @@ class Measurement:
 
 def _confirm() -> None:
     if not sys.stdin.isatty():
-        raise InputError("--yes", "", None, "is needed where there is no terminal to ask on")
-    typer.confirm("Is the way free, and a hand at the stop button? Move the arm?", abort=True,
+        raise InputError("--yes", "", None, "is required without a terminal")
+    typer.confirm("Is the path clear, and a hand on the stop button? Move the arm?", abort=True,
                   err=True)  # fmt: skip
 
 

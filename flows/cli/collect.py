@@ -122,7 +122,7 @@ def collect(
 
     result = run(run_request)
     if not result["taken"]:
-        console.say("nothing to do: the store holds every trial that can be taken")
+        console.say("nothing to do: all available trials are collected")
     if not as_json:
         from sliplab.flows.planning.campaign_trials import print_excluded
 

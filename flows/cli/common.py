@@ -43,7 +43,7 @@ def located(place: str) -> Path:
     """Return a store's folder: the folder itself, or the updated mirror of a URL.
 
     Raises:
-        StoreError: there is none.
+        StoreError: it does not exist.
     """
     from sliplab.storage.remote.mirror import open_mirror
     from sliplab.storage.remote.objects import is_url

@@ -116,7 +116,7 @@ def _decide(
     from sliplab.storage.trials.store import Store
 
     if not why.strip():
-        raise InputError("--why", "", why, "must say something: it is kept with the trial")
+        raise InputError("--why", "", why, "must not be empty: it is stored with the trial")
     opened = Store.open(store)
     by_campaign = requests.known_trials(opened, [campaign] if campaign else None, trials)
     outcomes = [
@@ -136,7 +136,9 @@ def _pause_words(store: Path, outcome: Outcome) -> str:
     did = {} if outcome.answer is None else outcome.answer["did"]
     if did.get("running"):
         return f"{store} is paused, between two trials; continue with `sliplab resume {store}`"
-    return f"{store} is paused; nothing ran, and nothing begins until `sliplab resume {store}`"
+    return (
+        f"{store} is paused; nothing was running, and nothing starts until `sliplab resume {store}`"
+    )
 
 
 def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
@@ -150,7 +152,7 @@ def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
     if not done:
         kind = outcomes[0].request.kind
         console.say(
-            f"not yet: the request stands and is carried out when the trial that runs is over "
+            f"not yet: the request stays open and is carried out when the trial that runs is over "
             f"({kind}, number {outcomes[0].request.number})"
         )
         raise typer.Exit(console.FAILED)

@@ -39,7 +39,7 @@ class Failure:
     """The error that ended a command.
 
     Attributes:
-        file: the file, folder or URL that is wrong; None where there is none.
+        file: the file, folder or URL that is wrong; None if there is none.
         key: the key inside it, or the option or argument.
         value: the offending value, as written.
         trace: the traceback, if the error is a bug in the program.

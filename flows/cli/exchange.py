@@ -91,8 +91,8 @@ def export(
         if len(holders) != 1:
             raise InputError(
                 store, "", what,
-                "is in several campaigns; export one of them" if holders
-                else f"is no campaign and no committed trial; campaigns: {', '.join(campaigns)}",
+                "is in several campaigns; name a trial or another campaign" if holders
+                else f"is no campaign or committed trial; campaigns: {', '.join(campaigns)}",
             )  # fmt: skip
         campaign, names = holders[0], [what]
     if labels:
@@ -146,7 +146,7 @@ def export_model(
     fitted = load_model(model)
     folder = store or model.resolve().parent.parent
     if store is None and not (folder / "store.json").exists():
-        raise InputError("--store", "", None, f"is needed: {model} lies in no store")
+        raise InputError("--store", "", None, f"is required: {model} is not in a store")
     opened = open_store(folder)
     prepare_store(folder)
     from sliplab.flows.export_model import export_model as run

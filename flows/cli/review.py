@@ -42,7 +42,7 @@ def review(
             summary = {"url": address, "trials": len(trials.rows), "to_decide": waiting}
             console.print_json(summary)
         else:
-            console.say(f"{len(trials.rows)} trials, {waiting} to decide. Ctrl-C ends the page:")
+            console.say(f"{len(trials.rows)} trials, {waiting} to review. Ctrl-C ends the page:")
             console.show(address)
 
     serve(open_store(store), campaign or (), port, who, ready)
@@ -72,7 +72,7 @@ def view(
             console.print_json({"trial": trial, "file": None})
         return
     if save.suffix != ".rrd" or not save.parent.is_dir():
-        raise InputError("--save", "", str(save), "must end in .rrd and stand in a folder")
+        raise InputError("--save", "", str(save), "must end in .rrd and its folder must exist")
     counts = looking.save(subject, save)
     if as_json:
         console.print_json({"file": str(save), "trial": trial, **counts})

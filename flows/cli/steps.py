@@ -132,7 +132,7 @@ def evaluate(
     if model is not None:
         for name, chosen in (("--baselines", baselines), ("--checks", checks)):
             if chosen:
-                raise InputError(name, "", None, "is for the store's own network")
+                raise InputError(name, "", None, "applies only to the store's own network")
         options |= {"model": model, "engine": None if engine is None else engine.value}
         scores = cast("NetworkScores", run_step(folder, campaign, "judge_model", dask, **options))
         if as_json:

@@ -112,7 +112,7 @@ def verify(
 
         with store_lock(opened):
             moved = quarantine_damaged(opened, problems)
-        console.say(f"{len(moved)} damaged trials are in quarantine; `sliplab collect` takes them")
+        console.say(f"{len(moved)} damaged trials were quarantined; `sliplab collect` retakes them")
     if as_json:
         damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
         console.print_json(
@@ -130,7 +130,7 @@ def verify(
         rows = [[item.path, item.what] for item in problems]
         console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
     else:
-        console.show(f"{total} trials, all as they were committed")
+        console.show(f"{total} trials, all intact")
     if problems:
         raise typer.Exit(console.FAILED)
 
@@ -159,7 +159,7 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     elif passed:
         console.show(f"format {passed[0]} to {opened.format}; copies: {copies}")
     else:
-        console.show(f"nothing to do: format {opened.format} is the newest")
+        console.show(f"nothing to do: format {opened.format} is the current one")
 
 
 UrlArgument = Annotated[
@@ -292,7 +292,7 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
         rows = [[item.path, item.what] for item in problems]
         console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
     else:
-        console.show(f"{trials} trials, all as they were committed")
+        console.show(f"{trials} trials, all intact")
     if problems:
         raise typer.Exit(console.FAILED)
 

@@ -74,7 +74,7 @@ def _status(folder: Path, as_json: bool) -> None:
 
     rows = read(folder)
     if not rows:
-        raise InputError("FOLDER", "", str(folder), f"must hold a study: there is no {FILE}")
+        raise InputError("FOLDER", "", str(folder), f"is not a study: it has no {FILE}")
     if as_json:
         console.print_json({"steps": [vars(row) for row in rows]})
     else:
@@ -92,7 +92,7 @@ def demo(
     """Run the pilot study on the simulated rig and print the report's path."""
     if rig == Path("rehearsal"):
         console.say(
-            "The demo's outside camera hands over simulated tracks of the markers, no video; "
+            "The demo's outside camera hands over simulated marker tracks, no video; "
             "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
         )
     _chain(folder, study_protocols(pilot=True, extra=False), rig, as_json)

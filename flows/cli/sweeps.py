@@ -199,7 +199,7 @@ def _scene(
         return
     title = f"Cost and error of the scene of {result['protocol']} (simulated)"
     console.print_table(title, *short_table(result))
-    console.print_pairs("The level that the protocol needs", choice_pairs(result))
+    console.print_pairs("Required level of physics", choice_pairs(result))
     console.show(f"Page (simulated): {(out / PAGE).resolve()}")
 
 
@@ -238,7 +238,7 @@ def _detector(
         console.print_pairs(f"tradeoff --detector {place}{simulated}", shown)
         return
     console.print_table(
-        f"The quickest detectors by false early trials{simulated}", *short_table(result)
+        f"The fastest detectors by false early trials{simulated}", *short_table(result)
     )
     console.show("Network: window ms/step ms/cell px/width; rule: windows, spikes.")
     console.show(f"Page{simulated}: {(target / PAGE).resolve()}")

@@ -1,1 +1,1 @@
-"""Taking trials: sessions at a rig, requests from other terminals, checks between two trials."""
+"""Collecting trials: sessions at a rig, requests from other terminals, checks between trials."""

@@ -1,8 +1,8 @@
 """Progress of a collection: time left, the console's bar, and Prefect's page.
 
-A thread of its own reports to the server, every few seconds at most, so that neither a batch of
-quick trials nor a slow server delays a trial. What cannot be reported is left out: the page is a
-view, and the store has it all.
+A separate thread reports to the server, every few seconds at most, so that neither a batch of
+quick trials nor a slow server delays a trial. Failed reports are dropped: the page is only a
+view of the store.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class Progress:
         """Count a trial that is over.
 
         Raises:
-            KeyboardInterrupt: somebody asked the program to stop.
+            KeyboardInterrupt: a stop was requested.
         """
         with self._lock:
             self._done += 1

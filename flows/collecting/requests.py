@@ -1,7 +1,7 @@
-"""Requests to a store from another terminal: pause, resume, stop, skip a trial, take it again.
+"""Requests to a store from another terminal: pause, resume, stop, skip or retake a trial.
 
-A running collection carries them out between two trials; while nobody collects, the program that
-asks does so. Either holds the store's lock. A stop is signalled before anything is written. This
+A running collection carries them out between two trials; without one, the requesting program
+does so. Either holds the store's lock. A stop is signalled before anything is written. This
 module loads little: the arm moves until `halt` has run.
 """
 
@@ -40,7 +40,7 @@ def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iter
     """Hold the store's lock for writing while the block runs; the store has the newest format then.
 
     Args:
-        brief: held for a moment only; a collection that begins meanwhile waits for it.
+        brief: held for a moment only; a collection that begins in the meantime waits for it.
         collects: the campaign that trials are taken for; `sliplab stop` stops nothing else.
 
     Raises:
@@ -79,7 +79,7 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]
             if where.begun:
                 trials = change(where, request.trials, request.by)
             else:
-                trials = dict.fromkeys(request.trials, "there is no such campaign")
+                trials = dict.fromkeys(request.trials, "no such campaign")
             did = {"trials": trials, "running": running}
         done.append((request, control.answer(store, request, did)))
     return done
@@ -166,7 +166,7 @@ def ask(
     made = control.ask(store, kind, who=who, why=why, campaign=campaign, trials=trials)
     holder = _carry_out_if_free(store)
     if control.answered(store, made) is None and limit_s > 0:
-        _wait(store, "waiting for the end of the trial (s)", limit_s, made)
+        _wait(store, "waiting for the current trial to end (s)", limit_s, made)
     return Outcome(made, control.answered(store, made), holder)
 
 
@@ -192,18 +192,18 @@ def note_stop(
 ) -> Outcome:
     """Record a stop whose signal `halt` has sent, and wait until the collection has ended."""
     if holder is not None and not holder.get("collects"):
-        console.say(f"{process.named(holder)}: collects nothing and was left alone")
+        console.say(f"{process.named(holder)}: is not collecting and was not signalled")
         holder = None
     if holder is not None:
         how = (
             "was signalled to stop"
             if reached
-            else "no signal reaches it; it stops at its next trial"
+            else "cannot be signalled; it stops before its next trial"
         )
         console.say(f"{process.named(holder)}: {how}")
     made = control.ask(store, "stop", who=who, why=why)
     if holder is not None and limit_s > 0:
-        _wait(store, "waiting until it has stopped (s)", limit_s, None)
+        _wait(store, "waiting for it to stop (s)", limit_s, None)
     left = holder_of(store.folder)
     if holder is not None and (left is None or left.get("pid") != holder["pid"]):
         control.answer(store, made, {"stopped": True, "running": True})
@@ -225,11 +225,15 @@ def known_trials(
     for trial in dict.fromkeys(trials):
         where = [name for name, ids in plans.items() if trial in ids]
         if len(where) > 1:
-            raise InputError("--campaign", "", None, f"is needed: {trial} is in {', '.join(where)}")
+            raise InputError(
+                "--campaign", "", None, f"is required: {trial} is in {', '.join(where)}"
+            )
         if not where:
             near = get_close_matches(trial, [i for ids in plans.values() for i in ids], n=1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise InputError("TRIAL", "", trial, f"is in no plan of {', '.join(plans)}{hint}")
+            raise InputError(
+                "TRIAL", "", trial, f"is in none of the plans of {', '.join(plans)}{hint}"
+            )
         found.setdefault(where[0], []).append(trial)
     return {name: tuple(ids) for name, ids in found.items()}
 

@@ -1,6 +1,6 @@
-"""One session at a rig: locks, recovery after a crash, one trial after the other, the trial gate.
+"""One session at a rig: locks, recovery after a crash, the sequence of trials, the trial gate.
 
-`open_session` opens a session: it holds the store and the rig, cleans up what a crash left, and
+`open_session` opens a session: it locks the store and the rig, cleans up after a crash, and
 builds the rig. `Session` takes trials and commits the good ones; `TrialGate` decides between two
 trials whether the next one may begin. None of them knows Prefect: `flows.collect` decides in what
 batches trials are taken. The store is the only record of progress, so a session may die at any
@@ -184,7 +184,7 @@ class Session:
             RigError: a device failed, or a person did not do what was asked.
             StoreError: the store's disk is full, read-only or failing.
             CampaignStopped: the trial gate ended the campaign.
-            KeyboardInterrupt: somebody asked to stop.
+            KeyboardInterrupt: a stop was requested.
         """
         for trial in trials:
             with translated_disk_errors(self.campaign.folder, RigError):
@@ -224,7 +224,7 @@ class Session:
             elif not self._mounted(trial):
                 self._ask(task)
                 if not self._mounted(trial):
-                    raise RigError("plate", f"{task.prompt}: the rig finds another mass mounted")
+                    raise RigError("plate", f"{task.prompt}: the rig detects another mass")
 
     def _warm_and_zero(self, trial: Trial) -> None:
         """Warm up the skin and find depth zero, unless that is done."""
@@ -454,7 +454,7 @@ class TrialGate:
         """Return whether to take `trial` now; waits while the store is paused.
 
         Raises:
-            KeyboardInterrupt: somebody asked to stop.
+            KeyboardInterrupt: a stop was requested.
             CampaignStopped: the disk has no room for it, or a pause was not ended in time.
             WindowOver: the trial does not fit into the window.
         """
@@ -477,7 +477,7 @@ class TrialGate:
             self._references.look(trial)
 
     def more(self) -> list[Trial]:
-        """Return pending trials that were asked for again meanwhile, in the plan's order."""
+        """Return pending trials that were requested again in the meantime, in the plan's order."""
         self._process_requests()
         retakes, self._retakes = self._retakes, set()
         if not retakes:

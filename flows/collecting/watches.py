@@ -67,7 +67,7 @@ class DiskWatch:
         if needed + RESERVE > free:
             known = "by the plan" if self._ratio is None else "by the trials so far"
             raise CampaignStopped(
-                f"{self._run_request.store}: stopped before its disk is full: {size(free)} are "
+                f"{self._run_request.store}: stopped, the disk is nearly full: {size(free)} are "
                 f"free, the next trial needs {size(needed)} ({known}) and {size(RESERVE)} stay in "
                 "reserve; make room, then run the same command to go on. Every committed trial "
                 "is kept"

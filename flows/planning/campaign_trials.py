@@ -1,4 +1,4 @@
-"""Trials of a campaign that are pending, and trials that are excluded: no collection takes those.
+"""Pending and excluded trials of a campaign; no collection takes excluded ones.
 
 A trial is excluded if a person skipped it, or if its gates rejected it as often as it may be
 retaken. `sliplab again` makes it pending.
@@ -111,7 +111,7 @@ def print_excluded(excluded: Sequence[ExcludedTrial]) -> None:
         for item in excluded
     ]
     console.print_table(
-        f"{len(rows)} trials set aside (`sliplab again` takes them)",
+        f"{len(rows)} excluded trials (`sliplab again` retakes them)",
         ["trial", "by", "cause"],
         rows,
         limit=40,

@@ -1,4 +1,4 @@
-"""Bytes that a plan takes on a rig's disk, estimated from measured needs of its streams."""
+"""Estimate of a plan's bytes on disk from the measured data rates of the streams."""
 
 from __future__ import annotations
 
@@ -51,6 +51,6 @@ def check_space(folder: Path, needed: float) -> int:
             "",
             str(folder),
             f"the plan needs {needed / 1e9:.1f} GB and {RESERVE / 1e9:.1f} GB in reserve, the disk "
-            f"has {free / 1e9:.1f} GB free; make room or choose another folder",
+            f"has {free / 1e9:.1f} GB free; free space or choose another folder",
         )
     return free

@@ -1,4 +1,4 @@
-"""A plan for people and for programs: trials in order, sums, and a simulated rig's scene."""
+"""Display of a plan as tables or JSON: trials in order, totals, and a simulated rig's scene."""
 
 from __future__ import annotations
 
@@ -154,15 +154,15 @@ def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
         )
     units = {name: factor.unit for name, factor in found.protocol.collection.all_factors.items()}
     named = [f"{name} ({units[name]})" if units[name] else name for name in factors]
-    columns = ["#", "block", *named, "rep.", "split", "motion (s)", "before it"]
+    columns = ["#", "block", *named, "rep.", "split", "motion (s)", "before"]
     console.print_table(f"{found.file}: {found.protocol.title}", columns, table, limit=40)
     console.print_pairs(
-        "In all",
+        "Total",
         {
             "trials": len(found),
             "motion": console.duration(found.total_seconds),
-            "disk": console.size(needed) if needed is not None else "give --rig to know",
-            "stretches without a person": ", ".join(
+            "disk": console.size(needed) if needed is not None else "give --rig to estimate",
+            "unattended stretches": ", ".join(
                 f"{last - first + 1} trials" for first, last in found.stretches()
             ),
         },

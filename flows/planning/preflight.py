@@ -50,7 +50,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     pending = pending_trials(run_request.plan, Store(store).campaign(run_request.campaign))
     found = [
         Check("protocol and limits", True, f"{len(run_request.plan)} trials within all limits"),
-        Check("campaign", True, f"{len(pending)} of {len(run_request.plan)} still to take"),
+        Check("campaign", True, f"{len(pending)} of {len(run_request.plan)} still to collect"),
     ]
     found.append(Check("outside camera", True, _outside_camera(run_request)))
     found += check_region(run_request)
@@ -98,7 +98,7 @@ def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
     if not found:
         entries = [name for name in COMMANDS if getattr(calibration, name) is not None]
         days = ", ".join(f"{name} {measured_on(calibration, name)}" for name in entries)
-        age = " (simulated: of any age)" if run_request.rig.simulated else ""
+        age = " (simulated: any age)" if run_request.rig.simulated else ""
         found.append(Check("calibration", True, f"{days}{age}"))
     return found
 
@@ -110,7 +110,7 @@ def _outside_camera(run_request: RunRequest) -> str:
         return "not recorded: these trials cannot be labelled"
     simulated = "simulated " if run_request.rig.simulated else ""
     if run_request.rig.frame_source == "tracks":
-        return f"{simulated}tracks of the markers, no video"
+        return f"{simulated}marker tracks, no video"
     return f"{simulated}video, {frame_px[0]} x {frame_px[1]} px"
 
 
@@ -136,7 +136,7 @@ def check_region(run_request: RunRequest) -> list[Check]:
             f"recording.region by {-2 * spare:.1f} mm"
         )
         return [Check("region", False, text)]
-    text = f"covers the centre marker on every way, with {spare:.1f} mm to spare"
+    text = f"covers the centre marker's whole path, with {spare:.1f} mm to spare"
     if spare < skin:
         text += f"; markers more than {spare:.1f} mm from the centre leave it on the longest"
     return [Check("region", True, text)]

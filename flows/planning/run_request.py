@@ -118,7 +118,7 @@ def make_request(
     Raises:
         InputError: protocol, rig, or a plan that this rig or this disk cannot take.
         NoStore: the folder holds something else.
-        StoreError: the campaign was begun under another collection.
+        StoreError: the campaign was started under another collection.
     """
     plan = load_plan(protocol, enable)
     rig_file, rig_text = load_rig_file(rig)
@@ -140,11 +140,11 @@ def make_request(
 
 
 def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
-    """Check that a campaign that was begun may go on under this request."""
+    """Check that a campaign that was started may continue under this request."""
     info = campaign.info
     if IMPORTED in info:
         raise StoreError(
-            f"{campaign.folder}: was imported; give the new one its own name with --campaign"
+            f"{campaign.folder}: is an imported campaign; choose another name with --campaign"
         )
     if info["collection_hash"] != run_request.plan.collection_hash:
         raise StoreError(
@@ -244,7 +244,7 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
 
 
 def missing_bytes(run_request: RunRequest) -> float:
-    """Return the bytes that the trials still to take are expected to need."""
+    """Return the bytes that the trials still to collect are expected to need."""
     pending = run_request.due_trials(Store(run_request.store).campaign(run_request.campaign))
     done = {trial.id for trial in run_request.plan} - {trial.id for trial in pending}
     return plan_bytes(run_request.rig, run_request.plan, done)
@@ -254,7 +254,7 @@ def check_disk(run_requests: list[RunRequest]) -> int:
     """Return the free bytes where the requests' store is or will be.
 
     Raises:
-        InputError: the trials still to take do not fit.
+        InputError: the trials still to collect do not fit.
     """
     return check_space(
         run_requests[0].store, sum(missing_bytes(run_request) for run_request in run_requests)

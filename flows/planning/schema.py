@@ -3,7 +3,7 @@
 Editors complete, explain and check YAML by the first two; programs check what they read by the
 others. They are made from the models that read the files, so they know the same keys. They know
 less than `sliplab plan` and `sliplab check`: a rule over several keys, such as a limit that a level
-breaks, stands in the models alone. They are of draft 7, the newest that the YAML language server
+breaks, is in the models alone. They are of draft 7, the newest that the YAML language server
 knows.
 """
 
@@ -116,7 +116,7 @@ def _plain(part: Any) -> Any:
         left.pop("default")
     if "prefixItems" in left:
         left |= {"items": left.pop("prefixItems"), "additionalItems": False}
-    if "$ref" in left and len(left) > 1:  # else what stands beside it would not count
+    if "$ref" in left and len(left) > 1:  # else what is beside it would not count
         left["allOf"] = [{"$ref": left.pop("$ref")}]
     return left
 

@@ -1,6 +1,6 @@
 """A Dask cluster that takes the parts of a step which fall into independent trials.
 
-Workers are looked at before anything is sent: each must run this version and see the same store,
+Workers are checked before anything is sent: each must run this version and see the same store,
 by the same path or by its URL. A worker that dies is replaced by the others; what it had in hand is
 made again. Nothing here is loaded without `--dask`.
 """
@@ -47,10 +47,10 @@ class ClusterError(RuntimeError):
 
 @dataclass(frozen=True)
 class Cluster:
-    """A scheduler with workers that were looked at.
+    """A scheduler with workers that were checked.
 
     Attributes:
-        cores: that the workers have together, when they were looked at.
+        cores: that the workers have together, when they were checked.
     """
 
     address: str
@@ -126,7 +126,7 @@ class Cluster:
 
     def _still_there(self, seen: float) -> float:
         if self.client.status != "running":
-            raise ClusterError(f"the Dask scheduler {self.address} is gone; {_GO_ON}")
+            raise ClusterError(f"the Dask scheduler {self.address} was lost; {_GO_ON}")
         if self.client.scheduler_info(n_workers=1)["workers"]:
             return monotonic()
         if monotonic() - seen > ALONE_S:
@@ -136,7 +136,7 @@ class Cluster:
         return seen
 
 
-_GO_ON = "what was made is kept; run the same command to go on"
+_GO_ON = "finished results are kept; run the same command to resume"
 
 
 @contextmanager
@@ -291,7 +291,7 @@ def _result(future: Any) -> Any:
         return future.result(timeout=CONNECT_S)
     except KilledWorker as error:
         raise ClusterError(
-            f"workers died again and again at one piece of the work ({_short(error)}); {_GO_ON}"
+            f"workers died repeatedly on one chunk of the work ({_short(error)}); {_GO_ON}"
         ) from None
     except (CommClosedError, CancelledError) as error:
         raise ClusterError(f"the Dask cluster lost the work ({_short(error)}); {_GO_ON}") from None

@@ -217,10 +217,10 @@ class Bar:
         """Advance by `count`; a stop request raises here.
 
         Args:
-            left: the time left in words, for a bar that was created to show it.
+            left: the time left as text, for a bar that was created to show it.
 
         Raises:
-            KeyboardInterrupt: somebody asked the program to stop.
+            KeyboardInterrupt: a stop was requested.
         """
         stopping.check()
         self._progress.update(self._task, advance=count, note=printable(note), left=left)
@@ -248,7 +248,7 @@ def bar(title: str, total: float, left: str | None = None) -> Iterator[Bar]:
     """A progress bar on standard error while the block runs.
 
     Args:
-        left: the time that is left in words, where the caller knows better than a count would.
+        left: the time that is left as text, where the caller knows better than a count would.
     """
     progress = Progress(
         TextColumn("{task.description}", markup=False),

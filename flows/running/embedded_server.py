@@ -2,10 +2,10 @@
 
 Prefect's own embedded server shares the terminal's process group, so Ctrl-C takes it away while
 the flow still has to tell it that it crashed (a minute of retries), and it outlives a killed
-parent. This one leads a session of its own, and the kernel ends it when its parent dies.
+parent. This one leads its own session, and the kernel ends it when its parent dies.
 
 It starts while its parent does other things: only asking for its `url` waits for it. What it leaves
-out, so that it keeps up with short trials, stands in `LEAN` (docs/decisions/0039).
+out, so that it keeps up with short trials, is in `LEAN` (docs/decisions/0039).
 
 It asks every client for a password, and answers no page but its own (docs/decisions/0071).
 
@@ -86,7 +86,7 @@ class EmbeddedServer:
             except OSError as error:
                 raise ServerError(f"port {port} of the loopback: {error.strerror}") from None
             self.port = int(listener.getsockname()[1])
-            # the server is given the port itself: another program could take a number meanwhile.
+            # the server inherits the open socket: another program could take a free number first.
             # Above the standard streams: with one of these closed, the port would have its number
             handle = fcntl.fcntl(listener, fcntl.F_DUPFD_CLOEXEC, 3)
             self._process = subprocess.Popen(
@@ -166,7 +166,7 @@ class EmbeddedServer:
     def _cause(self, code: int | None) -> str:
         """Return why it did not start: its exit code, its last message, a limit of the shell."""
         if code is None:
-            return f"no answer at {self.address} in {START_LIMIT_S:.0f} s"
+            return f"no response at {self.address} within {START_LIMIT_S:.0f} s"
         found = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         with suppress(OSError):
             lines = [line.strip() for line in self._log.read_text(errors="replace").split("\n")]

@@ -29,9 +29,7 @@ def lacking(error: BaseException, who: str) -> str | None:
     extra = _BRINGS.get(module or "")
     if extra is None:
         return None
-    return (
-        f"`{who}` needs {module}, which the extra '{extra}' brings: pip install 'sliplab[{extra}]'"
-    )
+    return f"`{who}` needs {module}, from the extra '{extra}': pip install 'sliplab[{extra}]'"
 
 
 @contextmanager

@@ -99,7 +99,7 @@ def _ask_loopback_directly() -> None:
 
 
 def start_server() -> None:
-    """Start the embedded server, if a flow will need it, and go on without waiting for it."""
+    """Start the embedded server, if a flow will need it, and continue without waiting for it."""
     if "PREFECT_API_URL" not in os.environ:
         embedded()
 
@@ -168,7 +168,7 @@ class ServerLink:
             name = "" if self.server == run_records.EMBEDDED else f" {self.server}"
             reason = error if isinstance(error, str) else self._reason(error)
             console.say(
-                f"warning: the Prefect server{name} does not answer ({reason}); the work goes on "
+                f"warning: the Prefect server{name} does not respond ({reason}); work continues "
                 "without it, the store keeps everything, and the next command reports this run"
             )
 

@@ -82,7 +82,7 @@ def parallel_map(
             ) from None
         except BaseException:
             for worker in active_children():
-                worker.terminate()  # what a worker had not handed over is simply made again
+                worker.terminate()  # what a worker had not provided is simply made again
             raise
 
 
@@ -280,7 +280,5 @@ def _recording(job: _Job) -> Recording:
     recording = store.campaign(job.campaign).recording(job.trial)
     recording.use_clocks(job.clocks)
     if recording.checksum != job.checksum:
-        raise StoreError(
-            f"{recording.folder}: is not the take that the command began with; run it again"
-        )
+        raise StoreError(f"{recording.folder}: was replaced while the command ran; run it again")
     return recording

@@ -137,7 +137,7 @@ _RAISE = "end other programs or raise the limit"
 _LEAST_BYTES = 150 << 20
 """Address space below which numpy cannot be loaded: OpenBLAS then ends the process by itself."""
 _PR_SET_PDEATHSIG = 1
-_GO_ON = "then run the same command to go on; every committed trial is kept"
+_GO_ON = "then run the same command to resume; every committed trial is kept"
 
 
 def exhausted(error: BaseException | None) -> str | None:

@@ -138,7 +138,9 @@ def close_killed_runs(store: Path, server: str, client: Any = None) -> list[Json
             _report(client, run, said["state"], said["message"])
             path.unlink(missing_ok=True)
         for item in dead:
-            message = f"its process was killed ({named(item['process'])}); found at the next start"
+            message = (
+                f"its process was killed ({named(item['process'])}); detected at the next start"
+            )
             _report(client, item["run"], "CRASHED", message)
             end(store, item["run"], "CRASHED", message, "next start")
     return dead

@@ -33,9 +33,9 @@ def refusal(hosts: list[str], origins: list[str], own: frozenset[str]) -> tuple[
         own: the server's `own_hosts`.
     """
     if len(hosts) != 1 or hosts[0].lower() not in own:
-        return 421, "this server is reached by its own address only\n"
+        return 421, "this server accepts requests to its own address only\n"
     if any(origin.removeprefix("http://") not in own for origin in origins):
-        return 403, "this server answers no other page\n"
+        return 403, "this server accepts no requests from other pages\n"
     return 0, ""
 
 

@@ -55,7 +55,7 @@ def request() -> None:
 
 
 def check() -> None:
-    """Stop here if somebody asked for it.
+    """Stop here if a stop was requested.
 
     Raises:
         KeyboardInterrupt: a stop was requested.
@@ -65,7 +65,7 @@ def check() -> None:
 
 
 def stop() -> None:
-    """Stop as on a signal: somebody asked for it in another way.
+    """Stop as on a signal: a stop was requested in another way.
 
     Raises:
         KeyboardInterrupt: always.
@@ -78,10 +78,10 @@ def wait(seconds: float) -> None:
     """Wait for some time; a stop request raises here.
 
     Raises:
-        KeyboardInterrupt: somebody asked the program to stop.
+        KeyboardInterrupt: a stop was requested.
     """
     check()
-    # on an event of its own: a handler that sets the one that is waited on could wait for itself
+    # on a separate event: a handler that sets the one that is waited on could wait for itself
     threading.Event().wait(seconds)
     check()
 

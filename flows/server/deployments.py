@@ -51,7 +51,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     """Do the work of one served flow run.
 
     Args:
-        work: gets the service and Prefect's flow run; returns in words what it did.
+        work: gets the service and Prefect's flow run; returns as text what it did.
 
     Returns:
         The state in which the run ends.
@@ -83,7 +83,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
             state = Failed(message=_words(error))
             if not isinstance(error, _EXPECTED):
                 console.messages.print_exception(max_frames=8)
-    except Pause:  # Prefect's page: leave the rig, go on when resumed
+    except Pause:  # Prefect's page: leave the rig, continue when resumed
         run_records.suspended(here.folder, str(run.id))
         raise
     with suppress(OSError):
@@ -128,7 +128,7 @@ def when_free(
             if run_request.until is None and waited >= patience_s:
                 raise
             if run_request.until is not None and datetime.now().timestamp() >= run_request.until:
-                raise WindowOver(f"the window is over and nothing was taken: {busy}") from None
+                raise WindowOver(f"the window is over and no trial was taken: {busy}") from None
             if not waited:
                 _report_waiting(run, str(busy))
         stopping.wait(LOOK_S)
@@ -268,7 +268,7 @@ def _chain(wanted: Chain, here: Service, run: Any) -> str:
 
     try:
         taken = _collect(wanted, here, run)
-    except WindowOver as over:  # the arm rests; what it took until then can be looked at
+    except WindowOver as over:  # the arm rests; what it took until then can be inspected
         taken = str(over)
     names = ["label", "train", "evaluate"] if wanted.train else ["label", "evaluate"]
     return "; ".join([taken, *(_steps(here, [], name) for name in names)])

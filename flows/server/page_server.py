@@ -1,7 +1,7 @@
 """The Prefect server of a service: its page, its password, and what is done when it is lost.
 
-A service outlives its server. A server of our own that ended, or does not answer, is started anew
-at its port; once a server answers again, the runs that ended meanwhile are reported to it.
+A service outlives its server. A server of our own that ended, or does not answer, is restarted
+at its port; once a server answers again, the runs that ended in the meantime are reported to it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MISSES = 3
 
 
 class PageServer:
-    """A server of our own with its page, which can be started anew at the same port.
+    """A server of our own with its page, which can be restarted at the same port.
 
     Raises:
         ServerError: the port is taken.
@@ -67,7 +67,7 @@ async def watch(page: PageServer | None, store: Path, server: str, stopped: asyn
             return
         if await _answers():
             if lost:
-                console.say("Prefect's server answers again")
+                console.say("Prefect's server responds again")
                 with suppress(Exception):  # the next start does it again
                     await asyncio.to_thread(run_records.close_killed_runs, store, server)
             misses, lost = 0, False
@@ -120,7 +120,7 @@ def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
         settings = page.server.settings()
         os.environ.update({setting.name: value for setting, value in settings.items()})
         with temporary_settings(updates=settings):
-            console.say(f"the page's password is in {home / PASSWORD}, which you alone can read")
+            console.say(f"the page's password is in {home / PASSWORD}, readable only by you")
             yield page.server.url, page
     finally:
         for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING"):
@@ -130,7 +130,7 @@ def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
 
 
 def refuse_open(url: str) -> None:
-    """Check that a Prefect server asks for a password; one that does not answer is not looked at.
+    """Check that a Prefect server asks for a password; one that does not answer is ignored.
 
     Raises:
         InputError: it does not, and whoever reaches it can move the arm.
@@ -145,7 +145,7 @@ def refuse_open(url: str) -> None:
         return
     raise InputError(
         "PREFECT_API_URL", "", address,
-        "asks for no password, so that any web page in a browser that reaches it can move the arm; "
+        "has no password, so any web page in a browser that reaches it could move the arm; "
         "set PREFECT_SERVER_API_AUTH_STRING for the server and PREFECT_API_AUTH_STRING here",
     )  # fmt: skip
 

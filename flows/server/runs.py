@@ -1,11 +1,11 @@
 """The runs that Prefect's page asks for: one at a time on the rig, a word to the arm at once.
 
 The service looks for runs that are due. One that moves the arm, or needs all cores, is carried out
-in a process of its own (`python -m sliplab.flows.server.runs ID FLOW`) that ends with the service.
+in a separate process (`python -m sliplab.flows.server.runs ID FLOW`) that ends with the service.
 Pause, resume and stop are carried out in threads of the service: they must wait neither for a
 process to load nor behind the collection that they are meant for.
 
-A server that does not answer is asked again. What ended meanwhile is reported when it answers.
+An unresponsive server is polled again, and runs that ended in the meantime are reported then.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class ServedRuns:
         if (kept := run_records.end_of(self._store, run)) is not None:
             state: Any = State(type=StateType(kept["state"]), message=kept["message"])
         elif cancelled:
-            state = Cancelled(message="stopped before it had begun")
+            state = Cancelled(message="stopped before it started")
         else:
             state = Crashed(message=f"its process was killed ({self._process.returncode})")
         await client.set_flow_run_state(self._run.id, state, force=True)

@@ -35,7 +35,7 @@ def _zone(name: str) -> str:
     try:
         ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise ValueError("is no time zone; write one like Europe/Rome or UTC") from None
+        raise ValueError("is not a time zone; write one like Europe/Rome or UTC") from None
     return name
 
 
@@ -68,7 +68,7 @@ def window_end(due: datetime, until: str, zone: str) -> datetime:
     """
     found = _UNTIL.fullmatch(until)
     if found is None:
-        raise ValueError(f"{until!r} is no time")
+        raise ValueError(f"{until!r} is not a time")
     day, hour, minute = found.groups()
     wall = ZoneInfo(zone)
     first = due.astimezone(wall).replace(
@@ -95,14 +95,14 @@ class Parameters(StrictModel):
 class OnRig(Parameters):
     """Parameters of every deployment that moves the arm."""
 
-    operator: str = Field(default="", description="Who stands at the rig.")
+    operator: str = Field(default="", description="Operator at the rig.")
     temperature_c: float | None = Field(
-        default=None, ge=-50, le=100, description="Room, degrees Celsius."
+        default=None, ge=-50, le=100, description="Room temperature, degrees Celsius."
     )
     humidity_percent: float | None = Field(
         default=None, ge=0, le=100, description="Relative, percent."
     )
-    note: str = Field(default="", description="Anything worth keeping.")
+    note: str = Field(default="", description="A note to store with the session.")
     until: Until | None = Field(
         default=None,
         description='When the rig must be free again: "06:00" or "mon 06:00". No trial is begun '
@@ -123,9 +123,9 @@ class Collect(OnRig):
 
     protocol: Path = Field(description="A protocol file (.yaml) below the service's own folder.")
     trials: int | None = Field(
-        default=None, ge=1, le=1_000_000, description="Take so many of the missing, no more."
+        default=None, ge=1, le=1_000_000, description="Collect at most this many trials."
     )
-    enable: list[str] = Field(default=[], description="Optional levels to switch on: factor=level.")
+    enable: list[str] = Field(default=[], description="Optional levels to enable: factor=level.")
     campaign: str | None = Field(default=None, description="Its name; the protocol's by default.")
 
 
@@ -141,9 +141,9 @@ class Chain(Collect):
 class Study(OnRig):
     """The whole chain over the shipped protocols, to the report."""
 
-    pilot: bool = Field(default=False, description="The small protocols.")
+    pilot: bool = Field(default=False, description="Use the small pilot protocols.")
     extra: bool = Field(
-        default=True, description="Also the disturbance of 125 % that the paper left out."
+        default=True, description="Include the 125 % disturbance that the paper left out."
     )
 
 
@@ -167,10 +167,13 @@ class Evaluate(Step):
 class Ask(Parameters):
     """A word to the collection that runs."""
 
-    who: str = Field(default="", description="Who asks; kept with the request.")
-    why: str = Field(default="", description="The reason; kept with the request.")
+    who: str = Field(default="", description="Requester's name; stored with the request.")
+    why: str = Field(default="", description="The reason; stored with the request.")
     wait_s: float = Field(
-        default=600.0, ge=0, le=86400, description="How long to wait until it is carried out, s."
+        default=600.0,
+        ge=0,
+        le=86400,
+        description="Maximum wait until the request is carried out, s.",
     )
 
 
@@ -234,7 +237,7 @@ class Scheduled(StrictModel):
 
 
 class _File(StrictModel):
-    """The file before each schedule is looked at by its flow."""
+    """The file before each schedule is checked by its flow."""
 
     timezone: Zone
     schedules: list[dict[str, Any]]
@@ -258,7 +261,7 @@ def load_schedules(path: Path) -> list[Scheduled]:
             value = error.value and read.written.get(key, error.value)
             raise InputError(path, key, value, error.expected) from None
         if made[-1].name in {item.name for item in made[:-1]}:
-            raise InputError(path, f"{where}.name", made[-1].name, "stands twice")
+            raise InputError(path, f"{where}.name", made[-1].name, "is used twice")
     return made
 
 
@@ -267,7 +270,9 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     if not isinstance(flow, str) or flow not in _MODELS:
         raise InputError(path, "flow", flow, f"must be one of {', '.join(get_args(FlowName))}")
     if "timezone" in data:
-        raise InputError(path, "timezone", data["timezone"], "stands once, at the file's top")
+        raise InputError(
+            path, "timezone", data["timezone"], "applies to the whole file; give it once at the top"
+        )
     model: Any = validate(_MODELS[flow], data, path)
     try:
         cron = _cron(model, timezone)
@@ -291,7 +296,7 @@ def _cron(model: Any, timezone: str) -> str:
     """The cron line.
 
     Raises:
-        KeyedError: there is none, or two ways of saying it, or it is not one.
+        KeyedError: it does not exist, or two ways of saying it, or it is not one.
     """
     if model.cron is None:
         if model.days is None or model.from_ is None:
@@ -300,14 +305,14 @@ def _cron(model: Any, timezone: str) -> str:
         return cron_of(model.days, model.from_)
     for key, value in (("days", model.days), ("from", model.from_)):
         if value is not None:
-            raise KeyedError(key, value, "stands beside cron; give one of the two")
+            raise KeyedError(key, value, "cannot be combined with cron")
     from prefect.client.schemas.schedules import CronSchedule
 
     try:
         CronSchedule(cron=model.cron, timezone=timezone)
     except ValueError:
         raise KeyedError(
-            "cron", model.cron, 'is no cron line; one is like "0 22 * * mon-thu"'
+            "cron", model.cron, 'is not a cron line; write one like "0 22 * * mon-thu"'
         ) from None
     return str(model.cron)
 
@@ -316,13 +321,13 @@ def _protocol(path: Path, name: Path, enable: list[str]) -> str:
     """A protocol's path, found now: a night must not fail for a name.
 
     Raises:
-        InputError: there is none, or it or a level to be enabled is wrong.
+        InputError: it does not exist, or it or a level to be enabled is wrong.
     """
     from sliplab.protocols import load_plan
 
     found = (path.parent / name).resolve()
     if not found.is_file():
-        raise InputError(path, "protocol", str(name), f"is no file ({found})")
+        raise InputError(path, "protocol", str(name), f"no such file ({found})")
     try:
         load_plan(found, enable)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""`sliplab serve`: one program registers the deployments of one rig and runs what is asked for."""
+"""`sliplab serve`: one program registers the deployments of one rig and runs what is requested."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def serve(
     port: int = PORT,
     poll_s: float = 3.0,
 ) -> None:
-    """Register the deployments and run what is asked for, until SIGINT or SIGTERM.
+    """Register the deployments and run what is requested, until SIGINT or SIGTERM.
 
     Args:
         rig: a rig file's absolute path, or the name of one that ships.
@@ -104,7 +104,7 @@ async def _serve(
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments */{here.name}")
     console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
     await asyncio.wait([ending, carrying_out], return_when=asyncio.FIRST_COMPLETED)
-    console.say("ending: what runs stops, arm first")
+    console.say("stopping: the arm first, then all runs")
     stopped.set()
     for outcome in await asyncio.gather(carrying_out, watching, ending, return_exceptions=True):
         if isinstance(outcome, Exception):
@@ -197,6 +197,6 @@ async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
         for run in runs:
             if str(run.id) in alive:
                 continue
-            message = "the service that had taken it was killed; found at the next start"
+            message = "its service was killed; detected at the next start"
             await client.set_flow_run_state(run.id, Crashed(message=message), force=True)
             console.say(f"closed: {run.name}, whose service was killed")

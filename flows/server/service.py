@@ -51,10 +51,10 @@ class Service:
         """The protocol file that a run's parameter names.
 
         Whoever names it may see less than the service does: a file that is not below the service's
-        folders is not looked at, and nothing of one that is no protocol is quoted.
+        folders is ignored, and nothing of one that is not a protocol is quoted.
 
         Raises:
-            InputError: it is elsewhere, links followed, or is no protocol.
+            InputError: it is elsewhere, links followed, or is not a protocol.
         """
         found = (Path(self.protocols[0]) / given).resolve()
         roots = [Path(root) for root in self.protocols]
@@ -71,9 +71,7 @@ class Service:
         except InputError:
             known = False
         if not known:
-            raise InputError(
-                found, "", None, "is no protocol; `sliplab plan` says what is wrong with it"
-            )
+            raise InputError(found, "", None, "is not a valid protocol; `sliplab plan` shows why")
         return found
 
 
@@ -85,6 +83,6 @@ def service() -> Service:
     """
     text = os.environ.get(ENVIRONMENT)
     if text is None:
-        raise RuntimeError("this flow runs under `sliplab serve` only")
+        raise RuntimeError("this flow runs only under `sliplab serve`")
     given = json.loads(text)
     return Service(**{**given, "protocols": tuple(given["protocols"])})

@@ -151,7 +151,7 @@ class TrialList:
             StoreError: a campaign is damaged.
             InputError: a campaign that the store does not have.
         """
-        # looked at before the rows are made: what changes meanwhile is seen the next time
+        # looked at before the rows are made: what changes in the meantime is seen the next time
         folders, counts = self._look()
         if folders == self._folders:
             changed = [row for row in self.rows if row.decisions != _count(counts, row)]
@@ -177,7 +177,7 @@ class TrialList:
                 try:
                     rows.append(row_of(self.store, item, trial, len(rows)))
                 except StoreError:
-                    continue  # it was damaged or taken away meanwhile: `verify` names it
+                    continue  # it was damaged or taken away in the meantime: `verify` names it
         self.items, self.rows, self._folders = items, rows, folders
         return True
 
@@ -399,13 +399,13 @@ def record_verdict(
 
     Raises:
         LabelChanged: the label on the disk is another one by now, or out of date.
-        Overtaken: somebody decided meanwhile.
+        Overtaken: somebody decided in the meantime.
         ValueError: onsets that cannot be, or a rejection without a reason.
         OSError: it cannot be written.
     """
     now = trials.renew(shown.row)
     if now.label != "fresh" or now.key != shown.label_key:
-        raise LabelChanged("the label has changed meanwhile: look at it again")
+        raise LabelChanged("the label has changed in the meantime; review it again")
     new = {"adjust": lines, "reject": Onsets()}.get(verdict, shown.onsets)
     for kind, time in vars(new).items():
         if time is not None and not shown.span_s[0] <= time / 1e9 <= shown.span_s[1]:

@@ -104,7 +104,7 @@ class Page:
         self._mark()
         left = sum(item.state in {"open", "stale"} for item in self._rows)
         self._head()
-        self.see.count.text = f"{len(self._rows)} trials, {left} to decide"
+        self.see.count.text = f"{len(self._rows)} trials, {left} to review"
 
     def _head(self) -> None:
         if self.shown is not None:
@@ -264,11 +264,11 @@ class Page:
                 self.see.reason.value,
             )  # fmt: skip
         except (LabelChanged, review.Overtaken) as error:
-            self._say(f"Not kept: {error}. Look at it, then decide again.")
+            self._say(f"Not saved: {error}. Review it and decide again.")
             self._choose(self.trials.renew(shown.row))
             return
         except (ValueError, OSError, StoreError) as error:
-            self._say(f"Not kept: {error}")
+            self._say(f"Not saved: {error}")
             return
         shown.row = self.trials.renew(shown.row)
         self._say(f"{shown.row.trial}: {made}", good=True)

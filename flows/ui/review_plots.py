@@ -381,9 +381,9 @@ def _colour(shown: ShownTrial, index: int, marker: int) -> str:
 def _caption(shown: ShownTrial, index: int, lost: np.ndarray) -> str:
     text = f"frame {index} at {shown.frame_s[index]:.3f} s"
     if not shown.recording.has_video:
-        text += ", a sketch of the camera's own tracks: no picture was kept"
+        text += ", drawn from the camera's tracks: no video was stored"
     elif shown.xy_px is None:
-        text += "; this label keeps no tracks: `sliplab label` makes a newer one"
+        text += "; this label has no tracks: `sliplab label` computes a new one"
     if len(lost):
         text += f"; markers not seen: {', '.join(map(str, lost))}"
     return text

@@ -116,7 +116,7 @@ class Widgets:
         self.heading, self.lines, self.flags, self.past = _div(), _div(), _div(), _div()
         self.said, self.caption = _div(), _div()
         self.who = TextInput(title="reviewer", value=who, width=120)
-        self.reason = TextInput(title="reason (needed to reject)", value="", width=300)
+        self.reason = TextInput(title="reason (required to reject)", value="", width=300)
         self.go_on = Checkbox(label="then the next", active=True)
         self.pressed = TextInput(value="", visible=False)
         self.picked = TextInput(value="", visible=False)
@@ -182,7 +182,7 @@ def heading_html(shown: ShownTrial, position: str) -> str:
         badges.append("<span class='state simulated'>simulated</span>")
     reasons = [f"<li class='doubt'>{escape(text)}</li>" for text in row.reasons]
     if row.label != "fresh":
-        words = {"missing": "There is no label yet", "stale": "This label is out of date"}
+        words = {"missing": "No label yet", "stale": "This label is out of date"}
         reasons.insert(
             0, f"<li class='doubt'>{words[row.label]}: run `sliplab label`, then decide.</li>"
         )
@@ -194,7 +194,7 @@ def heading_html(shown: ShownTrial, position: str) -> str:
     if row.problem:
         reasons.insert(0, f"<li class='doubt'>{escape(row.problem)}</li>")
     if not reasons:
-        reasons = ["<li>no reason for doubt</li>"]
+        reasons = ["<li>no doubts</li>"]
     return (
         f"<h1>{escape(levels)} {' '.join(badges)}</h1>"
         f"<p class='id'>{escape(row.campaign)} / {escape(row.trial)} &middot; {position}</p>"
@@ -209,7 +209,7 @@ def lines_html(shown: ShownTrial, onsets: Onsets) -> str:
         now, was = getattr(onsets, f"{kind}_ns"), getattr(shown.onsets, f"{kind}_ns")
         far = "" if now is None or was is None else f"{(now - was) / 1e6:+.1f} ms"
         if was is None and now is not None and now == getattr(shown.suggested, f"{kind}_ns"):
-            far = "suggested by the markers that were seen"
+            far = "suggested from the visible markers"
         rows.append(
             f"<tr><th class='{kind}'>{kind}</th><td>{_seconds(was)}</td>"
             f"<td>{_seconds(now)}</td><td>{far}</td></tr>"

@@ -12,7 +12,7 @@ arm                        tool centre point as a transform; arm/path; arm/x, y,
 pulses/sync_box, events, arm
 displacement/marker_N      px
 onsets/NAME                0 before, 1 after the incipient, 2 after the gross onset, of the label,
-                           the review and (simulated) the truth; onset_log in words
+                           the review and (simulated) the truth; onset_log as text
 network/no_slip ...        spike counts of the evaluated network
 """
 
@@ -54,7 +54,7 @@ def find(store: Store, trial: str, campaign: str | None = None) -> Subject:
     """Find the committed trial of this id.
 
     Raises:
-        InputError: there is none, or several campaigns have it.
+        InputError: it does not exist, or several campaigns have it.
     """
     found = [
         Collected(item)
@@ -123,9 +123,7 @@ def show(subject: Subject) -> None:
     """
     rerun()
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise StoreError(
-            "there is no display here; --save FILE.rrd writes a file to open elsewhere"
-        )
+        raise StoreError("no display available; --save FILE.rrd writes a file to open elsewhere")
     with tempfile.TemporaryDirectory(prefix="sliplab-view-") as folder:
         path = Path(folder) / f"{subject.item.name}.rrd"
         save(subject, path)
@@ -145,7 +143,7 @@ passes the file to any program that listens on its usual port, maybe another use
 def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
     """Run Rerun's program while the block runs; nothing of it is left afterwards.
 
-    It has a session of its own, because it starts another program, which outlives it otherwise.
+    It has its own session, because it starts another program, which outlives it otherwise.
     """
     # what it prints is for people: standard output has nothing but the command's result
     process = subprocess.Popen(
@@ -183,7 +181,7 @@ def silent() -> Iterator[dict[str, str]]:
     """Yield an environment in which Rerun's viewer sends no usage data.
 
     Its only switch is a file among the user's settings. It is set in a folder of our own, so that
-    the user's choice stays as it is.
+    the user's choice stays unchanged.
 
     Raises:
         StoreError: the switch could not be set.

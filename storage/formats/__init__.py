@@ -1,1 +1,1 @@
-"""Files of others, read as data and never trusted; and ours, written as others read them."""
+"""Foreign file formats: untrusted import, and export for other programs."""

@@ -1,9 +1,9 @@
-"""AEDAT4 read and written: the files of iniVation's cameras and of dv-processing.
+"""Reader and writer of AEDAT4, the files of iniVation's cameras and of dv-processing.
 
 A file is a line, a header that describes its streams in XML, and packets: stream, length, and a
-flatbuffer, mostly compressed. It is read here and not through dv-processing, which is C++ that
-believes what a file says; and it is written here, because that library takes events one by one.
-Both directions are held against it by tests. Times are microseconds as the file has them.
+flatbuffer, mostly compressed. It is not read through dv-processing, C++ code that trusts the file's
+content, and not written through it, because that library accepts events one by one only.
+Tests compare both directions with it. Times are microseconds, unchanged from the file.
 """
 
 from __future__ import annotations
@@ -88,12 +88,14 @@ class Aedat4File:
         try:
             self._bytes = path.stat().st_size
             if (line := self._handle.read(len(LINE))) != LINE:
-                raise FormatError(f"is no AEDAT4 file: it begins with {line!r}, not with {LINE!r}")
+                raise FormatError(
+                    f"is not an AEDAT4 file: it starts with {line!r}, not with {LINE!r}"
+                )
             header = self._exactly(_length(self._exactly(4), _MOST_HEADER))
             table = Table.root(memoryview(_prefixed(header)), b"IOHE")
             self._codec = _CODECS.get(table.number(0, "<i"), "")
             if self._codec == "":
-                raise FormatError("is compressed in an unknown way")
+                raise FormatError("has an unknown compression")
             end = table.number(1, "<q", -1)
             self._begin = self._handle.tell()
             self._end = self._bytes if end <= 0 else end
@@ -137,7 +139,7 @@ class Aedat4File:
             last = _split_events(rows, new.x, new.y, new.p, new.t_us, last)
             if last < 0:
                 event_chunk(new.x, new.y, new.p, new.t_us)
-                raise FormatError("holds events whose times run backwards")
+                raise FormatError("contains events with decreasing times")
             filled += count
         if filled:
             yield _part(room, 0, filled)
@@ -151,7 +153,7 @@ class Aedat4File:
         ]
         times = np.array([t for t, _ in found], np.int64)
         if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
-            raise FormatError("holds triggers whose times run backwards or are none")
+            raise FormatError("contains triggers with decreasing or invalid times")
         return Triggers(times, np.array([kind for _, kind in found], np.uint8))
 
     def pictures(self, number: int) -> Iterator[Picture]:
@@ -169,7 +171,7 @@ class Aedat4File:
                     "are 8-bit frames with 1, 3 or 4 channels (kinds 0, 16 and 24)"
                 )
             if not last <= t_ns < LATEST_US * 1000:
-                raise FormatError("holds frames whose times run backwards or are none")
+                raise FormatError("contains frames with decreasing or invalid times")
             last = t_ns
             yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
 
@@ -189,7 +191,7 @@ class Aedat4File:
                 yield self._unpacked(self._exactly(size))
             except (pa.ArrowException, OSError) as error:
                 raise FormatError(
-                    f"holds a packet that cannot be unpacked, at byte {at}: {error}"
+                    f"contains a packet that cannot be decompressed, at byte {at}: {error}"
                 ) from None
 
     def _unpacked(self, data: bytes) -> memoryview:
@@ -204,7 +206,7 @@ class Aedat4File:
             while part := stream.readinto(memoryview(self._buffer)[filled:]):
                 filled += part
                 if filled > _MOST_PACKET:
-                    raise FormatError("holds a packet that unpacks to too much")
+                    raise FormatError("contains a packet that is too large when decompressed")
                 if filled == len(self._buffer):  # room for what comes, not for what a header says
                     self._buffer = self._buffer + bytearray(filled)
         return memoryview(self._buffer)[:filled]
@@ -297,7 +299,7 @@ def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
 
 def _streams(text: bytes) -> dict[int, Stream]:
     if b"<!" in text:
-        raise FormatError("has a header that defines words of its own")
+        raise FormatError("has a header with entity definitions")
     try:
         root = ElementTree.fromstring(text.rstrip(b"\0").decode("utf-8"))
         found = {}
@@ -381,7 +383,7 @@ def read_aedat4(path: Path, name: str) -> ForeignTrial:
     with Aedat4File(path) as file:
         events, triggers, frames = (file.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES))
         if events is None:
-            raise FormatError("holds no stream of events")
+            raise FormatError("contains no event stream")
         streams = file.streams
         found = None if triggers is None else file.triggers(triggers)
         frame_px = None

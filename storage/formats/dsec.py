@@ -1,8 +1,8 @@
 """HDF5 files with events: DSEC's layout, ours, and the lab's with seconds as floats.
 
-A foreign file's columns may be links out of it, larger than any disk, or packed by filters that are
-not here. `storage.trials.hdf5_reader` refuses the first; the second is held against the bytes of
-the file.
+A foreign file's columns may be links out of the file, claim more data than any disk holds, or use
+unavailable filters. `storage.trials.hdf5_reader` rejects links; sizes are checked against the bytes
+of the file.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
         _same_length(columns)
         offset = int(_integers(file.rows("t_offset").read())) if file.has("t_offset") else 0
         if not 0 <= offset < LATEST_US:
-            raise FormatError(f"t_offset = {offset}: is no time")
+            raise FormatError(f"t_offset = {offset}: is not a time")
         triggers = None
         if file.has("triggers/t"):
             kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
@@ -77,7 +77,7 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         columns = {key: rows(f"events/{key}") for key in ("xs", "ys", "ps", "ts")}
         _same_length(columns)
         if len(columns["ts"]) > _MOST_UNSORTED:
-            raise FormatError(f"holds {len(columns['ts'])} events, too many to sort")
+            raise FormatError(f"holds {len(columns['ts'])} events, too many events to sort")
         size = _resolution(file.integers("sensor_resolution"), columns["xs"], columns["ys"])
 
     def all_events() -> Iterator[EventChunk]:
@@ -86,7 +86,7 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         t_us = rounded_us(ts, 1e6)
         low = int(t_us.min()) if len(t_us) else 0
         if low < 0:
-            raise FormatError("holds an event before its own clock began")
+            raise FormatError("contains an event before its own clock started")
         order = np.argsort(t_us, kind="stable")
         polarity = np.asarray(ps) > 0  # the lab's are 0 and 1, or -1 and 1
         yield event_chunk(_pixels(xs)[order], _pixels(ys)[order], polarity[order], t_us[order])
@@ -128,7 +128,7 @@ def _end(column: Rows) -> int:
 
 
 def _same_length(columns: Mapping[str, Sized]) -> None:
-    """Refuse columns of which one is cut short: nobody knows which events it has lost."""
+    """Refuse columns of which one is truncated: nobody knows which events it has lost."""
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
         stated = ", ".join(f"{key} {count}" for key, count in lengths.items())
@@ -156,7 +156,7 @@ def write_dsec(
     offset = int(events.t_us[0]) if len(events) else 0
     times = events.t_us - offset
     if len(times) and int(times[-1]) >= 1 << 32:
-        raise ValueError("is longer than 71.6 min, which DSEC's 32-bit times cannot tell")
+        raise ValueError("is longer than 71.6 min, which DSEC's 32-bit times cannot represent")
     packing = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)
     with h5py.File(path, "w") as file:
         file.attrs["simulated"] = np.int64(simulated)
@@ -188,7 +188,7 @@ class _opened:
         try:
             self._file = RowFile(self._path)
         except _FAULTS as error:
-            raise FormatError(f"is no HDF5 file, or a damaged one: {error}") from None
+            raise FormatError(f"is not an HDF5 file, or is damaged: {error}") from None
         self._most = self._path.stat().st_size * _MOST_PACKED
         return self._file, self._rows
 
@@ -211,7 +211,7 @@ class _opened:
 def _integers(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind not in "iu" or (found.size and int(found.max()) >= 1 << 62):
-        raise FormatError("holds times that are no whole numbers")
+        raise FormatError("contains times that are not integers")
     return found.astype(np.int64)
 
 
@@ -219,13 +219,13 @@ def _rising(found: Triggers) -> None:
     t = found.t_us
     wrong = np.any(t < 0) or np.any(t >= LATEST_US) or np.any(t[1:] < t[:-1])
     if len(t) != len(found.kind) or wrong:
-        raise FormatError("holds triggers whose times run backwards or are none")
+        raise FormatError("contains triggers with decreasing or invalid times")
 
 
 def _pixels(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind == "f":
         if not np.isfinite(found).all() or np.any(found != np.rint(found)):
-            raise FormatError("holds places that are no pixels")
+            raise FormatError("contains coordinates that are not pixels")
         found = np.clip(found, -1, 1 << 20)
     return found.astype(np.int64)

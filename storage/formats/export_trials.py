@@ -95,7 +95,7 @@ def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
         streams[1] = Stream(FRAMES, "frames", (width, height), _source(recording))
     streams[2] = Stream(TRIGGERS, "triggers", None, _source(recording))
     if len(frame_us) and int(frame_us.min()) < 0:
-        raise ValueError("has frames before the event camera's clock began")
+        raise ValueError("has frames before the event camera's clock started")
     with Aedat4Writer(path, streams) as file:
         count = 0
         for chunk in _pieces(recording):

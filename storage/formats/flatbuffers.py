@@ -4,9 +4,9 @@ Each buffer has its length in front: `EVTS` is a vector of 16-byte structs, `TRI
 tables, `FRME` a table with pixels, `IOHE` a header with a description. Layouts were read off what
 dv-processing 2.0.4 writes (tests hold them against it); all numbers little-endian.
 
-A flatbuffer is full of distances to other places in it. A table begins with the distance back to a
-list of where its fields are; a field that is not in the list has its default value. The reader
-checks every place against the bytes.
+A flatbuffer consists of offsets into itself. A table begins with the offset back to its vtable, the
+list of its fields' positions; a field that is not in the list has its default value. The reader
+checks every offset against the buffer's size.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Table:
         at += _number(self._data, "<I", at)
         count = _number(self._data, "<I", at)
         if count * size > len(self._data) - at - 4:
-            raise FormatError(f"is damaged: {count} things in too few bytes")
+            raise FormatError(f"is damaged: {count} items in too few bytes")
         return count, self._data[at + 4 : at + 4 + count * size]
 
     def tables(self, field: int) -> list[Table]:
@@ -93,7 +93,7 @@ class Table:
 
 def _number(data: memoryview, form: str, at: int) -> int:
     if not 0 <= at <= len(data) - struct.calcsize(form):
-        raise FormatError("is damaged: a packet leads out of its own bytes")
+        raise FormatError("is damaged: an offset points outside its packet")
     found: Any = struct.unpack_from(form, data, at)[0]
     return int(found)
 

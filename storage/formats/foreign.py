@@ -1,4 +1,4 @@
-"""A foreign trial before it is in a store: its streams and what is known of it, checked."""
+"""A foreign trial before its import: its checked streams and known properties."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14
 LATEST_US = 1 << 53
-"""285 years; what comes later is no time, and would not fit 64 bits of nanoseconds."""
+"""285 years; what comes later is not a time, and would not fit 64 bits of nanoseconds."""
 
 
 class FormatError(ValueError):
@@ -30,7 +30,7 @@ class FormatError(ValueError):
     """
 
     def __init__(self, message: str, file: Path | None = None) -> None:
-        """Make one whose `message` goes on after the file's name, such as "is cut short"."""
+        """Make one whose `message` continues after the file's name, such as "is truncated"."""
         self.file = file
         super().__init__(message)
 
@@ -63,9 +63,9 @@ class ForeignTrial:
 
     Attributes:
         name: its id in the store.
-        events: its events in order of time; read anew by each call.
+        events: its events in order of time; read again by each call.
         event_px: columns and rows of its camera, None if unknown; called once `events` were read.
-        epoch: what the times count from, in words.
+        epoch: what the times count from, as text.
         about: further properties in the file, to be kept in the record.
         unknown: names of what nobody knows of it any more.
     """
@@ -89,13 +89,13 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
     """Check columns of a foreign file and return them as a chunk.
 
     Raises:
-        FormatError: they differ in length, a pixel or time is none, or times run backwards.
+        FormatError: they differ in length, a pixel or time is none, or times decrease.
     """
     columns = [np.asarray(column) for column in (x, y, p, t_us)]
     if any(c.ndim != 1 or len(c) != len(columns[3]) for c in columns):
-        raise FormatError("holds columns of events that differ in length")
+        raise FormatError("contains event columns of different lengths")
     if any(c.dtype.kind not in "iub" for c in columns):
-        raise FormatError("holds events that are no integers")
+        raise FormatError("contains event values that are not integers")
     times = np.ascontiguousarray(columns[3], np.int64)
     ends = times[[0, -1]] if len(times) else times
     limits = (("column", MOST_PX), ("row", MOST_PX), ("polarity", 2), ("time", LATEST_US))
@@ -106,7 +106,7 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
         if negative or int(column.max()) >= most:
             raise FormatError(f"holds an event whose {what} is {column.min()} or {column.max()}")
     if np.any(times[1:] < times[:-1]):
-        raise FormatError("holds events whose times run backwards")
+        raise FormatError("contains events with decreasing times")
     return EventChunk(
         np.ascontiguousarray(columns[0], np.uint16),
         np.ascontiguousarray(columns[1], np.uint16),
@@ -122,10 +122,10 @@ def rounded_us(times: Any, per_unit: float) -> I64:
         per_unit: microseconds of one unit.
 
     Raises:
-        FormatError: one is no number, or beyond any time.
+        FormatError: one is not a number, or beyond any time.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what is beyond any number is found below
         found = np.asarray(times, np.float64) * per_unit
     if len(found) and not (np.isfinite(found).all() and float(np.abs(found).max()) < LATEST_US):
-        raise FormatError("holds a time that is no number, or beyond any time")
+        raise FormatError("contains a time that is not a number or is out of range")
     return np.rint(found).astype(np.int64)

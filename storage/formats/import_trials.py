@@ -1,11 +1,11 @@
-"""Import of foreign trials into a campaign of their own: each one complete or not at all.
+"""Import of foreign trials into a new campaign: each one complete or not at all.
 
-Formats are recognised by how a file begins. Where that says nothing the name's ending does, so that
-a damaged file is refused instead of left out.
+Formats are recognised by a file's first bytes, and otherwise by its extension, so that
+a damaged file is rejected instead of skipped.
 
-A trial is committed by the store's own rename after all of it was read and found right. What nobody
-knows of it (clocks against one another, poses, conditions) is said to be unknown and not made up:
-its time line is the event camera's own clock.
+A trial is committed by the store's own rename after all of it was read and checked. Unknown
+properties (relations of clocks, poses, conditions) are marked as unknown and never invented:
+the time line is the event camera's own clock.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def import_trials(
     campaign = store.campaign(name)
     fresh = not campaign.begun
     if not fresh and IMPORTED not in campaign.info:
-        raise InputError("--name", "", name, "is a campaign that was collected; give another name")
+        raise InputError("--name", "", name, "is a collected campaign; choose another name")
     existing = campaign.committed()
     imported: list[str] = []
     skipped: list[str] = []
@@ -164,7 +164,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
         if not len(chunk):
             continue
         if last_us is not None and int(chunk.t_us[0]) < last_us:
-            raise FormatError("holds events whose times run backwards")
+            raise FormatError("contains events with decreasing times")
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
         steps = np.diff(chunk.t_us, prepend=first_us if last_us is None else last_us)
         widest = int(steps.argmax())
@@ -174,7 +174,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
         _check_pixels(chunk, trial.event_px())
         writer.add_events(chunk)
     if first_us is None or last_us is None:
-        raise FormatError("holds no events, so there is nothing to import; leave it out")
+        raise FormatError("contains no events; nothing to import")
     if trial.triggers is not None:
         t_ns = trial.triggers.t_us * 1000
         writer.add_triggers(t_ns, trial.triggers.kind)
@@ -205,7 +205,7 @@ def _gap_warnings(gap_us: int, end_us: int) -> list[str]:
         return []
     return [
         f"{gap_us / 3.6e9:,.1f} hours without an event between {end_us - gap_us} and {end_us} us: "
-        "the camera's clock was set there, or the times on one side are wrong; kept as they are"
+        "the camera's clock was set there, or the times on one side are wrong; imported unchanged"
     ]
 
 
@@ -272,7 +272,7 @@ def kind_of(path: Path) -> str:
     what = f"holds files of several formats ({', '.join(sorted(map(str, found)))})"
     raise InputError(
         path, "", None,
-        f"{what if found else 'holds no file of a known format'}; name one of {', '.join(KINDS)}",
+        f"{what if found else 'contains no known file format'}; name one of {', '.join(KINDS)}",
     )  # fmt: skip
 
 
@@ -280,7 +280,7 @@ def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
     """Yield the trials of a file or folder, in the order of their names.
 
     Raises:
-        InputError: there is none, or a file is damaged.
+        InputError: it does not exist, or a file is damaged.
     """
     files = _files(path)
     if kind == LAB_PICKLES:
@@ -296,7 +296,7 @@ def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
         for item in manifest["trials"]:
             file = path / item["file"]
             if file.is_symlink() or not file.is_file():
-                raise InputError(file, "", None, "is missing, or no plain file")
+                raise InputError(file, "", None, "is missing or not a regular file")
             yield _as_exported(_read(reader, file, item["trial"]), item, manifest["simulated"])
         return
     wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
@@ -362,7 +362,7 @@ def _kind(file: Path) -> str | None:
 
 
 def _read_manifest(folder: Path) -> Json | None:
-    """Read and check the manifest of an exported campaign; None where there is none.
+    """Read and check the manifest of an exported campaign; None if there is none.
 
     Raises:
         InputError: it is damaged, or names a file outside of its folder.
@@ -391,7 +391,7 @@ def _read_manifest(folder: Path) -> Json | None:
 def _check_exported(item: Json, path: Path) -> None:
     texts = item["condition"]
     if not isinstance(texts, dict) or not all(isinstance(t, str) for t in texts.values()):
-        raise ValueError(f"{path}: a condition that is no text")
+        raise ValueError(f"{path}: a condition that is not text")
     for name in ("events", "frames", "triggers", "repetition"):
         if type(item[name]) is not int:
             raise ValueError(f"{path}: {name} must be an integer")

@@ -1,7 +1,7 @@
 """The lab's pickles: a list of times in ms for every pixel, one file for ON and one for OFF.
 
-They are called ``d3_s0.5_dir_back_r0_events_on``: depth, speed, direction, repetition. What units
-the first two have is not in the files. Most have no extension; ``.pickle``, ``.pkl`` and ``.npy``
+File names such as ``d3_s0.5_dir_back_r0_events_on`` give depth, speed, direction and repetition;
+the units of the first two are unknown. Most have no extension; ``.pickle``, ``.pkl`` and ``.npy``
 (numpy's header before the pickle) hold the same, and some names lack ``_events``.
 """
 
@@ -152,13 +152,15 @@ def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, 
         raise FormatError(f"holds {counts.sum()} times, more than its bytes can tell")
     times = [time for cell in cells for time in cell]
     if not {int, float}.issuperset(map(type, times)):
-        raise FormatError(f"holds times that are no numbers; {_RIGHT}")
+        raise FormatError(f"contains times that are not numbers; {_RIGHT}")
     try:
         t_us = rounded_us(times, 1000.0)
     except OverflowError:
-        raise FormatError("holds a time beyond any time") from None
+        raise FormatError("contains a time out of range") from None
     if len(t_us) and int(t_us.min()) < 0:
-        raise FormatError(f"holds an event at {t_us.min() / 1000:g} ms, before its own clock began")
+        raise FormatError(
+            f"holds an event at {t_us.min() / 1000:g} ms, before its own clock started"
+        )
     place = np.repeat(np.arange(len(cells)), counts)
     shape = (int(found.shape[0]), int(found.shape[1]))
     return shape, place % shape[1], place // shape[1], np.full(len(t_us), polarity), t_us
@@ -169,7 +171,7 @@ def _is_camera(shape: tuple[int, ...]) -> bool:
 
 
 def _as_array(found: Any) -> Any:
-    """Lists of lists of lists, as the array that they stand for."""
+    """Lists of lists of lists, as the array that they represent."""
     rows = found if type(found) in {list, tuple} else []
     width = len(rows[0]) if rows and type(rows[0]) in {list, tuple} else -1
     if any(type(row) not in {list, tuple} or len(row) != width for row in rows) or width < 0:
@@ -195,9 +197,7 @@ def _from_numpy(data: bytes, path: Path) -> Any:
     if dtype.kind == "O":
         found = parse_pickle(data[at:], path, at)
         if not isinstance(found, np.ndarray) or found.shape != shape:
-            raise FormatError(
-                f"holds something else than the array {shape} in its header; {_RIGHT}"
-            )
+            raise FormatError(f"contains data other than the array {shape} in its header; {_RIGHT}")
         return found
     # lists of one length: numpy makes them an array of numbers
     if dtype.kind not in "iuf" or len(shape) != 3 or not _is_camera(shape[:2]):
@@ -205,7 +205,7 @@ def _from_numpy(data: bytes, path: Path) -> Any:
     if math.prod(shape) > _MOST_EVEN:
         raise FormatError(f"holds {math.prod(shape)} times, as many in every pixel; {_RIGHT}")
     if math.prod(shape) * dtype.itemsize != len(data) - at:
-        raise FormatError(f"is cut short: {len(data) - at} bytes for an array of shape {shape}")
+        raise FormatError(f"is truncated: {len(data) - at} bytes for an array of shape {shape}")
     numbers = np.frombuffer(data, dtype, offset=at).reshape(shape, order="F" if fortran else "C")
     cells = np.empty(shape[:2], object)
     for index in np.ndindex(shape[:2]):

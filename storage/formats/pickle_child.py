@@ -1,8 +1,8 @@
 """Child process that reads one foreign pickle with Python's `Unpickler`, names restricted.
 
 `storage.formats.pickles` runs it as a script: the pickle comes on standard input, the value or the
-fault goes to standard output. It limits its own memory and processor time first, so that a length
-or a memo's index in the file can ask for anything. It imports the standard library only and starts
+fault goes to standard output. It limits its own memory and processor time first, so that no length
+or memo index in the file can exhaust the machine. It imports the standard library only and starts
 in about 20 ms; arrays stay bytes with a type here, and become numpy's in the parent.
 """
 
@@ -44,7 +44,7 @@ def array(*arguments: Any) -> Any:
 
 
 class Name:
-    """Stand-in for a name that a pickle may call. It is no class and takes no state."""
+    """Stand-in for a name that a pickle may call. It is not a class and takes no state."""
 
     __slots__ = ("_make",)
 
@@ -189,7 +189,7 @@ _NAMES = {
         )
     },
 }
-"""All that a pickle may name, and the stand-ins that it gets. Nothing is imported."""
+"""All that a pickle may name, and the placeholders that it gets. Nothing is imported."""
 
 
 class _Restricted(pickle.Unpickler):
@@ -215,7 +215,7 @@ def read(file: io.BytesIO) -> Any:
 
 
 def check(found: Any) -> None:
-    """Refuse cycles, depth and everything that is no value, level by level."""
+    """Refuse cycles, depth and everything that is not a value, level by level."""
     level: dict[int, Any] = {0: [found]}
     count = 0
     for _ in range(MAX_DEPTH + 1):

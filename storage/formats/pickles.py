@@ -1,8 +1,8 @@
-"""Pickles of foreign origin read as data: no import, no call of what they name.
+"""Safe reading of foreign pickles: nothing that they name is imported or called.
 
-A pickle is a program. Python's own `Unpickler` carries it out with the names restricted to
-stand-ins, and because it still allocates what a length says, and hashes any key, it does so in a
-child process of limited memory and time (`pickle_child`).
+A pickle is a program. Python's own `Unpickler` executes it with the names restricted to
+placeholders. Since it still allocates any requested length and hashes any key, it runs in a
+child process with limited memory and time (`pickle_child`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Prophesee's raw and dat files and `.es`, through faery, where it is installed.
+"""Reader of Prophesee's raw and dat files and of `.es`, through faery if it is installed.
 
-`pip install faery`. It is no dependency: nothing else here needs it.
+`pip install faery`. It is not a dependency of the project.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def read_by_faery(path: Path, name: str) -> ForeignTrial:
             path,
             "",
             None,
-            "is read by the library faery, which is not installed: pip install faery",
+            "needs the library faery, which is not installed: pip install faery",
         )
     form = faery_type(read_head(path))
     if form is None:
@@ -92,6 +92,6 @@ def _guarded(step: Callable[[], T], size: tuple[int, int] | None, count: int) ->
         if "overflow" in text and size is not None:
             text += f": an event outside of the {size[0]} x {size[1]} pixels in its header"
         raise FormatError(
-            "is damaged, cut short or of another format than its header says: after "
+            "is damaged, truncated or not of the format in its header: after "
             f"{count:,} events faery stops with: {text}"
         ) from None

@@ -61,7 +61,7 @@ class Manifest:
     Attributes:
         name: the folder's; empty for a description.
         files: checksums by path below the folder.
-        take: hash of the checksums of raw data and record; empty where there are none.
+        take: hash of the checksums of raw data and record; empty if there are none.
     """
 
     kind: Kind
@@ -108,16 +108,16 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
         said = found.pop("sum")
         sealed = said == hash_data(found)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise RemoteError(f"{where}: is no manifest, or only part of one") from None
+        raise RemoteError(f"{where}: is not a manifest, or is incomplete") from None
     if isinstance(found.get("format"), int) and found["format"] > FORMAT:
         raise RemoteError(
             f"{where}: format = {found['format']}: was pushed by a newer version of SlipLab; "
             f"this one reads formats up to {FORMAT}: update it"
         )
     if not sealed:
-        raise RemoteError(f"{where}: is damaged: its contents do not match its sum")
+        raise RemoteError(f"{where}: is damaged: its contents do not match its checksum")
     if (found.get("kind"), found.get("campaign"), found.get("name")) != (kind, campaign, name):
-        raise RemoteError(f"{where}: is of something else")
+        raise RemoteError(f"{where}: belongs to another trial or campaign")
     files, take = found.get("files"), found.get("take")
     if not isinstance(files, dict) or not isinstance(take, str) or len(files) > _MOST_FILES:
         raise RemoteError(f"{where}: lists no files")
@@ -137,7 +137,7 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
 def read_manifests(
     remote: Remote, campaign: str, kind: Kind, only: str = ""
 ) -> dict[str, Manifest | RemoteError]:
-    """Read every manifest of a kind, by its name; an error stands for a bad one.
+    """Read every manifest of a kind, by its name; an error represents a bad one.
 
     Args:
         only: the one of this name.
@@ -191,7 +191,7 @@ def trial_manifest(campaign: Campaign, trial_id: str) -> Manifest:
 
     Raises:
         ValueError: its checksums are missing or damaged.
-        OSError: it went away meanwhile.
+        OSError: it disappeared in the meantime.
     """
     folder = campaign.folder / "trials" / safe_name(trial_id)
     files = read_sums(folder) | _measured(folder, (CHECKSUMS, PROVENANCE))
@@ -240,5 +240,5 @@ def check_against_sums(manifest: Manifest, sums: Any, where: str) -> None:
 def _measured(folder: Path, names: Sequence[str]) -> Checksums:
     for name in names:
         if (folder / name).is_symlink():
-            raise StoreError(f"{folder / name}: is a link, which is not pushed")
+            raise StoreError(f"{folder / name}: is a link, links are not pushed")
     return {name: Checksum.of(folder / name) for name in names}

@@ -1,9 +1,9 @@
-"""A pushed store opened by its URL: a store in a cache folder whose big files come when read.
+"""Mirror of a pushed store: a store in a cache folder whose large files are downloaded on demand.
 
 Records, checksums and protocols of all visible trials are downloaded at once, events and videos of
-a trial when something reads them first, each held against its checksum. So whatever works on a
-store works on a URL, and a machine that labels a tenth of the trials fetches that tenth. Analysis
-writes into the cache folder as into any store. It may be deleted at any time.
+a trial on first access, each verified by its checksum. So every command for a store works on a URL,
+and a machine that labels a tenth of the trials downloads only that tenth. Analysis writes into the
+cache folder as into any store. The folder may be deleted at any time.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Objects on shared or object storage, reached through fsspec: ``s3://``, ``file://`` and others.
 
-Objects are written complete, read back and listed here; their meaning is in
-`storage.remote.manifest`. Address and keys of a server stand in the environment or in fsspec's own
-configuration (docs/scale.md), never in a URL and never in a store. Requests that fail are repeated
-by the library that makes them, by its own settings.
+This module writes, reads back and lists objects; `storage.remote.manifest` defines their meaning.
+Address and keys of a server are in the environment or in fsspec's own
+configuration (docs/scale.md), never in a URL and never in a store. Failed requests are retried
+by the underlying library, by its own settings.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def check_url(url: str) -> str:
     """Return `url` without a slash at its end.
 
     Raises:
-        InputError: it is no URL, is of a kind that chains others, or carries a secret.
+        InputError: it is not a URL, is of a kind that chains others, or carries a secret.
     """
     if not is_url(url):
         raise InputError("URL", "", url, "must be a URL such as s3://bucket/folder")
@@ -69,11 +69,11 @@ def check_url(url: str) -> str:
     if parts.username or parts.password or parts.query or parts.fragment:
         shown = f"{parts.scheme}://.../{parts.path.lstrip('/')}"
         raise InputError(
-            "URL", "", shown, "must not carry keys, passwords or options: put them into the "
+            "URL", "", shown, "must not contain keys, passwords or options: put them into the "
             "environment or fsspec's configuration",
         )  # fmt: skip
     if "::" in url or ".." in parts.path.split("/"):
-        raise InputError("URL", "", url, "must name one place, without '::' and '..'")
+        raise InputError("URL", "", url, "must name one location, without '::' and '..'")
     return url.rstrip("/")
 
 
@@ -90,7 +90,7 @@ class Remote:
 
         self.url = check_url(url)
         try:
-            # what another program put there meanwhile must be seen
+            # what another program put there in the meantime must be seen
             self._fs, root = fsspec.url_to_fs(
                 self.url, use_listings_cache=False, skip_instance_cache=True
             )
@@ -114,15 +114,15 @@ class Remote:
         """Make an empty place one of ours.
 
         Raises:
-            RemoteError: it holds other things, or is of a newer version.
+            RemoteError: it contains other files, or is of a newer version.
         """
         try:
             self.check()
         except RemoteMissing:
             if self._list(""):
                 raise RemoteError(
-                    f"{self.url}: holds other things; give an empty place, or one that "
-                    "`sliplab push` made"
+                    f"{self.url}: contains other files; give an empty location or one "
+                    "created by `sliplab push`"
                 ) from None
             self.put(LAYOUT_FILE, json_text({"layout": LAYOUT}).encode())
 
@@ -136,7 +136,7 @@ class Remote:
         try:
             data = self.read(LAYOUT_FILE)
         except RemoteMissing:
-            why = f"holds no pushed store (no {LAYOUT_FILE}); `sliplab push` makes one"
+            why = f"does not contain a pushed store (no {LAYOUT_FILE}); `sliplab push` creates one"
             raise NoPushedStore(self.url, why) from None
         try:
             layout = json.loads(data)["layout"]
@@ -185,7 +185,7 @@ class Remote:
         return data
 
     def read_many(self, keys: Sequence[str]) -> dict[str, bytes | RemoteError]:
-        """Read small objects, side by side where the storage can; an error stands for a bad one."""
+        """Read small objects, side by side where the storage can; an error represents a bad one."""
         if not keys:
             return {}
         paths = {self._path(key): key for key in keys}
@@ -298,8 +298,8 @@ class Remote:
         except Exception as error:  # each storage has its own kinds
             what = self._without_secrets(" ".join(str(error).split()) or type(error).__name__)
             raise RemoteError(
-                f"{self.where(key)}: cannot be {done}: {what[:_ANSWER_CHARACTERS]}; see to that, "
-                "then run the same command to go on"
+                f"{self.where(key)}: cannot be {done}: {what[:_ANSWER_CHARACTERS]}; fix this, "
+                "then run the same command to resume"
             ) from None
 
     def _without_secrets(self, text: str) -> str:

@@ -1,6 +1,6 @@
-"""Pull of pushed campaigns: files are checked while they arrive, trials appear by one rename.
+"""Download of pushed campaigns: files are verified on arrival, trials appear by one rename.
 
-What comes from elsewhere writes nothing but files of known names inside the store's own folders.
+Remote content can only write files of known names inside the store's own folders.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def pull(
     """Download what the store in `folder` lacks; it is made if there is none.
 
     A store that was pulled from here before follows: its descriptions are updated, and
-    trials that were taken again, or withdrawn, go to quarantine. In any other store nothing that
+    trials that were retaken, or withdrawn, go to quarantine. In any other store nothing that
     exists is changed.
 
     Args:
@@ -219,7 +219,7 @@ class _Pull:
                 return
             if cause is None and not self.follows:
                 raise _Differs(
-                    f"{target}: is another take than that at {self.remote.url}; pull into "
+                    f"{target}: is another attempt than that at {self.remote.url}; pull into "
                     "another store"
                 )
             reason = f"damaged: {cause}" if cause else f"replaced: another is at {self.remote.url}"
@@ -277,7 +277,7 @@ def download(
     """Download a manifest's folder: all files into `staging`, each checked, then one rename.
 
     Files that an interrupted download left in `staging` are used. If another process made
-    `target` meanwhile, that one stays.
+    `target` in the meantime, that one stays.
 
     Args:
         on_file: called with the bytes of each file that was fetched.

@@ -1,7 +1,8 @@
-"""Push of committed trials to shared or object storage: each is visible there complete or not.
+"""Upload of committed trials to shared or object storage: each appears complete or not at all.
 
-Files go first, each read back and held against its checksum; the trial's manifest goes last. Only
-committed trials are read, so a campaign may run meanwhile. What exists there is not sent again.
+Files are sent first, each read back and checked against its checksum, and the trial's manifest
+last. Only committed trials are read, so a campaign may run in the meantime. Files that exist at the
+URL are not sent again.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class PushResult:
 
     Attributes:
         trials: committed ones; pushed and replaced: of these, sent now, for the first time or
-            because they were taken again; there: they had been sent before.
+            because they were retaken; there: they had been sent before.
         withdrawn: no longer visible, because a person wants them again; set_aside: sent of
             quarantine; files and bytes: sent.
         problems: what was not sent, and why.
@@ -168,8 +169,8 @@ class _Push:
         foreign = existing is not None and existing.take not in {made.take, *self._takes(trial, "")}
         if foreign and not self.options.replace:
             self._problem(
-                f"{trial}: another take of it is there that is not of this store; push to another "
-                "place, or replace it with --replace"
+                f"{trial}: an attempt pushed from another store is there; push to another "
+                "location, or replace it with --replace"
             )
         elif self._send(made, folder, existing):
             if existing is None:
@@ -215,7 +216,7 @@ class _Push:
                 self.remote.put(key, path)
             except RemoteError:
                 if not path.exists():
-                    return "went away meanwhile"
+                    return "disappeared in the meantime"
                 raise
             if self.on_bytes is not None:
                 self.on_bytes(size)
@@ -223,7 +224,7 @@ class _Push:
                 break
         else:
             raise RemoteError(
-                f"{self.remote.where(key)}: came back with other bytes than were sent; see to "
+                f"{self.remote.where(key)}: reads back different from what was sent; see to "
                 "the storage, then run the same command to go on"
             )
         self.sizes[sha] = size
@@ -241,7 +242,7 @@ class _Push:
             return False
 
     def _manifests(self, kind: Kind) -> dict[str, Manifest]:
-        """Read the visible manifests; one that cannot be read is sent anew."""
+        """Read the visible manifests; one that cannot be read is sent again."""
         found = read_manifests(self.remote, self.campaign.name, kind)
         good = {name: item for name, item in found.items() if isinstance(item, Manifest)}
         if not self.options.check:
@@ -251,7 +252,7 @@ class _Push:
     def _check_same_campaign(self) -> None:
         """
         Raises:
-            _Conflict: the place has another campaign of this name.
+            _Conflict: the remote store has another campaign of this name.
         """
         theirs = read_manifests(self.remote, self.campaign.name, "about").get("")
         if not isinstance(theirs, Manifest):
@@ -260,11 +261,11 @@ class _Push:
             info = json.loads(self.remote.read(theirs.object_key(INFO)))
             differ = [name for name in _SAME if self.campaign.info.get(name) != info.get(name)]
         except (RemoteMissing, ValueError, AttributeError):
-            return  # it is sent anew
+            return  # it is sent again
         if differ:
             raise _Conflict(
                 f"another campaign of this name is there: it differs in {', '.join(differ)}; "
-                "push to another place"
+                "push to another location"
             )
 
     def _takes(self, trial: str, cause: str) -> set[str]:

@@ -1,4 +1,4 @@
-"""Check that everything that was pushed is as it was: all of it is read, nothing is changed."""
+"""Verification of a pushed store: everything is read and checked, nothing is changed."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The documents that a store holds, as models: one file each."""
+"""Models of the documents in a store, one module per document."""

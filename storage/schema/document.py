@@ -1,9 +1,9 @@
-"""Base of the documents in a store: frozen models that keep what they do not know.
+"""Base of the documents in a store: frozen models that preserve unknown keys.
 
-A document is written by one version of the program and read by others. A reader checks the keys
-that it knows, once, and keeps the rest as it is. A key that an older version did not write has a
-default. Only the keys that were given are written, so a document that is read and written again is
-the same to the byte.
+A document is written by one version of the program and read by others. A reader validates the keys
+that it knows and preserves the rest. A key that an older version did not write has a
+default. Only the given keys are written, so reading and writing a document reproduces it byte for
+byte.
 """
 
 from __future__ import annotations

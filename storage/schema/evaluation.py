@@ -23,7 +23,7 @@ class Share(Part):
 
     share: Number | None
     low: Number | None
-    """Lower end of the interval; null where there is none."""
+    """Lower end of the interval; null if there is none."""
     high: Number | None
     n: Int
     """Windows."""
@@ -49,7 +49,7 @@ class LeadShare(Share):
 
 
 class Accuracy(Part):
-    """Three accuracies over the same samples; null where there are no samples."""
+    """Three accuracies over the same samples; null if there are no samples."""
 
     argmax: Number | None
     """A sample whose class ties for the maximum with k-1 others counts 1/k, so a silent network
@@ -186,7 +186,7 @@ class TrainedBaseline(Baseline):
     """A trained method that the network is compared with."""
 
     made: dict[str, Any]
-    """Description of the fit, in words and numbers."""
+    """Description of the fit, as text and numbers."""
 
 
 class SampleCounts(Part):
@@ -432,7 +432,7 @@ class DetectorRate(Part):
     allowed: Int
     """The same in trials."""
     choice: Int
-    """Chosen smoothing, windows; 0 where there is nothing to choose."""
+    """Chosen smoothing, windows; 0 if there is nothing to choose."""
     levels: DetectorLevels
     validation: DetectorTrials
     test: DetectorTrials
@@ -507,7 +507,7 @@ class OtherEvaluation(Document):
     data_key: str | None = None
     """Of the test trials and their labels alone."""
     title: str
-    """The network in words."""
+    """The network as text."""
     engine: str
     """Engine that counted its spikes: `fast` or `sinabs`."""
     exact: Bool
@@ -526,7 +526,7 @@ class BaselineResult(Document):
     key: str = ""
     argmax: Number | None
     made: dict[str, Any]
-    """Description of the fit, in words and numbers."""
+    """Description of the fit, as text and numbers."""
 
 
 class LabelCheck(Document):

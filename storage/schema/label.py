@@ -1,4 +1,4 @@
-"""The label of a trial: its onsets by both rules, why one is in doubt, and how well it was seen.
+"""The label of a trial: its onsets by both rules, reasons for doubt, and tracking quality.
 
 Times are integer nanoseconds on the trial's time line. The arrays next to it hold the markers'
 places and displacements.
@@ -19,7 +19,7 @@ RULES: tuple[Rule, ...] = ("paper", "change_point")
 
 
 class OnsetDoubts(Part):
-    """Reason why an onset is ambiguous although a rule gives one, in words; null where known."""
+    """Reason why an onset is ambiguous although a rule gives one, as text; null where known."""
 
     incipient: str | None = None
     gross: str | None = None
@@ -87,7 +87,7 @@ class TrialLabel(RuleOnsets, Document):
     camera_moved_px: Number | None = None
     """Largest shift of the camera."""
     flags: tuple[str, ...] = ()
-    """Warnings that a reviewer should check first, in words."""
+    """Warnings that a reviewer should check first, as text."""
     quality: tuple[Number, ...] = ()
     """Each marker's lowest quality from the motion's start to its slip, 0 to 1."""
     source: str | None = None

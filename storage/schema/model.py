@@ -13,7 +13,7 @@ class ModelSamples(Part):
 
 
 class ValidationAccuracy(Part):
-    """Accuracies on validation windows at the chosen epoch; null where there are none."""
+    """Accuracies on validation windows at the chosen epoch; null if there are none."""
 
     argmax: Number | None
     strict: Number | None

@@ -1,7 +1,7 @@
 """The record of a trial, its provenance, and its clocks where they were fitted again.
 
 The record holds all that follows from protocol, seed and versions, and is under the trial's
-checksums. Who, when and where stand in the provenance, outside of them.
+checksums. Who, when and where are in the provenance, outside of them.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Gate(Part):
 
     passed: Bool
     value: Number | str | None
-    """The figure, negative where it is unknown; or why there is none, in words."""
+    """The figure, negative where it is unknown; or why there is none, as text."""
     limit: Number | None = None
     grade: str | None = None
     """Of a clock's gate: how the device is timed."""
@@ -101,7 +101,7 @@ class Step(Part):
     start_ns: Int
     end_ns: Int
     recorded: Bool = True
-    """The streams were recorded meanwhile."""
+    """The streams were recorded in the meantime."""
 
 
 class DeviceRecord(Part):
@@ -210,7 +210,7 @@ class Imported(Part):
     source: str = Field(alias="from")
     """Name of the file."""
     epoch: str | None = None
-    """The zero of its times, in words."""
+    """The zero of its times, as text."""
     unknown: tuple[str, ...] = ()
     """Facts about the trial that are no longer known."""
     warnings: tuple[str, ...] = ()

@@ -1,1 +1,1 @@
-"""The crash-safe store of trials: writing, reading, checking, and what people decided of them."""
+"""The crash-safe store of trials: writing, reading, verification, requests and reviews."""

@@ -1,6 +1,6 @@
-"""Named arrays in one file that maps into memory: a training set is read where it is needed.
+"""Named arrays in one memory-mapped file, so that a training set is read on demand.
 
-A line of JSON says which arrays there are and where; each begins at a multiple of 64 bytes. Nothing
+A line of JSON lists the arrays and their offsets, multiples of 64 bytes. Nothing
 is compressed and nothing is copied on reading.
 """
 
@@ -42,12 +42,12 @@ def map_arrays(path: Path) -> Arrays:
     """The arrays of a file, mapped.
 
     Raises:
-        OSError: there is none, or it cannot be read.
-        ValueError: it is no such file, or cut short.
+        OSError: it does not exist, or it cannot be read.
+        ValueError: it is no such file, or truncated.
     """
     with path.open("rb") as file:
         if file.readline(64) != _MAGIC:
-            raise ValueError(f"{path}: is no file of arrays of this program")
+            raise ValueError(f"{path}: is not an array file of this program")
         try:
             header = json.loads(file.readline())
             start = _up(file.tell())
@@ -61,7 +61,7 @@ def map_arrays(path: Path) -> Arrays:
                 at = start + int(item["at"])
                 if at + count * dtype.itemsize > size:
                     raise ValueError(f"it ends before {name} does")
-                # written to, a page would be copied: the file stays as it is
+                # written to, a page would be copied: the file stays unchanged
                 mapped = np.memmap(path, dtype, "c", at, shape) if count else np.empty(shape, dtype)
                 arrays[name] = mapped.view(np.ndarray)
         except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -1,12 +1,11 @@
-"""Every committed trial of a store as one pandas table, units in the column names.
+"""Table of all committed trials of a store, with units in the column names.
 
-100,000 trials need not be read again each time: an index keeps the table as it was when it was last
-asked for. The truth is the trials' folders; the index only spares reading those that have not
-changed. A trial is known by its folder's inode and the time of the folder's last change, which a
-rename, a new file and a deleted one all move, and by the file with its refitted clocks. Bytes that
-were changed inside a file are for `sliplab verify` to find. An index that is missing, damaged, or
-of another version of this module is made anew; it stands among the derived results and may be
-deleted at any time.
+An index caches the last table, so that 100,000 trials need not be read each time. The trials'
+folders remain the source of truth; the index only saves reading unchanged ones. A trial is known by
+its folder's inode and the time of the folder's last change, which a rename, a new file and a
+deleted one all move, and by the file with its refitted clocks. Bytes that were changed inside a
+file are for `sliplab verify` to find. An index that is missing, damaged, or of another version of
+this module is rebuilt; it is among the derived results and may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _META = b"sliplab"
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
     """One row a committed trial: campaign, id, condition, counts, quality.
 
-    Conditions become columns by factor; levels with a unit are numbers, the unit stands in the
+    Conditions become columns by factor; levels with a unit are numbers, the unit is in the
     column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since the
     catalogue was last asked for are not read again.
 
@@ -84,7 +83,7 @@ def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
         ValueError: the expression cannot be read, or names something besides columns.
     """
     if "@" in expression or "__" in expression:
-        raise ValueError("must use columns, numbers, text and operators only")
+        raise ValueError("may contain only columns, numbers, text and operators")
     try:
         return table.query(expression, engine="python", local_dict={}, global_dict={})
     except Exception as error:
@@ -298,7 +297,7 @@ def _stamp(path: Path, settled: bool = False) -> str:
 
 
 def _read_index(store: Store) -> _Known | None:
-    """Read the index; None where there is none that can be used."""
+    """Read the index; None if there is none that can be used."""
     try:
         content = _path(store).read_bytes()
     except OSError:

@@ -1,6 +1,6 @@
-"""Checksums of a folder's files, and whether the files still are what these say.
+"""Checksums of a folder's files, and their verification.
 
-A glance compares sizes; a full check reads every byte.
+A quick check compares sizes; a full check reads every byte.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Checksum(NamedTuple):
                 raise
             return "is missing"
         if not stat.S_ISREG(found.st_mode):
-            return "is no plain file"
+            return "is not a regular file"
         if found.st_size != self.bytes:
             return f"has {found.st_size} bytes, not {self.bytes}"
         return None
@@ -83,7 +83,7 @@ class Checksum(NamedTuple):
 Checksums = dict[str, Checksum]
 """Checksums of the files of one folder, by name."""
 Fetch = Callable[[Path, Checksum], None]
-"""Brings a missing file of a mirrored trial, held against its checksum."""
+"""Brings a missing file of a mirrored trial, checked against its checksum."""
 
 
 def read_sums(folder: Path, needed: Iterable[str] = (DATA, RECORD)) -> Checksums:
@@ -105,7 +105,7 @@ def read_sums(folder: Path, needed: Iterable[str] = (DATA, RECORD)) -> Checksums
     for name, item in data.items():
         found = Checksum.parse(item)
         if found is None or not _NAME.fullmatch(name):
-            raise ValueError(f"{path}: is no list of checksums")
+            raise ValueError(f"{path}: is not a list of checksums")
         sums[name] = found
     for name in needed:
         if name not in sums:
@@ -114,7 +114,7 @@ def read_sums(folder: Path, needed: Iterable[str] = (DATA, RECORD)) -> Checksums
 
 
 def as_json(sums: Checksums) -> Json:
-    """Return checksums as plain data, as they stand in files."""
+    """Return checksums as plain data, as they are in files."""
     return {name: known._asdict() for name, known in sums.items()}
 
 

@@ -1,4 +1,4 @@
-"""Requests of people to a store, and those that change which trials a campaign still takes.
+"""Operator requests to a store: pause, resume, stop, skip and retake.
 
     STORE/control/000001.json        a request: who, when, why
     STORE/control/000001.done.json   its answer: when and by whom it was carried out, and the result
@@ -73,7 +73,7 @@ def ask(
         )
         if journal.add(number, {k: value for k, value in vars(made).items() if k != "number"}):
             return made
-    raise OSError(f"{journal.folder}: no number is free")
+    raise OSError(f"{journal.folder}: no free number")
 
 
 def requests(store: Store) -> list[Request]:
@@ -143,8 +143,8 @@ def skipped(campaign: Campaign) -> dict[str, Json]:
         return {}
     except (OSError, ValueError) as error:
         raise StoreError(
-            f"{error}; it is damaged: put it back from a copy, or delete it to take those trials "
-            "after all (who asked for what is in control/)"
+            f"{error}; it is damaged: restore it from a copy, or delete it to collect those trials "
+            "(the requests themselves are in control/)"
         ) from None
 
 
@@ -155,7 +155,7 @@ def skip(campaign: Campaign, trials: Iterable[str], by: Json) -> dict[str, str]:
         by: who, when and why.
 
     Returns:
-        The result for each trial, in words.
+        The result for each trial, as text.
     """
     committed, known, did = campaign.committed(), skipped(campaign), {}
     for trial in trials:
@@ -178,7 +178,7 @@ def again(campaign: Campaign, trials: Iterable[str], by: Json) -> dict[str, str]
     many retakes, are skipped no longer.
 
     Returns:
-        The result for each trial, in words.
+        The result for each trial, as text.
     """
     committed, known, did = campaign.committed(), skipped(campaign), {}
     before = len(known)

@@ -1,4 +1,4 @@
-"""Derived results: each stands under its step and name, with the key of what made it.
+"""Derived results, stored by step and name with the key of their inputs.
 
 A key is the hash of a result's inputs, its parameters and its step's own version constant. A
 result whose key is still the wanted one is fresh and is not made again; anything else is stale.
@@ -57,7 +57,7 @@ class Derived:
 
     @staticmethod
     def of(store: Store, step: str, campaign: str | None = None) -> Derived:
-        """Return the results of `step`; those about single trials stand under their campaign."""
+        """Return the results of `step`; those about single trials are under their campaign."""
         folder = store.folder / "derived" / safe_name(step)
         folder = folder if campaign is None else folder / safe_name(campaign)
         return Derived(inside(folder, store.folder))

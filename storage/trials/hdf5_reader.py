@@ -1,7 +1,7 @@
-"""Reading of a trial's HDF5 file, column by column, through the library's own calls.
+"""Reading of a trial's HDF5 file, column by column, through h5py's low-level interface.
 
-h5py's files and datasets make a window of 30 ms cost twice as much as its events do. What is read
-must be in the file itself: links, external and virtual data would lead out of it.
+h5py's file and dataset objects would double the time to read a window of 30 ms. All data
+must be in the file itself: links, external and virtual data are rejected.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class RowFile:
         return int(value)
 
     def integers(self, name: str) -> list[int] | None:
-        """A small attribute of the file with integers in a row; None where there is no such one."""
+        """A small attribute of the file with integers in a row; None if there is no such one."""
         if not h5py.h5a.exists(self._file, name.encode()):
             return None
         found = h5py.h5a.open(self._file, name.encode())
@@ -97,7 +97,7 @@ class RowFile:
         """Return the kind of every named stream, by name; it is ``""`` where it is unknown.
 
         Raises:
-            ValueError: a stream points out of the file, has a wrong name, or there are too many.
+            ValueError: a stream points outside the file, has a wrong name, or there are too many.
         """
         group = STREAM_GROUP.encode()
         if not self._file.links.exists(group):
@@ -116,7 +116,7 @@ class RowFile:
         for part in name.encode().split(b"/"):
             at += b"/" + part
             if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
-                raise ValueError(f"{self.path}: {name} points out of the file")
+                raise ValueError(f"{self.path}: {name} points outside the file")
         found = h5py.h5o.open(self._file, at)
         if not isinstance(found, h5py.h5g.GroupID):
             raise ValueError(f"{self.path}: {name} is no group")
@@ -159,11 +159,11 @@ class RowFile:
         for part in name.encode().split(b"/"):
             at += b"/" + part
             if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
-                raise ValueError(f"{self.path}: {name} points out of the file")
+                raise ValueError(f"{self.path}: {name} points outside the file")
         data = h5py.h5d.open(self._file, at)
         kept = data.get_create_plist()
         if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
-            raise ValueError(f"{self.path}: {name} points out of the file")
+            raise ValueError(f"{self.path}: {name} points outside the file")
         return Rows(data)
 
 
@@ -223,7 +223,7 @@ class StreamReader:
 
     Raises:
         StoreError: it was written by a newer version.
-        ValueError: a column points out of the file.
+        ValueError: a column points outside the file.
     """
 
     def __init__(self, path: Path) -> None:

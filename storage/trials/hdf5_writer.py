@@ -1,8 +1,8 @@
-"""One HDF5 file a trial for everything but frames, in the event layout of the DSEC data set.
+"""One HDF5 file per trial for everything but frames, in the event layout of the DSEC data set.
 
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
 index reaches as far as their 32-bit times (71.6 min), later events are found by bisection. The
-other streams stand beside them. Columns are chunked and compressed with bitshuffle, events in
+other streams are beside them. Columns are chunked and compressed with bitshuffle, events in
 LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
 same data are the same bytes.
 
@@ -64,7 +64,7 @@ COLUMNS: dict[str, Kind] = {
     "frames/host": ("int64", (), "ns of the host's monotonic clock"),
     "frames/sync": ("uint8", (), "level of the sync line during exposure"),
 }
-# only there once something came, a row a frame; -1 stands for the number of markers
+# only there once something came, a row a frame; -1 represents the number of markers
 TRACKS: dict[str, Kind] = {
     "tracks/markers": ("float32", (-1, 2), "px, column and row; NaN where a marker was not seen"),
     "tracks/plate": ("float32", (2,), "px, column and row; NaN where the marker was not seen"),
@@ -230,7 +230,7 @@ class StreamFile:
         """Append events.
 
         Raises:
-            ValueError: times run backwards, inside the chunk or against the one before.
+            ValueError: times decrease, inside the chunk or against the one before.
         """
         if not len(chunk):
             return
@@ -280,7 +280,7 @@ class StreamFile:
         """Append rows to a named stream, which is made when its first row comes.
 
         Raises:
-            ValueError: the name is no small identifier, or the stream is of another kind.
+            ValueError: the name is not a small identifier, or the stream is of another kind.
         """
         if not STREAM_NAME.fullmatch(name):
             raise ValueError(f"stream '{name}': a name must match {STREAM_NAME.pattern}")

@@ -1,6 +1,6 @@
-"""Journals: what people asked for or decided, each in a numbered JSON file that stays for good.
+"""Journals of requests and decisions: numbered JSON files that are never changed.
 
-A number belongs to whoever writes its file first, so that two people at once never overwrite each
+The first writer of a file owns its number, so two people never overwrite each
 other. No lock is needed.
 """
 

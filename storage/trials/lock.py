@@ -1,7 +1,7 @@
-"""One holder at a time: an OS lock that dies with its holder, and names it to whoever is refused.
+"""Exclusive OS locks that are released with their holder and name it to other processes.
 
-The kernel frees the lock when the holder ends, however it ends. What stands in the file only says
-who holds it; it is believed only while the lock is held. Where locks do not reach other machines,
+The kernel releases the lock when the holder ends, however it ends. The file's content names
+the holder and is valid only while the lock is held. Where locks do not reach other machines,
 the note of another machine's holder is believed until a person deletes it. A file system without
 locks, or with locks that keep nobody out, is refused (docs/decisions/0070).
 """
@@ -36,11 +36,11 @@ _ALONE_OPTIONS = {"nobrl", "nolock", "local_lock=flock", "local_lock=all"}
 
 
 class NoLocks(StoreError):
-    """The file system of a lock keeps no file locks; the message says what to do."""
+    """The file system of a lock does not support file locks; the message gives the remedy."""
 
 
 class Locked(RuntimeError):
-    """Somebody else holds the lock; the message says who.
+    """Another process holds the lock; the message names it.
 
     Attributes:
         holder: the holder as `storage.process.this_process` describes it.
@@ -111,7 +111,7 @@ def _check_plain(handle: int, path: Path) -> None:
     """Refuse what is not made to be a lock: its content would be overwritten."""
     found = os.fstat(handle)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-        raise OSError(errno.EINVAL, "is no lock file of its own", str(path))
+        raise OSError(errno.EINVAL, "is not a regular lock file", str(path))
 
 
 def _acquire(handle: int, path: Path, what: str) -> None:
@@ -145,9 +145,9 @@ def _locks(handle: int, path: Path) -> bool:
 
 def _no_locks(path: Path, why: str) -> NoLocks:
     return NoLocks(
-        f"{path.parent}: its file system keeps no file locks ({why}), and two programs would write "
-        "at once: put the store on one that does, such as a local disk; `sliplab push` brings its "
-        "trials to a shared folder"
+        f"{path.parent}: its file system does not support file locks ({why}), so two programs "
+        "could write at once: put the store on one that does, such as a local disk; "
+        "`sliplab push` copies its trials to a shared folder"
     )
 
 
@@ -168,9 +168,9 @@ def _check(handle: int, path: Path, what: str) -> None:
     elsewhere = left.get("host") not in {None, ours["host"]} and left.get("boot") != ours["boot"]
     if elsewhere and (kind := _alone(handle)):
         raise Locked(
-            f"{what} was last held by another machine ({named(left)}) and not let go; locks on "
-            f"{kind} do not reach other machines, so it may be in use there: see that it is not, "
-            f"then delete {path}",
+            f"{what} was last held by another machine ({named(left)}) and not released; locks on "
+            f"{kind} do not reach other machines, so it may be in use there: make sure that it is "
+            f"not, then delete {path}",
             left,
         )
 

@@ -6,7 +6,7 @@
             may hold columns that format 1 did not know how to read |
 
 Committed trials are never rewritten: this version reads the files of every format. A migration
-that is interrupted is begun again: copies that are complete stay as they are, each step gives
+that is interrupted is restarted: copies that are complete stay unchanged, each step gives
 the same result however often it runs, and the store's format is written last.
 """
 
@@ -28,7 +28,7 @@ def _describe_with_sums(store: Store) -> None:
         missing = [name for name in names if not (campaign.folder / name).is_file()]
         if missing:
             raise StoreError(
-                f"{campaign.folder / missing[0]}: is missing: put it back from a copy, or move "
+                f"{campaign.folder / missing[0]}: is missing: restore it from a copy, or move "
                 f"{campaign.folder} away; nothing was changed"
             )
         write_sums(campaign.folder, names)
@@ -45,7 +45,7 @@ def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
         steps: by the format that each begins with; all that there are by default.
 
     Returns:
-        The formats that it had until now, oldest first; empty when it is the newest already.
+        The formats that it had until now, oldest first; empty when it is the current one already.
 
     Raises:
         StoreError: a campaign's description is damaged.

@@ -1,4 +1,4 @@
-"""A committed trial as analysis reads it: raw streams, clock maps, record."""
+"""Read access to a committed trial: raw streams, clock maps, record."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Recording:
     """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns.
 
     A committed trial is never rewritten, and never read where it is not what was committed: each
-    of its files is held against its checksum before this object first reads it. Where its clocks
-    were fitted again and came out otherwise, the new ones stand among the derived results, and are
+    of its files is checked against its checksum before this object first reads it. Where its clocks
+    were fitted again and came out otherwise, the new ones are among the derived results, and are
     used in the record's place.
 
     Args:
@@ -87,7 +87,7 @@ class Recording:
 
     @cached_property
     def raw_checksum(self) -> str:
-        """One hash that stands for the raw data of this trial and its record."""
+        """One hash that represents the raw data of this trial and its record."""
         return "".join(self._sums[name].sha256[:16] for name in sorted(self._sums))
 
     @cached_property
@@ -99,7 +99,7 @@ class Recording:
             raise self._damaged(str(error)) from None
 
     def _sound(self, name: str) -> Path:
-        """Return one of the trial's files, once it has been held against its checksum.
+        """Return one of the trial's files, once it has been checked against its checksum.
 
         Raises:
             StoreError: it is damaged.
@@ -111,8 +111,8 @@ class Recording:
             if to_fetch(path):
                 if self._fetch is None:
                     raise StoreError(
-                        f"{path}: was left at the URL that this store mirrors; open the store by "
-                        "`storage.remote.mirror.open_store`, which fetches it"
+                        f"{path}: was not downloaded from the URL that this store mirrors; open "
+                        "the store with `storage.remote.mirror.open_store`, which downloads it"
                     )
                 self._fetch(path, self._sums[name])
             if (problem := self._sums[name].problem(path)) is not None:
@@ -123,8 +123,8 @@ class Recording:
     def _damaged(self, what: str) -> StoreError:
         store = self.folder.parents[3] if len(self.folder.parents) > 3 else self.folder
         return StoreError(
-            f"{what}: this trial is damaged; `sliplab verify {store} --quarantine` sets it aside, "
-            "and `sliplab collect` takes it again"
+            f"{what}: this trial is damaged; `sliplab verify {store} --quarantine` quarantines "
+            "it, and `sliplab collect` retakes it"
         )
 
     @property
@@ -152,7 +152,7 @@ class Recording:
             return None
         try:
             found = SyncResult.load(self.sync_file)
-            # a trial that was taken anew under this id has nothing to do with it
+            # a trial that was retaken under this id has nothing to do with it
             if found.raw != self.raw_checksum or found.clocks is None:
                 return None
             if found.clocks.events is None and self.record.clocks.events is not None:
@@ -161,7 +161,7 @@ class Recording:
             raise StoreError(str(error)) from None
         except DocumentError as error:
             raise StoreError(
-                f"{error}; it is damaged: delete it, and `sliplab sync` makes it again"
+                f"{error}; it is damaged: delete it, and `sliplab sync` recomputes it"
             ) from None
         return found
 
@@ -303,7 +303,7 @@ class Recording:
             ValueError: the trial has none.
         """
         if not self.has_tracks:
-            raise ValueError(f"{self.folder}: holds no tracks")
+            raise ValueError(f"{self.folder}: contains no tracks")
         with self.open() as reader:
             plate = reader.column("tracks/plate") if reader.has("tracks/plate") else None
             markers = reader.column("tracks/markers")

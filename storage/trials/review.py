@@ -1,4 +1,4 @@
-"""Decisions of people about automatic labels: apart from them, append only, one file a decision.
+"""Review decisions about automatic labels: stored separately, append-only, one file per decision.
 
     STORE/review/CAMPAIGN/TRIAL/000001.json   the first decision about a trial's label, and so on
 
@@ -29,7 +29,7 @@ class Overtaken(StoreError):
 
 @dataclass(frozen=True)
 class Onsets:
-    """Two onsets on the trial's time line, ns; None where there is none, or it is not known."""
+    """Two onsets on the trial's time line, ns; None if there is none, or it is not known."""
 
     incipient_ns: int | None = None
     gross_ns: int | None = None
@@ -96,8 +96,8 @@ def decide(
     """Keep a decision, after all that were made before.
 
     Args:
-        label: key of the label that was looked at.
-        seen: number of the last decision that was looked at, 0 for none.
+        label: key of the label that was checked.
+        seen: number of the last decision that was checked, 0 for none.
 
     Raises:
         Overtaken: there is a newer decision than `seen`; nothing was written.
@@ -124,7 +124,7 @@ def decide(
     if max(journal.numbers(), default=0) == seen and journal.add(made.number, data):
         return made
     newest = history(store, campaign, trial)[-1]
-    raise Overtaken(f"{trial}: meanwhile there is another decision: {newest}")
+    raise Overtaken(f"{trial}: there is a newer decision:  {newest}")
 
 
 def history(store: Store, campaign: str, trial: str) -> list[Decision]:
@@ -177,7 +177,7 @@ def _read(journal: Journal, number: int) -> Decision:
         raise
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(
-            f"{path}: is no decision ({type(error).__name__}: {error}); put it back from a copy, "
+            f"{path}: is not a decision ({type(error).__name__}: {error}); restore it from a copy, "
             "or move it away and decide again"
         ) from None
     return Decision(number=number, verdict=data["verdict"], old=old, new=new, **texts)

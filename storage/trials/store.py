@@ -12,8 +12,8 @@
     STORE/derived/ models/ report/       results of analysis; may be deleted at any time
     STORE/before/                        copies of what a migration changed
 
-One rename, and nothing else, decides that a trial is committed. A folder among the committed trials
-that is incomplete all the same (a file was deleted or cut short) is no trial: readers skip it, and
+A single rename commits a trial. A folder among the committed trials that is incomplete nevertheless
+(a file was deleted or truncated) does not count as a trial: readers skip it, and
 the next collection quarantines it and takes the trial again. docs/store.md has all of it.
 """
 
@@ -154,8 +154,8 @@ class Campaign:
                 raise ValueError(f"{path}: lacks 'name' or 'simulated'")
         except (OSError, ValueError) as error:
             raise StoreError(
-                f"{error}; it is damaged: put it back from a copy, or move {self.folder} away "
-                "and collect anew"
+                f"{error}; it is damaged: restore it from a copy, or move {self.folder} away "
+                "and collect again"
             ) from None
         return cast("CampaignInfo", found)
 
@@ -211,7 +211,7 @@ class Campaign:
         """Return one committed trial.
 
         Raises:
-            StoreError: there is none of this id.
+            StoreError: no such trial.
         """
         path = self.folder / "trials" / safe_name(trial_id)
         if not path.is_dir():
@@ -251,7 +251,7 @@ class Campaign:
         return len(left)
 
     def quarantine(self, folder: Path, cause: str, **more: object) -> Path:
-        """Move a folder that is no trial, or no longer one, to quarantine, with its cause."""
+        """Move a folder that is not a trial, or no longer one, to quarantine, with its cause."""
         sweep_temporary(folder)
         write_json(folder / CAUSE, {"cause": masked(cause), "trial": folder.name, **more})
         target = self.quarantine_path(folder.name)
@@ -356,12 +356,12 @@ class Store:
         """
         path = folder / STORE
         if not path.is_file():
-            raise NoStore(folder, "is not a store (no store.json); `sliplab collect` makes one")
+            raise NoStore(folder, "is not a store (no store.json); `sliplab collect` creates one")
         try:
             found = read_json(path).get("format")
         except (OSError, ValueError) as error:
             raise StoreError(
-                f"{error}; it is damaged: put it back from a copy; in this version it says "
+                f"{error}; it is damaged: restore it from a copy; in this version it contains "
                 f'{{"format": {FORMAT}}}'
             ) from None
         if isinstance(found, int) and found > FORMAT:

@@ -1,4 +1,4 @@
-"""Check that everything in a store is as it was committed; nothing is changed."""
+"""Verification that everything in a store is as committed; nothing is changed."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def verify(store: Store, on_trial: Callable[[str], None] | None = None) -> list[
     folder = store.folder / "campaigns"
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         if path.is_symlink() or not path.is_dir():
-            problems.append(Problem(str(path), "is no folder of a campaign"))
+            problems.append(Problem(str(path), "is not a campaign folder"))
         else:
             problems += _campaign(store, Campaign(path), on_trial)
     return problems
@@ -86,7 +86,7 @@ def _campaign(
 
 
 def trial_folders(campaign: Campaign) -> list[Path]:
-    """Return everything that stands among the committed trials, complete or not."""
+    """Return everything that is among the committed trials, complete or not."""
     folder = campaign.folder / "trials"
     return sorted(folder.iterdir()) if folder.is_dir() else []
 
@@ -104,7 +104,7 @@ Found = list[tuple[Path, str]]
 
 def _trial(folder: Path) -> Found:
     if folder.is_symlink() or not folder.is_dir():
-        return [(folder, "is no folder of a trial")]
+        return [(folder, "is not a trial folder")]
     try:
         sums = read_sums(folder)
     except ValueError as error:
@@ -144,10 +144,10 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
 
     folder, found = campaign.folder, []
     if not campaign.begun:
-        return [problem(folder, "is a campaign that was not begun yet", UNFINISHED)]
+        return [problem(folder, "is a campaign without any trial yet", UNFINISHED)]
     for name in _FOLDERS:
         if (folder / name).is_symlink() or not (folder / name).is_dir():
-            found.append(problem(folder / name, "is missing, or no folder"))
+            found.append(problem(folder / name, "is missing or not a folder"))
     names = (PROTOCOL, RIG, INFO)
     sums: Checksums = {}
     if store.format > 1 and not (folder / CHECKSUMS).exists():
@@ -179,7 +179,7 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
 
 def _temporary(folder: Path, campaign: str) -> list[Problem]:
     """Find temporary files whose program is gone."""
-    what = "is what a killed program left; the next `sliplab collect` deletes it"
+    what = "was left by a killed program; the next `sliplab collect` deletes it"
     return [
         Problem(str(path), what, UNFINISHED, campaign)
         for path, runs in temporary_files(folder)
@@ -271,7 +271,7 @@ def _leftovers(campaign: Campaign) -> list[Problem]:
         try:
             read_json(path / CAUSE)["cause"]
         except (OSError, ValueError, KeyError) as error:
-            what = f"does not say why it is there: {error}"
+            what = f"gives no cause: {error}"
             found.append(Problem(str(path / CAUSE), what, DAMAGED, campaign.name))
     return found
 
@@ -280,7 +280,7 @@ def quarantine_damaged(store: Store, problems: list[Problem]) -> list[str]:
     """Quarantine every committed trial that has a problem; the caller holds the store's lock.
 
     Returns:
-        The ids, which the next collection takes again.
+        The ids, which the next collection retakes.
     """
     causes: dict[tuple[str, str], list[str]] = {}
     for problem in problems:

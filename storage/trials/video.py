@@ -1,8 +1,8 @@
-"""Frames as lossless video: FFV1 in Matroska, every frame a key frame, the same bytes every time.
+"""Lossless video of frames: FFV1 in Matroska, every frame a key frame, reproducible byte for byte.
 
 Matroska files carry random identifiers and dates unless the muxer is told not to; with the
 bit-exact flag two identical videos are two identical files, so checksums mean something.
-Encoding runs in threads of its own behind bounded queues: a full queue is back-pressure that the
+Encoding runs in separate threads behind bounded queues: a full queue is back-pressure that the
 caller sees as time, never as a lost frame. Frames know nothing of each other, so every thread has
 an encoder for itself and takes every so manieth frame: that costs a quarter less processor time
 than letting one encoder share the slices of each frame among threads.
@@ -83,7 +83,7 @@ class VideoWriter:
             try:
                 mine.put((self.frames, np.ascontiguousarray(image)), timeout=_PUT_TIMEOUT_S)
             except queue.Full:
-                raise RuntimeError("the video encoder has stood still for a minute") from None
+                raise RuntimeError("the video encoder has hung for a minute") from None
             self.frames += 1
 
     def close(self) -> None:

@@ -186,7 +186,7 @@ class TrialWriter:
         """
         self.seal()
         if self.target.exists():
-            raise FileExistsError(f"{self.target}: this trial is committed already")
+            raise FileExistsError(f"{self.target}: this trial is already committed")
         self._finish_folder(record, provenance)
         os.rename(self.folder, self.target)
         sync_folder(self.target.parent)
@@ -264,7 +264,7 @@ class Spool:
             )
             self._check()
             if not done:
-                raise OSError(f"{self.path}: the disk has stood still for {WAIT_S:g} s")
+                raise OSError(f"{self.path}: the disk has hung for {WAIT_S:g} s")
             self._waiting.append(images)
             self._bytes += images.nbytes
             self._changed.notify_all()
@@ -280,7 +280,7 @@ class Spool:
             self._changed.notify_all()
         self._thread.join(WAIT_S)
         if self._thread.is_alive():
-            raise OSError(f"{self.path}: the disk has stood still for {WAIT_S:g} s")
+            raise OSError(f"{self.path}: the disk has hung for {WAIT_S:g} s")
         self._file.close()
         self._check()
 

@@ -176,7 +176,7 @@ def test_another_network_is_another_measurement(
 def test_the_report_shows_them(store: Store) -> None:
     report(store, collected(store))
     page = (store.folder / "report" / "index.html").read_text()
-    assert "What the guesses of the scene decide" in page
+    assert "Sensitivity to assumed scene parameters" in page
     assert "contrast of the markers" in page
     data = (store.folder / "report/data/guesses.csv").read_text().splitlines()
     assert data[0].startswith("simulated,guess") or "guess" in data[0]

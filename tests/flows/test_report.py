@@ -193,7 +193,7 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
     assert "measured by its authors on their own robot" in text
     assert "here (simulated)" in text
     assert f"sliplab review {store.folder.resolve()}" in text
-    assert "no campaign takes reference trials" in text
+    assert "no campaign has reference trials" in text
     assert f"sliplab generalise {store.folder.resolve()}" in text
 
 
@@ -211,7 +211,7 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     assert "gross missed" in found.table.rows[0][1]
     command = f"sliplab view {store.folder.resolve()} a=1,r=1 --campaign {row.campaign}"
     assert found.table.rows[0][0] == command  # two campaigns have this trial
-    assert "2 of 3 judged trials failed" in render_section(found, simulated=True)[1]
+    assert "2 of 3 evaluated trials failed" in render_section(found, simulated=True)[1]
     many = failure_section(store.folder, [row] * (MOST_FAILURES + 1))
     assert len(many.table.rows) == MOST_FAILURES
     assert "summary.json" in render_section(many, simulated=True)[1]
@@ -227,7 +227,7 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
         "359 ms after it ended", "579 ms after it ended"
     ]  # fmt: skip
     none = render_section(failure_section(store.folder, [fine]), simulated=True)[1]
-    assert "0 of 1 judged trials failed in some way." in none
+    assert "0 of 1 evaluated trials failed in some way." in none
     assert "<table" not in none
 
 

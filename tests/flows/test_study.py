@@ -125,7 +125,7 @@ def test_plan_and_collection_agree(ran: tuple[list[RunRequest], Outcome]) -> Non
 
 def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[RunRequest], Outcome]) -> None:
     text = (store_of(ran).folder / "report" / "index.html").read_text()
-    assert "Every number and picture here is simulated" in text
+    assert "Every number and figure in this report is simulated" in text
     assert text.count("simulated tracks of the markers (no video was drawn)") >= 3
     assert "the video" not in text
     assert '<a href="sync.html">' in text
@@ -250,7 +250,7 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
     monkeypatch.setattr("sliplab.analysis.networks.gradients.devices", lambda: ["cuda", "cuda:0"])
     with pytest.raises(
         InputError,
-        match=r"analysis\.training\.device = cpu: there is none here; must be one of cuda, cuda:0",
+        match=r"analysis\.training\.device = cpu: not available here; must be one of cuda, cuda:0",
     ):
         train(store, collected(store))
 

@@ -208,8 +208,8 @@ def test_the_page_has_every_figure_and_stands_alone(store: Store) -> None:
     assert text.count("<figure>") == text.count(">simulated</text>") == 4
     for unit in ("residual (µs)", "drift (ppm)", "uncertainty (µs)", "missed pulses", "lost"):
         assert unit in text
-    assert "cannot be told from that of the device" in text
-    assert "Every number and picture here is simulated" in text
+    assert "cannot be separated from that of" in text
+    assert "Every number and figure on this page is simulated" in text
     assert "src=" not in text
     for recording in recordings(store):
         assert recording.folder.name in text
@@ -266,4 +266,4 @@ def test_a_campaign_without_trials_has_a_page_that_says_so(
     monkeypatch.setattr(Collected, "trials", [])
     result = sync(store, collected(store))
     assert (result["done"], result["fresh"]) == (0, 0)
-    assert "hold no committed trial" in Path(result["page"]).read_text()
+    assert "have no committed trial" in Path(result["page"]).read_text()

@@ -104,7 +104,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "depth over the limit": (
         _set(COLLECTION, "factors", "depth", "values", to=[2.4, 3.7]),
         "collection.factors.depth.values[1]",
-        "over collection.limits.depth = 3.6 mm",
+        "exceeds collection.limits.depth = 3.6 mm",
     ),
     "slide leaves the workspace": (
         _set(COLLECTION, "motion", 3, "distance", to="21 mm"),
@@ -125,7 +125,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "list and range": (
         _set(COLLECTION, "factors", "depth", "range", to={"from": 1, "to": 2, "step": 1}),
         "collection.factors.depth",
-        "either 'values' or 'range'",
+        "exactly one of 'values' and 'range'",
     ),
     "range that misses its end": (
         _set(
@@ -161,9 +161,9 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "unused factor": (
         _set(COLLECTION, "factors", "extra", to={"values": ["a"]}),
         "collection.factors.extra",
-        "used by no phase",
+        "not used by any phase",
     ),
-    "no hold": (_drop(COLLECTION, "motion", 2), "collection.motion", "hold still"),
+    "no hold": (_drop(COLLECTION, "motion", 2), "collection.motion", "must have a 'hold'"),
     "too long": (
         _set(COLLECTION, "limits", "duration", to="10 s"),
         "collection.limits.duration",
@@ -181,7 +181,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
             to={"method": "leave_conditions_out", "test_levels": {"depth": ["9 mm"]}},
         ),
         "analysis.split.test_levels.depth",
-        "is no level",
+        "is not one of its levels",
     ),
     "windows further apart than they are long": (
         _set("analysis", "detection", "stride_ms", to=31),
@@ -201,7 +201,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "a grid out of order": (
         _set("analysis", "detection", "smoothing_grid", to=[4, 1]),
         "analysis.detection.smoothing_grid",
-        "must ascend",
+        "ascending list of values",
     ),
     "a window of nothing": (
         _set("analysis", "detection", "smoothing_grid", to=[0, 1]),
@@ -211,14 +211,14 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "rates that are no shares": (
         _set("analysis", "detection", "compare", to={"rates": [0.01, 1.0]}),
         "analysis.detection.compare.rates",
-        "ascending shares",
+        "ascending list of shares",
     ),
     "shares that do not add up": (
         _set("analysis", "split", "train", to=0.9),
         "analysis.split",
         "add up to 1",
     ),
-    "name that leads out of the store": (_set("name", to="../x"), "name", "pattern"),
+    "name that points out of the store": (_set("name", to="../x"), "name", "pattern"),
     "strata that are no factors": (
         _set("analysis", "split", "strata", to=["depht", "speed"]),
         "analysis.split.strata[0]",
@@ -242,7 +242,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "a level held out twice over": (
         _set("analysis", "split", to={**LEFT_OUT, "validation_levels": {"depth": ["0.24 cm"]}}),
         "analysis.split.validation_levels.depth",
-        "is held out for the test already",
+        "is already held out for testing",
     ),
     "a reference to a factor that is none": (
         _set(COLLECTION, "motion", 3, "speed", to="$sped"),
@@ -265,7 +265,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
             to={**LEFT_OUT, "test_levels": {"depth": ["2.4 mm", "2400 um"]}},
         ),
         "analysis.split.test_levels.depth[1]",
-        "is held out twice",
+        "is listed twice as held out",
     ),
     "one direction twice": (
         _set(COLLECTION, "factors", "direction", "values", to=[0, 90, 360]),
@@ -329,8 +329,8 @@ RAW = {
     "text": (b"hello", "holds a str"),
     "not UTF-8": (b"name: caf\xe9\n", "is not UTF-8"),
     "broken": (b"a: [1, 2\n", "cannot be read"),
-    "key twice": (b"a: 1\na: 2\n", "stands twice"),
-    "alias": (b"a: &x [1]\nb: *x\n", "aliases are not read here"),
+    "key twice": (b"a: 1\na: 2\n", "duplicate key"),
+    "alias": (b"a: &x [1]\nb: *x\n", "aliases are not supported"),
     "deep": (b"a: " + b"[" * 200 + b"]" * 200, "nested more than"),
     "python object": (b"a: !!python/object/apply:os.system ['true']\n", "cannot be read"),
     "base 60": (b"a: 1:30.5\n", "base-60"),
@@ -354,7 +354,7 @@ def test_aliases_cannot_blow_up(tmp_path: Path) -> None:
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)]
     path = tmp_path / "bomb.yaml"
     path.write_text("\n".join(lines))
-    with pytest.raises(InputError, match="aliases are not read"):
+    with pytest.raises(InputError, match="aliases are not supported"):
         load_plan(path)
 
 
@@ -369,7 +369,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_what_is_no_plain_file_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.yaml")
     for path in (tmp_path / "pipe.yaml", Path("/dev/zero")):
-        with pytest.raises(InputError, match="is no plain file"):
+        with pytest.raises(InputError, match="is not a regular file"):
             load_plan(path)
 
 
@@ -481,7 +481,7 @@ def _caught_first() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("made", "key", "says"),
     [
-        (_without("catch"), "collection.motion", "is never caught: add"),
+        (_without("catch"), "collection.motion", "but never caught: add"),
         (_without("release"), "collection.motion", "must release the plate"),
         (_without("raise"), "collection.motion", "must raise the plate"),
         (_caught_first(), "collection.motion[4].action", "must come after"),
@@ -561,10 +561,10 @@ def test_whatever_stands_at_a_key_is_taken_or_named(where: Any, text: str) -> No
 @pytest.mark.parametrize(
     ("name", "level", "says"),
     [
-        ("depth", 30, "is over collection.limits.depth = 3.6 mm"),
+        ("depth", 30, "exceeds collection.limits.depth = 3.6 mm"),
         ("depth", -1, "must be more than 0"),
         ("depth", 0, "must be more than 0"),
-        ("speed", 900, "is over collection.limits.speed = 50 mm/s"),
+        ("speed", 900, "exceeds collection.limits.speed = 50 mm/s"),
         ("speed", 0, "must be more than 0"),
         ("direction", 1e6, "must be from -360 to 360 deg"),
     ],

@@ -133,12 +133,12 @@ def test_a_factor_of_another_dimension_is_refused(
 @pytest.mark.parametrize(
     ("place", "field", "unit", "level", "says"),
     [
-        (0, "clearance", "mm", 21, "is over collection.limits.clearance = 20 mm"),
-        (0, "speed", "mm/s", 51, "is over collection.limits.speed = 50 mm/s"),
-        (1, "depth", "mm", 3.7, "is over collection.limits.depth = 3.6 mm"),
-        (1, "speed", "mm/s", 51, "is over collection.limits.speed = 50 mm/s"),
-        (4, "clearance", "mm", 21, "is over collection.limits.clearance = 20 mm"),
-        (5, "speed", "mm/s", 51, "is over collection.limits.speed = 50 mm/s"),
+        (0, "clearance", "mm", 21, "exceeds collection.limits.clearance = 20 mm"),
+        (0, "speed", "mm/s", 51, "exceeds collection.limits.speed = 50 mm/s"),
+        (1, "depth", "mm", 3.7, "exceeds collection.limits.depth = 3.6 mm"),
+        (1, "speed", "mm/s", 51, "exceeds collection.limits.speed = 50 mm/s"),
+        (4, "clearance", "mm", 21, "exceeds collection.limits.clearance = 20 mm"),
+        (5, "speed", "mm/s", 51, "exceeds collection.limits.speed = 50 mm/s"),
     ],
 )
 def test_a_level_over_a_limit_is_named(

@@ -138,7 +138,7 @@ def test_the_optional_disturbance_level_adds_trials_only() -> None:
     ids = set(order_of(plain))
     assert [i for i in order_of(more) if i in ids] == order_of(plain)
     assert more.collection_hash == plain.collection_hash
-    with pytest.raises(InputError, match="optional are: 125 percent"):
+    with pytest.raises(InputError, match="optional levels: 125 percent"):
         load_plan(path, ["disturbance=130"])
 
 

@@ -79,7 +79,7 @@ def test_keys_beside_the_preset_go_before_it_and_are_named() -> None:
 
 def test_a_plan_warns_of_what_goes_before_the_preset(tmp_path: Path) -> None:
     warned = load_plan(file("pilot", tmp_path, preset="paper", detection={"margin": 3})).warnings()
-    assert warned == ["analysis.detection.margin: 3.0 goes before the 2.0 of the preset"]
+    assert warned == ["analysis.detection.margin: 3.0 overrides 2.0 of the preset"]
     assert load_plan(file("pilot", tmp_path, preset="paper")).warnings() == []
     assert load_plan(file("pilot", tmp_path)).warnings() == []
 

@@ -43,7 +43,7 @@ def test_one_quantity_however_it_is_written(text: str, unit: str, value: str) ->
     [
         (2.4, "has no unit"),
         ("2.4", "number with a unit"),
-        ("2.4 kg", "where one of these belongs: mm, um, cm, m"),
+        ("2.4 kg", "must be one of: mm, um, cm, m"),
         ("nan mm", "number with a unit"),
         ("inf mm", "number with a unit"),
         ("1e999 mm", "at most 1e9"),

@@ -31,5 +31,5 @@ def test_an_unknown_name_is_answered_with_those_there_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="ships with SlipLab: disturbance, gravity, kinematic"):
+    with pytest.raises(InputError, match="built-in: disturbance, gravity, kinematic"):
         load_plan(Path("pilott"))

@@ -1,1 +1,1 @@
-"""Figures as SVG text, a module a subject: values in, a picture out."""
+"""Figures as SVG text, one module per subject."""

@@ -1,4 +1,4 @@
-"""Figures of a campaign: what was collected, and how its trials changed in the order taken."""
+"""Figures of a campaign: collected trials, and their changes in the order of collection."""
 
 from __future__ import annotations
 

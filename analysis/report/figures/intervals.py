@@ -27,7 +27,7 @@ class Panel:
         label: of the axis, with its unit.
         values: by row, one a trial; a row without an entry stays empty.
         colour: of its dots.
-        zero: what stands at zero, in words; empty where zero is nothing.
+        zero: what stands at zero, as text; empty where zero is nothing.
         published: a line for what the paper has, and how it is called.
         notes: by row, what to write at its right end, such as how many have no value.
     """
@@ -119,7 +119,7 @@ def shares(
 
     Args:
         groups: by title; titles are written above their rows.
-        line: a share that all are held against, and how it is called.
+        line: a share that all are compared with, and how it is called.
     """
     with plt.rc_context(STYLE):
         count = sum(len(found) + 1 for found in groups.values())
@@ -196,7 +196,7 @@ class ChangePanel:
     Attributes:
         label: of the axis, with its unit.
         lower, higher: by row.
-        note: what it is unchanged, in words.
+        note: what it is unchanged, as text.
     """
 
     label: str

@@ -1,7 +1,7 @@
 """Colours and style of all figures, and the SVG text of a picture.
 
 Colours are distinct for the colour-blind (Okabe and Ito's palette), and a simulated figure says so
-in the picture itself, so that it still says so when somebody copies it out of its page.
+inside the image, so that a copy of the image is still marked.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def trial_overview(
     Args:
         frame_s: (n,) seconds; displacement_px: (n, m), the centre marker first.
         event_s: (k,) seconds of positive events; event_cell: (k,) their cell rows, 0..19.
-        onsets_s: incipient and gross onset, seconds; None where there is none.
+        onsets_s: incipient and gross onset, seconds; None if there is none.
         motion_s: when the slide or retraction begins.
     """
     with plt.rc_context(STYLE):

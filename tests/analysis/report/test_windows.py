@@ -55,7 +55,7 @@ def test_means_of_seeds_stand_against_each_other() -> None:
     found, said = made((0.93, 0.94, 0.95), (0.96, 0.95, 0.94))
     assert "Over 3 seeds the spiking network's strict accuracy is 94.0 % in the mean" in said
     assert "have 95.0 %: 1.00 points behind, ties counted as wrong" in said
-    assert "behind it (difference -2.0 to -0.1 in 95 %); trials tell them apart." in said
+    assert "behind it (difference -2.0 to -0.1 in 95 %); the difference is significant." in said
     assert found.others.rows[0][-1] == "95.0 % (94.0 % to 96.0 %)"
 
 

@@ -209,7 +209,7 @@ def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
 
 
 def test_a_camera_of_tracks_has_no_pictures_of_a_board(tmp_path: Path) -> None:
-    with pytest.raises(RigError, match="tracks and no pictures"):
+    with pytest.raises(RigError, match="tracks and no images"):
         calibrate.see_boards(session(lab(tmp_path)), 4)
 
 
@@ -279,7 +279,7 @@ def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFi
     ("arguments", "says"),
     [
         (("teach", "plane", "--rig", "mock", "--yes"), "--out: is needed: mock.yaml ships"),
-        (("teach", "plane", "--rig", "LAB"), "--yes: is needed where there is no terminal"),
+        (("teach", "plane", "--rig", "LAB"), "--yes: is required without a terminal"),
         (("teach", "plane", "--rig", "LAB", "--yes", "--search", 4.5), "limits.depth = 4 mm"),
         (("teach", "plane", "--rig", "LAB", "--yes", "--span", 20), "limits.reach = 15 mm"),
         (("teach", "plane", "--rig", "LAB", "--yes", "--span", 2), "at least 5 mm"),
@@ -287,7 +287,7 @@ def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFi
         (("teach", "tool", "--rig", "LAB", "--yes", "--tool", "1,2"), "must be x,y,z"),
         (("calibrate", "crop", "--rig", "LAB", "--yes", "--depth", 5), "limits.depth = 4 mm"),
         (("calibrate", "lens", "--rig", "LAB", "--columns", 60), "3 to 40"),
-        (("calibrate", "lens", "--rig", "LAB", "--images", "FOLDER"), "holds no .png"),
+        (("calibrate", "lens", "--rig", "LAB", "--images", "FOLDER"), "contains no .png"),
         (("calibrate", "board", "--out", "board.svg"), "must end in .pdf or .png"),
         (("teach", "plane", "--rig", "abacus"), "not one of the shipped rigs"),
     ],
@@ -358,7 +358,7 @@ def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
     monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
     assert run("teach", "plane", "--rig", path, "--yes") == console.INTERRUPTED
     said = capsys.readouterr().err
-    assert "the arm stands still, nothing was written" in said
+    assert "the arm is at rest, nothing was written" in said
     (rig,) = rigs
     assert rig.arm.progress().done
     assert rig.position().depth_mm <= -2.9

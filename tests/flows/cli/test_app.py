@@ -34,7 +34,7 @@ def test_plan_as_a_table() -> None:
     done = here("plan", "protocols/pilot.yaml")
     assert done.returncode == 0
     assert "36" in done.stdout
-    assert "give --rig to know" in done.stdout
+    assert "give --rig to estimate" in done.stdout
 
 
 def test_wrong_input_is_exit_2_and_one_message(tmp_path: Path) -> None:

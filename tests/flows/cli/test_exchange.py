@@ -95,11 +95,11 @@ def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
     ("arguments", "says"),
     [
         (("import", "none.aedat4", "--store", "s", "--name", "a"), "no such file"),
-        (("import", "bad.aedat4", "--store", "s", "--name", "a"), "is no AEDAT4 file"),
-        (("import", "bad.h5", "--store", "s", "--name", "a"), "is no HDF5 file"),
+        (("import", "bad.aedat4", "--store", "s", "--name", "a"), "is not an AEDAT4 file"),
+        (("import", "bad.h5", "--store", "s", "--name", "a"), "is not an HDF5 file"),
         (("import", "bad.aedat4", "--store", "s", "--name", "../a"), "--name"),
         (("import", "word", "bad.aedat4", "--store", "s", "--name", "a"), "must be one of"),
-        (("import", ".", "--store", "s", "--name", "a"), "is no HDF5 file"),
+        (("import", ".", "--store", "s", "--name", "a"), "is not an HDF5 file"),
         (("export", "ours", "nothing", "--output", "o"), "is no campaign"),
         (("export", "ours", "c", "--output", "o", "--format", "word"), "must be one of"),
         (("export", "ours", "c", "--labels", "--output", "o.xls"), "must end in"),
@@ -126,7 +126,7 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path, sliplab: Any) -> N
     lab_hdf5(tmp_path / "slide.h5")
     store = tmp_path / "store"
     assert sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "tiny")[0] == 0
-    with pytest.raises(StoreError, match="was imported"):
+    with pytest.raises(StoreError, match="is an imported campaign"):
         make_request(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
     with pytest.raises(StoreError, match="imported campaigns only"):
         collected(Store.open(store))

@@ -89,11 +89,9 @@ def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
     done = run(BLOCKED + PYTHON, tuple(EXTRAS), store)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
-        "`Store.label` needs prefect, which the extra 'prefect' brings: "
-        "pip install 'sliplab[prefect]'",
-        "`Store.train` needs prefect, which the extra 'prefect' brings: "
-        "pip install 'sliplab[prefect]'",
-        "`load_model` needs torch, which the extra 'learn' brings: pip install 'sliplab[learn]'",
+        "`Store.label` needs prefect, from the extra 'prefect': pip install 'sliplab[prefect]'",
+        "`Store.train` needs prefect, from the extra 'prefect': pip install 'sliplab[prefect]'",
+        "`load_model` needs torch, from the extra 'learn': pip install 'sliplab[learn]'",
     ]
 
 
@@ -134,7 +132,7 @@ def test_a_command_says_which_extra_it_lacks(
     else:
         assert (found["file"], found["key"], found["value"]) == (None, None, None)
         assert found["message"] == (
-            f"`sliplab {words[0]}` needs {module}, which the extra '{extra}' brings: "
+            f"`sliplab {words[0]}` needs {module}, from the extra '{extra}': "
             f"pip install 'sliplab[{extra}]'"
         )
     assert f"error: {found['message']}\n" in done.stderr

@@ -67,7 +67,7 @@ def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -
         (OSError(errno.ENFILE, "Too many open files in system"), "too many files are open"),
         (BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable"), "no more processes"),
         (RuntimeError("can't start new thread"), "no more processes or threads can be started"),
-        (OSError(errno.EFBIG, "File too large"), "its disk takes no larger file"),
+        (OSError(errno.EFBIG, "File too large"), "its disk does not allow a larger file"),
         (OSError(errno.ENOSPC, "No space left on device"), "its disk is full"),
     ],
 )  # fmt: skip

@@ -79,7 +79,7 @@ def test_a_url_stands_where_a_store_does(sliplab: Sliplab, made: Path, tmp_path:
     assert here["count"] == there["count"] == 2
     code, _, told = sliplab("trials", "file:///nothing/here")
     assert code == 2
-    assert "holds no pushed store" in told
+    assert "does not contain a pushed store" in told
     assert "\n" not in told.strip()
 
 

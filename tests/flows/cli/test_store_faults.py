@@ -153,5 +153,5 @@ def test_no_path_of_a_protocol_leads_out_of_the_store(whole: Path, name: str) ->
 
 def test_a_campaign_without_its_description_is_not_begun_anew(whole: Path) -> None:
     (whole / "store" / "campaigns" / "tiny" / "campaign.json").unlink()
-    with pytest.raises(StoreError, match=r"campaign.json.*put it back from a copy"):
+    with pytest.raises(StoreError, match=r"campaign.json.*restore it from a copy"):
         make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")

@@ -148,7 +148,7 @@ def test_a_change_that_was_not_made_is_noticed(tmp_path: Path) -> None:
             return True
 
     work.rig.operator = Absent()
-    with pytest.raises(RigError, match="another mass mounted"):
+    with pytest.raises(RigError, match="detects another mass"):
         take_all(work)
     assert campaign.committed() == set()
 

@@ -38,7 +38,7 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
         work.take(pending_trials(work.plan, campaign))
     message = str(stopped.value)
     for part in (
-        "stopped before its disk is full: 200.0 MB are free", "(by the trials so far)",
+        "stopped, the disk is nearly full: 200.0 MB are free", "(by the trials so far)",
         "200.0 MB stay in reserve", "make room, then run the same command to go on",
     ):  # fmt: skip
         assert part in message

@@ -123,7 +123,7 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
     [
         ({"reflex": "stop"}, "--reflex = 'stop'|--reflex = stop: needs --protocol"),
         ({}, "--seconds: is needed on rehearsal"),
-        ({"protocol": 1, "trial": "", "seconds": 3.0}, "--seconds = 3.0: belongs to listening"),
+        ({"protocol": 1, "trial": "", "seconds": 3.0}, "--seconds = 3.0: applies only without --protocol"),
         ({"protocol": 1, "trial": "", "reflex": "jump"}, "must be 'stop' or 'press:MM'"),
         ({"protocol": 1, "trial": "", "reflex": "press:-1"}, "must be 'stop' or 'press:MM'"),
         ({"protocol": 1, "trial": "depth=9mm"}, "fits no trial: depth=2.4mm,direction=0deg"),
@@ -161,7 +161,7 @@ def test_a_condition_may_leave_out_what_is_clear() -> None:
     assert choose_trial(plan, wanted).id == "depth=2.4mm,direction=90deg,speed=1mmps,r=1"
     with pytest.raises(InputError, match=r"fits several conditions: depth=.* and 3 more"):
         choose_trial(plan, "direction=90deg")
-    with pytest.raises(InputError, match="is needed: which of the protocol's conditions"):
+    with pytest.raises(InputError, match="is required: choose one of the protocol's conditions"):
         choose_trial(plan, None)
 
 

@@ -45,7 +45,7 @@ def test_the_shipped_example_is_right() -> None:
     [
         ({"flow": "colect"}, "schedules[0].flow = colect: must be one of collect, label"),
         ({"protcol": "x"}, "schedules[0].protcol = x: unknown key; did you mean 'protocol'?"),
-        ({"protocol": "none.yaml"}, "schedules[0].protocol = none.yaml: is no file"),
+        ({"protocol": "none.yaml"}, "schedules[0].protocol = none.yaml: no such file"),
         ({"days": ["mo"]}, "schedules[0].days[0] = mo"),
         ({"days": []}, "schedules[0].days = []"),
         ({"days": None}, "schedules[0].days: is missing"),
@@ -53,8 +53,8 @@ def test_the_shipped_example_is_right() -> None:
         ({"from": "24:00"}, 'schedules[0].from = 24:00: must be a time like "22:00"'),
         ({"until": "monday 6:00"}, "schedules[0].until = monday 6:00: must be a time like"),
         ({"cron": "0 22 * * *"}, "schedules[0].days"),
-        ({"cron": "0 25 * * *", "days": None, "from": None}, "is no cron line"),
-        ({"timezone": "UTC"}, "schedules[0].timezone = UTC: stands once"),
+        ({"cron": "0 25 * * *", "days": None, "from": None}, "is not a cron line"),
+        ({"timezone": "UTC"}, "schedules[0].timezone = UTC: applies to the whole file"),
         ({"trials": 0}, "schedules[0].trials = 0"),
         ({"name": "Nights!"}, "schedules[0].name = Nights!"),
         ({"flow": "pause"}, "schedules[0].flow = pause: must be one of"),
@@ -103,9 +103,9 @@ def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
 
 
 def test_names_and_zones_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: stands twice"):
+    with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: is used twice"):
         load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
-    with pytest.raises(InputError, match=r"timezone = Europe/Rom: is no time zone"):
+    with pytest.raises(InputError, match=r"timezone = Europe/Rom: is not a time zone"):
         load_schedules(write(tmp_path, NIGHT, timezone="Europe/Rom"))
 
 

@@ -154,7 +154,7 @@ def test_nothing_is_quoted_of_what_is_no_protocol(
     service: Service, tmp_path: Path, text: str
 ) -> None:
     (tmp_path / "settings.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"settings\.yaml: is no protocol") as error:
+    with pytest.raises(InputError, match=r"settings\.yaml: is not a valid protocol") as error:
         service.protocol(Path("settings.yaml"))
     assert SECRET not in str(error.value)
 
@@ -186,7 +186,7 @@ def test_a_rig_that_is_free_again_is_taken(
     assert deployments.when_free(run_request, 10.0, work, None) == {"taken": 1}
     assert told == ["the rig is in use by anna"]
     answers[:] = [Locked("the rig is in use by anna")]
-    with pytest.raises(WindowOver, match="nothing was taken: the rig is in use by anna"):
+    with pytest.raises(WindowOver, match="no trial was taken: the rig is in use by anna"):
         deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
 
 

@@ -140,7 +140,7 @@ def opened(served: Served) -> Iterator[Tab]:
 def test_all_trials_are_listed_doubtful_ones_first(served: Served, tab: Tab) -> None:
     assert served.told["trials"] == served.told["to_decide"] == TRIALS
     doubtful = served.made.ids[DOUBTFUL]
-    expect(tab.page.get_by_text(f"{TRIALS} trials, {TRIALS} to decide")).to_be_visible()
+    expect(tab.page.get_by_text(f"{TRIALS} trials, {TRIALS} to review")).to_be_visible()
     expect(tab.chosen()).to_have_text(f"{NAME} / {doubtful} · 1 of {TRIALS}")
     expect(tab.page.locator("li.doubt").first).to_contain_text("marker 3 could not be followed")
     # only what is seen stands in the page, however long the list
@@ -154,7 +154,7 @@ def test_all_trials_are_listed_doubtful_ones_first(served: Served, tab: Tab) -> 
     tab.page.locator(".doubtful-first input").uncheck()
     expect(tab.chosen()).to_contain_text(served.made.ids[0])
     tab.page.locator(".by-decision select").select_option("doubtful")
-    expect(tab.page.get_by_text("1 trials, 1 to decide")).to_be_visible()
+    expect(tab.page.get_by_text("1 trials, 1 to review")).to_be_visible()
     tab.page.locator(".by-decision select").select_option("all")
     tab.find(served.made.ids[-1])
     expect(tab.row(served.made.ids[-1])).to_be_visible()
@@ -214,7 +214,7 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
             expect(tab.decision(trial)).to_have_text("adjusted")
         else:
             tab.page.get_by_role("button", name="Reject").click()
-            expect(tab.page.get_by_text("Not kept: a rejection needs a reason")).to_be_visible()
+            expect(tab.page.get_by_text("Not saved: a rejection needs a reason")).to_be_visible()
             tab.press("r")
             tab.page.keyboard.type("<img src=x onerror=\"document.title='taken'\">")
             tab.page.get_by_role("button", name="Reject").click()

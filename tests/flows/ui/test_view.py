@@ -237,7 +237,7 @@ def test_what_is_missing_is_said(
     assert isinstance(subject.item, Collected)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(StoreError, match="no display here; --save"):
+    with pytest.raises(StoreError, match="no display available; --save"):
         view.show(subject)
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ModuleNotFoundError, match="rerun"):

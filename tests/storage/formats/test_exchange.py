@@ -292,7 +292,7 @@ def test_zstd_frames_that_say_a_wrong_size(tmp_path: Path, size: int) -> None:
     at = frame + 6 - (data[frame + 4] >> 5 & 1)
     data[at : at + 4] = struct.pack("<I", size)
     path.write_bytes(data)
-    with Aedat4File(path) as file, pytest.raises(FormatError, match="unpacked"):
+    with Aedat4File(path) as file, pytest.raises(FormatError, match=r"decompressed|too large"):
         list(file.events(0))
 
 
@@ -547,7 +547,7 @@ def test_names_become_plain() -> None:
 
 def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> None:
     lab_hdf5(tmp_path / "a.h5")
-    with pytest.raises(InputError, match="was collected"):
+    with pytest.raises(InputError, match="is a collected campaign"):
         import_trials(
             store, "c", trials_in(tmp_path / "a.h5", "lab-hdf5"), tmp_path / "a.h5", "lab-hdf5"
         )

@@ -182,9 +182,9 @@ def _text(path: Path) -> None:
 
 NAME = "d2_s1.0_dir_right_r0_events_on"
 BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "an empty aedat4": ("a.aedat4", lambda path: _aedat4(path, _events([])), "holds no events"),
-    "an empty dsec": ("a.h5", _empty_dsec, "holds no events"),
-    "empty pickles": (NAME, lambda path: _pickled(path, lab_cells(SIZE, {})), "holds no events"),
+    "an empty aedat4": ("a.aedat4", lambda path: _aedat4(path, _events([])), "contains no events"),
+    "an empty dsec": ("a.h5", _empty_dsec, "contains no events"),
+    "empty pickles": (NAME, lambda path: _pickled(path, lab_cells(SIZE, {})), "contains no events"),
     "aedat4 outside of its camera": (
         "a.aedat4", lambda path: _aedat4(path, _events([3, 64])),
         r"a\.aedat4: holds events up to column 64 and row 32, outside of the 64 x 48 pixels",
@@ -195,7 +195,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "an older aedat": (
         "a.aedat4", lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(50)),
-        r"begins with b'#!AER-DAT3\.1.*, not with b'#!AER-DAT4\.0",
+        r"starts with b'#!AER-DAT3\.1.*, not with b'#!AER-DAT4\.0",
     ),
     "text by the lab's name": (NAME, _text, f"{NAME}: byte 0: is no whole pickle"),
     "an empty file by the lab's name": (NAME, lambda path: path.touch(), "the file is empty"),
@@ -205,7 +205,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "npy cut short": (
         "a_on.npy", lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2)))[:-3]),
-        r"a_on\.npy: is cut short",
+        r"a_on\.npy: is truncated",
     ),
     "npy of 8 TB": (
         "a_on.npy",
@@ -227,7 +227,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         lambda path: path.write_bytes(
             _npy(lab_cells(SIZE, {})).split(b"\n")[0] + b"\n" + pickle.dumps([1])
         ),
-        r"a_on\.npy: holds something else than the array \(8, 6\)",
+        r"a_on\.npy: contains data other than the array \(8, 6\)",
     ),
     "npy of counts": (
         "a_on.npy", lambda path: _saved(path, np.zeros((39, 2, 250))),
@@ -261,7 +261,7 @@ def test_a_bad_file_is_named_with_what_would_be_right(tmp_path: Path, name: str)
     ("file", "write", "says"),
     [
         ("a.es", _es, r"after 0 events faery stops with: y overflow .*outside of the 320 x 16"),
-        ("a.raw", lambda path: _raw(path, f"% evt 2.0\n% {'x' * 47}\n"), "holds no events"),
+        ("a.raw", lambda path: _raw(path, f"% evt 2.0\n% {'x' * 47}\n"), "contains no events"),
         ("a.raw", lambda path: _raw(path, "% date today\n"), "gives no format: a .raw file"),
         ("a.dat", _text, "gives no format"),
     ],

@@ -225,7 +225,7 @@ def test_two_stores_do_not_mix(store: Store, remote: Remote, tmp_path: Path) -> 
     other = campaign(tmp_path / "other")
     commit(other, TRIALS[0], recorded_s=2.0)
     done = push(Store.open(tmp_path / "other"), remote)
-    assert "another take of it is there that is not of this store" in done.problems[0]
+    assert "an attempt pushed from another store is there" in done.problems[0]
     other.update({"name": "c", "simulated": False}, "protocol: 1\n", "rig: 1\n")
     done = push(Store.open(tmp_path / "other"), remote)
     assert "another campaign of this name is there: it differs in simulated" in done.problems[0]
@@ -239,7 +239,7 @@ def test_two_stores_do_not_mix(store: Store, remote: Remote, tmp_path: Path) -> 
     (tmp_path / "elsewhere" / "thesis.tex").touch()
     with pytest.raises(StoreError, match="holds other files"):
         pull(remote, tmp_path / "elsewhere")
-    with pytest.raises(RemoteError, match="holds other things"):
+    with pytest.raises(RemoteError, match="contains other files"):
         push(store, Remote(f"file://{tmp_path}/elsewhere"))
 
 
@@ -300,7 +300,13 @@ def test_names_and_objects_of_others_are_refused(
     done = pull(remote, tmp_path / "back")
     assert done.pulled == 1
     told = " ".join(done.problems)
-    for part in ("is of something else", "'a b'", "'c d'", "no checksum of data.h5", "only part"):
+    for part in (
+        "belongs to another trial or campaign",
+        "'a b'",
+        "'c d'",
+        "no checksum of data.h5",
+        "is incomplete",
+    ):
         assert part in told
     assert len(verify_remote(remote)[1]) == len(done.problems)
 
@@ -365,7 +371,7 @@ def test_a_mirror_fetches_what_is_read(
 def test_versions_and_places_that_cannot_be_used(
     store: Store, remote: Remote, tmp_path: Path
 ) -> None:
-    with pytest.raises(RemoteMissing, match="holds no pushed store"):
+    with pytest.raises(RemoteMissing, match="does not contain a pushed store"):
         pull(remote, tmp_path / "back")
     assert not (tmp_path / "back").exists()
     push(store, remote)

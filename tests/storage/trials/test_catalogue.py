@@ -175,7 +175,7 @@ def test_conditions_become_columns_with_units(tmp_path: Path) -> None:
 def test_expressions_that_are_no_query_are_refused(expression: str, tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
     commit(where, "a")
-    with pytest.raises(ValueError, match=r"must use columns|cannot be read"):
+    with pytest.raises(ValueError, match=r"may contain only columns|cannot be read"):
         query(catalogue(Store.open(tmp_path / "s")), expression)
 
 

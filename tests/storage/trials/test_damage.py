@@ -52,29 +52,29 @@ DAMAGE: dict[str, tuple[Callable[[Path, Path], object], str, str]] = {
     "checksums of a campaign gone": (
         lambda c, t: (c / "checksums.json").unlink(), "collect` writes it", UNFINISHED),
     "checksums of a campaign damaged": (
-        lambda c, t: (c / "checksums.json").write_text('{"a": 1}'), "no list of", DAMAGED),
-    "folder gone": (lambda c, t: (c / "bench").rmdir(), "is missing, or no folder", DAMAGED),
+        lambda c, t: (c / "checksums.json").write_text('{"a": 1}'), "not a list of", DAMAGED),
+    "folder gone": (lambda c, t: (c / "bench").rmdir(), "is missing or not a folder", DAMAGED),
     "campaign that never began": (
-        lambda c, t: (c.parent / "d").mkdir(), "d: is a campaign that was not begun", UNFINISHED),
+        lambda c, t: (c.parent / "d").mkdir(), "d: is a campaign without any trial", UNFINISHED),
     "file among campaigns": (
-        lambda c, t: (c.parent / "x").write_text(""), "x: is no folder of a campaign", DAMAGED),
+        lambda c, t: (c.parent / "x").write_text(""), "x: is not a campaign folder", DAMAGED),
     "campaign elsewhere": (
-        lambda c, t: _link(c, c.parents[2] / "away"), "is no folder of a campaign", DAMAGED),
+        lambda c, t: _link(c, c.parents[2] / "away"), "is not a campaign folder", DAMAGED),
     "temporary file": (
         lambda c, t: (c / f".campaign.json.{NOBODY}.tmp").write_text(""),
-        "is what a killed program left", UNFINISHED),
+        "was left by a killed program", UNFINISHED),
     "quarantine without cause": (
-        lambda c, t: (c / "quarantine" / "t.1").mkdir(), "does not say why", DAMAGED),
+        lambda c, t: (c / "quarantine" / "t.1").mkdir(), "gives no cause", DAMAGED),
     "empty trial": (lambda c, t: (c / "trials" / "e").mkdir(), "checksums.json: cannot", DAMAGED),
     "file among trials": (
-        lambda c, t: (c / "trials" / "e").write_text(""), "e: is no folder of a trial", DAMAGED),
+        lambda c, t: (c / "trials" / "e").write_text(""), "e: is not a trial folder", DAMAGED),
     "trial elsewhere": (
-        lambda c, t: _link(t, c.parents[2] / "away"), "is no folder of a trial", DAMAGED),
+        lambda c, t: _link(t, c.parents[2] / "away"), "is not a trial folder", DAMAGED),
     "data elsewhere": (
-        lambda c, t: _link(t / "data.h5", c.parents[2] / "away"), "is no plain file", DAMAGED),
+        lambda c, t: _link(t / "data.h5", c.parents[2] / "away"), "is not a regular file", DAMAGED),
     "checksums lead elsewhere": (
         lambda c, t: write_json(t / "checksums.json", {"../../x": {"sha256": "", "bytes": 0}}),
-        "is no list of checksums", DAMAGED),
+        "is not a list of checksums", DAMAGED),
     "checksums without data": (
         lambda c, t: write_json(t / "checksums.json", {}), "no checksum of data.h5", DAMAGED),
     "provenance gone": (
@@ -169,7 +169,7 @@ def test_a_damaged_description_says_what_to_do(tmp_path: Path) -> None:
     commit(where, "t")
     (where.folder / "campaign.json").unlink()
     assert where.begun
-    with pytest.raises(StoreError, match="put it back from a copy, or move"):
+    with pytest.raises(StoreError, match="restore it from a copy, or move"):
         _ = where.info
 
 
@@ -180,13 +180,13 @@ def test_a_damaged_description_says_what_to_do(tmp_path: Path) -> None:
 def test_a_link_does_not_lead_a_write_out_of_the_store(inner: str, tmp_path: Path) -> None:
     where, away = campaign(tmp_path / "s"), tmp_path / "away"
     _link(where.folder / inner, away)
-    with pytest.raises(StoreError, match="leads out of the store"):
+    with pytest.raises(StoreError, match="points out of the store"):
         where.update(where.info, "protocol: 2\n", "rig: 1\n")
     if inner in {"incoming", "trials"}:
-        with pytest.raises(StoreError, match="leads out of the store"):
+        with pytest.raises(StoreError, match="points out of the store"):
             where.begin("t", None, 100)
     if inner == "bench":
-        with pytest.raises(StoreError, match="leads out of the store"):
+        with pytest.raises(StoreError, match="points out of the store"):
             where.add_bench_record({})
     assert list(away.iterdir()) == []
 
@@ -210,7 +210,7 @@ def test_data_that_point_out_of_their_file_are_refused(tmp_path: Path) -> None:
         file["arm_pulses/t"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/t")
     writer.commit(record("t"), Provenance())
     with (
-        pytest.raises(ValueError, match="points out of the file"),
+        pytest.raises(ValueError, match="points outside the file"),
         where.recording("t").open() as reader,
     ):
         reader.pulses("arm_pulses")

@@ -113,14 +113,14 @@ def test_a_trial_without_a_clock_says_which_it_has(made: Campaign) -> None:
 def test_checksums_name_files_beside_them_only(tmp_path: Path, name: str) -> None:
     sums = {name: {"sha256": "0", "bytes": 1}}
     (tmp_path / "checksums.json").write_text(json.dumps(sums))
-    with pytest.raises(ValueError, match="no list of checksums"):
+    with pytest.raises(ValueError, match="not a list of checksums"):
         read_sums(tmp_path, ())
 
 
 @pytest.mark.parametrize("said", [{"sha256": 1, "bytes": 1}, {"sha256": "0", "bytes": "1"}, [], 1])
 def test_checksums_are_text_and_a_number(tmp_path: Path, said: Any) -> None:
     (tmp_path / "checksums.json").write_text(json.dumps({"a": said}))
-    with pytest.raises(ValueError, match="no list of checksums"):
+    with pytest.raises(ValueError, match="not a list of checksums"):
         read_sums(tmp_path, ())
 
 
@@ -147,7 +147,7 @@ def test_a_link_out_of_the_store_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "inside").mkdir()
     os.symlink(tmp_path / "outside", store.folder / name)
-    with pytest.raises(StoreError, match="leads out of the store"):
+    with pytest.raises(StoreError, match="points out of the store"):
         Store.open(store.folder)
     (store.folder / name).unlink()
     os.symlink("inside", store.folder / name)
@@ -160,7 +160,7 @@ def test_a_quarantine_that_leads_out_is_refused(tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     (where.folder / "quarantine").rmdir()
     os.symlink(tmp_path / "outside", where.folder / "quarantine")
-    with pytest.raises(StoreError, match="leads out of the store"):
+    with pytest.raises(StoreError, match="points out of the store"):
         where.quarantine(folder, "gate")
     assert list((tmp_path / "outside").iterdir()) == []
 
@@ -170,7 +170,7 @@ def test_derived_results_that_lead_out_are_refused(tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "derived").mkdir()
     os.symlink(tmp_path / "outside", store.folder / "derived" / "labels")
-    with pytest.raises(StoreError, match="leads out of the store"):
+    with pytest.raises(StoreError, match="points out of the store"):
         Derived.of(store, "labels", "c")
 
 
@@ -202,7 +202,7 @@ def test_set_aside_without_by_whom_is_damage(tmp_path: Path) -> None:
 
 def test_json_without_numbers_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"a": NaN}')
-    with pytest.raises(ValueError, match="no number of JSON"):
+    with pytest.raises(ValueError, match="not a JSON number"):
         read_json(tmp_path / "a.json")
 
 

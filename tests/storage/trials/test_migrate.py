@@ -100,7 +100,7 @@ def test_a_newer_store_is_refused_by_name(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="must be a number"):
             Store.open(store.folder)
     (store.folder / "store.json").write_text("{")
-    with pytest.raises(StoreError, match="put it back from a copy"):
+    with pytest.raises(StoreError, match="restore it from a copy"):
         Store.open(store.folder)
 
 
@@ -123,6 +123,6 @@ def test_a_newer_trial_is_refused_by_name(tmp_path: Path) -> None:
 def test_a_migration_names_what_it_cannot_bring_forward(tmp_path: Path) -> None:
     store = old(tmp_path / "s")
     (store.campaign("c").folder / "rig.yaml").unlink()
-    with pytest.raises(StoreError, match=r"rig.yaml: is missing: put it back .* nothing was"):
+    with pytest.raises(StoreError, match=r"rig.yaml: is missing: restore it .* nothing was"):
         migrate(store)
     assert store.format == 1

@@ -70,7 +70,7 @@ def test_a_trial_is_never_committed_twice(tmp_path: Path) -> None:
     commit(where, "t")
     writer = where.begin("t", FRAME, 100)
     fill(writer)
-    with pytest.raises(FileExistsError, match="committed already"):
+    with pytest.raises(FileExistsError, match="already committed"):
         writer.commit(record("t"), Provenance())
 
 

@@ -103,7 +103,7 @@ def test_the_catalogue_says_what_there_is(tmp_path: Path) -> None:
 
 def test_what_is_not_there_is_said(tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
-    with pytest.raises(ValueError, match="holds no tracks"):
+    with pytest.raises(ValueError, match="contains no tracks"):
         Recording(commit(where, "a")).tracks()
 
 
