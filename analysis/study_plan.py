@@ -157,6 +157,6 @@ class StudyPlan:
         if not found:
             raise InputError(
                 "--searches", "", True,
-                "needs a kinematic protocol, or a simulated rig with guesses",
+                "needs a kinematic protocol, or a simulated rig",
             )  # fmt: skip
         return found

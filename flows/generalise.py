@@ -39,7 +39,7 @@ SKINS, TRIALS = 5, 36
 
 @dataclass(frozen=True)
 class Generalised:
-    """The results that were asked for, by name.
+    """The results that were requested, by name.
 
     Attributes:
         made: how many of them were measured now.
@@ -73,7 +73,7 @@ def measure_generalisation(
     trials: int = TRIALS,
     epochs: int | None = None,
 ) -> Generalised:
-    """Measure what is missing of what is asked for.
+    """Measure what is missing of what is requested.
 
     Args:
         factors: these; all by default.

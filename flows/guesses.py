@@ -33,7 +33,7 @@ GUESSES = tuple(NAMES)
 
 @dataclass(frozen=True)
 class Measured:
-    """The settings that were asked for, by name.
+    """The settings that were requested, by name.
 
     Attributes:
         trials: their number, by campaign.
@@ -54,7 +54,7 @@ class Measured:
 def measure_guesses(
     store: Store, campaigns: list[Collected], guesses: Sequence[str], trials: int
 ) -> Measured:
-    """Measure what is missing; return the figures of all settings that were asked for.
+    """Measure what is missing; return the figures of all settings that were requested.
 
     Args:
         guesses: dotted names of assumed parameters.
@@ -92,7 +92,7 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
             known = ", ".join(GUESSES)
             raise InputError(
                 "GUESS", "", name,
-                f"must be a number of the scene that is not zero, such as {known}",
+                f"must be a non-zero parameter of the scene, such as {known}",
             )  # fmt: skip
     settings = (Setting(), *lower_and_higher(guesses))
     tasks = [

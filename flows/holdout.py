@@ -41,7 +41,7 @@ class HeldOut:
     """The figures of the campaign, and where they are kept.
 
     Attributes:
-        done: 1 where it was judged now, else 0.
+        done: 1 where it was evaluated now, else 0.
     """
 
     done: int

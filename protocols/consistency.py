@@ -44,7 +44,7 @@ def _check_strata(split: Split, factors: Mapping[str, Factor]) -> None:
         if name not in factors:
             raise KeyedError(key, name, unknown_factor(name, factors))
         if name in split.strata[:index]:
-            raise KeyedError(key, name, "stands twice")
+            raise KeyedError(key, name, "appears twice")
 
 
 def _check_held_out(split: Split) -> None:

@@ -129,13 +129,13 @@ def _list_units(schema: dict[str, Any]) -> None:
 
 
 def _other_unit(symbol: object) -> Unit | None:
-    """The unit of a symbol that is not canonical; None for others, and for what is no unit."""
+    """The unit of a symbol that is not canonical; None for others, and for what is not a unit."""
     found = find_unit(symbol) if isinstance(symbol, str) else None
     return None if found is None or canonical_of(found) == symbol else found
 
 
 def converted(level: Any, unit: Unit) -> Any:
-    """A level in a unit as a number in its canonical one; what is no number stays as it is."""
+    """A level in a unit as a number in its canonical one; what is not a number stays unchanged."""
     try:
         return to_decimal(level) * unit.factor
     except ValueError:
@@ -246,7 +246,7 @@ class Context(Factor):
     """One thing that is known of a trial and moves nothing: skin, temperature, serial number.
 
     Its levels belong to conditions, ids, tables and splits as those of a factor do. Text may be
-    any name, also one of digits only where it stands in quotes.
+    any name, also one of digits only where it is in quotes.
     """
 
     _HINT: ClassVar[str] = " (quote a number that is a name)"

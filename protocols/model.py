@@ -124,7 +124,7 @@ class Collection(StrictModel):
     @classmethod
     def _named(cls, factors: dict[str, Factor]) -> dict[str, Factor]:
         if not factors:
-            raise ValueError("is empty; give at least one factor")
+            raise ValueError("is empty; define at least one factor")
         _check_names(factors, "factors")
         return factors
 
@@ -265,8 +265,8 @@ class Collection(StrictModel):
                 raise KeyedError(
                     f"collection.factors.{name}",
                     name,
-                    f"is used by no phase; write ${name} where it belongs, or put it below "
-                    "collection.context if it moves nothing",
+                    f"is not used by any phase; write ${name} as the value of a phase's key, or "
+                    "move it to collection.context if it moves nothing",
                 )
 
 

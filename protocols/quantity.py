@@ -84,7 +84,7 @@ def parse(raw: object, unit: str) -> Decimal:
     found = find_unit(written)
     if found is None or canonical_of(found) != unit:
         allowed, broken = ", ".join(symbols_of(unit)), faults() if found is None else ""
-        raise ValueError(f"has the unit '{written}' where one of these belongs: {allowed}{broken}")
+        raise ValueError(f"has the unit '{written}'; must be one of: {allowed}{broken}")
     value = to_decimal(number) * found.factor
     check_size(value, unit)
     return value
@@ -211,7 +211,7 @@ def _writer(unit: str) -> Callable[[Any], str]:
 
 @dataclass(frozen=True)
 class _Schema:
-    """JSON Schema of a quantity, made when it is asked for: packages may have brought units."""
+    """JSON Schema of a quantity, made when it is requested: packages may have brought units."""
 
     unit: str
     negative: bool

@@ -362,8 +362,8 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
 def first_fault(model: type[BaseModel], error: ValidationError) -> KeyedError:
     """Return the fault of `error` that is said to a person: its key, the value and what is right.
 
-    A model that is chosen by what stands in it (a device by its driver) is validated by itself, and
-    its fault goes on from the key where it stands: `KeyedError` with a ``.`` before the key.
+    A model that is chosen by what is in it (a device by its driver) is validated by itself, and
+    its fault continues from the key where it stands: `KeyedError` with a ``.`` before the key.
     """
     # An unknown key is most often the cause of a missing one beside it: say it first.
     first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")

@@ -83,7 +83,7 @@ def source_words(summary: Summary) -> str:
 
 
 def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | None:
-    """Draw the trials by the first two factors; None where there are fewer."""
+    """Draw the trials by the first two factors; None if there are fewer."""
     factors = item.plan.protocol.collection.all_factors
     names = list(factors)[:2]
     if len(names) < 2:

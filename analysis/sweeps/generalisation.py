@@ -1,6 +1,6 @@
 """Generalisation: networks trained without a level of a factor, and tested on it alone.
 
-15 % of the other trials choose the epoch. Results of other skins stand in the same table. Each
+15 % of the other trials choose the epoch. Results of other skins are in the same table. Each
 result is kept as soon as it is there; a stopped training resumes at its last epoch.
 """
 
@@ -185,7 +185,7 @@ class Generalisation:
         self._inputs = [VERSION, dataset.VERSION, *several(campaigns), ids, settings]
 
     def levels(self, factor: str) -> list[str]:
-        """Return a factor's levels among the trials, in words, the lowest first.
+        """Return a factor's levels among the trials, as text, the lowest first.
 
         Raises:
             InputError: no trial has such a factor.

@@ -1,4 +1,4 @@
-"""A campaign that nothing was chosen by: its inputs, its figures, and when they were looked at."""
+"""The hold-out campaign: its inputs, its figures, and the history of its evaluations."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Holdout:
         return self.results.load(NAME, HoldoutResult)
 
     def evaluations(self) -> tuple[HoldoutLook, ...]:
-        """Return each time that the campaign was judged."""
+        """Return each time that the campaign was evaluated."""
         try:
             return self.result().evaluations
         except FileNotFoundError:

@@ -1,6 +1,6 @@
 """Sensitivity of a study's figures to assumed parameters of its simulated scene.
 
-Test trials of the study are repeated with one parameter lower, then higher, and judged by the
+Test trials of the study are repeated with one parameter lower, then higher, and evaluated by the
 study's own network and detection settings (`sliplab guesses`).
 """
 
@@ -60,7 +60,9 @@ class StudySensitivity:
         self.campaigns = campaigns
         self.folder = store.folder / "derived" / STEP
         if not all(item.info.get("simulated") for item in campaigns):
-            raise StoreError(f"{store.folder}: holds real trials; only simulated ones have guesses")
+            raise StoreError(
+                f"{store.folder}: contains real trials; only simulated ones have assumed parameters"
+            )
         self.detection = evaluation_of(store).detection
         self.model = choose_model(wanted_models(store, campaigns))
         self.trials = {item.name: _chosen(item, trials) for item in campaigns}

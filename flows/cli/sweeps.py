@@ -288,7 +288,7 @@ def generalise(
     simulated = ", simulated" if result.simulated else ""
     rows = [row_cells(name, row) for name, row in result.results.items()]
     console.print_table(f"generalise{simulated}", COLUMNS, rows)
-    console.say(f"kept in {result.file}; the next report shows it")
+    console.say(f"stored in {result.file}; the next report shows it")
 
 
 @app.command()
@@ -319,7 +319,7 @@ def guesses(
         for name, found in result.settings.items()
     ]
     console.print_table("guesses, simulated", ["setting", *columns], rows)
-    console.say(f"kept in {result.file}; the next report shows them")
+    console.say(f"stored in {result.file}; the next report shows them")
 
 
 @app.command()
@@ -349,7 +349,7 @@ def holdout(
         return
     rows = holdout_rows(holdout_part(done.result))
     console.print_table("hold-out, simulated", COLUMNS, rows)
-    console.say(f"kept in {done.file}, with its ledger; the next report shows it")
+    console.say(f"stored in {done.file} with all earlier evaluations; the next report shows it")
 
 
 def _opened(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:

@@ -85,7 +85,7 @@ class HoldoutScores(Classification):
 
 
 class HoldoutLook(Part):
-    """One time that the hold-out campaign was judged."""
+    """One time that the hold-out campaign was evaluated."""
 
     version: str
     """Of the program."""
@@ -110,4 +110,4 @@ class HoldoutResult(Document):
     rows: tuple[TrialScore, ...]
     kinematic: ExperimentScores
     evaluations: tuple[HoldoutLook, ...]
-    """Every time that the campaign was judged; the others are of the last time."""
+    """Every time that the campaign was evaluated; the others are of the last time."""

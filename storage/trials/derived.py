@@ -44,9 +44,7 @@ def load_document(path: Path, kind: type[DocumentT]) -> DocumentT:
     except NewerFormat as error:
         raise StoreError(str(error)) from None
     except DocumentError as error:
-        raise StoreError(
-            f"{error}; it is damaged: delete it, and its step makes it again"
-        ) from None
+        raise StoreError(f"{error}; it is damaged: delete it, and its step recomputes it") from None
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None
     assert latency["n"] + latency["missed"] + latency["late"] + latency["false_early"] == 4
     assert "at" not in json.dumps(summary["versions"])
     page = " ".join((store.folder / "report" / "index.html").read_text().split())
-    assert "Another skin and seed, which chose nothing" in page
+    assert "Hold-out: another skin and seed" in page
     assert "They were judged 1 time here" in page
     rows = holdout_rows(holdout_part(HoldoutResult.model_validate(kept)))
     assert rows[0][0] == "windows right, strict"

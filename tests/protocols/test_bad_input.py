@@ -227,7 +227,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "a stratum twice": (
         _set("analysis", "split", "strata", to=["depth", "depth"]),
         "analysis.split.strata[1]",
-        "stands twice",
+        "appears twice",
     ),
     "a factor held out that is none": (
         _set("analysis", "split", to={**LEFT_OUT, "test_levels": {"depht": ["2.4 mm"]}}),

@@ -158,5 +158,5 @@ def test_context_that_is_to_move_something_is_refused(tmp_path: Path) -> None:
 def test_a_factor_of_no_phase_is_told_where_it_belongs(tmp_path: Path) -> None:
     data = with_context()
     data["collection"]["factors"]["skin"] = {"values": ["a", "b"]}
-    with pytest.raises(InputError, match=r"or put it below collection\.context"):
+    with pytest.raises(InputError, match=r"or move it to collection\.context"):
         plan_of(data, tmp_path)

@@ -113,7 +113,7 @@ def test_a_level_in_another_unit_is_held_against_the_limits(tmp_path: Path) -> N
     def change(collection: dict[str, Any]) -> None:
         collection["factors"]["depth"] = {"unit": "um", "values": [2400, 3700]}
 
-    with pytest.raises(InputError, match=r"3\.7 mm: is over collection\.limits\.depth") as caught:
+    with pytest.raises(InputError, match=r"3\.7 mm: exceeds collection\.limits\.depth") as caught:
         plan_of(tmp_path, change)
     assert caught.value.key == "collection.factors.depth.values[1]"
 

@@ -120,7 +120,7 @@ def test_a_fault_is_blamed_on_the_file_that_has_it(
         ("extends: child.yaml\n", "extends = child.yaml: is circular"),
         ("extends: [mock.yaml]\n", "must be the path of a rig file"),
         ('extends: "a\\0b"\n', "must be the path of a rig file"),
-        ("extends: /dev/zero\n", "is no plain file"),
+        ("extends: /dev/zero\n", "is not a regular file"),
         ("extends: loop.yaml\n", "extends = child.yaml: is circular"),
     ],
 )

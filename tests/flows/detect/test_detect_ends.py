@@ -123,7 +123,10 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
     [
         ({"reflex": "stop"}, "--reflex = 'stop'|--reflex = stop: needs --protocol"),
         ({}, "--seconds: is needed on rehearsal"),
-        ({"protocol": 1, "trial": "", "seconds": 3.0}, "--seconds = 3.0: applies only without --protocol"),
+        (
+            {"protocol": 1, "trial": "", "seconds": 3.0},
+            "--seconds = 3.0: applies only without --protocol",
+        ),
         ({"protocol": 1, "trial": "", "reflex": "jump"}, "must be 'stop' or 'press:MM'"),
         ({"protocol": 1, "trial": "", "reflex": "press:-1"}, "must be 'stop' or 'press:MM'"),
         ({"protocol": 1, "trial": "depth=9mm"}, "fits no trial: depth=2.4mm,direction=0deg"),
