@@ -62,9 +62,9 @@ def test_means_of_seeds_stand_against_each_other() -> None:
 @pytest.mark.parametrize(("ours", "theirs"), [((0.9,), (0.9, 0.8)), ((0.9, 0.8), (0.9,))])
 def test_one_seed_is_no_mean(ours: tuple[float, ...], theirs: tuple[float, ...]) -> None:
     _, said = made(ours, theirs)
-    assert "It costs:" in said
+    assert "Cost:" in said
     assert "Over" not in said
 
 
 def test_without_other_methods_nothing_is_said_of_them() -> None:
-    assert "It costs:" not in made((0.9, 0.8), ())[1]
+    assert "Cost:" not in made((0.9, 0.8), ())[1]
