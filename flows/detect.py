@@ -3,7 +3,7 @@
 Without a protocol the arm does not move. With one, a trial's motion is executed (nothing is
 stored), and a reflex may interrupt it. However it ends, the arm is stopped first.
 
-`flows.detecting` has what is asked for and the sink that feeds the detector.
+`flows.detecting` has the request and the sink that feeds the detector.
 """
 
 from __future__ import annotations

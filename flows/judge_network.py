@@ -46,7 +46,7 @@ class NetworkScores(StepResult):
     """Scores of a model of a file.
 
     Attributes:
-        model: the network in words.
+        model: the network as text.
         same_as_sinabs: the engine gives the counts of Sinabs.
         margin: of the rule, in spikes, by campaign.
         accuracy, interval: of the sample windows.

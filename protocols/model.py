@@ -227,12 +227,12 @@ class Collection(StrictModel):
             fail("must end with 'return'")
         for name in ("approach", "press", "release", "return"):
             if names.count(name) != 1:
-                fail(f"must hold the phase '{name}' exactly once")
+                fail(f"must contain the phase '{name}' exactly once")
         acting = self.acting
         if not acting:
-            fail("must hold a 'slide' or 'retract', or a 'move' between press and release")
+            fail("must contain a 'slide' or 'retract', or a 'move' between press and release")
         if "hold" not in names[: acting[0]]:
-            fail("must hold still ('hold') before it moves in contact: recording begins there")
+            fail("must have a 'hold' before it moves in contact, where recording starts")
         ordered = [name for name in names if name in {"approach", "press", "release", "return"}]
         if ordered != ["approach", "press", "release", "return"]:
             fail("must have approach, press, release and return, in this order")

@@ -1,1 +1,1 @@
-"""Live detection: what is asked for, and the sink that feeds the detector."""
+"""Live detection: what is requested, and the sink that feeds the detector."""

@@ -84,10 +84,10 @@ def make_detect_request(
     if protocol is None:
         for name, text in (("--trial", trial), ("--reflex", reflex)):
             if text is not None:
-                right = "needs --protocol: without one the arm is not moved, only listened to"
+                right = "needs --protocol: without it the arm does not move"
                 raise InputError(name, "", text, right)
         if seconds is None and file.in_virtual_time:
-            right = f"is needed on {file.name}: its time is virtual and would never end"
+            right = f"is needed on {file.name}: its time is virtual and has no end"
             raise InputError("--seconds", "", None, right)
         return requested(
             rig=file,
@@ -95,7 +95,7 @@ def make_detect_request(
             seconds=seconds,
         )
     if seconds is not None:
-        right = "belongs to listening; a trial lasts as long as its motion"
+        right = "applies only without --protocol; a trial lasts as long as its motion"
         raise InputError("--seconds", "", seconds, right)
     plan = load_plan(protocol, enable)
     check_plan(file, plan, str(rig))
@@ -142,7 +142,7 @@ def choose_trial(plan: Plan, condition: str | None) -> Trial:
     more = f" and {len(firsts) - SHOWN} more" if len(firsts) > SHOWN else ""
     what = "fits several conditions" if found else "fits no trial"
     if condition is None:
-        what = "is needed: which of the protocol's conditions"
+        what = "is required: choose one of the protocol's conditions"
     raise InputError("--trial", "", condition, f"{what}: {'; '.join(names)}{more}")
 
 
@@ -154,7 +154,11 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
     """
     program = plan.program(trial)
     if not any(isinstance(step, Move) and step.phase in ACTING for step in program.steps):
+<<<<<<< HEAD
         raise InputError("--reflex", "", text, "the trial has no motion in contact to cut short")
+=======
+        raise InputError("--reflex", "", text, "the trial has no slide or retraction to interrupt")
+>>>>>>> 5d424c3 (Follow up the words of moved code)
     limits = plan.protocol.collection.limits
     deepest = min(float(limits.depth), float(file.limits.depth))
     kind, _, value = text.partition(":")

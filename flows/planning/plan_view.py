@@ -88,7 +88,7 @@ class Scene:
                 ("first slip after the start (s)", self.expected["first_slip_s"]),
                 ("incipient slip lasts (s)", self.expected["incipient_s"]),
             ):
-                pairs[title] = f"{low:.2f} to {high:.2f} (simulated, friction taken as even)"
+                pairs[title] = f"{low:.2f} to {high:.2f} (simulated, assuming uniform friction)"
         return pairs
 
 
