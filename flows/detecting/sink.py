@@ -28,8 +28,8 @@ from sliplab.rigs.core.reacting import SlipDetected
 from sliplab.storage.streams import EventChunk, NullSink, PulseChunk
 
 PATIENCE_US = 200_000
-"""A window without an event after it is evaluated so long after its end, by the camera's clock as it
-is known here: what was sent before must have arrived by then."""
+"""Wait before evaluating a window that no event follows, us on the camera's clock as estimated
+here: events that were sent earlier must have arrived by then."""
 KEPT = 100_000
 """Latencies that are kept for the summary: the last 55 minutes of 30 ms windows."""
 
