@@ -154,11 +154,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
     """
     program = plan.program(trial)
     if not any(isinstance(step, Move) and step.phase in ACTING for step in program.steps):
-<<<<<<< HEAD
         raise InputError("--reflex", "", text, "the trial has no motion in contact to cut short")
-=======
-        raise InputError("--reflex", "", text, "the trial has no slide or retraction to interrupt")
->>>>>>> 5d424c3 (Follow up the words of moved code)
     limits = plan.protocol.collection.limits
     deepest = min(float(limits.depth), float(file.limits.depth))
     kind, _, value = text.partition(":")
