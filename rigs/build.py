@@ -5,8 +5,11 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from sliplab.protocols.timing import ForceTiming
 from sliplab.rigs.core.arm_settings import BaseArmSettings, PlaneSettings
 from sliplab.rigs.core.capabilities import (
+    Arm,
+    ForceSensor,
     FrameCamera,
     Operator,
     Plate,
@@ -171,10 +174,11 @@ def _driven_rig(
         if "events" in file.cameras:
             events = devices.event_camera_driver.build(devices.event_camera)
             undo.callback(events.close)
+        arm = devices.arm_driver.build(calibrated_arm(file, devices))
         rig = Rig(
             name=file.name,
             clock=HostClock(),
-            arm=devices.arm_driver.build(calibrated_arm(file, devices)),
+            arm=arm,
             event_camera=events,
             frame_camera=frames,
             sync=devices.sync_box_driver.build(devices.sync_box),
@@ -185,6 +189,7 @@ def _driven_rig(
             touch_mm=file.calibration.touch_depth,
             tail_s=DRIVEN_TAIL_S,
             plate=plate,
+            force=_force_sensor(file, devices, arm),
             simulation=shown,
         )
         undo.pop_all()
@@ -198,6 +203,26 @@ def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None
         return driver.build(settings, px_per_mm)
     assert driver.fake is not None  # the rig file was held against it
     return driver.fake(settings, px_per_mm, shown, file.scene.frame_camera.exposure_us * 500)
+
+
+def _force_sensor(file: RigFile, devices: DeviceSettings, arm: Arm) -> ForceSensor | None:
+    """The rig's force sensor, if it has one.
+
+    Raises:
+        RigError: the rig file says another grade than its own.
+    """
+    driver = devices.force_sensor_driver
+    if driver is None or devices.force_sensor is None:
+        return None
+    sensor = driver.build(devices.force_sensor, arm)
+    said = (file.timing.force or ForceTiming()).grade
+    if sensor.grade != said:
+        raise RigError(
+            "force sensor",
+            f"its times are of the grade '{sensor.grade}', and the rig file says "
+            f"timing.force.grade: {said}; write timing.force: {{grade: {sensor.grade}}}",
+        )
+    return sensor
 
 
 def _check_grade(file: RigFile, frames: FrameCamera) -> None:

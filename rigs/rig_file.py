@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -178,12 +178,17 @@ class RigFile(StrictModel):
         ):
             if value != right:
                 raise KeyedError(key, value, f"must be {right}, which is what the fakes simulate")
-        fakes = {
+        fakes: dict[str, Any] = {
             "arm": self.devices.arm_driver.fake,
             "event_camera": self.devices.event_camera_driver.reach,
             "frame_camera": self.devices.frame_camera_driver.fake,
             "sync_box": self.devices.sync_box_driver.reach,
         }
+        if self.devices.force_sensor_driver is not None:
+            fakes["force_sensor"] = self.devices.force_sensor_driver.fake
+            if self.mock.force is None:
+                text = "is needed: it is what the fake of devices.force_sensor shows"
+                raise KeyedError("mock.force", None, text)
         for name, fake in fakes.items():
             if fake is None:
                 found = getattr(self.devices, name).driver

@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Literal, NotRequired, Protocol, TypedDict, runtime_checkable
 
 from sliplab.protocols.program import PlateAction
-from sliplab.protocols.timing import Code
+from sliplab.protocols.timing import Code, ForceGrade
 from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
@@ -260,6 +260,8 @@ class ForceSensor(Protocol):
     """A sensor of force and torque with a clock of its own, or that of the arm."""
 
     mounting: Mounting
+    grade: ForceGrade
+    """How its samples come onto the time line."""
     zeroing: Literal["trial", "session", "never"]
     """When the rig, or the sensor itself, takes the present load for zero: before each trial while
     the arm is clear of the plate, once when it connects, or never."""

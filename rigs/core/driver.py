@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
-from sliplab.rigs.core.capabilities import Arm, EventCamera, FrameCamera, SyncBox
+from sliplab.rigs.core.capabilities import Arm, EventCamera, ForceSensor, FrameCamera, SyncBox
 from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
 from sliplab.rigs.core.fakes import FakeController
-from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk
+from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
 
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)
 ArmSettingsT = TypeVar("ArmSettingsT", bound=BaseArmSettings)
@@ -36,7 +36,7 @@ class Driver(Generic[SettingsT]):
     """The declaration of one kind of device. `name` is what a rig file writes as `driver:`."""
 
     kind: ClassVar[str]
-    """``arm``, ``event camera``, ``frame camera`` or ``sync box``."""
+    """``arm``, ``event camera``, ``frame camera``, ``sync box`` or ``force sensor``."""
     name: str
     title: str
     """Make and model for people, such as ``Universal Robots``."""
@@ -143,3 +143,39 @@ class SyncBoxDriver(Driver[SettingsT]):
     reach: Callable[[SettingsT | None, str], SettingsT] | None = None
     """Return settings that reach the fake box of a loopback rig, which speaks the firmware's
     protocol at a serial port; the rest from a rig file's settings where it has some."""
+
+
+class FakeForceSensor(Protocol):
+    """A force sensor on a wire, that sends what a simulated scene shows."""
+
+    @property
+    def address(self) -> Any:
+        """Where the driver finds it, for `ForceSensorDriver.reach`; it can be pickled."""
+
+    def send(self, chunk: WrenchChunk) -> None:
+        """Send samples of the plate's load, in the sensor's axes and clock."""
+
+    def overload(self) -> None:
+        """The load is out of range from now on."""
+
+    def silence(self) -> None:
+        """Send nothing from now on."""
+
+    def close(self) -> None:
+        """Unplug it; any number of times."""
+
+
+@dataclass(frozen=True)
+class ForceSensorDriver(Driver[SettingsT]):
+    """A kind of force sensor."""
+
+    kind = "force sensor"
+    build: Callable[[SettingsT, Arm], ForceSensor] = field(kw_only=True)
+    """Make the device, not connected yet; beside the arm, whose controller may measure forces.
+
+    Raises RigError where that arm has none.
+    """
+    fake: Callable[[SettingsT], FakeForceSensor] | None = None
+    """Make a fake; None: no loopback rig can have this sensor."""
+    reach: Callable[[SettingsT, Any], SettingsT] | None = None
+    """Return settings that reach a fake at an address."""

@@ -29,6 +29,8 @@ BUILT_IN = {
     "dvxplorer": "sliplab.rigs.devices.dvxplorer:DRIVER",
     "basler": "sliplab.rigs.devices.basler:DRIVER",
     "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
+    "ati_net_ft": "sliplab.rigs.devices.ati_net_ft:DRIVER",
+    "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
 }
 
 

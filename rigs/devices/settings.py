@@ -20,6 +20,7 @@ from sliplab.rigs.core.driver import (
     ArmDriver,
     Driver,
     EventCameraDriver,
+    ForceSensorDriver,
     FrameCameraDriver,
     SyncBoxDriver,
 )
@@ -92,12 +93,14 @@ class DeviceSettings(StrictModel):
     """Left out where the rig's `cameras` has no `frames`."""
     sync_box: Annotated[DriverSettings, _OfKind("sync box", "sync_box")] | None = None
     """Needed by a real rig; a loopback rig brings its own."""
+    force_sensor: Annotated[DriverSettings, _OfKind("force sensor")] | None = None
+    """Left out, the rig has none."""
     plate: OperatedPlate | None = None
     """If left out, the rig has no sliding plate, and supports only kinematic protocols."""
 
     def drivers(self) -> Iterator[tuple[Driver[Any], DriverSettings]]:
         """The driver of every device, with its settings, the arm first."""
-        for kind in ("arm", "event camera", "frame camera", "sync box"):
+        for kind in ("arm", "event camera", "frame camera", "sync box", "force sensor"):
             settings = getattr(self, kind.replace(" ", "_"))
             if settings is not None:
                 yield find_driver(settings.driver, kind), settings
@@ -131,4 +134,13 @@ class DeviceSettings(StrictModel):
         name = "sync_box" if self.sync_box is None else self.sync_box.driver
         found = find_driver(name, "sync box")
         assert isinstance(found, SyncBoxDriver)
+        return found
+
+    @property
+    def force_sensor_driver(self) -> ForceSensorDriver[Any] | None:
+        """The driver of the force sensor, if the rig has one."""
+        if self.force_sensor is None:
+            return None
+        found = find_driver(self.force_sensor.driver, "force sensor")
+        assert isinstance(found, ForceSensorDriver)
         return found

@@ -45,6 +45,7 @@ class Loopback:
     Attributes:
         sync_port: name of the sync box's serial port.
         event_address: where the event camera's driver finds its fake.
+        force_address: where that of the force sensor does; None without one.
 
     Raises:
         RigError: they do not start.
@@ -63,7 +64,7 @@ class Loopback:
         theirs.close()
         their_frames.close()
         try:
-            self.sync_port, self.event_address = self._answer(READY_S)
+            self.sync_port, self.event_address, self.force_address = self._answer(READY_S)
         except BaseException:
             self.close()
             raise
@@ -84,12 +85,14 @@ class Loopback:
         camera, box = devices.event_camera_driver.reach, devices.sync_box_driver.reach
         assert camera is not None  # the rig file was held against it
         assert box is not None
-        return devices.model_copy(
-            update={
-                "event_camera": camera(devices.event_camera, self.event_address),
-                "sync_box": box(devices.sync_box, self.sync_port),
-            }
-        )
+        update = {
+            "event_camera": camera(devices.event_camera, self.event_address),
+            "sync_box": box(devices.sync_box, self.sync_port),
+        }
+        force = devices.force_sensor_driver
+        if force is not None and force.reach is not None and devices.force_sensor is not None:
+            update["force_sensor"] = force.reach(devices.force_sensor, self.force_address)
+        return devices.model_copy(update=update)
 
     # -- Simulation ------------------------------------------------------------------------
 
@@ -140,7 +143,7 @@ class Loopback:
 
     def restore(self, device: str) -> None:
         """Clear a device's faults; see `SimulationServer.restore`. Drivers must be rebuilt."""
-        self.sync_port, self.event_address = self._ask("restore", device)
+        self.sync_port, self.event_address, self.force_address = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
         """Return the true position of the sensor: right and up on the plate, and depth, mm."""
@@ -206,7 +209,7 @@ def _serve(
     status, server = 1, None
     try:
         server = SimulationServer(settings, timing, devices, frames.send)
-        pipe.send((True, (server.sync_box.port, server.camera.address)))
+        pipe.send((True, server.addresses))
         while True:
             if pipe.poll(TURN_S):
                 what, arguments = pipe.recv()

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, Truth
-from sliplab.rigs.core.driver import ArmScene
+from sliplab.rigs.core.driver import ArmScene, FakeForceSensor
 from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
@@ -30,6 +30,7 @@ from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.event_camera import MockEventCamera
+from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
 from sliplab.rigs.mock.path import ContactPlane
@@ -105,13 +106,31 @@ class SimulationServer:
             self._path.motion, ControllerClock(self._arm_now_s), self._arm_input, REACH_MM
         )
         self.arm = fake_arm(devices.arm, scene)
+        self._force: MockForceSensor | None = None
+        self._make_force = None
+        self.force: FakeForceSensor | None = None
+        if devices.force_sensor_driver is not None:
+            assert settings.force is not None  # the rig file was held against it
+            assert devices.force_sensor_driver.fake is not None
+            # the sensor on the wire takes its load for zero itself
+            alone = settings.force.model_copy(update={"bias": "never"})
+            self._force = MockForceSensor(self.world, alone)
+            self._make_force = partial(devices.force_sensor_driver.fake, devices.force_sensor)
+            self.force = self._make_force()
+            self._force.start()
         self.arm.start()
         self._events.start()
 
+    @property
+    def addresses(self) -> tuple[str, Any, Any]:
+        """The sync box's port, and the addresses of event camera and force sensor."""
+        return self.sync_box.port, self.camera.address, self.force and self.force.address
+
     def close(self) -> None:
         """Close every fake."""
-        for part in (self.arm, self.camera, self.sync_box):
-            part.close()
+        for part in (self.arm, self.camera, self.sync_box, self.force):
+            if part is not None:
+                part.close()
 
     # -- time ------------------------------------------------------------------------------
 
@@ -146,8 +165,16 @@ class SimulationServer:
             self._sent["events"] += len(chunk)
             self._sent["event_pulses"] += len(pulses.t_ns)
             self._stamps_us.append(chunk.t_us)
+        if self._force is not None and self.force is not None:
+            self._send_forces(self._force, self.force)
         if self._grabbing:
             self._send_frames()
+
+    def _send_forces(self, seen: MockForceSensor, wire: FakeForceSensor) -> None:
+        try:
+            wire.send(seen.read())
+        except RigError:  # beyond its range
+            wire.overload()
 
     def _send_frames(self) -> None:
         frames = self._frames.read()
@@ -188,6 +215,8 @@ class SimulationServer:
         self.world.begin_trial(seed)
         self._path.begin(self.world.past_ns)
         self._events.start()
+        if self._force is not None:
+            self._force.start()
         self._sent.clear()
         self._stamps_us.clear()
 
@@ -267,9 +296,10 @@ class SimulationServer:
         """Inject a fault of a device now.
 
         Args:
-            device: ``arm``, ``sync_box`` or ``event_camera``.
+            device: ``arm``, ``sync_box``, ``event_camera`` or ``force_sensor``.
             kind: for the arm a value of `rigs.core.fakes.Kind`; for the sync box ``reset``,
-                ``silence`` or ``unplug``; for the event camera ``stall`` or ``unplug``.
+                ``silence`` or ``unplug``; for the event camera ``stall`` or ``unplug``; for the
+                force sensor ``silence``, ``overload`` or ``unplug``.
 
         Raises:
             RigError: no such fault.
@@ -283,19 +313,25 @@ class SimulationServer:
             },
             "event_camera": {"stall": self.camera.stall, "unplug": self.camera.close},
         }
+        if self.force is not None:
+            known["force_sensor"] = {
+                "silence": self.force.silence,
+                "overload": self.force.overload,
+                "unplug": self.force.close,
+            }
         try:
             what = known[device][kind]
         except KeyError:
             raise RigError(device, f"its fake cannot simulate '{kind}'") from None
         what()
 
-    def restore(self, device: str) -> tuple[str, Any]:
+    def restore(self, device: str) -> tuple[str, Any, Any]:
         """A person puts right whatever is wrong with a device.
 
         A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
 
         Returns:
-            The sync box's port and the event camera's address, which may be new ones.
+            `addresses`, which may be new ones.
 
         Raises:
             RigError: no such device.
@@ -313,9 +349,12 @@ class SimulationServer:
         elif device == "event_camera":
             self.camera.close()
             self.camera = self._make_camera()
+        elif device == "force_sensor" and self.force is not None and self._make_force is not None:
+            self.force.close()
+            self.force = self._make_force()
         else:
             raise RigError(device, "has no fake")
-        return self.sync_box.port, self.camera.address
+        return self.addresses
 
 
 class SyncLevel:

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import Mounting, RigError
 from sliplab.rigs.mock.clocks import FaultyClock, Lateness, Noise, faulty, undisturbed
 from sliplab.rigs.mock.history import History
@@ -36,6 +37,7 @@ class MockForceSensor:
     """
 
     mounting = Mounting()
+    grade: ForceGrade = "host time"
 
     def __init__(self, world: World, settings: ForceSensor) -> None:
         self._world, self._settings = world, settings

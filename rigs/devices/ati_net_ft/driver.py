@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import DeviceHealth, Mounting, RigError
 from sliplab.rigs.devices.ati_net_ft import rdt
 from sliplab.rigs.devices.ati_net_ft.settings import FILTER_NUMBERS, AtiNetFtSettings
@@ -52,6 +53,8 @@ class Counts:
 
 class AtiNetFt:
     """An ATI Net F/T sensor; a `ForceSensor` of `rigs.core.capabilities`."""
+
+    grade: ForceGrade = "host time"
 
     def __init__(self, settings: AtiNetFtSettings) -> None:
         self._settings = settings

@@ -18,6 +18,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from sliplab.rigs.devices.ati_net_ft import rdt
+from sliplab.storage.streams import F64, WrenchChunk
 
 TURN_S = 0.0005
 """Period at which the fake looks what is due."""
@@ -57,6 +58,7 @@ class FakeNetFt:
         now_ns: the clock that its counter runs by.
         ticks: where the 32-bit sample counter stands first.
         units: of force and torque, as its page names them.
+        fed: it sends what `send` is given instead, when it is given.
 
     Attributes:
         port, web_port: where it listens.
@@ -73,10 +75,13 @@ class FakeNetFt:
         ticks: int = 0,
         units: tuple[str, str] = ("N", "N-m"),
         web: bool = True,
+        fed: bool = False,
     ) -> None:
         self.host, self._load, self._now_ns = host, load, now_ns
         self.rate_hz, self._tick_hz, self._first_ticks = rate_hz, tick_hz, ticks
         self._units, self.filter_number = units, 0
+        self._fed, self._last = fed, (0, np.zeros(6))
+        self._overloaded = False
         self._origin_ns = now_ns()
         self._bias = np.zeros(6)
         self._left: dict[Kind, int] = {}
@@ -111,17 +116,44 @@ class FakeNetFt:
         if self._web is not None:
             self._web.shutdown()
             self._web.server_close()
+            self._web = None
         for thread in self._threads:
             thread.join(JOIN_S)
         self._socket.close()
+
+    @property
+    def address(self) -> tuple[int, int]:
+        """Its ports: of RDT and of the page."""
+        return self.port, self.web_port
+
+    def send(self, chunk: WrenchChunk) -> None:
+        """Send samples of a scene, stamped by the scene's clock of this sensor."""
+        with self._lock:
+            loads = np.column_stack([chunk.force_n, chunk.torque_nm])
+            for at_ns, load in zip(chunk.t_ns.tolist(), loads, strict=True):
+                self._last = at_ns * self._tick_hz // 1_000_000_000, load
+                if self._to is not None:
+                    self._number += 1
+                    self._send(*self._last)
+
+    def overload(self) -> None:
+        """Say that the load is out of range from now on."""
+        with self._lock:
+            self._overloaded = True
+            if self._to is not None:
+                self._send(*self._last)
+
+    def silence(self) -> None:
+        """Send nothing from now on."""
+        self.inject(Kind.SILENCE)
 
     @property
     def streaming(self) -> bool:
         """True while records are sent."""
         return self._to is not None
 
-    def happen(self, kind: Kind, count: int = 1) -> None:
-        """Make something go wrong now."""
+    def inject(self, kind: Kind, count: int = 1) -> None:
+        """Inject a fault now."""
         with self._lock:
             if kind is Kind.RESTART:
                 self._origin_ns, self._first_ticks = self._now_ns(), 0
@@ -178,16 +210,24 @@ class FakeNetFt:
             self._to, self._number, self._most = sender, 0, count
             self._due_ns = self._now_ns()
         elif command == rdt.SET_BIAS:
-            self._bias = np.array(self._load(self._now_ns()), np.float64)
+            load = self._last[1] if self._fed else self._load(self._now_ns())
+            self._bias = np.array(load, np.float64)
         elif command == rdt.STOP:
             self._to = None
 
     def _send_due(self) -> None:
+        if self._fed:
+            if self._to is not None and self._most:
+                self._number += 1
+                self._send(*self._last)
+                self._to = None
+            return
         period_ns = 1_000_000_000 // self.rate_hz
         while self._to is not None and self._due_ns <= self._now_ns():
             at_ns, self._due_ns = self._due_ns, self._due_ns + period_ns
             self._number += 1
-            self._send(at_ns)
+            passed = (at_ns - self._origin_ns) * self._tick_hz // 1_000_000_000
+            self._send(self._first_ticks + passed, self._load(at_ns))
             if self._most and self._number == self._most:
                 self._to = None
 
@@ -197,18 +237,17 @@ class FakeNetFt:
             self._left[kind] = left - 1
         return left > 0
 
-    def _send(self, at_ns: int) -> None:
+    def _send(self, ticks: int, felt: Sequence[float] | F64) -> None:
         if self._left.get(Kind.SILENCE):
             return
         record = np.zeros(1, rdt.RECORD)
-        ticks = self._first_ticks + (at_ns - self._origin_ns) * self._tick_hz // 1_000_000_000
         record["rdt"], record["ft"] = self._number % 2**32, ticks % 2**32
-        load = np.asarray(self._load(at_ns), np.float64) - self._bias
+        load = np.asarray(felt, np.float64) - self._bias
         force = rdt.NEWTONS.get(self._units[0], 1.0)
         torque = rdt.NEWTON_METRES.get(self._units[1], 1.0)
         record["force"] = np.rint(load[:3] / force * COUNTS_PER_N)
         record["torque"] = np.rint(load[3:] / torque * COUNTS_PER_NM)
-        if self._happens(Kind.SATURATED):
+        if self._overloaded or self._happens(Kind.SATURATED):
             record["status"] = OUT_OF_RANGE
         data = record.tobytes()
         if self._happens(Kind.LOSS):

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError
+from sliplab.rigs.core.device_settings import DriverSettings
 
 Angle = Annotated[float, Field(ge=-360, le=360)]
 Filter = Literal[0, 5, 8, 18, 35, 73, 152, 326, 838]
@@ -16,10 +17,10 @@ FILTER_NUMBERS: dict[int, int] = {
 """Numbers by which the sensor's web page names its low-pass filters, by their cut-off in Hz."""
 
 
-class AtiNetFtSettings(StrictModel):
+class AtiNetFtSettings(DriverSettings):
     """An ATI Net F/T sensor (Net Box), or an Ethernet Axia, which speaks the same protocol."""
 
-    driver: Literal["ati_net_ft"]
+    driver: Literal["ati_net_ft"] = "ati_net_ft"
     host: str = Field(min_length=1)
     """Name or address of the sensor; it leaves the factory with 192.168.1.1."""
     port: int = Field(default=49152, ge=1, le=65535)

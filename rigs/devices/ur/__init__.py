@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from sliplab.rigs.core.capabilities import Arm
-from sliplab.rigs.core.driver import ArmDriver, ArmScene
+from sliplab.rigs.core.capabilities import Arm, ForceSensor, RigError
+from sliplab.rigs.core.driver import ArmDriver, ArmScene, ForceSensorDriver
 from sliplab.rigs.core.fakes import FakeController
 from sliplab.rigs.core.network import answers, arm_lock
-from sliplab.rigs.devices.ur.settings import UrSettings
+from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
 
 RTDE_PORT = 30004
 
@@ -41,4 +41,22 @@ DRIVER = ArmDriver(
     locks=arm_lock,
     build=_build,
     fake=_fake,
+)
+
+
+def _build_wrench(settings: UrWrenchSettings, arm: Arm) -> ForceSensor:
+    from sliplab.rigs.devices.ur.driver import UrArm
+    from sliplab.rigs.devices.ur.wrench import UrWrench
+
+    if not isinstance(arm, UrArm):
+        raise RigError("force sensor", "ur_wrench needs the arm of driver: ur")
+    return UrWrench(settings, arm)
+
+
+WRENCH_DRIVER = ForceSensorDriver(
+    name="ur_wrench",
+    title="Universal Robots, its own wrench",
+    settings=UrWrenchSettings,
+    ping=lambda settings: None,  # the arm is looked for already
+    build=_build_wrench,
 )

@@ -16,7 +16,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from sliplab.rigs.core.capabilities import (
@@ -32,7 +32,15 @@ from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.ur import ports
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
-from sliplab.rigs.devices.ur.rtde import OUTPUTS, Packet, RtdeError, RtdeReader, UrStatus, status_of
+from sliplab.rigs.devices.ur.rtde import (
+    OUTPUTS,
+    WRENCH,
+    Packet,
+    RtdeError,
+    RtdeReader,
+    UrStatus,
+    status_of,
+)
 from sliplab.rigs.devices.ur.settings import UrSettings
 from sliplab.storage.streams import Json
 
@@ -80,6 +88,9 @@ class UrArm(ThreadedArm):
         self._closing = False
         self._moved_ns: int | None = None
         """Host time at which the last move was sent; None once the arm is confirmed at rest."""
+        self.on_wrench: Callable[[int, int, tuple[float, ...]], None] | None = None
+        """Receives the wrench of every packet, with controller and host time, ns; set before the
+        arm is connected, otherwise the controller is not asked for it."""
         self._missing = 0
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
@@ -170,6 +181,15 @@ class UrArm(ThreadedArm):
                 raise
             self._begin(run)
 
+    def zero_force(self) -> None:
+        """Take the present load of the tool for zero; takes at most `COMMAND_S` and 3 `STILL_S`.
+
+        Raises:
+            ArmFault: the arm is not connected, or its control client is lost.
+        """
+        if not self._call("zeroFtSensor"):
+            raise self._fault(self.state(), "did not zero its force sensor")
+
     def stop(self) -> None:
         """Stop the arm over every available channel; never unlocks anything.
 
@@ -237,8 +257,9 @@ class UrArm(ThreadedArm):
 
     def _open_stream(self) -> None:
         reader = RtdeReader(self._settings.host, ANSWER_S, SILENCE_S)
+        names = OUTPUTS if self.on_wrench is None else (*OUTPUTS, WRENCH)
         try:
-            reader.open(OUTPUTS, self._settings.frequency_hz)
+            reader.open(names, self._settings.frequency_hz)
         except RtdeError as error:
             raise ArmFault(
                 "arm", f"{error}; check its power, its network and its address"
@@ -338,6 +359,8 @@ class UrArm(ThreadedArm):
         xyz_mm = (x * MM_PER_M, y * MM_PER_M, z * MM_PER_M)
         rotvec_deg = (math.degrees(a), math.degrees(b), math.degrees(c))
         self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
+        if self.on_wrench is not None:
+            self.on_wrench(status.t_ns, packet.host_ns, packet.values[-6:])
 
     def _rested(self, moved_ns: int) -> None:
         """Record that the arm is at rest after the move of `moved_ns`, if that is the last one."""

@@ -74,6 +74,9 @@ class UrProgram:
         self.remote = True
         self.runtime = Runtime.STOPPED
         self.tcp = [0.0] * 6
+        self.tool_load: Callable[[float], Sequence[float]] = lambda t_s: (0.0,) * 6
+        """Force and torque on the tool by controller time, base axes, N and N m."""
+        self._zero_load = [0.0] * 6
         self.payload_kg = 0.0
         self.uploads = 0
         self.faults = FaultPlan(faults, self.inject)
@@ -235,8 +238,12 @@ class UrProgram:
             "runtime_state": lambda _: int(self.runtime),
             "robot_mode": lambda _: 7 if self.powered else 3,
             "payload": lambda _: self.payload_kg,
+            "actual_TCP_force": self._felt,
         }
         return known.get(name, lambda _: 0)
+
+    def _felt(self, t_s: float) -> list[float]:
+        return [a - b for a, b in zip(self.tool_load(t_s), self._zero_load, strict=True)]
 
     def _velocity(self) -> list[float]:
         """Return the tool centre point's linear velocity in the last cycle, m/s."""
@@ -272,6 +279,8 @@ class UrProgram:
             # stopJ is given in rad/s^2; without joints it is treated as m/s^2
             self.motion.stop(values[0] * MM_PER_M, self._t)
             self._begin(bool(self.ints_in[1]))
+        elif command == 8:
+            self._zero_load = list(self.tool_load(self._t))
         elif command == 17:
             self.payload_kg = values[0]
         elif command == 29:

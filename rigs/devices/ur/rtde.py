@@ -182,6 +182,8 @@ OUTPUTS = (
     "output_int_register_2",
 )
 """Output fields that the driver requests, in this order."""
+WRENCH = "actual_TCP_force"
+"""Force and torque on the tool in the base's axes, N and N m; requested last, where needed."""
 _EMERGENCY = 0b1110_0000
 """System, robot and any emergency stop."""
 _PROTECTIVE = 0b111_0001_1100

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings, Positive
+from sliplab.rigs.core.device_settings import DriverSettings
 
 
 class UrSettings(BaseArmSettings):
@@ -23,3 +24,12 @@ class UrSettings(BaseArmSettings):
     """Rate of the pose stream; 500 is the controller's native rate."""
     sync_input: Annotated[int, Field(ge=0, le=17)] = 0
     """Bit of `actual_digital_input_bits` with the sync line (0 to 7: standard inputs)."""
+
+
+class UrWrenchSettings(DriverSettings):
+    """The wrench at the tool that a Universal Robots e-Series controller measures."""
+
+    driver: Literal["ur_wrench"] = "ur_wrench"
+    bias: Literal["trial", "session", "never"] = "trial"
+    """When the present load becomes zero: before every trial while the sensor is clear of the
+    plate, once when it is connected, or never."""

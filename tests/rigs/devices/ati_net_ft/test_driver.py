@@ -193,7 +193,7 @@ def test_lost_records_are_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     chunks = gather(sensor, 20)
-    fake.happen(Kind.LOSS, 7)
+    fake.inject(Kind.LOSS, 7)
     chunks += gather(sensor, 50)
     assert sensor.counts.lost == 7
     assert np.diff(times(chunks)).max() == pytest.approx(8_000_000, abs=150_000)
@@ -203,9 +203,9 @@ def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     chunks = gather(sensor, 20)
-    fake.happen(Kind.REORDER, 3)
+    fake.inject(Kind.REORDER, 3)
     chunks += gather(sensor, 50)
-    fake.happen(Kind.DUPLICATE, 2)
+    fake.inject(Kind.DUPLICATE, 2)
     chunks += gather(sensor, 50)
     assert np.all(np.diff(times(chunks)) > 0)
     assert (sensor.counts.late, sensor.counts.lost) == (5, 0)
@@ -215,7 +215,7 @@ def test_what_is_no_record_is_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     gather(sensor, 5)
-    fake.happen(Kind.MALFORMED, 2)
+    fake.inject(Kind.MALFORMED, 2)
     gather(sensor, 20)
     assert (sensor.counts.malformed, sensor.counts.lost) == (2, 2)
 
@@ -224,7 +224,7 @@ def test_silence_is_a_fault(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     gather(sensor, 5)
-    fake.happen(Kind.SILENCE)
+    fake.inject(Kind.SILENCE)
     assert "nothing came for 0.3 s" in fault_of(sensor, SILENCE_S)
     with pytest.raises(RigError, match="nothing came"):
         sensor.read()
@@ -246,7 +246,7 @@ def test_a_saturated_sensor_is_a_fault(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     gather(sensor, 5)
-    fake.happen(Kind.SATURATED)
+    fake.inject(Kind.SATURATED)
     assert "0xC0000000: force or torque out of range" in fault_of(sensor, 0.5)
 
 
@@ -254,7 +254,7 @@ def test_a_sensor_that_begins_anew_is_a_fault(make: Make) -> None:
     sensor, fake = make(wire={"ticks": 10**6})
     sensor.start()
     gather(sensor, 5)
-    fake.happen(Kind.RESTART)
+    fake.inject(Kind.RESTART)
     assert "it began anew" in fault_of(sensor, 0.5)
 
 
@@ -269,7 +269,7 @@ def test_a_sensor_that_is_not_there_is_named_within_its_bound(make: Make) -> Non
 
 def test_a_page_that_answers_without_records_is_named(make: Make) -> None:
     sensor, fake = make(connected=False)
-    fake.happen(Kind.SILENCE)
+    fake.inject(Kind.SILENCE)
     begin = time.monotonic()
     with pytest.raises(RigError, match=r"no record from .*: none within 0.6 s"):
         sensor.connect()
@@ -278,7 +278,7 @@ def test_a_page_that_answers_without_records_is_named(make: Make) -> None:
 
 def test_a_saturated_sensor_does_not_connect(make: Make) -> None:
     sensor, fake = make(connected=False)
-    fake.happen(Kind.SATURATED)
+    fake.inject(Kind.SATURATED)
     with pytest.raises(RigError, match="out of range; take the load off"):
         sensor.connect()
 

@@ -169,7 +169,7 @@ def _answers(host: str) -> bool:
         return False
 
 
-@pytest.mark.parametrize("call", ["speedL([0.01, 0, 0, 0, 0, 0], 0.1, 0.1)", "zeroFtSensor()"])
+@pytest.mark.parametrize("call", ["speedL([0.01, 0, 0, 0, 0, 0], 0.1, 0.1)", "forceModeStop()"])
 def test_a_command_that_is_not_simulated_fails(robot: FakeUr, call: str) -> None:
     found = client(
         robot,
