@@ -118,7 +118,7 @@ def _made_from_these(source: _Source) -> bool:
         return False
 
 
-def _look_at(samples: dict[str, SampleSet]) -> SampleSet:
+def _first_set(samples: dict[str, SampleSet]) -> SampleSet:
     """Return the samples that figures are measured on: those of test trials, else any others."""
     for split in reversed(SPLITS):
         if len(samples[split]):
@@ -281,7 +281,7 @@ def export_files(
     files: dict[str, bytes | str] = {}
     made_from_these = _made_from_these(source)
     samples = {split: load_samples(source.labels, campaigns, split) for split in SPLITS}
-    seen = _look_at(samples)
+    seen = _first_set(samples)
     advance("windows")
     checks = 0
     if checked is not None:

@@ -256,7 +256,7 @@ def _list(
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state
-    both, asked, nowhere = polarity == 2, polarity == 1, plane.size - 1
+    both, wanted, dummy = polarity == 2, polarity == 1, plane.size - 1
     e = 0
     for n in range(starts.size):
         end = starts[n]
@@ -269,8 +269,8 @@ def _list(
                 i += 1
                 # half of the events have the other polarity, unpredictable for the processor:
                 # they are written to a dummy last cell, without a branch
-                selected = (column >= 0) & (row >= 0) & (both | (positive == asked))
-                place = ((both & positive) * cells + row) * cells + column if selected else nowhere
+                selected = (column >= 0) & (row >= 0) & (both | (positive == wanted))
+                place = ((both & positive) * cells + row) * cells + column if selected else dummy
                 found = plane[place]
                 touched[m] = place
                 m += (found == 0) & selected

@@ -232,7 +232,7 @@ def teach_plane(
     if by is By.HAND:
         command.run([], yes, dry_run, steps.teach_plane_by_hand, "a person jogs the arm")
         return
-    creep = _creep(speed, search, clearance)
+    creep = _creep_settings(speed, search, clearance)
     steps.check_touches(command.file, "plane", span, creep)
     places = list(steps.plane_places(span).items())
     moves = steps.planned_touches(places, creep)
@@ -263,7 +263,7 @@ def teach_zero(
     from sliplab.flows.calibrating.measurement import Measurement
 
     command = Measurement(rig, out, "zero", as_json)
-    creep = _creep(speed, search, clearance)
+    creep = _creep_settings(speed, search, clearance)
     steps.check_touches(command.file, "zero", 0.0, creep)
     both = by is ZeroBy.BOTH
     moves = steps.planned_zero(creep, both)
@@ -388,7 +388,7 @@ def calibrate_board(
     console.say("print at 100 %, measure the ruler, and fix the sheet to something flat")
 
 
-def _creep(speed: float, search: float, clearance: float) -> Creep:
+def _creep_settings(speed: float, search: float, clearance: float) -> Creep:
     from sliplab.rigs.core.teaching import Creep
 
     return Creep(speed, search, clearance)

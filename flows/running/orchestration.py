@@ -161,8 +161,8 @@ class ServerLink:
         with SyncClientContext(httpx_settings={"event_hooks": hooks}) as context:
             yield context.client
 
-    def lose(self, error: BaseException | str) -> None:
-        """Say once that the server does not answer."""
+    def mark_lost(self, error: BaseException | str) -> None:
+        """Record that the server is unreachable, and warn once."""
         if self.server not in _lost_servers:
             _lost_servers.add(self.server)
             name = "" if self.server == run_records.EMBEDDED else f" {self.server}"
@@ -211,7 +211,7 @@ def is_unreachable() -> bool:
 def report_unreachable(reason: str) -> None:
     """Say that the server of the flow that runs now does not answer."""
     if _link is not None:
-        _link.lose(reason)
+        _link.mark_lost(reason)
 
 
 def work_is_over() -> None:
@@ -308,7 +308,7 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
                     f"the Prefect server {link.server}, to which the workers of --dask report, "
                     f"does not answer ({reason_of(error)})"
                 ) from error
-            link.lose(str(error) if isinstance(error, ServerError) else error)
+            link.mark_lost(str(error) if isinstance(error, ServerError) else error)
             return _without_server(work, argument)
         return _reported(flow, flow_run, argument, work, link, cluster)
 
@@ -342,11 +342,11 @@ def _reported(
         delivered = True
     except Exception as error:
         if not work.started:
-            link.lose(error)
+            link.mark_lost(error)
             with suppress(BaseException):  # it is kept, and raised below
                 _without_server(work, argument)
         elif not (delivered := error is work.error):
-            link.lose(error)
+            link.mark_lost(error)
     except BaseException as error:  # Ctrl-C, during the work or while its end was reported
         interrupted = error
         delivered = error is work.error

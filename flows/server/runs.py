@@ -77,7 +77,7 @@ class ServedRuns:
     async def _look(self, client: Any, threads: ThreadPoolExecutor) -> None:
         """See how the run on the rig is, and begin what is due."""
         if self._process is not None:
-            await self._see_to(client)
+            await self._supervise(client)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
         due = await client.get_scheduled_flow_runs_for_deployments(
             [*self._on_rig, *self._control], scheduled_before=datetime.now(UTC)
@@ -104,7 +104,7 @@ class ServedRuns:
             *command, self._on_rig[run.deployment_id].name, start_new_session=True
         )
 
-    async def _see_to(self, client: Any) -> None:
+    async def _supervise(self, client: Any) -> None:
         """Stop the run on the rig if the page cancels it; once it has ended, close it."""
         assert self._process is not None
         state = (await client.read_flow_run(self._run.id)).state
@@ -180,7 +180,7 @@ def _carry_out(run_id: str, flow_name: str) -> None:
         except (Abort, Pause):
             pass  # the server said so
         except Exception as error:
-            link.lose(error)
+            link.mark_lost(error)
             if (kept := run_records.end_of(here.folder, run_id)) is not None:
                 run_records.record_undelivered_end(
                     here.folder, run_id, kept["state"], kept["message"]

@@ -47,7 +47,7 @@ class Request(Entry):
         return {**{name: getattr(self, name) for name in names}, "request": self.number}
 
     def __str__(self) -> str:
-        return self._told(self.kind)
+        return self._summary(self.kind)
 
 
 def ask(

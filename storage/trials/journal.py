@@ -34,7 +34,7 @@ class Entry:
     why: str = ""
     host: str = ""
 
-    def _told(self, what: str) -> str:
+    def _summary(self, what: str) -> str:
         why = f" ({self.why})" if self.why else ""
         return f"{what} by {self.who}, {self.when}{why}"
 

@@ -77,7 +77,7 @@ class Decision(Entry):
     new: Onsets
 
     def __str__(self) -> str:
-        return self._told(self.verdict)
+        return self._summary(self.verdict)
 
 
 def decide(

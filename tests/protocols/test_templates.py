@@ -81,11 +81,11 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
     "another template": ({"template": "pull"}, "template", "must be one of disturbance, gravity"),
     "no template": ({"template": None}, "template", "must be one of"),
     "a parameter too many": ({"dept": "2 mm"}, "dept", "did you mean 'depth'?"),
-    "a wrong unit": ({"distance": "9 kg"}, "distance", "where one of these belongs: mm"),
+    "a wrong unit": ({"distance": "9 kg"}, "distance", "must be one of: mm"),
     "no unit": ({"distance": 9}, "distance", "has no unit"),
     "out of range": ({"press": "-1 mm/s"}, "press", "must be more than 0 mm/s"),
     "over a limit": ({"depth": "4 mm", "speed": "$depth2"}, "speed", "unknown factor $depth2"),
-    "too fast": ({"travel": "51 mm/s"}, "travel", "is over collection.limits.speed"),
+    "too fast": ({"travel": "51 mm/s"}, "travel", "exceeds collection.limits.speed"),
 }  # fmt: skip
 
 
@@ -179,7 +179,7 @@ def change_move(place: int, **change: Any) -> dict[str, Any]:
         (1, {"to": {"depth": "-21 mm"}}, "collection.motion[1].to.depth", "limits.clearance"),
         (4, {"by": {"x": "14 mm"}}, "collection.motion", "limits.workspace.x"),
         (4, {"by": {"depth": "1 mm"}}, "collection.motion", "limits.depth"),
-        (4, {"by": {"x": "1 kg"}}, "collection.motion[4].by.x", "belongs: mm"),
+        (4, {"by": {"x": "1 kg"}}, "collection.motion[4].by.x", "must be one of: mm"),
     ],
 )
 def test_a_wrong_move_is_named(

@@ -87,8 +87,8 @@ def test_a_lost_server_gets_one_limited_request_tried_twice(
             client.send(end)
     assert limits == [BEGIN_S, BEGIN_S, LOST_S, END_S, LOST_S]
     assert not orchestration.is_unreachable()
-    link.lose("nothing came")
-    link.lose("nothing came")
+    link.mark_lost("nothing came")
+    link.mark_lost("nothing came")
     assert orchestration.is_unreachable()
 
 
