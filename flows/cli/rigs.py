@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import typer
 
@@ -86,7 +86,7 @@ def rigs(
     if as_json:
         console.print_json({"rigs": found})
     else:
-        rows = [[str(item[name]) for name in COLUMNS] for item in found]
+        rows = [[str(cell) for name, cell in item.items() if name in COLUMNS] for item in found]
         console.print_table("rigs", [*COLUMNS.values()], rows)
     if any(item["wrong"] for item in found):
         raise typer.Exit(console.FAILED)
@@ -122,7 +122,26 @@ def _list_drivers(as_json: bool) -> None:
         raise typer.Exit(console.FAILED)
 
 
-def _about(path: Path, ask: bool) -> dict[str, Any]:
+class RigRow(TypedDict):
+    """A rig file as `sliplab rigs --json` lists it.
+
+    Attributes:
+        answer: whether the devices respond, in words, or why the file cannot be read.
+        silent: by device, why it does not respond.
+    """
+
+    name: str
+    driver: str
+    arm: str
+    cameras: str
+    answer: str
+    wrong: bool
+    simulated: NotRequired[bool]
+    silent: NotRequired[dict[str, str]]
+    file: str
+
+
+def _about(path: Path, ask: bool) -> RigRow:
     """Describe one rig file."""
     from sliplab.rigs.rig_file import load_rig_file
     from sliplab.storage.errors import masked
@@ -131,8 +150,10 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
         file, _ = load_rig_file(path)
     except InputError as error:
         text = masked(str(error))
-        known = dict.fromkeys(COLUMNS, "")
-        return {**known, "name": path.name, "answer": text, "wrong": True, "file": str(path)}
+        return {
+            "name": path.name, "driver": "", "arm": "", "cameras": "", "answer": text,
+            "wrong": True, "file": str(path),
+        }  # fmt: skip
     answers = _ask(file) if ask and file.driver == "devices" else {}
     silent = {name: masked(why) for name, why in answers.items() if why is not None}
     return {

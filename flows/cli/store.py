@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -306,7 +307,7 @@ def _chosen(store: Store, names: list[str] | None) -> list[Campaign]:
     return [there[name] for name in (names or there)]
 
 
-def _collects(holder: dict[str, Any] | None) -> bool:
+def _collects(holder: Mapping[str, object] | None) -> bool:
     return bool(holder and holder.get("collects"))
 
 

@@ -84,7 +84,7 @@ def rerun() -> ModuleType:
     return found
 
 
-def save(subject: Subject, path: Path) -> dict[str, Any]:
+def save(subject: Subject, path: Path) -> dict[str, int]:
     """Write a trial as an .rrd file, complete or not at all.
 
     Returns:
