@@ -88,7 +88,7 @@ def disk_error(folder: Path, error: BaseException) -> StoreError | None:
         fault += f" ({shutil.disk_usage(there).free / 1e9:.1f} GB free)"
         todo = "make room"
     return StoreError(
-        f"{folder}: its disk {fault}: {todo}, then run the same command to go on; every "
+        f"{folder}: its disk {fault}: {todo}, then run the same command to resume; every "
         "committed trial is kept"
     )
 

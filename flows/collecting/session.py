@@ -536,7 +536,7 @@ class TrialGate:
                 raise CampaignStopped(
                     f"{self._store.folder} was paused ({request}) for "
                     f"{console.duration(PAUSE_LIMIT_S)} and nobody resumed it: `sliplab resume "
-                    f"{self._store.folder}`, then run the same command to go on"
+                    f"{self._store.folder}`, then run the same command to resume"
                 )
             self.wait(LOOK_S)
             waited += LOOK_S

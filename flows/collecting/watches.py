@@ -69,7 +69,7 @@ class DiskWatch:
             raise CampaignStopped(
                 f"{self._run_request.store}: stopped, the disk is nearly full: {size(free)} are "
                 f"free, the next trial needs {size(needed)} ({known}) and {size(RESERVE)} stay in "
-                "reserve; make room, then run the same command to go on. Every committed trial "
+                "reserve; make room, then run the same command to resume. Every committed trial "
                 "is kept"
             )
 

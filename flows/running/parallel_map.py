@@ -78,7 +78,7 @@ def parallel_map(
         except BrokenProcessPool:
             raise WorkerKilled(
                 f"{name}: a worker process was killed, perhaps because memory was short; what was "
-                "made is kept; run the same command to go on"
+                "made is kept; run the same command to resume"
             ) from None
         except BaseException:
             for worker in active_children():

@@ -225,7 +225,7 @@ class _Push:
         else:
             raise RemoteError(
                 f"{self.remote.where(key)}: reads back different from what was sent; see to "
-                "the storage, then run the same command to go on"
+                "the storage, then run the same command to resume"
             )
         self.sizes[sha] = size
         self.trusted.add(sha)
