@@ -244,7 +244,7 @@ class SyncBox(Protocol):
 
 @dataclass(frozen=True)
 class Mounting:
-    """How a force sensor's axes, and the direction of its load, follow from the plate's."""
+    """Orientation of a force sensor's axes, and the sign of its load, relative to the plate."""
 
     axes: Literal["plate", "base"] = "plate"
     """The frame that `rotvec_deg` turns to: the plate's axes (x right, y up, z into the plate),

@@ -1,4 +1,4 @@
-"""Settings that every device of a kind has in a rig file, whatever its make; cheap to import."""
+"""Settings common to all devices of a kind, of any make; cheap to import."""
 
 from __future__ import annotations
 

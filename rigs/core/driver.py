@@ -1,9 +1,9 @@
-"""Driver: all that SlipLab knows of a kind of device, as the device's own folder declares it.
+"""Driver declarations: everything that SlipLab knows about a type of device.
 
-One declaration a device: which settings a rig file gives it, how it is made and looked for, what
-only one program may use at a time, and the fake that stands in for it on a loopback rig. Nothing
-outside the device's folder knows it by name (`rigs.core.registry` finds it). Declarations are cheap
-to import: a maker's library is loaded when a device is made, not when a rig file is read.
+Each device's folder has one declaration: its settings in a rig file, how it is built and pinged,
+which resources need a lock, and its fake on a loopback rig. Nothing outside the folder refers to
+the device by name (`rigs.core.registry` finds it). Declarations are cheap to import: a vendor
+library is loaded when a device is built, not when a rig file is read.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _no_address(settings: Any) -> str:
 
 @dataclass(frozen=True)
 class Driver(Generic[SettingsT]):
-    """The declaration of one kind of device. `name` is what a rig file writes as `driver:`."""
+    """The declaration of one type of device. `name` is the value of `driver:` in rig files."""
 
     kind: ClassVar[str]
     """``arm``, ``event camera``, ``frame camera``, ``sync box`` or ``force sensor``."""
@@ -43,29 +43,29 @@ class Driver(Generic[SettingsT]):
     settings: type[SettingsT]
     """Keys that a rig file may write; field `driver` is a `Literal` of `name`."""
     ping: Callable[[SettingsT], str | None]
-    """Look whether the device can be reached, within seconds and without taking control of it.
+    """Check within seconds that the device can be reached, without taking control of it.
 
-    Returns None if it can, else why not and what to check. May raise RigError.
+    Returns None if it can, else the reason and what to check. May raise RigError.
     """
     libraries: tuple[str, ...] = ()
-    """Modules of the maker's library, for the message where they are not installed."""
+    """Modules of the vendor library, which are checked before a device is built."""
     address: Callable[[SettingsT], str] = _no_address
     """Address for people, such as a host name; empty where there is none to show."""
     locks: Callable[[SettingsT], dict[str, str]] = field(default=_no_locks)
-    """What one program at a time may use: a name for it (``arm-192.168.0.9``), and in words."""
+    """Resources for one program at a time: lock name (``arm-192.168.0.9``) and description."""
 
 
 @dataclass(frozen=True)
 class ArmScene:
-    """What the fake of an arm shows on a loopback rig."""
+    """The part of a simulated scene that the fake of an arm needs on a loopback rig."""
 
     motion: StraightMotion
-    """Where the tool centre point is."""
+    """Motion of the tool centre point."""
     clock: ControllerClock
     sync: Callable[[float], bool]
     """Level of the sync line at a time of the controller's clock, s."""
     reach_mm: float
-    """How far from its base the fake moves: the rig file's limits are the driver's to hold."""
+    """Reach of the fake from its base; the driver enforces the rig file's limits."""
 
 
 @dataclass(frozen=True)
@@ -76,24 +76,24 @@ class ArmDriver(Driver[ArmSettingsT]):
     build: Callable[[ArmSettingsT], Arm] = field(kw_only=True)
     """Make the device, not connected yet."""
     fake: Callable[[ArmSettingsT, ArmScene], FakeController] | None = None
-    """Make a fake controller, not started yet; None: no loopback rig can have this arm."""
+    """Build a fake controller, not started yet; None: not available on a loopback rig."""
 
 
 class FakeEventCamera(Protocol):
-    """An event camera on a wire, that sends what a simulated scene shows."""
+    """A fake event camera that sends the events of a simulated scene."""
 
     @property
     def address(self) -> Any:
-        """Where the driver finds it, for `EventCameraDriver.reach`; it can be pickled."""
+        """Address for the driver, used by `EventCameraDriver.reach`; it can be pickled."""
 
     def send(self, chunk: EventChunk, pulses: PulseChunk) -> None:
-        """Send events, and rising edges of its input; nothing while it is stalled."""
+        """Send events and rising edges of the input; nothing while stalled."""
 
     def stall(self) -> None:
-        """Send nothing from now on; the connection stays."""
+        """Stop sending; the connection stays open."""
 
     def close(self) -> None:
-        """Unplug it: connections break. Any number of times."""
+        """Break the connections, as an unplugged cable would; safe to call more than once."""
 
 
 @dataclass(frozen=True)
@@ -104,19 +104,19 @@ class EventCameraDriver(Driver[SettingsT]):
     build: Callable[[SettingsT], EventCamera] = field(kw_only=True)
     """Open the device, not streaming yet. Raises RigError."""
     fake: Callable[[tuple[int, int]], FakeEventCamera] | None = None
-    """Make a fake of so many columns and rows."""
+    """Build a fake with the given numbers of columns and rows."""
     reach: Callable[[SettingsT, Any], SettingsT] | None = None
     """Return settings that reach a fake at an address."""
 
 
 class SceneFrames(Protocol):
-    """The frames of a simulated scene that runs elsewhere."""
+    """The frames of a simulated scene in another process."""
 
     on_frames: Callable[[FrameChunk], None]
-    """Is given every chunk of frames, in a thread."""
+    """Called in a thread with every chunk of frames."""
 
     def grab(self, width_px: int, height_px: int) -> None:
-        """Begin to expose a centred region."""
+        """Start to expose a centred region."""
 
     def stop_grabbing(self) -> None:
         """Stop; an empty chunk ends the frames."""
@@ -128,7 +128,7 @@ class FrameCameraDriver(Driver[SettingsT]):
 
     kind = "frame camera"
     build: Callable[[SettingsT, float], FrameCamera] = field(kw_only=True)
-    """Open the device, not grabbing yet; of so many pixels a millimetre. Raises RigError."""
+    """Open the device, not grabbing yet, with its scale in px per mm. Raises RigError."""
     fake: Callable[[SettingsT, float, SceneFrames, int], FrameCamera] | None = None
     """Open the driver on frames of a scene: settings, px per mm, frames, half the exposure (ns)."""
 

@@ -1,4 +1,4 @@
-"""Devices on the network: whether somebody answers at a port, and the lock of an arm."""
+"""Devices on the network: a check that a port answers, and the lock of an arm."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import socket
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 
 ANSWER_S = 1.0
-"""Time limit of a connection, s."""
+"""Timeout of a connection, s."""
 
 
 def answers(host: str, port: int) -> str | None:
-    """Return None if somebody takes a TCP connection at a port within `ANSWER_S`, else why not."""
+    """Return None if a port accepts a TCP connection within `ANSWER_S`, else the reason."""
     try:
         with socket.create_connection((host, port), ANSWER_S):
             return None

@@ -1,12 +1,12 @@
-"""Registry of drivers: those that ship with SlipLab, and those that other packages bring.
+"""Registry of drivers: those shipped with SlipLab, and those of other packages.
 
-A package brings drivers by entry points of the group `sliplab.drivers`:
+A package provides drivers by entry points of the group `sliplab.drivers`:
 
     [project.entry-points."sliplab.drivers"]
     my_arm = "my_package.my_arm:DRIVER"
 
-Until a rig file names a driver only the metadata of installed packages is read. A package that
-cannot be imported spoils no other one: it is named, with the reason, where its driver is asked for.
+Until a rig file names a driver, only the metadata of installed packages is read. A package that
+cannot be imported does not affect others; the error is reported when its driver is requested.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ BUILT_IN = {
 
 
 class DriverError(Exception):
-    """A driver that is not installed, or a package whose driver cannot be used."""
+    """A driver that is not installed, or cannot be used."""
 
 
 @dataclass(frozen=True)
 class Listed:
-    """A driver by its metadata; nothing of it is imported."""
+    """A driver's metadata, without importing it."""
 
     name: str
     place: str
     """Module and attribute, such as ``my_package.my_arm:DRIVER``."""
     package: str
-    """Distribution that brings it, and its version."""
+    """Distribution that provides it, and its version."""
 
 
 @cache
@@ -54,7 +54,7 @@ def listed() -> dict[str, Listed]:
     """Return every installed driver by name, those that ship first."""
     found = {name: Listed(name, place, "sliplab") for name, place in BUILT_IN.items()}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, _package(point))):
-        if point.name not in found:  # the name of a driver that ships is not for others to take
+        if point.name not in found:  # another package cannot replace a shipped driver
             found[point.name] = Listed(point.name, point.value, _package(point))
     return found
 
@@ -64,7 +64,7 @@ def _package(point: EntryPoint) -> str:
 
 
 def taken() -> list[str]:
-    """Return a line for every entry point whose name another driver has already."""
+    """Return a message for every entry point whose name is already taken."""
     known = listed()
     return [
         f"{point.name} of {_package(point)} is not used: {known[point.name].package} has a driver "
@@ -75,10 +75,10 @@ def taken() -> list[str]:
 
 
 def find_driver(name: str, kind: str) -> Driver[Any]:
-    """Return a driver by name, importing the package that brings it.
+    """Return a driver by name, importing the package that provides it.
 
     Raises:
-        DriverError: no package brings it, it cannot be imported, or it is of another kind.
+        DriverError: no package provides it, it cannot be imported, or it is of another kind.
     """
     known = listed()
     if name not in known:
@@ -107,12 +107,12 @@ def load_driver(item: Listed) -> Driver[Any]:
     """Import the driver that an entry point names.
 
     Raises:
-        DriverError: its module raises an error, or holds no driver of that name there.
+        DriverError: its module raises an error, or has no driver of that name.
     """
     module, _, attribute = item.place.partition(":")
     try:
         driver = getattr(import_module(module), attribute)
-    except Exception as error:  # a package of somebody else's may raise anything
+    except Exception as error:  # a third-party package may raise anything
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise DriverError(f"{item.name} of {item.package} cannot be imported: {reason}") from None
     if not isinstance(driver, Driver):
@@ -125,7 +125,7 @@ def load_driver(item: Listed) -> Driver[Any]:
 
 
 def drivers(kind: str) -> Iterator[Driver[Any]]:
-    """Every driver of a kind that can be imported, those that ship first."""
+    """Iterate over the importable drivers of a kind, shipped ones first."""
     for item in listed().values():
         try:
             driver = load_driver(item)

@@ -1,7 +1,7 @@
 """The devices of a real rig in its rig file: the driver of each, and how to reach it.
 
-The driver that a device names has the rest of its keys (`rigs.core.registry`). Cheap to import:
-`sliplab plan` reads rig files, and no maker's library is needed for that.
+A device's driver defines its other keys (`rigs.core.registry`). Cheap to import:
+`sliplab plan` reads rig files without any vendor library.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ register_tags_of("source", "usb", "network")
 
 
 class _OfKind:
-    """Settings of any installed driver of a kind: `driver` says which model checks the others."""
+    """Settings of any installed driver of a kind; `driver` selects the model of the other keys."""
 
     def __init__(self, kind: str, default: str | None = None) -> None:
         self._kind, self._default = kind, default
@@ -92,14 +92,14 @@ class DeviceSettings(StrictModel):
     frame_camera: Annotated[FrameCameraSettings, _OfKind("frame camera", "basler")] | None = None
     """Left out where the rig's `cameras` has no `frames`."""
     sync_box: Annotated[DriverSettings, _OfKind("sync box", "sync_box")] | None = None
-    """Needed by a real rig; a loopback rig brings its own."""
+    """Required by a real rig; a loopback rig has its own."""
     force_sensor: Annotated[DriverSettings, _OfKind("force sensor")] | None = None
-    """Left out, the rig has none."""
+    """If left out, the rig has no force sensor."""
     plate: OperatedPlate | None = None
     """If left out, the rig has no sliding plate, and supports only kinematic protocols."""
 
     def drivers(self) -> Iterator[tuple[Driver[Any], DriverSettings]]:
-        """The driver of every device, with its settings, the arm first."""
+        """Iterate over the driver and settings of every device, the arm first."""
         for kind in ("arm", "event camera", "frame camera", "sync box", "force sensor"):
             settings = getattr(self, kind.replace(" ", "_"))
             if settings is not None:

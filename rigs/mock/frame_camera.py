@@ -1,9 +1,9 @@
-"""The simulated frame camera: pictures or tracks on every tick, on its own clock, and losses.
+"""The simulated frame camera: images or tracks on every tick, on its own clock, and losses.
 
-Ticks are the sync box's, or the camera's own where it runs by itself.
+Ticks are the sync box's, or the camera's own in free run.
 
-At the level `tracks` no picture is drawn: every frame gives the places that tracking its picture
-would have found, with the noise that was measured there. Times, numbers and sync bits are the same.
+At the level `tracks` no image is rendered: every frame has the marker positions that tracking its
+image would give, with the measured tracking noise. Times, numbers and sync bits are the same.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 _NOISE_FRAMES = 256
-"""Frames whose centroid noise is drawn together."""
+"""Number of frames whose centroid noise is drawn at once."""
 
 
 class MockFrameCamera:
     """The camera that looks through the plate.
 
     Args:
-        trigger: what starts its exposures, the sync box or the camera itself.
-        grade: how its frames' times are known; only `host arrival` changes what it says.
+        trigger: source of its exposures, the sync box or the camera itself.
+        grade: grade of its time stamps; only `host arrival` changes them.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class MockFrameCamera:
         settings = world.settings.frame_camera
         self.px_per_mm, self.rate_hz = settings.px_per_mm, settings.rate_hz
         self.mid_exposure_ns = settings.exposure_us * 500
-        """From the start of an exposure, which is its tick, to its middle."""
+        """Time from the start of an exposure, which is its tick, to its middle."""
         self._size = (settings.width, settings.height)
         self._view: PlateView | None = None
         self._shown: tuple[tuple[BoardPlace, tuple[int, int]], U8] | None = None
@@ -79,14 +79,14 @@ class MockFrameCamera:
         self._noise: tuple[int, F64] | None = None
 
     def set_region(self, width_px: int, height_px: int) -> None:
-        """Read out a centred region only.
+        """Read out only a centred region.
 
         Raises:
-            RigError: while grabbing, or a region that does not fit the sensor.
+            RigError: the camera is grabbing, or the region exceeds the sensor.
         """
         settings = self._world.settings.frame_camera
         if self._running:
-            raise RigError("frame camera", "the region cannot change while it grabs; stop first")
+            raise RigError("frame camera", "the region cannot change while grabbing; stop first")
         if not (1 <= width_px <= settings.width and 1 <= height_px <= settings.height):
             raise RigError(
                 "frame camera",
@@ -97,7 +97,7 @@ class MockFrameCamera:
             self._size, self._view = (width_px, height_px), None
 
     def start(self) -> None:
-        """Begin to grab, on the sync box's ticks or its own."""
+        """Start grabbing, on the sync box's ticks or its own."""
         if isinstance(self._trigger, FreeRun):
             self._trigger.start()
         self._run, self._number = self._trigger.run, 0
@@ -105,7 +105,7 @@ class MockFrameCamera:
         self._running, self._until_ns = True, NEVER
 
     def read(self) -> FrameChunk:
-        """Frames since the last call whose read-out is over."""
+        """Return the frames since the last call whose read-out is complete."""
         world, trigger, settings = self._world, self._trigger, self._world.settings.frame_camera
         world.advance()
         if trigger.run != self._run:
@@ -118,7 +118,7 @@ class MockFrameCamera:
             ticks = ticks[:0]
         true = trigger.true_ns(ticks) if len(ticks) else ticks
         host = self._faults.arrival_ns(ticks, true + after_ns) + self._late.ns(ticks)
-        # in order: a frame that is late holds up the next one
+        # in order: a late frame delays the next one
         host = np.maximum(np.maximum.accumulate(host), self._arrived_ns)
         host = host[host <= world.now_ns]
         ticks = ticks[: len(host)]
@@ -152,7 +152,7 @@ class MockFrameCamera:
         return FrameChunk(images, number, stamp, host, sync)
 
     def read_clock(self) -> ClockReads:
-        """The camera's clock now: one row."""
+        """Read the camera's clock: one row."""
         return self._clock_reader.read(self._world.clocks.frame_camera)
 
     def stop(self) -> None:
@@ -163,15 +163,15 @@ class MockFrameCamera:
             self._running, self._until_ns = False, self._world.now_ns
 
     def close(self) -> None:
-        """Give the device back."""
+        """Close the device."""
         self.stop()
 
     def _tracks(self, view: PlateView, seen: Exposures, number: I64) -> tuple[F32, F32 | None]:
-        """Return what tracking the pictures of `seen` would give: markers and the plate."""
+        """Return the result of tracking the images of `seen`: markers and the plate."""
         settings = self._world.settings.frame_camera
         noise = self._centroid_noise(number)
         markers = view.centre_px(seen.tips_mm)
-        # as the tracker does it: a marker cut by the picture's edge is not measured
+        # like the tracker: a marker cut off by the image's edge is not measured
         _blank_cut(markers, view.radius_px(seen.tips_mm) + 1.0, *self._size)
         markers += settings.centroid_noise_px * noise[:, 1:]
         if not self._world.plate_marked:
@@ -183,7 +183,7 @@ class MockFrameCamera:
         return markers.astype(np.float32), plate.astype(np.float32)
 
     def _board(self, place: BoardPlace) -> U8:
-        """The board that is held before the camera; it hides what is behind it."""
+        """Return the image of the board in front of the camera, which hides the scene."""
         if self._shown is None or self._shown[0] != (place, self._size):
             optics = self._world.settings.frame_camera
             camera = BoardCamera(
@@ -201,7 +201,7 @@ class MockFrameCamera:
         things = 1 + len(self._world.skin)
         result = np.empty((len(number), things, 2))
         blocks, inside = np.divmod(number, _NOISE_FRAMES)
-        # numbers rise: what is of one block stands together
+        # numbers increase, so those of one block are contiguous
         edges = [0, *(np.flatnonzero(np.diff(blocks)) + 1).tolist(), len(number)]
         for first, last in itertools.pairwise(edges if len(number) else ()):
             block = int(blocks[first])
@@ -244,17 +244,17 @@ def _optics(settings: MockSettings) -> FrameOptics:
 Mask = npt.NDArray[np.bool_]
 
 OUT_OF_SIGHT_MM = 500.0
-"""Beside or below the plate's centre: where a marker is put that nobody can see."""
+"""Distance beside or below the plate's centre at which hidden markers are placed."""
 
 
 class FrameFaults:
-    """The frame camera's share in the faults of whatever trial runs."""
+    """The current trial's faults of the frame camera."""
 
     def __init__(self, world: World, trigger: Ticks) -> None:
         self._world, self._trigger = world, trigger
 
     def lost(self, ticks: I64) -> Mask:
-        """Return which frames never reach the host, (k,) for the frames on k ticks."""
+        """Return a mask of the frames that never reach the host, (k,) for k ticks."""
         lost = np.zeros(len(ticks), np.bool_)
         if not len(ticks):
             return lost
@@ -268,11 +268,11 @@ class FrameFaults:
         return lost
 
     def arrival_ns(self, ticks: I64, on_time_ns: I64) -> I64:
-        """Return when frames reach the host, ns, in order: one waits for the other.
+        """Return the arrival times of frames, ns; a late frame delays the following ones.
 
         Args:
-            ticks: (k,), rising.
-            on_time_ns: (k,), when they would come without any fault.
+            ticks: (k,), increasing.
+            on_time_ns: (k,), arrival times without faults.
         """
         arrival = on_time_ns
         for fault, begin_ns, _ in self._world.faults.spans(FrameLate):
@@ -280,7 +280,7 @@ class FrameFaults:
             after = ticks >= first
             if after.any():
                 last_late = np.minimum(ticks[after], first + fault.count - 1)
-                # on time they come a fixed while after their ticks
+                # without faults the delay after a tick is constant
                 early = self._trigger.true_ns(ticks[after]) - self._trigger.true_ns(last_late)
                 late = on_time_ns[after] - early + round(fault.seconds * 1e9)
                 arrival = arrival.copy()
@@ -288,9 +288,9 @@ class FrameFaults:
         return arrival
 
     def hide(self, mid_ns: I64, seen: Exposures) -> Exposures:
-        """Return what k exposures about `mid_ns` see: hidden markers are moved out of the picture.
+        """Return k exposures around `mid_ns` with hidden markers moved out of the image.
 
-        A torn papilla has no white spot any more, and an occluded marker none for a while.
+        A torn papilla has lost its marker; an occluded marker is hidden for some time.
         """
         hidden: list[tuple[int | None, Mask]] = [
             (papilla, mid_ns >= due_ns) for papilla, due_ns in self._world.faults.torn()

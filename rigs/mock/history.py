@@ -1,4 +1,4 @@
-"""Rows of a simulated state and their times, kept as long as somebody needs them."""
+"""A growing table of simulated states and their times, whose oldest rows can be dropped."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ I64 = npt.NDArray[np.int64]
 
 
 _ROOM = 1 << 15
-"""Rows at first: few trials need more, and growing copies them all. What is not written to takes no
+"""Initial capacity: few trials need more, and growing copies all rows. Unwritten rows take no
 memory."""
 _FEW = 512
 
 
 class History:
-    """A growing table of rows at rising times; it is never asked before it has a row."""
+    """A growing table of rows at increasing times; add a row before reading."""
 
     def __init__(self, width: int) -> None:
         self._length = 0
@@ -35,7 +35,7 @@ class History:
         return int(self._t_ns[self._length - 1])
 
     def grow(self, t_ns: I64) -> F64:
-        """Room for rows at times after the last one, to be filled by the caller, (k, width)."""
+        """Append rows at later times and return them for the caller to fill, (k, width)."""
         n = len(t_ns)
         if self._length + n > len(self._rows):
             size = max(2 * len(self._rows), self._length + n)
@@ -48,12 +48,12 @@ class History:
         return self._rows[self._length - n : self._length]
 
     def shrink(self, n: int, end_ns: int) -> None:
-        """Take back the last `n` rows of room; the row before them ends at `end_ns`."""
+        """Remove the last `n` rows, and set the time of the row before them to `end_ns`."""
         self._length -= n
         self._t_ns[self._length - 1] = end_ns
 
     def between(self, first_ns: int, last_ns: int) -> tuple[I64, F64]:
-        """Times and rows from the last row at or before `first_ns` to the first at or after
+        """Return times and rows from the last row at or before `first_ns` to the first at or after
         `last_ns`, or to the end; views, (k,) and (k, width).
 
         Raises:
@@ -61,16 +61,16 @@ class History:
         """
         times = self._t_ns[: self._length]
         if not self._length or first_ns < times[0]:
-            raise IndexError(f"nothing is known of the time {first_ns} ns")
+            raise IndexError(f"the time {first_ns} ns lies before the kept history")
         first = int(np.searchsorted(times, first_ns, side="right")) - 1
         last = int(np.searchsorted(times, last_ns, side="left")) + 1
         return times[first:last], self._rows[first : min(last, self._length)]
 
     def at(self, t_ns: I64) -> F64:
-        """Rows at times by straight lines; after the end the last row, (k, width).
+        """Interpolate rows linearly at times; after the end the last row, (k, width).
 
         Args:
-            t_ns: (k,); none is before its first or after its last.
+            t_ns: (k,), increasing.
 
         Raises:
             IndexError: a time lies before the first row.
@@ -85,11 +85,11 @@ class History:
         return result
 
     def forget(self, before_ns: int) -> None:
-        """Drop rows that nobody needs who asks from `before_ns` on."""
+        """Drop the rows that are not needed for times from `before_ns` on."""
         times = self._t_ns[: self._length]
         drop = max(int(np.searchsorted(times, before_ns, side="right")) - 1, 0)
         kept = self._length - drop
-        # in one place while that is cheap, so that what is read next lies in the cache
+        # compact while that is cheap, so that the next reads hit the cache
         if drop > max(_FEW, kept):
             self._rows[:kept] = self._rows[drop : self._length].copy()
             self._t_ns[:kept] = times[drop:].copy()
@@ -98,7 +98,7 @@ class History:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _join(times, rows, after, t_ns, result):  # type: ignore[no-untyped-def]
-    """Rows at `t_ns`, each on the straight line to the first row not before it, into `result`."""
+    """Interpolate rows linearly at `t_ns` into `result`; `after` is the first row not before."""
     last = len(times) - 1
     for k in range(len(t_ns)):
         i = min(max(after[k], 1), last)

@@ -1,4 +1,4 @@
-"""The virtual clock, the sliding plate and the person at the simulated rig."""
+"""The virtual clock, the sliding plate and the operator of the simulated rig."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _LONGEST_S = 3600.0
 
 
 class VirtualClock:
-    """The host's clock of a simulated rig: it stands still unless somebody waits.
+    """The host's clock of a simulated rig, which advances only in `wait`.
 
-    It starts at 0 with every trial, so that host times in a recording depend on the trial alone.
+    It starts at 0 with every trial, so that host times in a recording depend only on the trial.
     """
 
     def __init__(self, world: World) -> None:
         self._world = world
 
     def now_ns(self) -> int:
-        """True nanoseconds since the trial began."""
+        """Return the true nanoseconds since the trial began."""
         return self._world.now_ns
 
     def wait(self, seconds: float) -> None:
@@ -49,7 +49,7 @@ class MockPlate:
         """Raise and hold, release over `seconds`, or catch.
 
         Raises:
-            RigError: another action, or a time that cannot be.
+            RigError: an unknown action, or an implausible time.
         """
         if action not in get_args(PlateAction) or not 0.0 <= seconds < _LONGEST_S:
             raise RigError("plate", f"'{action}' over {seconds} s is not simulated")
@@ -61,8 +61,8 @@ class MockPlate:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One thing that the operator was asked to do."""
+class OperatorRequest:
+    """One request to the operator."""
 
     task: str
     prompt: str
@@ -70,26 +70,26 @@ class Asked:
 
 
 class SimulatedOperator:
-    """A simulated person, who does at once what is asked and says so.
+    """A simulated operator, who does every request at once and confirms it.
 
-    `changeover` mounts the mass that `expected` names (``0.205 kg``), and a `condition` (another
-    skin, a temperature) is only confirmed: the scene stays; `protective_stop` clears a
-    stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before
-    the camera (`rigs.mock.operator`). What leaves no trace in the simulation is only confirmed.
+    `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
+    stop at the pendant; `jog` moves the tip to a point; `board` holds a printed board in front of
+    the camera. Tasks without an effect in the simulation, such as a `condition` (another skin, a
+    temperature), are only confirmed.
     """
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self.asked: list[Asked] = []
+        self.asked: list[OperatorRequest] = []
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """Do it, and confirm.
+        """Do the task, and confirm it.
 
         Raises:
             RigError: a changeover whose expected mass cannot be read, or a task that is not
                 simulated.
         """
-        self.asked.append(Asked(task, prompt, expected))
+        self.asked.append(OperatorRequest(task, prompt, expected))
         if task == "changeover":
             self._world.mass_kg = mass_of(expected)
         elif task == "protective_stop":
@@ -104,9 +104,9 @@ class SimulatedOperator:
 
 
 HAND_MM = 0.02
-"""Standard deviation of where a person stops, along each axis."""
+"""Standard deviation of the operator's final position, along each axis."""
 PIN_MM = (0.0, 0.0, -40.0)
-"""The point of the pin that the tip is brought to, in the plate's coordinates."""
+"""Point of the pin for pivoting, in plate coordinates."""
 _TOUCHED = {
     "centre": (0.0, 0.0), "right": (12.0, 0.0), "above": (0.0, 12.0), "check": (-9.0, -9.0),
 }  # fmt: skip
@@ -114,10 +114,10 @@ _SPEED_MM_S = 20.0
 
 
 def jog(world: World, expected: str) -> bool:
-    """Bring the tip to where `expected` says (``touched right``, ``pivot 3``); others do nothing.
+    """Move the tip as `expected` says (``touched right``, ``pivot 3``); others do nothing.
 
     Returns:
-        False where the arm is not healthy, and nobody can jog it.
+        False if the arm is not healthy, so that it cannot be jogged.
     """
     what, _, which = expected.partition(" ")
     if what == "touched" and which in _TOUCHED:
@@ -138,19 +138,19 @@ def jog(world: World, expected: str) -> bool:
 
 
 def _pivoted(world: World, number: int) -> Pose:
-    """The tip on the pin, the tool leaning another way each time."""
-    lean, way = np.radians(25.0), np.radians(100.0 * number)
-    leaning = matrix((
-        float(np.degrees(lean * np.cos(way))), float(np.degrees(lean * np.sin(way))),
+    """Return a pose with the tip on the pin, tilted in another direction for each number."""
+    tilt, azimuth = np.radians(25.0), np.radians(100.0 * number)
+    tilted = matrix((
+        float(np.degrees(tilt * np.cos(azimuth))), float(np.degrees(tilt * np.sin(azimuth))),
         15.0 * (number % 3 - 1),
     ))  # fmt: skip
-    tool = world.plane.rotation @ leaning
+    tool = world.plane.rotation @ tilted
     pin = world.plane.origin_mm + world.plane.rotation @ np.array(PIN_MM)
     x, y, z = (pin - tool @ world.plane.tip_mm).tolist()
     return Pose((x, y, z), rotvec_deg(tool))
 
 
 def hold_board(world: World, expected: str) -> None:
-    """Hold the board up as ``view 3`` wants it, or take it away."""
+    """Hold up the board for a request such as ``view 3``, or remove it."""
     what, _, which = expected.partition(" ")
     world.board = VIEWS[int(which) % len(VIEWS)] if what == "view" and which.isdigit() else None

@@ -1,7 +1,7 @@
-"""The arm's place at any time: the true plate, the commanded legs, the deviation.
+"""The simulated arm's position at any time: true plate, commanded legs, deviation.
 
-Rotation vectors are in degrees; a state is xyz, rotation vector and the five numbers of the sensor
-over the true plate.
+Rotation vectors are in degrees; a state is xyz, rotation vector and the sensor's five numbers
+relative to the true plate.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ F64 = npt.NDArray[np.float64]
 
 @lru_cache(maxsize=64)
 def matrix(rotvec_deg: tuple[float, float, float]) -> F64:
-    """Rotation matrix of a rotation vector in degrees (Rodrigues), shape (3, 3), not to be changed.
+    """Rotation matrix of a rotation vector in degrees (Rodrigues), shape (3, 3); do not modify.
 
-    Kept: a tool seldom turns.
+    Cached, because a tool seldom rotates.
     """
     vector = np.radians(np.asarray(rotvec_deg, np.float64))
     angle = float(np.sqrt(vector @ vector))
@@ -54,18 +54,18 @@ def rotvec_deg(rotation: F64) -> tuple[float, float, float]:
 class ContactPlane:
     """The true surface of the plate in the arm's base frame: x right, y up, z into the plate.
 
-    Right, up and into make a right-handed frame as the outside camera sees it, from behind.
+    These axes are right-handed as the outside camera sees them, from behind.
     """
 
     def __init__(self, origin_mm: F64, rotation: F64, tip_mm: F64 | None = None) -> None:
-        """`tip_mm`: where the tip truly is from the reported tool centre point, in tool axes."""
+        """`tip_mm`: true position of the tip from the reported tool centre point, tool axes."""
         self.origin_mm = origin_mm
         self.rotation = rotation
         self.tip_mm = np.zeros(3) if tip_mm is None else tip_mm
 
     @classmethod
     def from_settings(cls, contact: Contact, tip_mm: Sequence[float] = (0, 0, 0)) -> ContactPlane:
-        """The nominal plane, tilted about an axis in it and set back along its normal."""
+        """Tilt the nominal plane about an axis in it, and offset it along its normal."""
         nominal = matrix(contact.nominal_rotvec_deg)
         azimuth = math.radians(contact.tilt_axis_deg)
         tilt = matrix((
@@ -76,15 +76,15 @@ class ContactPlane:
         return cls(origin, rotation, np.asarray(tip_mm, np.float64))
 
     def pose(self, x_mm: float, y_mm: float, depth_mm: float) -> Pose:
-        """The tool pose that puts the sensor squarely there."""
+        """Return the tool pose that places the sensor there, parallel to the plate."""
         place = np.array([x_mm, y_mm, depth_mm]) - self.tip_mm
         x, y, z = (self.origin_mm + self.rotation @ place).tolist()
         return Pose((x, y, z), rotvec_deg(self.rotation))
 
     def sensor(self, pose: Pose) -> F64:
-        """x, y, depth (mm) of the highest tip, and depth's slopes over the layout, shape (5,).
+        """Return x, y, depth (mm) of the highest tip, and slopes of depth over the layout, (5,).
 
-        Turning about the plate's normal is left out: the skin looks much the same after it.
+        Rotation about the plate's normal is neglected: the skin is nearly symmetric under it.
         """
         tool = self.rotation.T @ matrix(pose.rotvec_deg)
         place = self.rotation.T @ (np.asarray(pose.xyz_mm) - self.origin_mm) + tool @ self.tip_mm
@@ -100,7 +100,7 @@ I64 = npt.NDArray[np.int64]
 _LOOK_BACK_NS = 1_000_000
 _MOVING_MM = 1e-9
 _X, _Y = 6, 7
-"""Columns of an arm state (`rigs.mock.path`): the sensor's place on the plate."""
+"""Columns of an arm state: the sensor's position on the plate."""
 
 
 class Deviation:
@@ -109,7 +109,7 @@ class Deviation:
     def __init__(
         self, book: FaultBook, plane: ContactPlane, commanded: Callable[[I64], F64]
     ) -> None:
-        """`commanded`: from rising true times, ns, (n,) to states, (n, 11)."""
+        """`commanded`: maps increasing true times, ns, (n,) to states, (n, 11)."""
         self._book, self._plane, self._commanded = book, plane, commanded
         self._frozen_ns = NEVER
 
@@ -117,19 +117,19 @@ class Deviation:
         return bool(self._book.of(ArmOffPath))
 
     def freeze(self, at_ns: int) -> None:
-        """The arm stopped: whatever pulled it aside pulls no further."""
+        """Freeze the deviation, because the arm has stopped."""
         self._frozen_ns = min(self._frozen_ns, at_ns)
 
     def at(self, t_ns: I64) -> F64:
-        """Deviations at true times, (n, 11): place of the tool and of the sensor, mm."""
+        """Return deviations at true times, (n, 11): positions of tool and sensor, mm."""
         result = np.zeros((len(t_ns), 11))
         for fault, begin, end in self._book.spans(ArmOffPath):
             t = np.minimum(t_ns, self._frozen_ns)
-            way_mm = fault.mm * np.clip((t - begin) / (end - begin), 0.0, 1.0)
-            if way_mm.any():
-                aside = way_mm[:, None] * self._direction(fault, begin)
-                result[:, :3] += aside @ self._plane.rotation[:, :2].T
-                result[:, _X : _Y + 1] += aside
+            offset_mm = fault.mm * np.clip((t - begin) / (end - begin), 0.0, 1.0)
+            if offset_mm.any():
+                lateral = offset_mm[:, None] * self._direction(fault, begin)
+                result[:, :3] += lateral @ self._plane.rotation[:, :2].T
+                result[:, _X : _Y + 1] += lateral
         return result
 
     def _direction(self, fault: ArmOffPath, at_ns: int) -> F64:
@@ -137,7 +137,7 @@ class Deviation:
         if fault.direction_deg is not None:
             angle = math.radians(fault.direction_deg)
             return np.array([math.cos(angle), math.sin(angle)])
-        # looking back: what lies ahead may still be changed
+        # from the past motion, because the future path may still change
         states = self._commanded(np.array([at_ns - _LOOK_BACK_NS, at_ns], np.int64))
         x, y = (states[1] - states[0])[_X : _Y + 1].tolist()
         length = math.hypot(x, y)
@@ -146,7 +146,7 @@ class Deviation:
 
 TURN_DEG_PER_S = 30.0
 FADE_NS = 200_000_000
-"""Time in which a tremor builds up and dies away."""
+"""Time in which a tremor builds up and decays."""
 EVERY = slice(0, 11)
 TOOL, SENSOR = slice(0, 6), slice(6, 11)
 """Columns of a state."""
@@ -154,17 +154,17 @@ TOOL, SENSOR = slice(0, 6), slice(6, 11)
 
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """One straight move; `state` vectors are xyz, rotation vector, then the sensor's five."""
+    """One straight move; states are xyz, rotation vector, then the sensor's five numbers."""
 
     start_ns: int
     end_ns: int
     start: F64
     end: F64
     planned: tuple[int, F64] | None = None
-    """When and where it would have ended, had the arm not been stopped."""
+    """Planned end time and state of a leg that was cut short."""
 
     def at(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """States at times within the leg, shape (n, 11) or those columns."""
+        """Return states at times within the leg, shape (n, 11) or those columns."""
         end_ns, end = self.planned or (self.end_ns, self.end)
         start = self.start[columns]
         share = (t_ns - self.start_ns) / (end_ns - self.start_ns)
@@ -173,7 +173,7 @@ class Leg:
 
 
 class ArmPath:
-    """Legs in order of time, with rest between and after them."""
+    """Legs in order of time; the arm is at rest between and after them."""
 
     def __init__(self, plane: ContactPlane, pose: Pose) -> None:
         self._plane = plane
@@ -182,12 +182,12 @@ class ArmPath:
         self.deviation: Deviation | None = None
 
     def restart(self, now_ns: int) -> None:
-        """Forget the legs; the arm stands where it should be at `now_ns`."""
+        """Discard the legs; the arm rests at its commanded position at `now_ns`."""
         self._rest = self.commanded(np.array([now_ns], np.int64))[0]
         self.legs = []
 
     def follow(self, segments: Sequence[Segment], now_ns: int) -> list[Leg]:
-        """Append legs that begin at `now_ns`; returns them."""
+        """Append legs that begin at `now_ns`, and return them."""
         state, begin, legs = self.commanded(np.array([now_ns], np.int64))[0], now_ns, []
         for segment in segments:
             target = self._state(segment.to)
@@ -200,12 +200,12 @@ class ArmPath:
         return legs
 
     def cut(self, now_ns: int) -> None:
-        """Stand still from `now_ns` on."""
+        """Stop at `now_ns`."""
         kept = [leg for leg in self.legs if leg.start_ns < now_ns]
         if kept and kept[-1].end_ns > now_ns:
             leg = kept[-1]
             here = leg.at(np.array([now_ns], np.int64))[0]
-            # the way there stays the same to the bit
+            # the path up to here stays bit-identical
             planned = leg.planned or (leg.end_ns, leg.end)
             kept[-1] = replace(leg, end_ns=now_ns, end=here, planned=planned)
         self.legs = kept
@@ -213,18 +213,18 @@ class ArmPath:
             self.deviation.freeze(now_ns)
 
     def states(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """xyz (mm), rotation vector (deg) and sensor vector at rising times, shape (n, 11).
+        """Return xyz (mm), rotation vector (deg) and sensor vector at increasing times, (n, 11).
 
         Args:
-            columns: those wanted, such as `TOOL`.
+            columns: columns to return, such as `TOOL`.
         """
         states = self.commanded(t_ns, columns)
         return states + self.deviation.at(t_ns)[:, columns] if self.deviation else states
 
     def commanded(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """The same, as commanded: without its deviation."""
+        """Return the same as `states` without the deviation."""
         result = np.empty((len(t_ns), columns.stop - columns.start))
-        # each leg holds from its start to that of the next
+        # each leg applies from its start to that of the next
         begins = np.searchsorted(t_ns, np.array([leg.start_ns for leg in self.legs], np.int64))
         edges = [*begins.tolist(), len(t_ns)]
         result[: edges[0]] = self._rest[columns]
@@ -237,11 +237,11 @@ class ArmPath:
         return result
 
     def stirred(self, t_ns: I64) -> F64:
-        """Return how much the arm trembles at rising times, 0 to 1; it fades with motion."""
+        """Return the tremor's envelope at increasing times, 0 to 1; it decays after a motion."""
         return stirred([(leg.start_ns, leg.end_ns) for leg in self.legs], t_ns)
 
     def moving(self, now_ns: int) -> bool:
-        """Return whether a leg is yet to end."""
+        """Return whether a leg has not ended."""
         return bool(self.legs) and self.legs[-1].end_ns > now_ns
 
     def _state(self, pose: Pose) -> F64:
@@ -249,7 +249,7 @@ class ArmPath:
 
 
 def stirred(moves: Sequence[tuple[int, int]], t_ns: I64) -> F64:
-    """Strength of the tremor, 0 to 1, at rising times (n,), for moves from one time to another."""
+    """Return the tremor's envelope, 0 to 1, at increasing times (n,), for moves (start, end)."""
     if not len(t_ns):
         return np.zeros(0)
     runs: list[tuple[int, int]] = []

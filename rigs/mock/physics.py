@@ -1,9 +1,8 @@
-"""The skin on the plate through one trial: springs, plate, and what is kept of them row by row.
+"""The skin on the plate through one trial: springs, plate, and their history row by row.
 
-Rows stand on a global grid: every `step_ms` while the plate is held, every millisecond while it
-may fall, and nothing is computed beyond the present; one more stands where the plate meets its
-stop. Which rows there are depends on what the
-plate was commanded and when, never on who looked how often.
+Rows are on a global grid: every `step_ms` while the plate is held, every millisecond while it may
+fall, plus one where the plate meets its stop. Nothing is computed beyond the present. The rows
+depend only on the plate's commands and their times, never on how often the state is read.
 """
 
 from __future__ import annotations
@@ -28,20 +27,20 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 FINE_NS = 1_000_000
-"""Step while the plate may fall."""
+"""Step while the plate may fall, ns."""
 KEPT_NS = 300_000_000_000
-"""History kept at least, twice as much at most; a trial takes a few tens of seconds."""
+"""Minimum kept history, at most twice as much; a trial takes a few tens of seconds."""
 _CHUNK = 4096
 OUT_OF_REACH_MM = 1e6
-"""Indentation at which a torn papilla would touch."""
+"""Gap of a torn papilla, which never touches."""
 
 
 class Physics:
     """State and history of one trial.
 
     Attributes:
-        step_ns: the last row is never further behind the present than this.
-        track: `rigs.scene.contact.record`'s rows since the trial began.
+        step_ns: largest lag of the last row behind the present.
+        track: rows of `rigs.scene.contact.record` since the trial began.
         loads: forces of every row since `keep_loads`, or None.
         wrench: sum of the contact's forces on the plate, and their torque about its centre, of
             every row since `keep_wrench`, (k, 6) in N and N m; or None, at no cost.
@@ -58,8 +57,8 @@ class Physics:
         """Put the skin at rest on the plate.
 
         Args:
-            sensor_at: from times to x, y, depth (mm) and slopes of depth, (k, 5) from (k,).
-            torn: papillae that tear off, and the true times, ns, as far as they are known.
+            sensor_at: maps times (k,) to x, y, depth (mm) and slopes of depth, (k, 5).
+            torn: papillae that tear off, with known true times, ns.
         """
         self._settings, self._sensor_at, self._torn = settings, sensor_at, torn
         self._off: set[int] = set()
@@ -76,7 +75,7 @@ class Physics:
         self._advance_over(np.array([-self.step_ns, 0], np.int64))
 
     def advance(self, now_ns: int) -> int:
-        """Compute the rows up to a time; returns the time of the last one, ns."""
+        """Compute the rows up to a time; return the time of the last one, ns."""
         while True:
             step = FINE_NS if self.plate_free else self.step_ns
             first = (self.track.end_ns // step + 1) * step
@@ -91,7 +90,7 @@ class Physics:
         return self.track.end_ns
 
     def _tear_off(self, first_ns: int, step_ns: int) -> int:
-        """Tear off what is torn before the row at `first_ns`; the last row before the next is."""
+        """Remove papillae torn before `first_ns`; return the last row before the next tear."""
         last = NEVER
         for papilla, due_ns in self._torn():
             if due_ns >= first_ns:
@@ -104,7 +103,7 @@ class Physics:
         return last
 
     def _catch_up(self, now_ns: int) -> None:
-        """Compute rows up to the last millisecond, whatever the step: something begins here."""
+        """Compute rows up to the last millisecond at any step, because a change begins here."""
         self.advance(now_ns)
         behind = np.arange(self.track.end_ns, now_ns + 1, FINE_NS, dtype=np.int64)
         if len(behind) > 1:
@@ -182,10 +181,10 @@ class Physics:
         result: F64 = share * (mass_kg * self._settings.scene.plate.gravity_m_s2)
         return result
 
-    # -- what devices look at --------------------------------------------------------------
+    # -- state for devices -----------------------------------------------------------------
 
     def keep_loads(self, now_ns: int) -> History:
-        """Keep the forces of every row from the present on, until `loads` is let go."""
+        """Record the forces of every row from now on, until `loads` is reset."""
         self._catch_up(now_ns)
         tips = self.tips
         self.loads = History(3 * len(tips.state))
@@ -203,9 +202,9 @@ class Physics:
         return self.wrench
 
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
-        """Places of the tips in the world and heights of the plate, mm: (k, n, 2) and (k,).
+        """Return positions of the tips and heights of the plate, mm: (k, n, 2) and (k,).
 
-        `t_ns` are rising true times not after the last row; between rows the line is straight.
+        `t_ns` are increasing true times up to the last row; rows are interpolated linearly.
         """
         n = len(self.tips.state)
         here = self.track.at(t_ns)
@@ -233,7 +232,7 @@ def plate_wrench(track: F64, load: F64) -> F64:
 
 
 def springs_of(settings: MockSettings, skin: Skin, seed: int) -> Springs:
-    """The springs of one trial, at the scene's level of physics."""
+    """Build the springs of one trial at the scene's physics level."""
     scene, friction = settings.scene, settings.scene.friction
     return make_springs(
         skin,

@@ -1,8 +1,8 @@
-"""Every number of the simulated rig, in one place that is cheap to import.
+"""Settings of the simulated rig, in one place that is cheap to import.
 
-`sliplab plan` reads rig files to learn rates and picture sizes, so nothing here may pull in numba
-or OpenCV. Units stand in the names. The defaults are fitted guesses that tell a plausible story;
-none of them was measured on a real skin, and whatever is computed from them is a simulation.
+`sliplab plan` reads rig files for rates and image sizes, so nothing here may import numba or
+OpenCV. Names carry the unit. The defaults are plausible assumed values; none of them was measured
+on a real skin, and everything computed from them is simulated.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Skin(StrictModel):
-    """The papillae: a centre and two rings, falling outwards."""
+    """The papillae: a centre and two rings, lower towards the outside."""
 
     seed: Seed | None = None
-    """Fabrication scatter: another seed is another skin. Left out, the rig's seed."""
+    """Seed of the fabrication scatter: another seed is another skin. Default: the rig's seed."""
     ring_counts: tuple[Annotated[int, Field(ge=1, le=48)], ...] = (1, 6, 12)
-    """Papillae a layer, from the centre out."""
+    """Papillae per layer, from the centre outwards."""
     heights_mm: tuple[Positive, ...] = (10.1, 9.0, 7.9)
-    """Height above the skin plane, a layer each."""
+    """Height above the skin plane, one per layer."""
     spacing_mm: Positive = 5.6
     """Radial distance between neighbouring layers."""
     radius_mm: Positive = 2.0
@@ -44,12 +44,12 @@ class Skin(StrictModel):
     bending: Positive = 12.0
     """Denominator of the bending term: 12 for a guided end, 3 for a free one."""
     base_normal_n_per_m: Positive | None = 150.0
-    """Stiffness of the membrane under a papilla; null is a rigid one: the centre may buckle."""
+    """Stiffness of the membrane under a papilla; null for rigid, where the centre may buckle."""
     base_tangential_n_per_m: Positive | None = 200.0
     height_scatter_mm: NonNegative = 0.08
     """Half the range of a uniform deviation of each height."""
     position_scatter_mm: NonNegative = 0.05
-    """Standard deviation of each papilla's place, cut at two of them."""
+    """Standard deviation of each papilla's position, clipped at two sigma."""
     relaxation_share: Share = 0.2
     """Share of a suddenly applied force that relaxes away (standard linear solid)."""
     relaxation_s: Positive = 1.0
@@ -60,7 +60,7 @@ class Skin(StrictModel):
             raise KeyedError(
                 "mock.scene.skin.heights_mm",
                 list(self.heights_mm),
-                f"must hold one height for each of the {len(self.ring_counts)} layers",
+                f"must have one height for each of the {len(self.ring_counts)} layers",
             )
         return self
 
@@ -75,37 +75,37 @@ class Friction(StrictModel):
     """Friction at sliding speed w is kinetic times 1 + strengthening ln(1 + w / weak_mm_s)."""
     weak_mm_s: Positive = 0.1
     path_variation: Annotated[float, Field(ge=0, le=0.3)] = 0.05
-    """Relative standard deviation of friction along each tip's path, drawn anew every trial."""
+    """Relative standard deviation of friction along each tip's path, drawn for every trial."""
     correlation_mm: Positive = 0.5
     papilla_scatter: Annotated[float, Field(ge=0, le=0.3)] = 0.05
-    """Relative standard deviation between papillae (fabrication), cut at two of them."""
+    """Relative standard deviation between papillae (fabrication), clipped at two sigma."""
 
 
 class Plate(StrictModel):
     """The sliding plate of gravity trials, its slider and its marker."""
 
     mass_kg: Positive = 0.205
-    """Mass mounted at first; the operator changes it."""
+    """Initially mounted mass; the operator changes it."""
     stiction_n: NonNegative = 0.001
     damping_s: NonNegative = 0.01
-    """Damping over stiffness inside each tip's spring; to ground it would hold the plate up."""
+    """Ratio of damping to stiffness in each tip's spring; not damping to ground."""
     stroke_mm: Positive = 25.0
-    """Distance that the plate may fall before it meets its stop."""
+    """Distance that the plate falls to its stop."""
     gravity_m_s2: Positive = 9.81
     marker_id: Annotated[int, Field(ge=0, le=49)] = 0
     """Identity in OpenCV's DICT_4X4_50."""
     marker_side_mm: Positive = 6.0
-    """Side of the black square; the white quiet zone of one module comes on top."""
+    """Side of the black square, without the white quiet zone of one module."""
     marker_centre_mm: tuple[Finite, Finite] = (16.6, 16.6)
-    """In plate coordinates; inside a region of 41.6 mm, and beside the skin however far it fell."""
+    """Position in plate coordinates; in a region of 41.6 mm, clear of the skin after any fall."""
 
 
 class Contact(StrictModel):
-    """The plate's true place in the arm's base frame, which teaching has to find out."""
+    """The plate's true position in the arm's base frame, which teaching must find."""
 
     nominal_origin_mm: Triple = (400.0, 0.0, 300.0)
     nominal_rotvec_deg: Triple = (69.28203230275508, 69.28203230275508, 69.28203230275508)
-    """Tool orientation with its axes on the plate's: x right, y up, z into the plate."""
+    """Tool orientation with axes parallel to the plate's: x right, y up, z into the plate."""
     tilt_deg: Annotated[float, Field(ge=-10, le=10)] = 0.4
     tilt_axis_deg: Finite = 25.0
     """In-plane direction of the axis of the tilt, from the plate's x."""
@@ -124,12 +124,12 @@ class Contact(StrictModel):
 
 
 class Scene(StrictModel):
-    """The physics: what is there, whether or not anything looks at it."""
+    """The physics of the scene, independent of the devices."""
 
     level: Literal["auto", "L1", "L2", "L3"] = "auto"
-    """Level of the contact's physics (`rigs.scene.springs`); `auto` takes what a plan needs."""
+    """Physics level of the contact (`rigs.scene.springs`); `auto` uses the level a plan needs."""
     step_ms: Literal[1, 2, 4, 8, 16, 32] = 2
-    """Step of the contact while the plate is held; while it may fall, a millisecond."""
+    """Time step of the contact while the plate is held; 1 ms while it may fall."""
     skin: Skin = Skin()
     friction: Friction = Friction()
     plate: Plate = Plate()
@@ -143,49 +143,48 @@ class EventCamera(StrictModel):
     height: Annotated[int, Field(ge=64, le=4096)] = 480
     px_per_mm: Positive = 14.0
     shift_mm_per_n: Finite = 4.5
-    """Motion of a marker in the image for a tangential force, in mm of the skin."""
+    """Motion of a marker in the image per tangential force, in mm of the skin."""
     growth_mm_per_n: Finite = 0.4
     """Growth of a marker's radius with normal force."""
     radius_mm: Positive = 1.2
     edge_px: Positive = 0.8
-    """Scale of the logistic edge; the profile is cut at five of them."""
+    """Scale of the logistic edge; the profile is truncated at five scales."""
     contrast: Positive = 2.08
-    """Log intensity of a marker over its surroundings."""
+    """Log intensity of a marker relative to its surroundings."""
     threshold: Positive = 0.2
     threshold_sigma: NonNegative = 0.03
-    """Spread between pixels, cut at three of them."""
+    """Standard deviation between pixels, clipped at three sigma."""
     threshold_off: Positive | None = None
-    """Mean threshold of negative events; null: as `threshold`. With this or the next one, negative
-    thresholds are drawn apart from positive ones; without, a pixel has one for both."""
+    """Mean threshold of negative events; null: as `threshold`. With this or the next setting,
+    negative thresholds are drawn independently; without, a pixel has one for both polarities."""
     threshold_off_sigma: NonNegative | None = None
-    """Their spread; null: as `threshold_sigma`."""
+    """Standard deviation of negative thresholds; null: as `threshold_sigma`."""
     cutoff_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Bandwidth (3 dB) of a pixel at full brightness, elsewhere less in proportion to intensity;
-    0: no limit."""
+    """Bandwidth (3 dB) of a pixel at full brightness, proportional to intensity elsewhere; 0: no
+    limit."""
     refractory_us: NonNegative = 500.0
     noise_hz: Annotated[float, Field(ge=0, le=100)] = 0.01
-    """Noise events a second of a dark pixel."""
+    """Noise events per second of a dark pixel."""
     leak: Literal["events", "reference"] = "events"
-    """Effect of leakage: positive events at random times, or a memorised level that falls steadily,
-    so that positive events come sooner and negative ones later, as in v2e."""
+    """Effect of leakage: positive events at random times, or a steadily falling reference level,
+    which advances positive events and delays negative ones, as in v2e."""
     leak_share: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Share of that noise that is leakage (always positive, however bright); the rest is shot noise
-    of both polarities, of which the brightest pixels have a quarter."""
+    """Share of the noise that is leakage (positive, at any brightness); the rest is shot noise of
+    both polarities, which the brightest pixels have a quarter of."""
     hot_pixels: Annotated[int, Field(ge=0, le=4096)] = 8
-    """Pixels that fire all the time; the rig's seed chooses them."""
+    """Number of hot pixels, selected by the rig's seed."""
     hot_hz: Annotated[float, Field(ge=0, le=1000)] = 10.0
-    """Mean rate of each of them, always positive."""
+    """Mean event rate of a hot pixel; its events are positive."""
     readout_hz: Annotated[float, Field(ge=0, le=10_000)] = 5000.0
-    """Scans a second: an event is read in the next scan, and in one scan a pixel sends one event at
-    most. At least 1000; 0: every event has its own time."""
+    """Read-out scans per second: an event is read in the next scan, at most one per pixel and scan.
+    At least 1000; 0: every event has its own time."""
     scan_us: Annotated[float, Field(ge=0, le=1000)] = 192.0
-    """Time in which a scan reads its columns from left to right; an event has the time at which its
-    column is read. At most the time from scan to scan, where that is less; 0: all events of a scan
-    have the time at which it begins."""
+    """Time in which a scan reads its columns from left to right; an event has the read time of its
+    column. Limited to the scan period; 0: all events of a scan have its start time."""
     block_ms: Literal[1, 2, 4, 8, 16, 32, 64] = 32
-    """Events that the camera sends together: its latency."""
+    """Duration of the blocks that the camera sends, which is its latency."""
     path: Literal["cubic", "chord"] = "cubic"
-    """Path of markers between two steps of the contact: smooth, or straight."""
+    """Interpolation of markers between two steps of the contact: smooth, or straight."""
 
     @model_validator(mode="after")
     def _scans(self) -> EventCamera:
@@ -193,24 +192,24 @@ class EventCamera(StrictModel):
             raise KeyedError(
                 "mock.event_camera.readout_hz",
                 self.readout_hz,
-                "must be 0 (no scans), or 1000 to 10000 scans a second",
+                "must be 0 (no scans), or 1000 to 10000 scans per second",
             )
         return self
 
 
 class Reflections(StrictModel):
-    """Light mirrored by the acrylic, still in the picture: a nuisance for the labels.
+    """Static reflections in the acrylic, which disturb the labels.
 
-    To be expected at the default level: onsets move by a few milliseconds. Above about 40 (a
-    quarter of the contrast) the tracker takes reflections for markers, and labels mean nothing.
+    At the default level onsets shift by a few milliseconds. Above about 40 (a quarter of the
+    contrast) the tracker mistakes reflections for markers, and labels are meaningless.
     """
 
     count: Annotated[int, Field(ge=0, le=100)] = 0
-    """Soft blobs and streaks a trial, placed by its seed; 0 switches them off."""
+    """Number of soft blobs and streaks per trial, placed by its seed; 0 for none."""
     level: Annotated[float, Field(ge=0, le=255)] = 10.0
-    """Grey levels that they add at most."""
+    """Largest added grey level."""
     size_mm: Positive = 3.0
-    """Standard deviation along each of them, more or less."""
+    """Approximate standard deviation along each of them."""
 
 
 Tilt = Annotated[float, Field(ge=-30, le=30)]
@@ -220,40 +219,40 @@ class FrameCamera(StrictModel):
     """The camera that looks through the plate."""
 
     level: Literal["video", "tracks"] = "video"
-    """`video`: pictures are drawn and stored. `tracks`: every frame gives the places of the markers
-    with the noise of tracking a video, and no picture; a fraction of the time and the bytes."""
+    """`video`: images are rendered and stored. `tracks`: every frame has only the marker positions
+    with the noise of tracking a video, at a fraction of the time and size."""
     width: Annotated[int, Field(ge=32, le=8192)] = 1920
     height: Annotated[int, Field(ge=32, le=8192)] = 1200
     px_per_mm: Positive = 20.0
-    """At the picture's centre."""
+    """Scale at the image centre."""
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
-    """Tilt of the plate against the picture: about its x, then about its y."""
+    """Tilt of the plate relative to the image plane: about its x, then about its y."""
     k1: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Radial distortion of the lens, OpenCV's first coefficient."""
     distance_mm: Positive = 300.0
-    """From lens to plate; only matters with a tilt or a distortion."""
+    """Distance from lens to plate; only used with a tilt or a distortion."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
     exposure_us: Annotated[int, Field(ge=10, le=100_000)] = 2000
     """Exposure; motion while the shutter is open is blurred."""
     tip_radius_mm: Positive = 1.0
-    """Of the white spot on each papilla's top. The tips of this scene do not push each other aside,
-    so a spot as wide as its papilla (2 mm) would run into its neighbour's."""
+    """Radius of the white marker on each papilla. Tips in this scene do not push each other aside,
+    so markers as wide as a papilla (2 mm) would overlap."""
     tip_level: Annotated[int, Field(ge=0, le=240)] = 200
     ground_level: Annotated[int, Field(ge=15, le=255)] = 25
     noise: Annotated[float, Field(ge=0, le=3)] = 1.5
-    """Standard deviation of the grey levels, in patches round what is looked at."""
+    """Standard deviation of the grey levels, in patches around the evaluated features."""
     reflections: Reflections = Reflections()
     centroid_noise_px: NonNegative = 0.0045
-    """Root mean square error of a tracked papilla's column and row, for the level `tracks`;
-    measured on the level `video` with the settings above, along a slide."""
+    """Root mean square error of a tracked papilla's column and row at the level `tracks`; measured
+    at the level `video` with the settings above, along a slide."""
     plate_noise_px: NonNegative = 0.02
-    """The same of the centre of the plate's marker, along a fall: what fitting its sides does with
-    fractions of a pixel."""
+    """The same for the centre of the plate's marker, along a fall: the subpixel error of fitting
+    its sides."""
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 4000
-    """From the end of exposure to the host."""
+    """Delay from the end of exposure to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 5000.0
-    """Delay of a frame where only its arrival time is known
-    (`timing.frames: host arrival`); half-normal, four standard deviations wide."""
+    """Additional delay of a frame where only its arrival time is known
+    (`timing.frames: host arrival`); half-normal, up to this limit of four sigma."""
 
 
 class Arm(StrictModel):
@@ -262,21 +261,21 @@ class Arm(StrictModel):
     pose_rate_hz: Annotated[float, Field(gt=0, le=10_000)] = 500.0
     pose_noise_um: NonNegative = 2.0
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1000
-    """From a controller's cycle to the host."""
+    """Delay from a controller's cycle to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 200.0
-    """Delay of a pose; half-normal, four standard deviations wide."""
+    """Additional delay of a pose; half-normal, up to this limit of four sigma."""
     vibration_um: NonNegative = 15.0
-    """Largest tremor along each axis while the arm moves, of which each trial has a random share;
-    the reported poses do not show it."""
+    """Largest tremor along each axis while the arm moves, scaled randomly in each trial; the
+    reported poses do not show it."""
     vibration_hz: Positive = 5.0
-    """Its frequencies lie within 30 % of this one."""
+    """Centre frequency of the tremor, whose frequencies are within 30 % of it."""
     input_sampling_us: Annotated[int, Field(ge=0, le=100_000)] = 0
-    """Grid on which the digital input is sampled; 0 stamps each edge when it comes."""
+    """Sampling period of the digital input; 0 for exact edge times."""
     tip_offset_mm: Triple = (0.0, 0.0, 0.0)
     """True position of the centre papilla's tip from the reported tool centre point, in the tool's
-    axes: what pivoting has to find out."""
+    axes, which pivoting must find."""
     start_xyz_mm: Triple | None = None
-    """Position of the arm when the rig is switched on; left out, 60 mm clear of the plate."""
+    """Position of the arm at power-on; 60 mm clear of the plate if left out."""
 
 
 Row = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
@@ -300,7 +299,7 @@ class ForceSensor(StrictModel):
     """Largest drift of zero along each axis; a trial has a random share of it, either way."""
     drift_nm_per_min: NonNegative = 0.0004
     cross_talk: tuple[Row, Row, Row, Row, Row, Row] | None = None
-    """What a reading shows of the load besides the load: the matrix C of (1 + C) load, of Fx, Fy,
+    """Cross-talk matrix C; a reading is (1 + C) times the load of Fx, Fy,
     Fz in N and Tx, Ty, Tz in N m. Left out, it is drawn from the seed."""
     cross_talk_share: Share = 0.01
     """Largest share of one axis that shows on another where the matrix is drawn."""
@@ -319,26 +318,26 @@ class ForceSensor(StrictModel):
 
 
 class Clocks(StrictModel):
-    """Deviations of the devices' clocks from the truth. Drifts belong to the rig."""
+    """Errors of the devices' clocks. Drifts are a property of the rig."""
 
     arm_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
-    """Largest drift, either way; each rig's seed draws its own. `timing` has to promise as much."""
+    """Largest drift of either sign, drawn from the rig's seed. `timing` must allow as much."""
     event_camera_ppm: Annotated[float, Field(ge=0, le=20_000)] = 30.0
     frame_camera_ppm: Annotated[float, Field(ge=0, le=20_000)] = 20.0
     sync_box_ppm: Annotated[float, Field(ge=0, le=20_000)] = 10.0
     offset_h: Annotated[float, Field(ge=0, le=1e6)] = 12.0
-    """Longest time that a clock has run before a trial begins; drawn anew every trial."""
+    """Longest time for which a clock has run before a trial; drawn for every trial."""
     pulse_jitter_us: NonNegative = 2.0
-    """Standard deviation of the stamp of a pulse on arm and event camera."""
+    """Standard deviation of pulse time stamps on arm and event camera."""
     frame_jitter_us: NonNegative = 1.0
     exposure_jitter_us: NonNegative = 1.0
-    """Standard deviation of the sync box's stamp of an exposure that it did not trigger."""
+    """Standard deviation of the sync box's time stamps of exposures that it did not trigger."""
     read_shortest_us: NonNegative = 200.0
-    """Least time of a request for a device's clock, and of its answer."""
+    """Shortest time of a request for a device's clock, and of its answer."""
     read_spread_us: NonNegative = 100.0
-    """Mean of what either takes besides, exponentially distributed."""
+    """Mean additional time of either, exponentially distributed."""
     read_longest_us: NonNegative = 5000.0
-    """Limit at which that is cut."""
+    """Limit at which this time is clipped."""
 
     @model_validator(mode="after")
     def _reads(self) -> Clocks:
@@ -355,7 +354,7 @@ class MockSettings(StrictModel):
     """A simulated rig."""
 
     seed: Seed = 1
-    """Fabrication scatter, contrast thresholds and clock drifts: what makes it this rig."""
+    """Seed of fabrication scatter, contrast thresholds and clock drifts, which identify the rig."""
     scene: Scene = Scene()
     event_camera: EventCamera = EventCamera()
     frame_camera: FrameCamera = FrameCamera()
@@ -373,7 +372,7 @@ class MockSettings(StrictModel):
 
 
 def skin_of(settings: MockSettings) -> scene_skin.Skin:
-    """Return the skin that belongs to a simulated rig."""
+    """Return the skin of a simulated rig."""
     from sliplab.rigs.scene import skin as scene_skin  # numpy, which a rig file does without
 
     made = settings.scene.skin
@@ -385,10 +384,10 @@ def skin_of(settings: MockSettings) -> scene_skin.Skin:
 
 
 def check_timing(mock: MockSettings, timing: Timing) -> None:
-    """Hold a simulated rig's clocks and delays against `timing`.
+    """Check a simulated rig's clocks and delays against `timing`.
 
     Raises:
-        KeyedError: the first setting that is beyond it.
+        KeyedError: the first setting beyond it.
     """
     for device, drift, jitters in (
         ("sync_box", "sync_box_ppm", _jitters("exposure", timing.frames == "exposure line")),
@@ -437,7 +436,7 @@ def _check_force(force: ForceSensor, timing: Timing) -> None:
 
 
 def _jitters(stream: str, used: bool) -> tuple[str, ...]:
-    """The settings of jitter that show in this rig's stamps."""
+    """Return the jitter settings that affect this rig's time stamps."""
     return (f"{stream}_jitter_us",) if used else ()
 
 

@@ -1,7 +1,7 @@
-"""Ticks of the simulated sync box and of a camera that runs by itself, and who sees their edges.
+"""Ticks of the simulated sync box and of a free-running camera, and inputs for their edges.
 
 Where the box does not trigger the frame camera, exposures follow the camera's own clock. To the
-camera either is a source of ticks: tick k is the start of exposure k.
+camera both are sources of ticks: tick k is the start of exposure k.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from sliplab.storage.streams import ClockReads, PulseChunk
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 REPORT_NS = 100_000
-"""From an edge to its report; longer than any jitter, so that no edge is reported early."""
+"""Delay from an edge to its report; longer than any jitter, so that no edge is reported early."""
 
 
 class Ticks:
-    """Numbered ticks at even distances of a clock, from a moment on.
+    """Numbered ticks at regular intervals of a clock, from a given time on.
 
     Attributes:
-        run: counts the trains, so that whoever follows the ticks notices a new one.
-        clock: true time to the clock that the ticks are counted by.
-        stopped_ns: true time after which none comes; None while they go on.
+        run: number of trains, by which readers detect a new one.
+        clock: true time to the clock of the ticks.
+        stopped_ns: true time after which there are no ticks; None while they continue.
     """
 
     def __init__(self, world: World) -> None:
@@ -48,28 +48,28 @@ class Ticks:
         world.on_begin.append(self._clear)
 
     def _clear(self) -> None:
-        """Forget the train: a trial begins."""
+        """Discard the train, because a trial begins."""
         self.clock = ClockMap.line(0, 0)
         self._period_ns, self._origin_ns = 0.0, 0
         self.stopped_ns: int | None = 0
 
     def _tick_on(self, clock: ClockMap, period_ns: float, origin_ns: int = 0) -> None:
-        """Begin a train whose tick 0 comes when the clock, without its jumps, shows `origin_ns`."""
+        """Start a train with tick 0 at `origin_ns` of the clock without its jumps."""
         self.run += 1
         self.clock, self._period_ns, self._origin_ns = clock, period_ns, origin_ns
         self.stopped_ns = None
 
     @property
     def ticking(self) -> bool:
-        """True if a train began since the trial did."""
+        """True if a train has started in this trial."""
         return self._period_ns > 0.0
 
     def _last_ns(self, until_ns: int) -> int:
-        """The true time up to which ticks come that are asked for up to `until_ns`."""
+        """Return the true time of the last possible tick up to `until_ns`."""
         return until_ns if self.stopped_ns is None else min(until_ns, self.stopped_ns)
 
     def ticks(self, first: int, until_ns: int) -> I64:
-        """Return the numbers of the ticks from `first` on that came up to a true time."""
+        """Return the numbers of the ticks from `first` on up to a true time."""
         end = max(self.tick_at(self._last_ns(until_ns) + 1), first)
         return np.arange(first, end, dtype=np.int64)
 
@@ -86,7 +86,7 @@ class Ticks:
         return guess
 
     def _true_of(self, tick: int) -> int:
-        """`true_ns` of one tick, without arrays: it is asked often."""
+        """Return `true_ns` of one tick without arrays, for speed."""
         if isinstance(self.clock, FaultyClock):
             return int(self.true_ns(np.array([tick], np.int64))[0])
         return self.clock.to_device(self._origin_ns + round(tick * self._period_ns))
@@ -101,19 +101,19 @@ class Ticks:
         return self.clock.cycle_ns(true_ns) if isinstance(self.clock, FaultyClock) else true_ns
 
     def bits(self, ticks: I64) -> U8:
-        """Return the level of the sync line that is seen at ticks: low where none is wired."""
+        """Return the level of the sync line at ticks; low where none is wired."""
         return np.zeros(len(ticks), np.uint8)
 
 
 class FreeRun(Ticks):
-    """Exposures of a camera that runs by itself; the first one comes within a period."""
+    """Exposures of a free-running camera; the first comes within one period."""
 
     def _clear(self) -> None:
         super()._clear()
         self._starts = 0
 
     def start(self) -> None:
-        """Begin; cycles that run are given up."""
+        """Start exposures; running cycles are discarded."""
         world = self._world
         period_ns = 1e9 / world.settings.frame_camera.rate_hz
         clock, now_ns = world.clocks.frame_camera, world.now_ns
@@ -125,15 +125,15 @@ class FreeRun(Ticks):
         self._starts += 1
 
     def stop(self) -> None:
-        """No exposure begins from now on."""
+        """Stop exposures; no new one begins."""
         if self.stopped_ns is None:
             self.stopped_ns = self._world.now_ns
 
 
 class ExposureLine:
-    """The camera's output that is high during exposures, with its edges as the box captures them.
+    """The camera's output that is high during exposures, as the box captures its edges.
 
-    A frame that is lost on its way to the host was exposed all the same.
+    A frame that is lost in transfer was exposed all the same.
     """
 
     def __init__(self, world: World, camera: FreeRun) -> None:
@@ -150,7 +150,7 @@ class ExposureLine:
         """Return the true times, with jitter, of the starts of exposures since the last call, ns.
 
         Args:
-            until_ns: exposures that begin after this true time are left for a later call.
+            until_ns: exposures after this true time are left for a later call.
         """
         camera = self._camera
         if camera.run != self._run:
@@ -169,8 +169,8 @@ class ExposureLine:
 class ClockReader:
     """Reads of one device's clock.
 
-    The virtual clock stands still meanwhile, so an answer lies ahead of it by a fraction of a
-    millisecond as a rule; the next question waits for the answer before.
+    The virtual clock does not advance during a read, so the answer's time is usually ahead of it by
+    a fraction of a millisecond; the next request starts after the previous answer.
     """
 
     def __init__(self, world: World, device: str) -> None:
@@ -183,11 +183,11 @@ class ClockReader:
         self._answered_ns = 0
 
     def read(self, clock: ClockMap, unit_ns: int = 1) -> ClockReads:
-        """One read.
+        """Read the clock once.
 
         Args:
-            clock: true time to the device's.
-            unit_ns: what the device cuts its clock to.
+            clock: true time to the device's clock.
+            unit_ns: resolution of the device's clock.
         """
         settings = self._world.settings.clocks
         late_us = settings.read_shortest_us + settings.read_spread_us * (
@@ -203,10 +203,10 @@ class ClockReader:
 
 
 class MockSyncBox(Ticks):
-    """Ticks at a fixed rate with a code on the line, and an input for the camera's exposures.
+    """The simulated sync box: ticks with a code, and an input for the camera's exposures.
 
     Args:
-        exposures: the frame camera's output, where it is wired.
+        exposures: the frame camera's output; None where it is not wired.
     """
 
     def __init__(self, world: World, exposures: ExposureLine | None = None) -> None:
@@ -221,12 +221,12 @@ class MockSyncBox(Ticks):
         self._reports = _PulseFaults(self._world, self, "sync_box")
 
     def connect(self) -> None:
-        """It is there."""
+        """Do nothing: the simulated box is always connected."""
 
     def start(
         self, rate_hz: float, seed: int, code: Code = "lfsr", at_ns: int | None = None
     ) -> None:
-        """Begin ticks and code, now or at a true time to come; a train that runs is given up."""
+        """Start ticks and code, now or at a future true time; a running train is ended."""
         if not 0.0 < rate_hz <= 10_000.0:
             raise RigError("sync box", f"rate {rate_hz} Hz: must lie between 0 and 10,000")
         if not 1 <= seed <= SEEDS:
@@ -239,7 +239,7 @@ class MockSyncBox(Ticks):
         self._reports = _PulseFaults(world, self, "sync_box")
         if world.faults.recording_ns is None:
             world.faults.recording_ns = self.started_ns
-        # a box without power does not tick, and does not go on by itself when it has some again
+        # a box without power does not tick, and does not resume when power returns
         self._dark_ns = world.faults.lost_power_ns("sync_box", self.started_ns)
 
     def _last_ns(self, until_ns: int) -> int:
@@ -250,7 +250,7 @@ class MockSyncBox(Ticks):
         return self._code.upto(int(ticks.max(initial=-1)) + 1)[ticks]
 
     def read_pulses(self) -> PulseChunk:
-        """Return the pulses sent since the last call, box clock, whole microseconds."""
+        """Return the pulses sent since the last call, box clock, integer microseconds."""
         now_ns = self._world.now_ns
         ticks = self.ticks(self._read, now_ns - REPORT_NS)
         self._read += len(ticks)
@@ -263,7 +263,7 @@ class MockSyncBox(Ticks):
         return PulseChunk(sent // 1000 * 1000)
 
     def read_exposures(self) -> PulseChunk:
-        """Return the starts of exposures since the last call, box clock, whole microseconds."""
+        """Return the starts of exposures since the last call, box clock, integer microseconds."""
         if self._exposures is None or not self.ticking:
             return PulseChunk(np.empty(0, np.int64))
         edges = self._exposures.edges_ns(self._world.now_ns - REPORT_NS)
@@ -271,7 +271,7 @@ class MockSyncBox(Ticks):
         return PulseChunk(self.clock.to_reference(edges) // 1000 * 1000)
 
     def read_clock(self) -> ClockReads:
-        """Return the box's clock now, whole microseconds: one row."""
+        """Read the box's clock, integer microseconds: one row."""
         return self._clock_reader.read(self.clock, 1000)
 
     def stop(self, at_ns: int | None = None) -> None:
@@ -280,12 +280,12 @@ class MockSyncBox(Ticks):
             self.stopped_ns = self._world.now_ns if at_ns is None else at_ns
 
     def close(self) -> None:
-        """Give the device back."""
+        """Close the device."""
         self.stop()
 
 
 class SyncInput:
-    """A device's input on the sync line: which edges it saw, in true time with its own jitter."""
+    """A device's input on the sync line: its edges in true time with the device's jitter."""
 
     def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
         self._world, self._box, self._device = world, box, device
@@ -300,12 +300,12 @@ class SyncInput:
         )
 
     def skip(self) -> None:
-        """Forget the edges up to now."""
+        """Discard the edges up to now."""
         self._run, self._read = self._box.run, self._box.tick_at(self._world.now_ns)
         self._faults = _PulseFaults(self._world, self._box, self._device)
 
     def edges_ns(self, until_ns: int | None = None) -> I64:
-        """True times of the edges since the last call, with jitter, ns.
+        """Return the true times of the edges since the last call, with jitter, ns.
 
         Args:
             until_ns: edges after this true time are left for a later call.
@@ -324,7 +324,7 @@ class SyncInput:
 
 
 class _PulseFaults:
-    """Faults of the pulses of one train on their way through one device."""
+    """Faults of the pulses of one train in one device."""
 
     def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
         self._box, self._device, self._book = box, device, world.faults
@@ -336,10 +336,10 @@ class _PulseFaults:
         self._whole = device not in lost and not self._reorders
 
     def of(self, ticks: I64, true_ns: I64, stamps: I64, until_ns: int) -> tuple[I64, I64]:
-        """True times and stamps of what is reported of the pulses on `ticks`.
+        """Return true times and time stamps of the reported pulses on `ticks`.
 
-        Pulses are reported in the order of their times. Where some come late or twice, whatever
-        lies after the true time `until_ns` waits for the next call.
+        Pulses are reported in order of time. Where some come late or twice, those after the true
+        time `until_ns` are kept for the next call.
         """
         if self._whole:
             return true_ns, stamps
@@ -361,7 +361,7 @@ class _PulseFaults:
     def _hit(
         self, kind: type[PulsesLost] | type[PulsesLate] | type[PulsesDuplicated]
     ) -> tuple[I64, I64]:
-        """Ticks whose pulses suffer from a kind of fault, and by how much, ns."""
+        """Return the ticks whose pulses have a kind of fault, and the shift, ns."""
         ticks: list[int] = []
         shift: list[int] = []
         for fault in self._book.of(kind) if self._box.ticking else ():

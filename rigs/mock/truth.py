@@ -1,4 +1,4 @@
-"""The truth of a simulated trial, which labels are checked against."""
+"""The ground truth of a simulated trial, for checking labels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sliplab.storage.clockmap import IDENTITY, ClockMap
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 SLIP_MM = 1e-6
-"""A tip has slipped once it slid this far: beyond rounding, and microseconds of sliding."""
+"""Sliding distance at which a tip has slipped: above rounding and microseconds of sliding."""
 
 
 def truth_of(
@@ -27,21 +27,21 @@ def truth_of(
     threshold_px: float = 2.0,
     hold_true_ns: int | None = None,
 ) -> Truth:
-    """Onsets after the start of the slide or retraction, on the sync box's clock.
+    """Return the onsets after the start of the slide or retraction, on the sync box's clock.
 
     Args:
         box: true time to sync box time.
         reference_true_ns: start of the step `slide` or `retract`; displacements are measured from
-            where the tips were then.
-        threshold_px: displacement in the outside picture that counts as slip.
-        hold_true_ns: start of the recorded hold, where it is wanted from there too.
+            the tips' positions then.
+        threshold_px: displacement in the outside image that counts as slip.
+        hold_true_ns: start of the recorded hold, to measure displacements from there too.
 
     Returns:
         the truth without its `clocks`; with `hold_true_ns` also `from_hold`. Markers' displacements
-        are taken as linear between the rows; the onsets of sliding are located within them.
+        are linear between rows; onsets of sliding are located within rows.
 
     Raises:
-        RigError: a reference is older than the history that is kept (minutes).
+        RigError: a reference is older than the kept history (minutes).
     """
     world.advance()
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm
@@ -66,7 +66,7 @@ def truth_of(
 
 
 def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
-    """Distance of each marker from where it stood on the plate, from one true time to another."""
+    """Return each marker's displacement on the plate from one true time to another."""
     n = len(world.physics.tips.state)
     places = world.physics.track.at(np.array([start_ns, end_ns], np.int64))[:, : 2 * n]
     moved = (places[1] - places[0]).reshape(n, 2)
@@ -76,10 +76,10 @@ def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
 def _counted_from(
     world: World, box: ClockMap, reference_true_ns: int, threshold_mm: float
 ) -> TrueOnsets:
-    """Onsets after a true time, displacements from where the tips were then; see `truth_of`."""
+    """Return the onsets after a true time, with displacements from then; see `truth_of`."""
     history = world.physics.track
     if reference_true_ns < history.begin_ns:
-        raise RigError("simulation", "the trial is too long: its beginning is forgotten")
+        raise RigError("simulation", "the trial is too long: its start is no longer kept")
     start = history.at(np.array([reference_true_ns], np.int64))[0]
     t_ns, rows = history.between(reference_true_ns, history.end_ns)
     t_ns = t_ns.copy()
@@ -92,7 +92,7 @@ def _counted_from(
     torn_ns = dict(world.faults.torn())
 
     def there(i: int, true_ns: float | None) -> float | None:
-        """Return the time, or None for a papilla that was torn off before: that is no slip."""
+        """Return the time, or None for a papilla that was torn off before, which is no slip."""
         late = true_ns is not None and true_ns >= torn_ns.get(i, NEVER)
         return None if late else true_ns
 
@@ -111,15 +111,15 @@ def _counted_from(
 def clocks_of(
     world: World, box: ClockMap, recorded_ns: tuple[int, int], frames: FrameGrade
 ) -> dict[str, list[list[int]]]:
-    """Return the readings of the clocks every second of a recording, without any jitter.
+    """Return the readings of the clocks at every second of a recording, without jitter.
 
     Args:
         box: true time to sync box time.
-        recorded_ns: true times at which the recording began and ended; the end is added.
-        frames: with `host arrival` the frame camera's stamps are by the host's clock.
+        recorded_ns: true start and end of the recording; the end is added to the readings.
+        frames: with `host arrival` the frame camera's time stamps are the host's.
 
     Returns:
-        For `arm`, `event_camera` and `frame_camera` pairs of that clock and the box's, ns.
+        for `arm`, `event_camera` and `frame_camera` pairs of that clock and the box's, ns.
     """
     clocks = world.clocks
     found = {"arm": clocks.arm, "event_camera": clocks.event_camera}
@@ -137,9 +137,9 @@ def readings_of(clock: ClockMap, box: ClockMap, recorded_ns: tuple[int, int]) ->
 def _onsets(
     rows: F64, start: F64, t_ns: I64, threshold_mm: float
 ) -> tuple[list[float | None], list[float | None]]:
-    """Return when each displacement exceeds the threshold, and when its tip began to slide.
+    """Return the times at which displacements exceed the threshold, and tips begin to slide.
 
-    Both in true ns, or None. `rows` are the track's, the first of them `start` in effect.
+    Both in true ns, or None. `rows` are rows of the track; the first is treated as `start`.
     """
     n = rows.shape[1] // 4
     crossed: list[float | None] = [None] * n
@@ -148,22 +148,22 @@ def _onsets(
     for i in range(n):
         if moved[i]:
             k = moved[i]
-            way = rows[k - 1 : k + 1, 2 * i : 2 * i + 2] - start[2 * i : 2 * i + 2]
-            low, high = np.hypot(way[:, 0], way[:, 1]).tolist()
+            shift = rows[k - 1 : k + 1, 2 * i : 2 * i + 2] - start[2 * i : 2 * i + 2]
+            low, high = np.hypot(shift[:, 0], shift[:, 1]).tolist()
             low = low if k > 1 else 0.0
-            # straight between the rows
+            # linear between the rows
             share = (threshold_mm - low) / (high - low)
             crossed[i] = float(t_ns[k - 1]) + share * float(t_ns[k] - t_ns[k - 1])
         if slid[i]:
-            # as the solver located it within its step; a row or two may pass before the way slid
-            # counts: the tip began where it last stuck
+            # as the solver located it within its step; some rows may pass before the slid distance
+            # counts: sliding began at the tip's last stick
             began[i] = max(float(rows[slid[i], 3 * n + i]) * 1e9, float(t_ns[0]))
     return crossed, began
 
 
 @njit(cache=True, nogil=True)
 def _first_beyond(rows, start, n, moved_mm, slid_mm):  # type: ignore[no-untyped-def]
-    """First rows, (n,) each, in which a marker has moved and its tip has slid further; else 0."""
+    """Return the first rows in which a marker has moved and its tip has slid farther; else 0."""
     moved, slid = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for k in range(1, len(rows)):
         for i in range(n):

@@ -1,9 +1,9 @@
-"""The world that all simulated devices look at: one arm, one plate, one skin, one true time.
+"""The world that all simulated devices share: one arm, one plate, one skin, one true time.
 
-Time moves only when the virtual clock waits, and the physics follow when a device looks: the
-state then advances on a fixed grid of steps up to the present. A trial's data depend on the rig's
-settings, the trial's seed and the commands to the devices, never on what ran before: `begin_trial`
-puts the skin at rest, sets the true time to 0 and draws everything that varies from trial to
+Time passes only when the virtual clock waits. The physics are evaluated lazily: when a device reads
+the state, it advances on a fixed grid of steps up to the present. A trial's data depend on the
+rig's settings, the trial's seed and the commands to the devices, never on earlier trials:
+`begin_trial` puts the skin at rest, sets the true time to 0 and draws everything that varies by
 trial from the seed.
 """
 
@@ -36,7 +36,7 @@ NEAR_MM = 5.0
 
 
 def start_pose(settings: MockSettings) -> Pose:
-    """Return where the arm stands when the rig is switched on."""
+    """Return the arm's pose at power-on."""
     plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
     start = plane.pose(0.0, 0.0, -CLEARANCE_MM)
     if settings.arm.start_xyz_mm is not None:
@@ -45,19 +45,19 @@ def start_pose(settings: MockSettings) -> Pose:
 
 
 class World:
-    """The simulated world. Devices ask it; nothing outside the mock rig does.
+    """The simulated world, which only simulated devices access.
 
     Attributes:
         now_ns: true time since the trial began, which is also the host's monotonic clock.
         past_ns: true time spent in earlier trials.
-        trials: how often `begin_trial` was called.
-        board: where a printed board is held before the outside camera, if it is.
-        plate_marked: whether the sliding plate with its ArUco marker stands there.
+        trials: number of calls of `begin_trial`.
+        board: position of a printed board in front of the outside camera; None if there is none.
+        plate_marked: True once the sliding plate with its ArUco marker is used.
 
     Args:
-        path: where the arm is, if it is driven from outside; left out, it follows `start_arm`.
-        run_on: the devices' clocks go on from trial to trial, as real ones do; else each trial
-            finds them at a time of its own.
+        path: path of an arm that is driven from outside; if left out, the arm follows `start_arm`.
+        run_on: True if the devices' clocks continue from trial to trial, as real ones do; else
+            each trial draws its own offsets.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class World:
         self._prepare(settings.seed)
 
     def begin_trial(self, seed: int) -> None:
-        """Start over with the randomness of `seed`: skin at rest, true time 0, devices stopped.
+        """Reset with the randomness of `seed`: skin at rest, true time 0, devices stopped.
 
         The arm stays where it is and keeps a protective stop; the mounted mass stays too.
 
@@ -112,7 +112,7 @@ class World:
         self.plate_marked = False
 
     def _sensor_at(self, t_ns: I64) -> F64:
-        """x, y and depth (mm) of the sensor and the slopes of depth at rising times, (k, 5)."""
+        """Return x, y and depth (mm) of the sensor and slopes of depth at times, (k, 5)."""
         sensor = self.path.states(t_ns, SENSOR)
         if self._vibration:
             strength = self.path.stirred(t_ns)[:, None]
@@ -122,7 +122,7 @@ class World:
     # -- time ------------------------------------------------------------------------------
 
     def pass_time(self, ns: int) -> None:
-        """Let true time pass; faults that fall due in it happen."""
+        """Let true time pass, with the faults that are due in it."""
         end_ns = self.now_ns + ns
         halt = self.faults.arm_halt(self.now_ns, end_ns, lambda t_ns: self.path.states(t_ns)[:, :3])
         if halt is not None:
@@ -131,21 +131,21 @@ class World:
         self.now_ns = end_ns
 
     def advance(self) -> int:
-        """Let the physics follow to the present; returns the time of the last row, ns."""
+        """Advance the physics to the present; return the time of the last row, ns."""
         return self.physics.advance(self.now_ns)
 
     @property
     def step_ns(self) -> int:
-        """The last row is never further behind the present than this."""
+        """Largest lag of the last row behind the present."""
         return self.physics.step_ns
 
     # -- the arm ---------------------------------------------------------------------------
 
     def start_arm(self, segments: Sequence[Segment]) -> list[Leg]:
-        """Follow `segments` from now on; returns the legs."""
+        """Start to follow `segments`; return the legs."""
         self.advance()
         if self.path.moving(self.now_ns):
-            raise RigError("arm", "is moving already; wait for its path to end, or stop it")
+            raise RigError("arm", "is already moving; wait for its path to end, or stop it")
         for segment in segments:
             if segment.speed_mm_s <= 0.0:
                 raise RigError("arm", f"speed {segment.speed_mm_s} mm/s: must be more than 0")
@@ -154,13 +154,13 @@ class World:
             if near and turned > MOST_TURNED_DEG:
                 raise ArmFault(
                     "arm",
-                    f"the tool would meet the plate turned by {turned:.0f} degrees; its axes "
-                    "must be the plate's: x right, y up, z into the plate",
+                    f"the tool would touch the plate rotated by {turned:.0f} degrees; its axes "
+                    "must be parallel to the plate's: x right, y up, z into the plate",
                 )
         return self.path.follow(segments, self.now_ns)
 
     def halt_arm(self, at_ns: int, state: ArmState) -> None:
-        """The arm stands still from `at_ns` on, not before the present, and is in `state`."""
+        """Stop the arm at `at_ns`, not before the present, and set its state."""
         self.advance()
         self.path.cut(at_ns)
         self.arm_state = state
@@ -174,10 +174,10 @@ class World:
             return
         self.physics.act(action, seconds, self.now_ns, self.mass_kg)
 
-    # -- what devices look at --------------------------------------------------------------
+    # -- state for devices -----------------------------------------------------------------
 
     def keep_loads(self) -> History:
-        """Keep the forces of every row from the last one on, until `drop_loads`."""
+        """Record the forces of every row from the last one on, until `drop_loads`."""
         return self.physics.keep_loads(self.now_ns)
 
     def keep_wrench(self) -> History:
@@ -189,12 +189,12 @@ class World:
         self.physics.wrench = None
 
     def drop_loads(self) -> None:
-        """Nobody looks at the forces any longer."""
+        """Stop recording forces."""
         self.physics.loads = None
 
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
-        """Places of the tips in the world and heights of the plate, mm: (k, n, 2) and (k,).
+        """Return positions of the tips and heights of the plate, mm: (k, n, 2) and (k,).
 
-        `t_ns` are rising true times not after the last row; between rows the line is straight.
+        `t_ns` are increasing true times up to the last row; rows are interpolated linearly.
         """
         return self.physics.tips_at(t_ns)

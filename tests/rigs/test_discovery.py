@@ -1,4 +1,4 @@
-"""Whether devices can be reached is told by name, with what to look at."""
+"""Devices that cannot be reached are reported by name, with what to check."""
 
 from __future__ import annotations
 

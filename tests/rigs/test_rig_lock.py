@@ -30,7 +30,7 @@ with held(load_rig_file(Path("ur5"))[0], Path("/data/study")):
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where locks are while the test runs."""
+    """Return the folder of the locks during the test."""
     monkeypatch.setenv(ENVIRONMENT, str(tmp_path / "locks"))
     return tmp_path / "locks"
 

@@ -1,4 +1,4 @@
-"""What tests of drivers and of fakes share: an address of their own, and bounded waiting."""
+"""Helpers of tests of drivers and fakes: own addresses, and bounded waiting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an ATI Net F/T sensor says: records of its Raw Data Transfer, and its configuration page.
+"""Protocol of an ATI Net F/T sensor: records of its Raw Data Transfer, and its configuration page.
 
 RDT is UDP, big-endian. A request is 8 bytes: `u16 0x1234, u16 command, u32 count`, a count of 0
 being without end. A record is 36 bytes: `u32 rdt_sequence, u32 ft_sequence, u32 status` and six

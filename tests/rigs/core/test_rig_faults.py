@@ -107,7 +107,7 @@ def test_closing_says_that_the_arm_was_not_seen_to_stand_and_closes_all() -> Non
 
 
 def closed_while(error: BaseException, rig: Any) -> None:
-    """What a command does: something fails, and the rig is closed on the way out."""
+    """Fail as a command would, and close the rig on the way out."""
     try:
         raise error
     finally:

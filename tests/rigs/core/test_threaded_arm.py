@@ -13,7 +13,7 @@ PERIOD_S = 0.004
 
 
 def watch(path: list[Segment], pause_s: float = 0.05) -> list[tuple[float, float]]:
-    """What a watch says of a path, s, with each segment begun when the one before has rested."""
+    """Return the segment times that a watch finds, s; each begins after the previous has rested."""
     motion, seen = StraightMotion(A), SegmentWatch(A, path)
     t, todo, free_s, found = 0.0, list(path), 1.0, []
     while not seen.done and t < 60:

@@ -78,7 +78,7 @@ def egm_message(number: int, t_s: float | None, pose: Pose) -> egm_pb2.EgmRobot:
 
 
 def mm_after_kill(program: str, settings: str, robot: Any, limit_s: float) -> float:
-    """How far a fake's arm goes at 40 mm/s once the program that moves it is killed (mm)."""
+    """Return the distance that a fake arm moves at 40 mm/s after its program is killed, mm."""
     with subprocess.Popen([sys.executable, "-c", program, settings]) as process:
         try:
             until(lambda: robot.pose().xyz_mm[1] > 5.0, 60.0)

@@ -1,4 +1,4 @@
-"""What arms say of themselves, asked through the makers' own ways; and that silence is an error."""
+"""Health reports of arms through the vendors' interfaces; silence is an error."""
 
 from __future__ import annotations
 

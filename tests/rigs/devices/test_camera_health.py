@@ -69,7 +69,7 @@ def test_an_event_camera_says_what_it_is_and_when_it_is_gone() -> None:
 
 
 class Usb:
-    """What a DVXplorer answers; only to names that the library has."""
+    """A fake DVXplorer that answers only to names that the library has."""
 
     def __init__(self) -> None:
         self.answers: dict[str, Any] = {

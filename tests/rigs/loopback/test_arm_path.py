@@ -18,7 +18,7 @@ from sliplab.storage.clockmap import ClockMap
 PLANE = ContactPlane.from_settings(MockSettings().scene.contact)
 HOME = PLANE.pose(0.0, 0.0, -5.0)
 AHEAD_NS = 7_000_000_000
-"""What the controller's clock shows at the true time 0."""
+"""Reading of the controller's clock at true time 0."""
 
 
 def path_of(ppb: int = 0) -> FakeArmPath:
@@ -30,7 +30,7 @@ def away(x_mm: float, depth_mm: float = -5.0) -> Pose:
 
 
 def gone_mm(path: FakeArmPath, *t_s: float) -> list[float]:
-    """How far from home at true times."""
+    """Return the distance from home at true times."""
     states = path.commanded(np.array([round(t * 1e9) for t in t_s], np.int64))
     return [math.dist(state[:3], HOME.xyz_mm) for state in states]
 

@@ -34,7 +34,7 @@ def rig(
 
 @dataclass
 class Streams:
-    """What came in one recording, in whole arrays."""
+    """Data of one recording, as complete arrays."""
 
     frames: dict[str, np.ndarray]
     poses: dict[str, np.ndarray]

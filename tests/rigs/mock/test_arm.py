@@ -44,7 +44,7 @@ def test_a_tool_that_looks_away_is_refused_near_the_plate() -> None:
     devices = build_mock(SMALL)
     devices.arm.connect()
     place = devices.world.plane.pose(0, 0, 0)
-    with pytest.raises(ArmFault, match="turned"):
+    with pytest.raises(ArmFault, match="rotated"):
         devices.arm.start([Segment(type(place)(place.xyz_mm, (0.0, 0.0, 0.0)), 5.0)])
 
 

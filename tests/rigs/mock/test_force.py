@@ -143,7 +143,7 @@ def slide_by(devices: Any, x_mm: float) -> None:
 
 
 def at_rest(force: dict[str, Any], seconds: float, seed: int = 3) -> tuple[Any, WrenchChunk]:
-    """What a sensor reads of a plate that nothing touches."""
+    """Return the sensor's readings while nothing touches the plate."""
     devices = build_mock(MockSettings(force=force))
     devices.begin_trial(seed)
     devices.force.start()

@@ -21,7 +21,7 @@ def test_rows_between_reach_over_both_ends() -> None:
         times, rows = history.between(first, last)
         assert times.tolist() == expected
         assert rows[:, 0].tolist() == expected
-    with pytest.raises(IndexError, match="nothing is known"):
+    with pytest.raises(IndexError, match="before the kept history"):
         history.between(-1, 3)
     with pytest.raises(IndexError):
         History(2).between(0, 1)

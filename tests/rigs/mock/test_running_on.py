@@ -11,7 +11,7 @@ CLOCKS = ("arm", "event_camera", "frame_camera")
 
 
 def shown(world: World) -> list[int]:
-    """What the devices' clocks show now, ns."""
+    """Return the current readings of the devices' clocks, ns."""
     clocks = (getattr(world.clocks, name) for name in CLOCKS)
     return [int(clock.to_reference(world.now_ns)) for clock in clocks]
 

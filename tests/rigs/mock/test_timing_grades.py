@@ -1,4 +1,4 @@
-"""What each timing grade's devices say, held against the simulation's true clocks."""
+"""Time stamps of each timing grade, compared with the simulation's true clocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How fast the whole law converges with its step, against a scheme that shares nothing with it."""
+"""Convergence of the contact law with its step, against an independent scheme."""
 
 import math
 

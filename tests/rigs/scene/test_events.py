@@ -221,7 +221,7 @@ def test_chunks_do_not_matter(
 
 @pytest.mark.parametrize("slots", [0, 40])
 def test_lists_of_pixels_change_no_event(slots: int) -> None:
-    """Whether a marker's pixels come from its list or are all looked at."""
+    """Return whether a marker's pixels come from its list or are all examined."""
     optics = EventOptics(width=160, height=120, **QUIET)
     layout = np.array([[-2.5, 0.0], [2.0, 1.0]])
     sensor = MarkerSensor(optics, layout, 7)

@@ -127,7 +127,7 @@ def one_by_one(a: Look, state: np.ndarray) -> np.ndarray:
 def search_all(  # type: ignore[no-untyped-def]
     segments, first, since, until, inverse, curve, tree, threshold, state, stack, out
 ):
-    """How many events the exact search finds, pixel by pixel and piece by piece."""
+    """Count the events that the exact search finds, pixel by pixel and piece by piece."""
     n = 0
     for y in range(HEIGHT):
         for x in range(WIDTH):

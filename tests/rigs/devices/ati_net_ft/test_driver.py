@@ -56,7 +56,7 @@ def settings_for(fake: FakeNetFt, **more: Any) -> AtiNetFtSettings:
 
 
 def gather(sensor: AtiNetFt, rows: int, within_s: float = 5.0) -> list[WrenchChunk]:
-    """What is read until it is enough."""
+    """Read until there is enough."""
     found: list[WrenchChunk] = []
 
     def enough() -> bool:

@@ -53,7 +53,7 @@ class Result:
 
 
 class Device:
-    """What the thread needs of a camera; gives what it is told to."""
+    """A fake camera for the thread that returns prepared results."""
 
     def __init__(self, *results: Result) -> None:
         self.results, self.error, self.removed = list(results), None, False

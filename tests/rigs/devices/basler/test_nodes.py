@@ -1,4 +1,4 @@
-"""What was left in a frame camera does not change a recording, and the record says what is set."""
+"""Settings left in a frame camera do not change a recording, and its record has all settings."""
 
 from __future__ import annotations
 

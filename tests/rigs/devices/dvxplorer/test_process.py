@@ -1,4 +1,4 @@
-"""What answers where an event camera is expected and is none: an error in time, never a hang."""
+"""A server that is no event camera gives an error in time, never a hang."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ SEED = 0xACE1
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
 ANSWER_S, SILENCE_S = 0.3, 0.4
 SLACK_S = 0.5
-"""What a busy machine may add to a bound."""
+"""Allowance for a busy machine in addition to a timeout, s."""
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def settings(wire: FakeSyncBox) -> SyncBoxSettings:
 
 
 def gather(read: Callable[[], np.ndarray], done: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """What `read` hands over, until it is enough; 5 s at the most."""
+    """Call `read` until it has returned enough, for at most 5 s."""
     found, end = [read()], time.monotonic() + 5.0
     while not done(np.concatenate(found)) and time.monotonic() < end:
         threading.Event().wait(0.01)

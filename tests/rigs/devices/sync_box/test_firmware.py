@@ -39,7 +39,7 @@ LATEST_CYCLES = 4
 
 
 def lacking() -> str:
-    """What is not installed; empty where everything is."""
+    """Return the tools that are not installed; empty if all are."""
     tools = [tool for tool in ("avr-gcc", "avr-nm", "make", "cc") if shutil.which(tool) is None]
     if tools:
         return ", ".join(tools)
@@ -70,7 +70,7 @@ class Built:
     elf: Path
     host: Path
     wraps_at: int
-    """Where the firmware counts its timer's wraps, in data memory."""
+    """Return the address of the firmware's timer wrap counter in data memory."""
 
 
 @pytest.fixture(scope="module")

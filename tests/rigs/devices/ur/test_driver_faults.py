@@ -1,4 +1,4 @@
-"""What the UR driver makes of each fault, and how long that takes at most.
+"""The UR driver's reaction to each fault, within its timeout.
 
 Bounds are held against the clock here with what a busy machine may add; `docs/arms.md` has what was
 measured. The client is the real ur_rtde throughout.
@@ -35,7 +35,7 @@ from tests.rigs.waiting import own_address, until
 pytestmark = pytest.mark.realtime
 
 BUSY_S = 3.0
-"""What a loaded machine may add to a bound."""
+"""Allowance for a busy machine in addition to a timeout, s."""
 TARGET = Pose((400.0, 15.0, 300.0), HOME.rotvec_deg)
 SLIDE = [Segment(TARGET, 1.6)]
 

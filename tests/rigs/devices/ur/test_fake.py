@@ -39,7 +39,7 @@ def robot() -> Iterator[FakeUr]:
 
 
 def client(robot: FakeUr, script: str) -> dict[str, object]:
-    """What a script that speaks through the real client found out."""
+    """Run a script that uses the real client, and return its output."""
     done = subprocess.run(
         [sys.executable, "-c", HEAD + script + "\nprint('SAID', json.dumps(said))", robot.host],
         capture_output=True,
