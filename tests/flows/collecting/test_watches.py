@@ -39,7 +39,7 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
     message = str(stopped.value)
     for part in (
         "stopped, the disk is nearly full: 200.0 MB are free", "(by the trials so far)",
-        "200.0 MB stay in reserve", "make room, then run the same command to go on",
+        "200.0 MB stay in reserve", "make room, then run the same command to resume",
     ):  # fmt: skip
         assert part in message
     assert len(campaign.committed()) == 2

@@ -118,7 +118,7 @@ def test_a_worker_process_that_is_killed_is_said_and_the_rest_is_made(
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        with pytest.raises(WorkerKilled, match="run the same command to go on"):
+        with pytest.raises(WorkerKilled, match="run the same command to resume"):
             label(store, collected(store))
     finally:
         over.set()
