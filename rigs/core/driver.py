@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
-from sliplab.rigs.core.capabilities import Arm, EventCamera, ForceSensor, FrameCamera, SyncBox
 from sliplab.rigs.core.device_settings import DriverSettings
-from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
-from sliplab.rigs.core.fakes import FakeController
-from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import Arm, EventCamera, ForceSensor, FrameCamera, SyncBox
+    from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+    from sliplab.rigs.core.fakes import FakeController
+    from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
 
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)
 ArmSettingsT = TypeVar("ArmSettingsT", bound=BaseArmSettings)

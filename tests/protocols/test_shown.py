@@ -16,6 +16,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.shown import MASK, is_secret, printable, shown, shown_key
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, without_secrets
+from sliplab.rigs.core.registry import listed, load_driver
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 
@@ -50,6 +51,8 @@ def _names(kind: Any, seen: set[Any]) -> set[str]:
 
 def test_no_other_key_of_our_files_counts_as_a_secret() -> None:
     names = _names(Protocol, set()) | _names(RigFile, set())
+    for item in listed().values():
+        names |= _names(load_driver(item).settings, set())
     assert len(names) > 300
     assert {name for name in names if is_secret(name)} == {"password"}
 

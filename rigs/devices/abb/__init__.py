@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from sliplab.rigs.core.capabilities import Arm
+from typing import TYPE_CHECKING
+
 from sliplab.rigs.core.driver import ArmDriver, ArmScene
-from sliplab.rigs.core.fakes import FakeController
 from sliplab.rigs.core.network import answers, arm_lock
 from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import Arm
+    from sliplab.rigs.core.fakes import FakeController
 
 
 def _build(settings: AbbSettings) -> Arm:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sliplab.rigs.core.capabilities import Arm, ForceSensor
 from sliplab.rigs.core.driver import FakeForceSensor, ForceSensorDriver
 from sliplab.rigs.core.network import answers
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import Arm, ForceSensor
 
 
 def _build(settings: AtiNetFtSettings, arm: Arm) -> ForceSensor:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from sliplab.rigs.core.capabilities import FrameCamera
+from typing import TYPE_CHECKING
+
 from sliplab.rigs.core.driver import FrameCameraDriver, SceneFrames
 from sliplab.rigs.devices.basler.settings import BaslerSettings
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import FrameCamera
 
 
 def _build(settings: BaslerSettings, px_per_mm: float) -> FrameCamera:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from sliplab.rigs.core.capabilities import EventCamera
+from typing import TYPE_CHECKING
+
 from sliplab.rigs.core.driver import EventCameraDriver, FakeEventCamera
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import EventCamera
 
 
 def _build(settings: DvxplorerSettings) -> EventCamera:

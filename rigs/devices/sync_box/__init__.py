@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING
 
-from sliplab.rigs.core.capabilities import SyncBox
 from sliplab.rigs.core.driver import SyncBoxDriver
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import SyncBox
 
 
 def _build(settings: SyncBoxSettings) -> SyncBox:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from sliplab.rigs.core.capabilities import Arm, ForceSensor, RigError
+from typing import TYPE_CHECKING
+
 from sliplab.rigs.core.driver import ArmDriver, ArmScene, ForceSensorDriver
-from sliplab.rigs.core.fakes import FakeController
 from sliplab.rigs.core.network import answers, arm_lock
 from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.capabilities import Arm, ForceSensor
+    from sliplab.rigs.core.fakes import FakeController
 
 RTDE_PORT = 30004
 
@@ -45,6 +49,7 @@ DRIVER = ArmDriver(
 
 
 def _build_wrench(settings: UrWrenchSettings, arm: Arm) -> ForceSensor:
+    from sliplab.rigs.core.capabilities import RigError
     from sliplab.rigs.devices.ur.driver import UrArm
     from sliplab.rigs.devices.ur.wrench import UrWrench
 
