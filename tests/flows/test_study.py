@@ -235,8 +235,8 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
         assert kinematic["trained_baselines"][name]["argmax"] == pytest.approx(share)
     text = (store.folder / "report" / "index.html").read_text()
     assert "ordinary convolutions on the summed frame" in text
-    assert "It buys:" in text
-    assert "It costs:" in text
+    assert "Saving:" in text
+    assert "Cost: the best other method" in text
     for path in (store.folder / "derived" / "baselines").iterdir():
         path.unlink()
     assert report(store, campaigns)["done"] == 1
