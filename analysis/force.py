@@ -81,6 +81,58 @@ def plate_forces(recording: Recording, name: str = STREAM) -> PlateForces:
     )
 
 
+MEAN_NS = 10_000_000
+"""Peaks are those of means over this long: one sample's noise is no peak."""
+_IN_CONTACT = 0.1
+"""Share of the hold's normal force below which no friction is computed."""
+
+
+def force_figures(t_ns: I64, force_n: F64, edges_ns: tuple[int, int, int]) -> dict[str, float]:
+    """Return the figures of a trial's forces that are known, N, to a tenth of a millinewton.
+
+    Args:
+        t_ns: times on the time line, (n,).
+        force_n: forces on the plate, (n, 3).
+        edges_ns: start of the recording, start of the slide or retraction, and its end.
+
+    Returns:
+        ``normal_peak_n``, the largest normal force in the recording; ``normal_hold_n``, its mean in
+        the hold; ``tangential_peak_n``, the largest tangential force in the motion; and
+        ``friction_peak``, the largest ratio of the two there.
+    """
+    start, moving, end = edges_ns
+    found: dict[str, float] = {}
+    recorded = (t_ns >= start) & (t_ns <= end)
+    if np.count_nonzero(recorded) < 2:
+        return found
+    period = max(float(np.median(np.diff(t_ns[recorded]))), 1.0)
+    t_ns, force = t_ns[recorded], moving_mean(force_n[recorded], max(1, round(MEAN_NS / period)))
+    normal, tangential = force[:, 2], np.hypot(force[:, 0], force[:, 1])
+    found["normal_peak_n"] = float(normal.max())
+    held, moves = t_ns < moving, t_ns >= moving
+    if held.any():
+        found["normal_hold_n"] = float(normal[held].mean())
+    if moves.any():
+        found["tangential_peak_n"] = float(tangential[moves].max())
+        pressed = moves & (normal > _IN_CONTACT * max(found.get("normal_hold_n", 0.0), 0.0))
+        pressed &= normal > 0
+        if pressed.any():
+            found["friction_peak"] = float((tangential[pressed] / normal[pressed]).max())
+    return {name: round(value, 4) for name, value in found.items()}
+
+
+def moving_mean(values: F64, width: int) -> F64:
+    """Return means of so many neighbouring rows, shorter at both ends; the shape stays."""
+    if width < 2 or len(values) < 2:
+        return values
+    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    low = np.maximum(np.arange(len(values)) - width // 2, 0)
+    high = np.minimum(np.arange(len(values)) + (width + 1) // 2, len(values))
+    counts = (high - low).reshape(-1, *(1 for _ in values.shape[1:]))
+    means: F64 = (total[high] - total[low]) / counts
+    return means
+
+
 def step_ns(t_ns: I64, values: F64, half_width: int = 10) -> int:
     """Return the moment at which the largest step of a signal is half over, ns.
 

@@ -17,18 +17,21 @@ import numpy as np
 from numba import njit
 
 from sliplab.analysis.clocks.synchronise import TrialSync, streams_of, synchronise
+from sliplab.analysis.force import STREAM as FORCE
+from sliplab.analysis.force import force_figures
 from sliplab.analysis.labels.places import handed_over
 from sliplab.analysis.labels.rest import offsets
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
 from sliplab.storage.schema.trial import Clocks, Counts, Gate, StreamRecord
-from sliplab.storage.streams import F64, I64, PathSegment
+from sliplab.storage.streams import F64, I64, PathSegment, WrenchChunk
 from sliplab.storage.trials.checksums import DATA
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import TRACKS
 from sliplab.storage.trials.recording import Recording
 
+Rows = tuple[tuple[float, float, float], ...]
 UNVOUCHED_S = 0.3
 """A recording may begin and end this much before and after the pulses on which a clock's fit
 stands: the code may be silent for 16 ticks."""
@@ -102,6 +105,7 @@ def assess(
     rate_hz: int,
     mid_exposure_ns: int | None,
     with_events: bool = True,
+    to_plate: Rows | None = None,
 ) -> Assessment:
     """Fit the clocks of a sealed trial and apply the protocol's gates.
 
@@ -109,6 +113,7 @@ def assess(
         timing: how the rig's devices are timed.
         mid_exposure_ns: from a frame's trigger to its time; None without a video.
         with_events: events were recorded.
+        to_plate: rows of the matrix from the force sensor's axes to the plate's, if there is one.
     """
     with StreamReader(folder / DATA) as reader:
         streams = streams_of(reader, mid_exposure_ns)
@@ -119,6 +124,7 @@ def assess(
             name: StreamRecord(kind=kind, rows=reader.stream_counts()[name]["t"])
             for name, kind in reader.streams().items()
         }
+        wrenches = reader.wrenches(FORCE) if FORCE in named and to_plate is not None else None
     sync = synchronise(streams, timing, rate_hz, with_events=with_events)
     there = {"events": with_events, "arm": True, "frames": mid_exposure_ns is not None}
     devices = [*(name for name, recorded in there.items() if recorded), *sorted(sync.streams)]
@@ -137,6 +143,14 @@ def assess(
     results["path_deviation_mm"] = _gate(away, float(gates.path_deviation))
     off = speed_deviation_percent(streams.pose_ns, streams.pose_host_ns, pose_mm, motion.path)
     results["speed_deviation_percent"] = _gate(off, float(gates.speed_deviation))
+    if wrenches is not None and to_plate is not None:
+        figures = _force_figures(wrenches, to_plate, sync, motion)
+        results |= _force_gates(figures, gates)
+        named[FORCE] = StreamRecord(
+            kind=wrenches.KIND, rows=len(wrenches), to_plate=to_plate, figures=figures
+        )
+    elif gates.normal_force is not None or gates.hold_force is not None:
+        results |= _force_gates({}, gates)
     counts = Counts(
         events=len(event_us),
         frames=len(streams.frame_ns),
@@ -144,6 +158,33 @@ def assess(
         pulses=len(streams.sync_pulses),
     )
     return Assessment(sync.record(), results, counts, named)
+
+
+def _force_figures(
+    wrenches: WrenchChunk, to_plate: Rows, sync: TrialSync, motion: Motion
+) -> dict[str, float]:
+    """Return the figures of a trial's forces on the plate; none where a clock is not known."""
+    if FORCE not in sync.devices or "arm" not in sync.devices:
+        return {}
+    on_box = np.asarray(sync.devices[FORCE].map.to_reference(wrenches.t_ns))
+    start, moving, end = (
+        int(sync.devices["arm"].map.to_reference(t))
+        for t in (motion.recorded_ns[0], motion.moving_ns[0], motion.moving_ns[1])
+    )
+    force = wrenches.force_n @ np.asarray(to_plate, np.float64).T
+    return force_figures(on_box, force, (start, moving, end))
+
+
+def _force_gates(figures: dict[str, float], gates: Gates) -> dict[str, Gate]:
+    """Apply the protocol's gates of force; a figure that is not known passes none."""
+    found = {}
+    if gates.normal_force is not None:
+        value = figures.get("normal_peak_n", -1.0)
+        found["normal_force_n"] = _gate(value, float(gates.normal_force))
+    if gates.hold_force is not None:
+        value, limit = figures.get("normal_hold_n", -1.0), float(gates.hold_force)
+        found["hold_force_n"] = Gate(value=value, limit=limit, passed=value >= limit)
+    return found
 
 
 def hold_rate(recording: Recording) -> float:

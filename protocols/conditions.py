@@ -12,6 +12,7 @@ from sliplab.protocols.quantity import (
     KilogramsOrRef,
     Millimetres,
     PositiveMillimetres,
+    PositiveNewtons,
     PositivePercent,
     PositivePixels,
     PositiveSeconds,
@@ -100,6 +101,11 @@ class Gates(StrictModel):
     """Largest motion of a papilla's marker in the recorded hold, on a plate that slides relative to
     the plate; looked at where the rig provides tracks. Videos are only tracked by `label`, which
     doubts the trial by `analysis.labelling.hold_slip_px`. Left out, it is ignored."""
+    normal_force: PositiveNewtons | None = None
+    """Largest normal force on the plate in the recording, on a rig with a force sensor. Left out,
+    it is ignored."""
+    hold_force: PositiveNewtons | None = None
+    """Least mean normal force in the recorded hold, on such a rig: less is no contact."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """Retakes of a trial before it is quarantined for good."""
     reference: ReferenceGate | None = None

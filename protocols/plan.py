@@ -261,7 +261,7 @@ class Plan:
         if not data["context"]:  # as in protocols from before it came
             data.pop("context")
         gates = self.protocol.collection.gates
-        for name in ("reference", "hold_slip"):
+        for name in ("reference", "hold_slip", "normal_force", "hold_force"):
             if getattr(gates, name) is None:  # hashes of protocols from before it came stay
                 data["gates"].pop(name)
         if gates.speed_deviation == Gates().speed_deviation:  # the same

@@ -242,6 +242,7 @@ PositiveSpeed: Any = _quantity("mm/s", "0", True, ref=False)
 Seconds: Any = _quantity("s", "0", False, ref=False)
 PositiveSeconds: Any = _quantity("s", "0", True, ref=False)
 PositivePixels: Any = _quantity("px", "0", True, ref=False)
+PositiveNewtons: Any = _quantity("N", "0", True, ref=False)
 PositivePercent: Any = _quantity("percent", "0", True, ref=False)
 # The same, or a factor's name after a dollar sign.
 MillimetresOrRef: Any = _quantity("mm", "0", True, ref=True)

@@ -250,6 +250,13 @@ class RigFile(StrictModel):
         return self.simulated or (self.devices is not None and self.devices.plate is not None)
 
     @property
+    def has_force(self) -> bool:
+        """True if there is a force sensor."""
+        if self.driver == "mock":
+            return self.scene.force is not None
+        return self.devices is not None and self.devices.force_sensor is not None
+
+    @property
     def frame_source(self) -> str:
         """Output of the outside camera: ``video`` or ``tracks``."""
         return self.mock.frame_camera.level if self.mock is not None else "video"
@@ -362,6 +369,16 @@ def _check_cameras(rig: RigFile, plan: Plan) -> None:
             raise InputError(plan.file, "collection.recording.streams", name, text)
 
 
+def _check_force(rig: RigFile, plan: Plan) -> None:
+    """Check that a protocol that asks for forces has a rig that measures them."""
+    gates = plan.protocol.collection.gates
+    for name in ("normal_force", "hold_force"):
+        value = getattr(gates, name)
+        if value is not None and not rig.has_force:
+            text = f"needs a force sensor, and the rig {rig.name} has none: leave the gate out"
+            raise InputError(plan.file, f"collection.gates.{name}", f"{value} N", text)
+
+
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     """Check every motion of a plan against the rig's limits.
 
@@ -381,6 +398,7 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
             )
     _check_cameras(rig, plan)
     _check_exposure(rig, plan, file)
+    _check_force(rig, plan)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")

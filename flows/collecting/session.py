@@ -32,7 +32,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun
+from sliplab.rigs.core.rig import Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
@@ -43,7 +43,6 @@ from sliplab.storage.schema.trial import (
     Quality,
     RecordedTiming,
     Step,
-    StreamRecord,
     TrialRecord,
 )
 from sliplab.storage.streams import Json
@@ -297,6 +296,7 @@ class Session:
                 rate_hz,
                 mid_exposure_ns,
                 with_events=with_events,
+                to_plate=self._to_plate(),
             )
             record = self._record(trial, number, run, found, frame_px)
             provenance = self._provenance(started)
@@ -371,17 +371,14 @@ class Session:
         known = {
             "devices": self.rig.describe(),
             "simulation_truth": run.truth,
-            "streams": self._streams(found),
+            "streams": found.streams,
         }
         return record.model_copy(update={name: value for name, value in known.items() if value})
 
-    def _streams(self, found: Assessment) -> dict[str, StreamRecord]:
-        """Return the named streams, that of the force sensor with its axes."""
-        streams, force = dict(found.streams), self.rig.force
-        if force is not None and FORCE in streams:
-            rows = self.rig.plate_frame.force_matrix(force.mounting)
-            streams[FORCE] = StreamRecord(**{**dict(streams[FORCE]), "to_plate": rows})
-        return streams
+    def _to_plate(self) -> tuple[tuple[float, float, float], ...] | None:
+        """Return the rows of the matrix from the force sensor's axes to the plate's."""
+        force = self.rig.force
+        return None if force is None else self.rig.plate_frame.force_matrix(force.mounting)
 
     def _geometry(self, frame_px: tuple[int, int] | None) -> Geometry:
         with_events = self.rig_file.with_events(self.plan)

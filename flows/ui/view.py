@@ -10,6 +10,7 @@ events/rate                events a second
 camera, camera/markers     frames (JPEG), the markers in them; camera/plate the plate's marker
 arm                        tool centre point as a transform; arm/path; arm/x, y, z in mm
 pulses/sync_box, events, arm
+force/normal, tangential   N on the plate, where the rig measures it; force/x, y along it
 displacement/marker_N      px
 onsets/NAME                0 before, 1 after the incipient, 2 after the gross onset, of the label,
                            the review and (simulated) the truth; onset_log as text
@@ -33,6 +34,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.force import has_forces, plate_forces
 from sliplab.analysis.labels.reviewed import label_key, state_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
@@ -103,7 +105,8 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
             APPLICATION, recording_id=f"{subject.item.name}/{subject.trial}"
         )
         try:
-            stream.save(unfinished, default_blueprint=blueprint(library))
+            forces = has_forces(subject.recording)
+            stream.save(unfinished, default_blueprint=blueprint(library, forces=forces))
             counts = send(library, stream, subject)
             stream.flush()
         finally:
@@ -265,6 +268,7 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
     _frames(to, subject, arrays)
     _arm(to, subject)
     _pulses(to, subject)
+    _forces(to, subject)
     if "displacement_px" in arrays:
         for marker, values in enumerate(arrays["displacement_px"].T):
             there = np.isfinite(values)
@@ -394,6 +398,17 @@ def _pulses(to: _Columns, subject: Subject) -> None:
         to.scalars(path, seen[name], np.full(len(seen[name]), float(height)), f"pulses_{title}")
 
 
+def _forces(to: _Columns, subject: Subject) -> None:
+    """Send forces on the plate, if the trial has any."""
+    if not has_forces(subject.recording):
+        return
+    found = plate_forces(subject.recording)
+    to.scalars("force/normal", found.t_ns, found.normal_n, "forces")
+    to.scalars("force/tangential", found.t_ns, found.tangential_n)
+    for axis, values in zip("xy", found.force_n[:, :2].T, strict=True):
+        to.scalars(f"force/{axis}", found.t_ns, values)
+
+
 def _onsets(to: _Columns, subject: Subject, label: TrialLabel | None, key: str) -> None:
     recording = subject.recording
     known: dict[str, tuple[int | None, int | None]] = {
@@ -434,15 +449,16 @@ def _network(to: _Columns, subject: Subject) -> None:
     to.sent["windows"] = len(arrays["end_ns"])
 
 
-def blueprint(library: ModuleType) -> Any:
-    """Arrange the viewer."""
+def blueprint(library: ModuleType, *, forces: bool = False) -> Any:
+    """Arrange the viewer; with a panel of the forces, where there are any."""
     views = library.blueprint
+    force = [("force", "force on the plate (N)")] if forces else []
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (
             ("displacement", "displacement (px)"), ("events/rate", "events (1/s)"),
             ("onsets", "onsets: 1 incipient, 2 gross"), ("network", "network, spikes a window"),
-            ("pulses", "sync pulses"),
+            *force, ("pulses", "sync pulses"),
         )
     ]  # fmt: skip
     pictures = [

@@ -225,6 +225,9 @@ class StreamRecord(Part):
     to_plate: tuple[tuple[Number, Number, Number], ...] | None = None
     """Of a wrench: rows of the matrix from its axes to those of the plate (x right, y up, z into
     the plate), such that the product is the force on the plate; null where it is unknown."""
+    figures: dict[str, Number] = Field(default_factory=dict)
+    """Of forces on the plate: `normal_peak_n`, `normal_hold_n`, `tangential_peak_n` and
+    `friction_peak`; only those that are known."""
 
 
 class TrialRecord(Document):

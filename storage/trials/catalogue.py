@@ -213,6 +213,11 @@ def _row(campaign: str, recording: Recording) -> Row:
         "sync_uncertainty_us": None if uncertainty_ns is None else uncertainty_ns / 1000,
         "passed": record.quality.passed,
         **condition_columns(record.condition),
+        **{
+            f"{name}_{figure}": value
+            for name, stream in record.streams.items()
+            for figure, value in stream.figures.items()
+        },
     }
 
 

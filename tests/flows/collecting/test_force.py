@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.analysis.force import has_forces, plate_forces
+from sliplab.analysis.force import force_figures, has_forces, plate_forces
+from sliplab.flows.ui import view
+from sliplab.protocols import InputError
 from sliplab.storage.errors import StoreError
+from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import session, short, take_all
+from tests.flows.ui.test_view import Read
 
 TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
 TRACKS = {"level": "tracks"}
@@ -65,6 +69,51 @@ def test_forces_stand_on_the_plate_and_on_the_time_line(taken: Recording) -> Non
     assert 1e6 < found.uncertainty_ns < 4e6
 
 
+def test_figures_of_the_forces_are_in_record_and_catalogue(taken: Recording) -> None:
+    figures = taken.record.streams["force"].figures
+    assert figures["normal_peak_n"] == pytest.approx(figures["normal_hold_n"], rel=0.15)
+    assert 0.5 < figures["tangential_peak_n"] < figures["normal_peak_n"]
+    assert 0.4 < figures["friction_peak"] < 1.0
+    table = catalogue(Store.open(taken.folder.parents[3]))
+    row = table[table["trial"] == taken.trial_id].iloc[0]
+    for name, value in figures.items():
+        assert row[f"force_{name}"] == value
+
+
+@pytest.mark.parametrize(
+    ("gate", "said"),
+    [
+        ({"normal_force": "0.5 N"}, "normal_force_n = "),
+        ({"hold_force": "4 N"}, "hold_force_n = "),
+    ],
+)
+def test_gates_of_force_reject_a_trial(gate: dict[str, str], said: str, tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["gates"] = {"retakes": 0, **gate}
+    work, campaign = session(tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    take_all(work)
+    assert campaign.committed() == set()
+    assert all(said in failed["cause"] for failed in campaign.quarantined())
+
+
+def test_gates_that_hold_leave_the_trials(tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["gates"] = {"normal_force": "5 N", "hold_force": "1 N"}
+    work, campaign = session(tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    take_all(work)
+    assert len(campaign.committed()) == 3
+    gates = next(iter(campaign.recordings())).record.quality.gates
+    assert gates["normal_force_n"].passed
+    assert gates["hold_force_n"].passed
+
+
+def test_a_gate_of_force_needs_a_sensor(tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["gates"] = {"normal_force": "5 N"}
+    with pytest.raises(InputError, match=r"gates.normal_force = 5 N: needs a force sensor"):
+        session(tmp_path / "a", data, frame_camera=TRACKS)
+
+
 def test_a_rig_without_a_sensor_says_nothing_of_forces(tmp_path: Path) -> None:
     work, campaign = session(tmp_path / "a", short(), frame_camera=TRACKS)
     take_all(work)
@@ -91,3 +140,29 @@ def test_a_clock_that_jumps_back_is_refused_and_the_trial_taken_again(tmp_path: 
     (failed,) = campaign.quarantined()
     assert "sync_uncertainty_force_s: its clock fell back" in failed["cause"]
     assert len(campaign.committed()) == 3
+
+
+def test_figures_are_of_the_right_stretches() -> None:
+    t_ns = np.arange(3000, dtype=np.int64) * 1_000_000
+    force = np.zeros((3000, 3))
+    force[:, 2] = 2.0
+    force[1000:, 0] = np.linspace(0.0, 1.0, 2000)
+    force[2500:, 2] = 9.0  # after the end
+    found = force_figures(t_ns, force, (100_000_000, 1_000_000_000, 2_400_000_000))
+    assert found == {
+        "normal_peak_n": 2.0, "normal_hold_n": 2.0,
+        "tangential_peak_n": pytest.approx(0.7, abs=0.01),
+        "friction_peak": pytest.approx(0.35, abs=0.005),
+    }  # fmt: skip
+    assert force_figures(t_ns, force, (5_000_000_000, 6_000_000_000, 7_000_000_000)) == {}
+
+
+def test_forces_are_seen_in_rerun(taken: Recording, tmp_path: Path) -> None:
+    store = Store.open(taken.folder.parents[3])
+    path = tmp_path / "a.rrd"
+    counts = view.save(view.find(store, taken.trial_id), path)
+    forces = plate_forces(taken)
+    assert counts["forces"] == len(forces.t_ns)
+    times, values = Read(path).curve("/force/normal")
+    assert times == forces.t_ns.tolist()
+    assert np.allclose(values, forces.normal_n)
