@@ -142,7 +142,7 @@ def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.Monk
     assert load_rig_file(Path("mine"))[0].name == "mock"
     with pytest.raises(
         InputError,
-        match=r"rehersal: .* shipped rigs: irb120, loopback, mock, mock_force, mock_noisy",
+        match=r"rehersal: .* shipped rigs: irb120, loopback, mock, mock_events, mock_force, ",
     ):
         rig_path(Path("rehersal"))
 

@@ -98,7 +98,7 @@ def test_a_store_keeps_no_password_of_a_rig_file(tmp_path: Path) -> None:
         update={"devices": None}
     )
     assert rig_hash(text) == where.info["rig_hash"]
-    with pytest.raises(InputError, match=r"arm\.password = \*\*\*\*: .* the rig's own"):
+    with pytest.raises(InputError, match=r"arm\.password = \*\*\*\*: .* the rig's password"):
         load_rig_file(copy)  # it would not log in
 
 
