@@ -3,7 +3,7 @@
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import Plan, Task, Trial, load_plan, make_plan
-from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step, Twist
 
 __all__ = [
     "Dwell",
@@ -17,6 +17,7 @@ __all__ = [
     "Step",
     "Task",
     "Trial",
+    "Twist",
     "load_plan",
     "make_plan",
 ]

@@ -11,6 +11,8 @@ from sliplab.protocols.factors import MAX_TRIALS, ContextLevel
 from sliplab.protocols.quantity import (
     KilogramsOrRef,
     Millimetres,
+    PositiveDegrees,
+    PositiveDegreesPerSecond,
     PositiveMillimetres,
     PositiveNewtons,
     PositivePercent,
@@ -74,6 +76,10 @@ class Limits(StrictModel):
     clearance: PositiveMillimetres
     workspace: Workspace
     duration: PositiveSeconds
+    twist: PositiveDegrees | None = None
+    """Largest angle about the plate's normal; needed where the motion has a twist."""
+    twist_speed: PositiveDegreesPerSecond | None = None
+    """The same of its speed."""
 
 
 class ReferenceGate(StrictModel):

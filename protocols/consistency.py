@@ -64,8 +64,9 @@ def _check_held_out(split: Split) -> None:
 
 def _check_directions(collection: Collection) -> None:
     """Two directions that differ by full turns are one condition under two names."""
+    directions = {ref.factor for key, ref in collection.bindings() if key.endswith(".direction")}
     for name, factor in collection.factors.items():
-        if factor.unit != "deg":
+        if name not in directions or factor.unit is None:
             continue
         seen: dict[Decimal, Decimal] = {}
         for level in (*factor.levels(), *factor.optional):

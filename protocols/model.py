@@ -151,7 +151,7 @@ class Collection(StrictModel):
         press, release = names.index("press"), names.index("release")
         return tuple(
             index for index, name in enumerate(names)
-            if name in {"slide", "retract"} or (name == "move" and press < index < release)
+            if name in {"slide", "retract", "twist"} or (name == "move" and press < index < release)
         )  # fmt: skip
 
     def key_of(self, name: str) -> str:
@@ -230,7 +230,7 @@ class Collection(StrictModel):
                 fail(f"must contain the phase '{name}' exactly once")
         acting = self.acting
         if not acting:
-            fail("must contain a 'slide' or 'retract', or a 'move' between press and release")
+            fail("must contain a 'slide', 'retract' or 'twist', or a 'move' between press and release")
         if "hold" not in names[: acting[0]]:
             fail("must have a 'hold' before it moves in contact, where recording starts")
         ordered = [name for name in names if name in {"approach", "press", "release", "return"}]
@@ -241,6 +241,12 @@ class Collection(StrictModel):
             fail("must slide or retract between press and release")
         if any(names.index("approach") > i for i, name in enumerate(names) if name == "hold"):
             fail("cannot have a hold before the approach")
+        for name in ("twist", "twist_speed"):
+            if "twist" in names and getattr(self.limits, name) is None:
+                key = f"collection.limits.{name}"
+                raise KeyedError(key, None, "is needed: the motion has a twist")
+        if "twist" in names and self.plate is not None:
+            fail("cannot twist on a sliding plate")
         if ("plate" in names) != (self.plate is not None):
             fail("a phase 'plate' and the section 'plate' require each other")
         references = self.bindings()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from decimal import Decimal
 from itertools import product
 from typing import Any
@@ -25,12 +26,15 @@ from sliplab.protocols.phases import (
     Return,
     Slide,
     Travel,
+    TwistPhase,
 )
-from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step, Twist
 from sliplab.protocols.quantity import FactorRef, canonical, check_least
 from sliplab.protocols.yaml_file import KeyedError
 
 Condition = Mapping[str, Level]
+UNTWIST_DEG_S = 20.0
+"""Speed at which a sensor that was twisted turns back, clear of the plate."""
 
 
 def _value(field: Decimal | FactorRef | str, condition: Condition) -> float:
@@ -66,7 +70,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             at = Position(*start_xy, -_value(phase.clearance, condition))
             steps.append(Move("approach", at, _value(phase.speed, condition)))
         elif isinstance(phase, Press):
-            at = Position(at.x_mm, at.y_mm, _value(phase.depth, condition))
+            at = replace(at, depth_mm=_value(phase.depth, condition))
             steps.append(Move("press", at, _value(phase.speed, condition)))
         elif isinstance(phase, Hold):
             settle = _value(phase.settle, condition)
@@ -75,12 +79,12 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             steps.append(Dwell("hold", _value(phase.duration, condition), recorded))
         elif isinstance(phase, Slide):
             half = _half_slide(phase, condition)
-            at = Position(at.x_mm + 2 * half[0], at.y_mm + 2 * half[1], at.depth_mm)
+            at = replace(at, x_mm=at.x_mm + 2 * half[0], y_mm=at.y_mm + 2 * half[1])
             steps.append(Move("slide", at, _value(phase.speed, condition), recorded))
         elif isinstance(phase, Retract):
             distance, speed = _value(phase.distance, condition), _value(phase.speed, condition)
             share = _signed_share(phase, condition)
-            at = Position(at.x_mm + share * distance, at.y_mm, at.depth_mm - distance)
+            at = replace(at, x_mm=at.x_mm + share * distance, depth_mm=at.depth_mm - distance)
             steps.append(Move("retract", at, speed * math.hypot(1.0, share), recorded))
         elif isinstance(phase, PlateMotion):
             steps.append(
@@ -91,9 +95,15 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             name = "move" if index in acting else "travel"
             steps.append(Move(name, at, _value(phase.speed, condition), recorded))
         elif isinstance(phase, Release):
-            at = Position(at.x_mm, at.y_mm, -_value(phase.clearance, condition))
+            at = replace(at, depth_mm=-_value(phase.clearance, condition))
             steps.append(Move("release", at, _value(phase.speed, condition)))
+        elif isinstance(phase, TwistPhase):
+            at = replace(at, twist_deg=at.twist_deg + _value(phase.angle, condition))
+            steps.append(Twist("twist", at, _value(phase.speed, condition), recorded))
         elif isinstance(phase, Return):
+            if at.twist_deg:
+                at = replace(at, twist_deg=0.0)
+                steps.append(Twist("untwist", at, UNTWIST_DEG_S))
             at = Position(0.0, 0.0, home.depth_mm)
             steps.append(Move("return", at, _value(phase.speed, condition)))
     return Program(home, tuple(steps))
@@ -113,7 +123,7 @@ def _place(phase: Travel, at: Position, condition: Condition) -> Position:
     assert place is not None
     return Position(
         coordinate(place.x, at.x_mm), coordinate(place.y, at.y_mm),
-        coordinate(place.depth, at.depth_mm),
+        coordinate(place.depth, at.depth_mm), at.twist_deg,
     )  # fmt: skip
 
 
@@ -189,7 +199,9 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
     _check_levels(collection, written)
     for index, phase in enumerate(collection.motion):
         base = f"collection.motion[{index}]"
-        if not isinstance(phase, (Hold, PlateMotion)):
+        if isinstance(phase, TwistPhase):
+            _check_twist(phase, base, levels, limits)
+        elif not isinstance(phase, (Hold, PlateMotion)):
             at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
             at_most(phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
@@ -265,13 +277,37 @@ def _outside(place: Position, limits: Any) -> str | None:
     return _inside(place.x_mm, place.y_mm, limits)
 
 
+def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> None:
+    for angle, where in levels(phase.angle, f"{base}.angle"):
+        if not 0 < abs(angle) <= limits.twist:
+            raise KeyedError(
+                where,
+                f"{canonical(angle)} deg",
+                f"must not be 0, and at most collection.limits.twist = {canonical(limits.twist)} "
+                "deg either way",
+            )
+    for speed, where in levels(phase.speed, f"{base}.speed"):
+        if speed > limits.twist_speed:
+            raise KeyedError(
+                where,
+                f"{canonical(speed)} deg/s",
+                f"is over collection.limits.twist_speed = {canonical(limits.twist_speed)} deg/s",
+            )
+
+
 def path_fault(collection: Collection, program: Program) -> str | None:
     """Return how a program with moves breaks the limits on its way; None if it does not.
 
     Phases other than a move are held against the limits one by one, which names the level.
     """
-    if any(isinstance(phase, Travel) for phase in collection.motion):
+    if any(isinstance(phase, Travel | TwistPhase) for phase in collection.motion):
+        most = float(collection.limits.twist or 0)
         for step in program.steps:
+            if isinstance(step, Twist) and abs(step.to.twist_deg) > most + 1e-9:
+                return (
+                    f"reaches a twist of {step.to.twist_deg:g} deg, over collection.limits.twist "
+                    f"= {most:g} deg"
+                )
             if isinstance(step, Move) and (broken := _outside(step.to, collection.limits)):
                 return broken
     return None

@@ -14,6 +14,7 @@ from sliplab.protocols.quantity import (
     REF_SCHEMA,
     AnyMillimetresOrRef,
     DegreesOrRef,
+    DegreesPerSecondOrRef,
     FactorRef,
     MillimetresOrRef,
     PercentOrRef,
@@ -87,6 +88,15 @@ class Retract(StrictModel):
     disturbance: Disturbance | None = None
 
 
+class TwistPhase(StrictModel):
+    """A rotation of the sensor about the plate's normal, through its centre, in contact."""
+
+    phase: Literal["twist"]
+    angle: DegreesOrRef
+    """Counterclockwise as the outside camera sees it; clockwise if negative."""
+    speed: DegreesPerSecondOrRef
+
+
 class PlateMotion(StrictModel):
     """Something done to the sliding plate."""
 
@@ -145,9 +155,29 @@ class Return(StrictModel):
     speed: SpeedOrRef
 
 
-_PHASES = ("approach", "press", "hold", "slide", "retract", "plate", "move", "release", "return")
+_PHASES = (
+    "approach",
+    "press",
+    "hold",
+    "slide",
+    "retract",
+    "twist",
+    "plate",
+    "move",
+    "release",
+    "return",
+)
 register_tags(*_PHASES)
 Phase = Annotated[
-    Approach | Press | Hold | Slide | Retract | PlateMotion | Travel | Release | Return,
+    Approach
+    | Press
+    | Hold
+    | Slide
+    | Retract
+    | TwistPhase
+    | PlateMotion
+    | Travel
+    | Release
+    | Return,
     Field(discriminator="phase"),
 ]

@@ -260,6 +260,9 @@ class Plan:
         data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
         if not data["context"]:  # as in protocols from before it came
             data.pop("context")
+        for name in ("twist", "twist_speed"):
+            if data["limits"][name] is None:
+                data["limits"].pop(name)
         gates = self.protocol.collection.gates
         for name in ("reference", "hold_slip", "normal_force", "hold_force"):
             if getattr(gates, name) is None:  # hashes of protocols from before it came stay

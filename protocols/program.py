@@ -12,18 +12,29 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-ACTING = ("slide", "retract", "move")
+ACTING = ("slide", "retract", "twist", "move")
 """Phases of a program in which the sensor moves in contact and slip is looked for."""
 PlateAction = Literal["raise", "release", "catch"]
 
 
 @dataclass(frozen=True)
 class Position:
-    """A place of the sensor's centre in plate coordinates, millimetres."""
+    """A place of the sensor's centre in plate coordinates, millimetres, and how it is turned.
+
+    Attributes:
+        twist_deg: rotation about the plate's normal, counterclockwise as the outside camera sees
+            it (from x to y).
+    """
 
     x_mm: float
     y_mm: float
     depth_mm: float
+    twist_deg: float = 0.0
+
+    def __repr__(self) -> str:
+        twist = f", twist_deg={self.twist_deg!r}" if self.twist_deg else ""
+        place = f"x_mm={self.x_mm!r}, y_mm={self.y_mm!r}, depth_mm={self.depth_mm!r}"
+        return f"Position({place}{twist})"
 
     def distance_mm(self, other: Position) -> float:
         """Straight-line distance to `other`."""
@@ -52,6 +63,16 @@ class Dwell:
 
 
 @dataclass(frozen=True)
+class Twist:
+    """A rotation of the sensor about the plate's normal at constant speed; it stays where it is."""
+
+    phase: str
+    to: Position
+    speed_deg_s: float
+    recorded: bool = False
+
+
+@dataclass(frozen=True)
 class PlateStep:
     """Something done to the sliding plate: `release` takes `seconds` as a ramp."""
 
@@ -61,7 +82,7 @@ class PlateStep:
     recorded: bool = False
 
 
-Step = Move | Dwell | PlateStep
+Step = Move | Twist | Dwell | PlateStep
 
 
 @dataclass(frozen=True)
@@ -85,4 +106,6 @@ def step_seconds(step: Step, at: Position) -> tuple[float, Position]:
     """Duration of `step` begun at `at`, seconds, and where it ends."""
     if isinstance(step, Move):
         return at.distance_mm(step.to) / step.speed_mm_s, step.to
+    if isinstance(step, Twist):
+        return abs(step.to.twist_deg - at.twist_deg) / step.speed_deg_s, step.to
     return step.seconds, at

@@ -238,6 +238,8 @@ def _quantity(unit: str, low: str | None, strict: bool, *, ref: bool) -> Any:
 # Types for pydantic fields: decimals in the canonical unit that the name says.
 Millimetres: Any = _quantity("mm", None, False, ref=False)
 PositiveMillimetres: Any = _quantity("mm", "0", True, ref=False)
+PositiveDegrees: Any = _quantity("deg", "0", True, ref=False)
+PositiveDegreesPerSecond: Any = _quantity("deg/s", "0", True, ref=False)
 PositiveSpeed: Any = _quantity("mm/s", "0", True, ref=False)
 Seconds: Any = _quantity("s", "0", False, ref=False)
 PositiveSeconds: Any = _quantity("s", "0", True, ref=False)
@@ -251,6 +253,7 @@ SpeedOrRef: Any = _quantity("mm/s", "0", True, ref=True)
 SecondsOrRef: Any = _quantity("s", "0", False, ref=True)
 PositiveSecondsOrRef: Any = _quantity("s", "0", True, ref=True)
 DegreesOrRef: Any = _quantity("deg", None, False, ref=True)
+DegreesPerSecondOrRef: Any = _quantity("deg/s", "0", True, ref=True)
 KilogramsOrRef: Any = _quantity("kg", "0", True, ref=True)
 PercentOrRef: Any = _quantity("percent", "0", False, ref=True)
 

@@ -154,14 +154,23 @@ def _cases(
         for trial, recording in item.trials:
             truth = recording.simulation_truth()
             label = labels.load(trial.id, TrialLabel)
-            centre = recording.record.geometry.centre
+            centre, twists = recording.record.geometry.centre, recording.motion_phase == "twist"
             for rule, keys in _TRUTH.items():
                 known = truth
                 if truth is not None and rule == "paper" and label.reference == "hold_start":
                     known = truth.get("from_hold", truth)  # older records have the motion's
                 for kind in KINDS:
                     true = None if known is None else known.get(keys[kind])
-                    yield rule, kind, label, true[centre] if isinstance(true, list) else true
+                    if isinstance(true, list):
+                        true = _last_other(true, centre) if twists else true[centre]
+                    yield rule, kind, label, true
+
+
+def _last_other(times: list[int | None], centre: int) -> int | None:
+    """The latest slip of all markers but the centre; None unless each slipped."""
+    others = [t for marker, t in enumerate(times) if marker != centre]
+    slipped = [t for t in others if t is not None]
+    return max(slipped) if slipped and len(slipped) == len(others) else None
 
 
 def read_check(store: Store) -> LabelCheck | None:

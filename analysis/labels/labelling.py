@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.labels.camera_shift import CameraShift
 from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
-from sliplab.analysis.labels.onsets import Onsets, paper_onsets, rest_time
+from sliplab.analysis.labels.onsets import Onsets, last_off_axis, paper_onsets, rest_time
 from sliplab.analysis.labels.places import Places, places_of
 from sliplab.analysis.labels.rest import Reference, offsets
 from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
@@ -225,6 +225,7 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
         motion_ns,
         settings,
         centre=recording.record.geometry.centre,
+        twists=recording.motion_phase == "twist",
         exposure_ns=0 if timing is None else 2 * (timing.mid_exposure_ns or 0),
         source=recording.frame_source,
     )
@@ -239,6 +240,7 @@ def label_places(
     centre: int,
     exposure_ns: int,
     source: str,
+    twists: bool = False,
 ) -> Label:
     """Apply both rules to a trial's positions.
 
@@ -249,12 +251,18 @@ def label_places(
     Args:
         frame_ns: (n,) int64 on the time line. motion_ns: start and end of slide or retraction.
         exposure_ns: how long the shutter was open.
+        twists: the sensor turned about its centre, which does not slip: gross slip begins with the
+            last of the other markers.
 
     Raises:
         ValueError: there is no frame in the hold.
     """
     start_ns, stop_ns = motion_ns
     found = offsets(places, frame_ns, start_ns, settings.reference_ms)
+    if twists:
+        away = found.counted_from("hold_end")
+        moved = np.hypot(away[..., 0], away[..., 1])
+        centre = last_off_axis(paper_onsets(frame_ns, moved, centre, settings, start_ns), centre)
     held = slipped_in_hold(found.hold_slip_px, settings.hold_slip_px)
     knocked = _knocked(frame_ns, found.camera)
 

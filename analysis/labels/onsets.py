@@ -37,6 +37,20 @@ class Onsets:
     per_marker_ns: NDArray[np.int64]
 
 
+def last_off_axis(onsets: Onsets, centre: int) -> int:
+    """The marker besides the centre that slips last, or one that never does: gross in a twist.
+
+    About its own axis the centre marker turns on the spot, however far the others have slipped.
+    """
+    others = [marker for marker in range(len(onsets.per_marker_ns)) if marker != centre]
+    latest = np.iinfo(np.int64).max
+    return max(
+        others,
+        key=lambda m: latest if (t := int(onsets.per_marker_ns[m])) == NO_ONSET else t,
+        default=centre,
+    )
+
+
 def mean_positions(
     xy: NDArray[np.float64], frames: slice | NDArray[np.bool_]
 ) -> NDArray[np.float64]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
-from sliplab.protocols import InputError, Move, Plan, Trial
+from sliplab.protocols import InputError, Move, Plan, Trial, Twist
 from sliplab.rigs.rig_file import RigFile
 
 RESERVE = 200_000_000
 """Bytes that must stay free: other programs use the disk, too."""
+TWIST_ARM_MM = 8.0
+"""Mean distance of the papillae from the axis of a twist."""
 
 
 def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
@@ -20,6 +23,10 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
     for step in plan.program(trial).steps:
         if isinstance(step, Move):
             moved += at.distance_mm(step.to) if step.recorded else 0.0
+            at = step.to
+        elif isinstance(step, Twist):
+            turn = abs(math.radians(step.to.twist_deg - at.twist_deg))
+            moved += TWIST_ARM_MM * turn if step.recorded else 0.0
             at = step.to
     plate = plan.protocol.collection.plate is not None
     events = known.noise_events_per_s * seconds + known.signal_events_per_mm * moved

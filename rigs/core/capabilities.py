@@ -81,10 +81,16 @@ class Pose:
 
 @dataclass(frozen=True)
 class Segment:
-    """One straight move of the tool centre point at constant speed."""
+    """One straight move of the tool centre point at constant speed, or a turn on the spot.
+
+    Attributes:
+        turn_deg_s: speed of a turn on the spot; None for a move. `speed_mm_s` then bounds the
+            tool centre point, which should not move.
+    """
 
     to: Pose
     speed_mm_s: float
+    turn_deg_s: float | None = None
 
 
 @dataclass(frozen=True)

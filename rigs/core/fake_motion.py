@@ -21,6 +21,8 @@ from sliplab.rigs.core.pose import angle_deg, between, distance_mm, straight_pat
 
 F64 = npt.NDArray[np.float64]
 _OFF_LINE_MM = 0.01
+ON_THE_SPOT_MM = 1e-6
+"""Way of the tool centre point below which a move is a turn."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,9 @@ class StraightMotion:
         """Start a move to `to`; a rotation in place counts its degrees as mm."""
         with self._lock:
             begin = self._line.pose(t_s)
-            length = distance_mm(begin, to) or angle_deg(begin, to)
+            length = distance_mm(begin, to)
+            if length < ON_THE_SPOT_MM:
+                length = angle_deg(begin, to) or length
             self._follow(Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s), t_s)
 
     def extend(self, to: Pose, speed_mm_s: float, t_s: float) -> bool:
@@ -139,6 +143,8 @@ class StraightMotion:
         with self._lock:
             line = self._line
             if t_s >= self._rest_s or line.ramp.peak != speed_mm_s:
+                return False
+            if distance_mm(line.begin, to) < ON_THE_SPOT_MM:
                 return False
             ramp = replace(line.ramp, length=distance_mm(line.begin, to))
             on_line = between(line.begin, to, line.ramp.length / ramp.length if ramp.length else 0)

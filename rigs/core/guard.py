@@ -87,6 +87,8 @@ class Guard:
             if not all(map(math.isfinite, numbers)):
                 raise RigError("arm", f"{where} contains a number that is not finite")
             self._speed(segment.speed_mm_s, where)
+            if segment.turn_deg_s is not None and not 0 < segment.turn_deg_s < math.inf:
+                raise RigError("arm", f"{where} turns at {segment.turn_deg_s} deg/s")
             self._box(segment.to, where)
             self._depth(segment.to, where)
             turn = angle_deg(at, segment.to)

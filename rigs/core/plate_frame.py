@@ -64,7 +64,10 @@ class PlateFrame:
         x, y, z = self.axes
         depth = position.depth_mm + self.zero_mm
         xyz = self.origin + position.x_mm * x + position.y_mm * y + depth * z
-        return Pose((float(xyz[0]), float(xyz[1]), float(xyz[2])), self._rotvec_deg)
+        rotvec_deg = self._rotvec_deg
+        if position.twist_deg:
+            rotvec_deg = turned_about_z(rotvec_deg, position.twist_deg)
+        return Pose((float(xyz[0]), float(xyz[1]), float(xyz[2])), rotvec_deg)
 
     @cached_property
     def _rotvec_deg(self) -> tuple[float, float, float]:
@@ -74,7 +77,7 @@ class PlateFrame:
         return a, b, c
 
     def position(self, xyz_mm: Sequence[float]) -> Position:
-        """Convert a tool centre point in the base frame to plate coordinates."""
+        """Convert a tool centre point in the base frame to plate coordinates, not twisted."""
         x, y, z = self.axes @ (np.asarray(xyz_mm, dtype=np.float64) - self.origin)
         return Position(float(x), float(y), float(z) - self.zero_mm)
 
@@ -89,3 +92,13 @@ class PlateFrame:
         signed = turn if mounting.feels == "plate" else -turn
         rows = (signed + 0.0).tolist()  # no negative zeros
         return tuple((float(a), float(b), float(c)) for a, b, c in rows)
+
+
+def turned_about_z(
+    rotvec_deg: tuple[float, float, float], angle_deg: float
+) -> tuple[float, float, float]:
+    """Return a rotation vector, degrees, after a rotation about the tool's own z axis."""
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(angle_deg)])
+    rotation = Rotation.from_rotvec(np.radians(rotvec_deg)) * turn
+    a, b, c = np.degrees(rotation.as_rotvec()).tolist()
+    return a, b, c

@@ -16,9 +16,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.capabilities import Pose, Segment
 
 MM_PER_M = 1000.0
+TURN_PER_M = 4.0
+"""Radians that a UR's `movel` turns a metre of its speed, where the tool turns on the spot.
+
+Universal Robots does not document it; users measured it (forum, "MoveL: Tool Angular Speed"). The
+driver holds the time that a turn took against it.
+"""
 F64 = npt.NDArray[np.float64]
 
 
@@ -83,6 +89,13 @@ def angle_deg(one: Pose, other: Pose) -> float:
 def distance_mm(one: Pose, other: Pose) -> float:
     """Distance between two tool centre points, mm."""
     return math.dist(one.xyz_mm, other.xyz_mm)
+
+
+def segment_seconds(begin: Pose, segment: Segment) -> float:
+    """Duration of a segment from `begin` at its speed, without ramps, s."""
+    if segment.turn_deg_s is not None:
+        return angle_deg(begin, segment.to) / segment.turn_deg_s
+    return distance_mm(begin, segment.to) / segment.speed_mm_s
 
 
 def between(one: Pose, other: Pose, share: float) -> Pose:

@@ -10,10 +10,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sliplab.protocols.program import ACTING, Move, PlateStep, Position, Program, Step, step_seconds
+from sliplab.protocols.motion import UNTWIST_DEG_S
+from sliplab.protocols.program import (
+    ACTING,
+    Move,
+    PlateStep,
+    Position,
+    Program,
+    Step,
+    Twist,
+    step_seconds,
+)
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import (
     Arm,
@@ -33,6 +43,7 @@ from sliplab.rigs.core.capabilities import (
     Truth,
 )
 from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.touching import POLL_S, QUIET_S, RateTouch, count_central
 from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
@@ -108,6 +119,8 @@ class Rig:
     """The event camera while it is recorded."""
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
+    _twisted: bool = field(default=False, init=False)
+    """The sensor does not stand as the plate's axes do."""
     _plate_uncaught: bool = field(default=False, init=False)
     """True while the plate is released and not caught: it hangs on the sensor, or falls."""
 
@@ -322,6 +335,11 @@ class Rig:
         if isinstance(step, Move):
             start, end = self.move(step, at, sink)
             return StepTimes(index, step.phase, start, end)
+        if isinstance(step, Twist):
+            self._twisted = True
+            start, end = self.twist(step, at, sink)
+            self._twisted = step.to.twist_deg != 0.0
+            return StepTimes(index, step.phase, start, end)
         if isinstance(step, PlateStep):
             if self.plate is None:
                 raise RigError("plate", f"this rig has no sliding plate to {step.action}")
@@ -338,23 +356,36 @@ class Rig:
             StopRequested: as `wait`; the arm is still moving then, and `safely` stops it.
             ArmFault: the arm stopped, or did not finish in time.
         """
-        start = self.arm.now_ns()
         seconds = at.distance_mm(step.to) / step.speed_mm_s
+        segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
+        return self._follow(segment, seconds, step.phase, sink)
+
+    def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
+        """Turn about the plate's normal on the spot; as `move`."""
+        seconds = abs(step.to.twist_deg - at.twist_deg) / step.speed_deg_s
+        segment = Segment(self.plate_frame.pose(step.to), RETRACT_SPEED_MM_S, step.speed_deg_s)
+        return self._follow(segment, seconds, step.phase, sink)
+
+    def _follow(
+        self, segment: Segment, seconds: float, phase: str, sink: Sink | None
+    ) -> tuple[int, int]:
+        """Send one segment of known duration, and wait for its end."""
+        start = self.arm.now_ns()
         if seconds == 0:
             return start, start
-        self.arm.start([Segment(self.plate_frame.pose(step.to), step.speed_mm_s)])
+        self.arm.start([segment])
         deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
         while not (progress := self.arm.progress()).done:
             if not progress.state.healthy:
-                raise arm_fault(progress.state, step.phase)
+                raise arm_fault(progress.state, phase)
             if self.clock.now_ns() > deadline:
-                raise ArmFault("arm", f"did not finish the phase '{step.phase}' in time")
+                raise ArmFault("arm", f"did not finish the phase '{phase}' in time")
             left = seconds - (self.arm.now_ns() - start) / 1e9
             self.wait(min(self.poll_s, max(left, 1e-3)), sink)
         if not progress.state.healthy:
-            raise arm_fault(progress.state, step.phase)
+            raise arm_fault(progress.state, phase)
         if not progress.finished:
-            raise ArmFault("arm", f"was stopped from outside in the phase '{step.phase}'")
+            raise ArmFault("arm", f"was stopped from outside in the phase '{phase}'")
         return progress.finished[-1]
 
     def wait(self, seconds: float, sink: Sink | None = None) -> None:
@@ -432,6 +463,11 @@ class Rig:
 
         The sensor is clear of the plate there, so a force sensor is zeroed.
         """
+        if self._twisted:  # an earlier trial ended in its twist
+            here = self.position()
+            left = angle_deg(self.arm.pose(), self.plate_frame.pose(here))
+            self.twist(Twist("untwist", here, UNTWIST_DEG_S), replace(here, twist_deg=left))
+            self._twisted = False
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
@@ -512,7 +548,10 @@ class Rig:
             out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
             if at.distance_mm(out) == 0:
                 return None
-            self.arm.start([Segment(self.plate_frame.pose(out), RETRACT_SPEED_MM_S)])
+            pose = self.plate_frame.pose(out)
+            if self._twisted:  # straight out as it stands; it turns back where it is clear
+                pose = replace(pose, rotvec_deg=self.arm.pose().rotvec_deg)
+            self.arm.start([Segment(pose, RETRACT_SPEED_MM_S)])
             polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
             for _ in range(polls):
                 if (progress := self.arm.progress()).done:

@@ -169,8 +169,12 @@ class SegmentWatch:
         if self._start_ns is None:
             self._start_ns = before[0]
         segment = self._path[self._count]
-        speed = distance_mm(before[1], pose) / (t_ns - before[0]) * 1e9
-        if not is_at(pose, segment.to) or speed > REST_SHARE * segment.speed_mm_s:
+        if segment.turn_deg_s is None:
+            gone, full = distance_mm(before[1], pose), segment.speed_mm_s
+        else:
+            gone, full = angle_deg(before[1], pose), segment.turn_deg_s
+        speed = gone / (t_ns - before[0]) * 1e9
+        if not is_at(pose, segment.to) or speed > REST_SHARE * full:
             return None
         times = self._start_ns, t_ns
         self._begin, self._start_ns = pose, None

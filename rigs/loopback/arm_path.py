@@ -81,7 +81,7 @@ class FakeArmPath(ArmPath):
             self.cut_ns = now_ns
 
     def commanded(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """Return the states at increasing true times of the trial, (n, 11) or those columns."""
+        """Return the states at increasing true times of the trial, (n, 12) or those columns."""
         with self._lock:
             lines, past_ns = self._lines, self._past_ns
         result = np.empty((len(t_ns), columns.stop - columns.start))

@@ -16,6 +16,7 @@ from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.readout import Scans
 from sliplab.storage.streams import EventChunk, PulseChunk
 
+F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
@@ -116,7 +117,8 @@ class MockEventCamera:
         world = self._world
         loads = self._loads = world.keep_loads()
         self._next_ns = loads.end_ns
-        self._sensor.reset(loads.between(self._next_ns, self._next_ns)[1][0], world.seed)
+        row_ns, rows = loads.between(self._next_ns, self._next_ns)
+        self._sensor.reset(self._on_skin(row_ns, rows)[0], world.seed)
         self._begun_ns, self._until_ns, self._running = world.now_ns, NEVER, True
         self._input.skip()
 
@@ -139,7 +141,7 @@ class MockEventCamera:
         if last_ns <= self._next_ns:
             return _no_events()
         row_ns, rows = loads.between(self._next_ns, last_ns)
-        t_ns, x, y, p = self._sensor.sense(rows, row_ns)
+        t_ns, x, y, p = self._sensor.sense(self._on_skin(row_ns, rows), row_ns)
         t_ns, x, y, p = self._bursts.into(
             (t_ns, x, y, p), self._next_ns, last_ns, self._sensor.scans
         )
@@ -151,6 +153,17 @@ class MockEventCamera:
             t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
         stamps = world.clocks.event_camera.to_reference(t_ns) // 1000
         return EventChunk(x, y, p, self._stamps.of(stamps))
+
+    def _on_skin(self, t_ns: I64, loads: F64) -> F64:
+        """Loads in the sensor's own axes, which turn with it, from those in the plate's."""
+        turn = self._world.turn_at(t_ns)
+        if not turn.any():
+            return loads
+        cosine, sine = np.cos(turn)[:, None], np.sin(turn)[:, None]
+        turned = loads.copy()
+        turned[:, 0::3] = cosine * loads[:, 0::3] + sine * loads[:, 1::3]
+        turned[:, 1::3] = cosine * loads[:, 1::3] - sine * loads[:, 0::3]
+        return turned
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses since the last call, camera clock in ns."""

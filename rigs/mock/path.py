@@ -1,6 +1,6 @@
 """The simulated arm's position at any time: true plate, commanded legs, deviation.
 
-Rotation vectors are in degrees; a state is xyz, rotation vector and the sensor's five numbers
+Rotation vectors are in degrees; a state is xyz, rotation vector and the sensor's six numbers
 relative to the true plate.
 """
 
@@ -82,17 +82,18 @@ class ContactPlane:
         return Pose((x, y, z), rotvec_deg(self.rotation))
 
     def sensor(self, pose: Pose) -> F64:
-        """Return x, y, depth (mm) of the highest tip, and slopes of depth over the layout, (5,).
+        """Return x, y, depth (mm) of the highest tip, slopes of depth over the layout, turn, (6,).
 
-        Rotation about the plate's normal is neglected: the skin is nearly symmetric under it.
+        The turn is the angle of the tool about the plate's normal, rad, from x to y.
         """
         tool = self.rotation.T @ matrix(pose.rotvec_deg)
         place = self.rotation.T @ (np.asarray(pose.xyz_mm) - self.origin_mm) + tool @ self.tip_mm
-        return np.array([*place, tool[2, 0], tool[2, 1]])
+        return np.array([*place, tool[2, 0], tool[2, 1], math.atan2(tool[1, 0], tool[0, 0])])
 
-    def turned_deg(self, pose: Pose) -> float:
-        """Angle between the tool's axes and the plate's."""
-        trace = float(np.trace(self.rotation.T @ matrix(pose.rotvec_deg)))
+    def turned_deg(self, pose: Pose, twist_rad: float = 0.0) -> float:
+        """Angle between the tool's axes and the plate's, after the tool turned about its own z."""
+        turn = matrix((0.0, 0.0, math.degrees(twist_rad)))
+        trace = float(np.trace(self.rotation.T @ matrix(pose.rotvec_deg) @ turn.T))
         return math.degrees(math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0)))
 
 
@@ -109,7 +110,7 @@ class Deviation:
     def __init__(
         self, book: FaultBook, plane: ContactPlane, commanded: Callable[[I64], F64]
     ) -> None:
-        """`commanded`: maps increasing true times, ns, (n,) to states, (n, 11)."""
+        """`commanded`: maps increasing true times, ns, (n,) to states, (n, 12)."""
         self._book, self._plane, self._commanded = book, plane, commanded
         self._frozen_ns = NEVER
 
@@ -121,8 +122,8 @@ class Deviation:
         self._frozen_ns = min(self._frozen_ns, at_ns)
 
     def at(self, t_ns: I64) -> F64:
-        """Return deviations at true times, (n, 11): positions of tool and sensor, mm."""
-        result = np.zeros((len(t_ns), 11))
+        """Return deviations at true times, (n, 12): positions of tool and sensor, mm."""
+        result = np.zeros((len(t_ns), 12))
         for fault, begin, end in self._book.spans(ArmOffPath):
             t = np.minimum(t_ns, self._frozen_ns)
             offset_mm = fault.mm * np.clip((t - begin) / (end - begin), 0.0, 1.0)
@@ -147,14 +148,16 @@ class Deviation:
 TURN_DEG_PER_S = 30.0
 FADE_NS = 200_000_000
 """Time in which a tremor builds up and decays."""
-EVERY = slice(0, 11)
-TOOL, SENSOR = slice(0, 6), slice(6, 11)
+EVERY = slice(0, 12)
+TOOL, SENSOR = slice(0, 6), slice(6, 12)
 """Columns of a state."""
+TURN = 11
+"""Column of a state: the angle about the plate's normal, rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """One straight move; states are xyz, rotation vector, then the sensor's five numbers."""
+    """One straight move; states are xyz, rotation vector, then the sensor's six numbers."""
 
     start_ns: int
     end_ns: int
@@ -162,13 +165,22 @@ class Leg:
     end: F64
     planned: tuple[int, F64] | None = None
     """Planned end time and state of a leg that was cut short."""
+    turns: bool = False
+    """A turn on the spot: orientations follow the shortest rotation, not a line."""
 
     def at(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """Return states at times within the leg, shape (n, 11) or those columns."""
+        """Return states at times within the leg, shape (n, 12) or those columns."""
         end_ns, end = self.planned or (self.end_ns, self.end)
         start = self.start[columns]
         share = (t_ns - self.start_ns) / (end_ns - self.start_ns)
         result: F64 = start + share[:, None] * (end[columns] - start)
+        if self.turns and columns.start == 0:
+            from scipy.spatial.transform import Rotation  # a plan is read without it
+
+            begin = Rotation.from_rotvec(self.start[3:6], degrees=True)
+            turn = (begin.inv() * Rotation.from_rotvec(end[3:6], degrees=True)).as_rotvec()
+            turned = begin * Rotation.from_rotvec(share[:, None] * turn)
+            result[:, 3:6] = turned.as_rotvec(degrees=True)
         return result
 
 
@@ -193,8 +205,11 @@ class ArmPath:
             target = self._state(segment.to)
             travel = math.dist(state[:3], target[:3]) / segment.speed_mm_s
             turn = math.dist(state[3:6], target[3:6]) / TURN_DEG_PER_S
+            if segment.turn_deg_s is not None:
+                turn = abs(math.degrees(_unwound(target, state) - state[TURN])) / segment.turn_deg_s
+                target[TURN] = _unwound(target, state)
             end = begin + round(max(travel, turn) * 1e9)
-            legs.append(Leg(begin, end, state, target))
+            legs.append(Leg(begin, end, state, target, turns=segment.turn_deg_s is not None))
             state, begin = target, end
         self.legs += legs
         return legs
@@ -213,7 +228,7 @@ class ArmPath:
             self.deviation.freeze(now_ns)
 
     def states(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """Return xyz (mm), rotation vector (deg) and sensor vector at increasing times, (n, 11).
+        """Return xyz (mm), rotation vector (deg) and sensor vector at increasing times, (n, 12).
 
         Args:
             columns: columns to return, such as `TOOL`.
@@ -246,6 +261,11 @@ class ArmPath:
 
     def _state(self, pose: Pose) -> F64:
         return np.concatenate([pose.xyz_mm, pose.rotvec_deg, self._plane.sensor(pose)])
+
+
+def _unwound(target: F64, state: F64) -> float:
+    """The turn of `target` as the nearest one to that of `state`, rad."""
+    return float(state[TURN] + math.remainder(target[TURN] - state[TURN], 2.0 * math.pi))
 
 
 def stirred(moves: Sequence[tuple[int, int]], t_ns: I64) -> F64:

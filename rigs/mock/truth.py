@@ -16,6 +16,8 @@ from sliplab.storage.clockmap import IDENTITY, ClockMap
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
+TWIST_RAD = math.radians(0.5)
+"""A sensor that turned further than this in its motion was twisted."""
 SLIP_MM = 1e-6
 """Sliding distance at which a tip has slipped: above rounding and microseconds of sliding."""
 
@@ -31,8 +33,9 @@ def truth_of(
 
     Args:
         box: true time to sync box time.
-        reference_true_ns: start of the step `slide` or `retract`; displacements are measured from
-            the tips' positions then.
+        reference_true_ns: start of the motion in contact; displacements are measured from the
+            tips' positions then. In a twist the centre stays where it is, and gross slip begins
+            with the last of the other tips.
         threshold_px: displacement in the outside image that counts as slip.
         hold_true_ns: start of the recorded hold, to measure displacements from there too.
 
@@ -97,11 +100,15 @@ def _counted_from(
         return None if late else true_ns
 
     markers = [on_box(there(i, true_ns)) for i, true_ns in enumerate(crossed)]
+    gross = markers[0]
+    if np.ptp(world.turn_at(t_ns)) > TWIST_RAD:
+        others = [t for t in markers[1:] if t is not None]
+        gross = max(others) if len(others) == len(markers) - 1 else None
     slips = [on_box(there(i, true_ns)) for i, true_ns in enumerate(began)]
     return {
         "reference_ns": box.to_reference(reference_true_ns),
         "incipient_ns": min((t for t in markers if t is not None), default=None),
-        "gross_ns": markers[0],
+        "gross_ns": gross,
         "per_papilla_ns": markers,
         "first_slip_ns": min((t for t in slips if t is not None), default=None),
         "slip_per_papilla_ns": slips,

@@ -105,6 +105,8 @@ class World:
             clocks = clocks.after(self.past_ns)
         self.clocks: TrialClocks = with_faults(clocks, self.faults)
         self.path.deviation = Deviation(self.faults, self.plane, self.path.commanded)
+        here = self.path.commanded(np.array([self.now_ns], np.int64), SENSOR)[0]
+        self._straight_rad = float(here[5])
         self._vibration = Vibration(
             settings.arm.vibration_um, settings.arm.vibration_hz, settings.seed, seed
         )
@@ -112,12 +114,23 @@ class World:
         self.plate_marked = False
 
     def _sensor_at(self, t_ns: I64) -> F64:
-        """Return x, y and depth (mm) of the sensor and slopes of depth at times, (k, 5)."""
+        """Return x, y and depth (mm) of the sensor and slopes of depth at times, (k, 5).
+
+        Where it is turned from its angle at the trial's start, the difference (rad) is a sixth
+        column.
+        """
         sensor = self.path.states(t_ns, SENSOR)
+        sensor[:, 5] -= self._straight_rad
+        if not sensor[:, 5].any():
+            sensor = np.ascontiguousarray(sensor[:, :5])
         if self._vibration:
             strength = self.path.stirred(t_ns)[:, None]
             sensor[:, :3] += strength * self._vibration.at(t_ns)
         return sensor
+
+    def turn_at(self, t_ns: I64) -> F64:
+        """Angle of the sensor about the plate's normal since the trial began, rad, (k,)."""
+        return self.path.states(t_ns, SENSOR)[:, 5] - self._straight_rad
 
     # -- time ------------------------------------------------------------------------------
 
@@ -149,8 +162,9 @@ class World:
         for segment in segments:
             if segment.speed_mm_s <= 0.0:
                 raise RigError("arm", f"speed {segment.speed_mm_s} mm/s: must be more than 0")
-            near = self.plane.sensor(segment.to)[2] > -NEAR_MM
-            turned = self.plane.turned_deg(segment.to)
+            sensor = self.plane.sensor(segment.to)
+            near = sensor[2] > -NEAR_MM
+            turned = self.plane.turned_deg(segment.to, float(sensor[5]) - self._straight_rad)
             if near and turned > MOST_TURNED_DEG:
                 raise ArmFault(
                     "arm",

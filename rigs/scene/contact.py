@@ -161,13 +161,16 @@ def respond(w, field, law, first, count, sensor, plate_y, step):  # type: ignore
     Args:
         w: a block.
         first, count: the block's first tip, and how many it has.
-        sensor: x, y, depth (mm) at the end of the step, and the two slopes of depth, (5,).
+        sensor: x, y, depth (mm) at the end of the step, and the two slopes of depth, (5,); if the
+            sensor turns about the plate's normal its angle, rad, is a sixth number.
         plate_y: height of the plate at the end of the step, mm.
         step: `Step`.
     """
+    turn = sensor[5] if sensor.shape[0] > 5 else 0.0
     stale, touching = _approach(
-        w, law, sensor[0], sensor[1], sensor[2], sensor[3], sensor[4], plate_y, step
-    )
+        w, law, sensor[0], sensor[1], sensor[2], sensor[3], sensor[4], np.cos(turn), np.sin(turn),
+        plate_y, step,
+    )  # fmt: skip
     if stale > 0:
         for j in range(count):
             if w.wanted[j] != w.knot[j]:
@@ -185,7 +188,7 @@ def respond(w, field, law, first, count, sensor, plate_y, step):  # type: ignore
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _approach(w, law, x, y, depth, slope_x, slope_y, plate_y, step):  # type: ignore[no-untyped-def]
+def _approach(w, law, x, y, depth, slope_x, slope_y, cosine, sine, plate_y, step):  # type: ignore[no-untyped-def]
     """Move the bases, and begin to seek the bends.
 
     Returns:
@@ -195,7 +198,10 @@ def _approach(w, law, x, y, depth, slope_x, slope_y, plate_y, step):  # type: ig
     for j in range(LANES):
         lx, ly = w.layout_x[j], w.layout_y[j]
         deep = depth + slope_x * lx + slope_y * ly - w.gap[j]
-        w.to_x[j], w.to_y[j], w.deep[j] = x + lx, y + ly - plate_y, deep
+        # without a turn these are x + lx and y + ly to the bit
+        w.to_x[j] = x + (cosine * lx - sine * ly)
+        w.to_y[j] = y + (cosine * ly + sine * lx) - plate_y
+        w.deep[j] = deep
         place_x, place_y = w.place_x[j], w.place_y[j]
         w.foot_x[j], w.foot_y[j] = place_x, place_y
         w.old_x[j], w.old_y[j] = w.base_x[j] - place_x, w.base_y[j] - place_y
@@ -712,7 +718,8 @@ def advance(table, field, law, state, t_ns, sensor, plate_y, track, load):  # ty
     Args:
         table, field, law: of `Springs`; state: of `Tips`, written.
         t_ns: when the first step begins and when each ends, rising, int64, (m + 1,).
-        sensor: x, y, depth (mm) and the two slopes of depth at the end of each step, (m, 5).
+        sensor: x, y, depth (mm) and the two slopes of depth at the end of each step, (m, 5); and
+            its angle about the plate's normal, rad, if it turns, (m, 6).
         plate_y: height of the plate, mm: before the first step, and after each, (m + 1,).
         track: filled with one row a step, (m, track_width(n)).
         load: tangential force x, y and normal force of each tip, N, (m, 3 n); or (m, 0).

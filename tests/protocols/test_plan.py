@@ -122,6 +122,7 @@ def test_the_order_is_the_same_in_any_process(hash_seed: str) -> None:
         ("disturbance", 80),
         ("pilot", 36),
         ("pilot_gravity", 8),
+        ("press_twist", 54),
     ],
 )
 def test_shipped_protocols(name: str, count: int) -> None:

@@ -22,7 +22,7 @@ from sliplab.rigs.core.capabilities import (
     Progress,
     Segment,
 )
-from sliplab.rigs.core.pose import compose, distance_mm
+from sliplab.rigs.core.pose import compose, distance_mm, segment_seconds
 from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.core.threaded_arm import Run, SegmentWatch, ThreadedArm, has_left, is_at
 from sliplab.rigs.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
@@ -626,6 +626,6 @@ class AbbArm(ThreadedArm):
         """Return the duration of each segment without its ramps, s."""
         places = [self._planned or run.path[0].to, *(segment.to for segment in run.path)]
         return [
-            distance_mm(one, segment.to) / segment.speed_mm_s + PAUSE_S
+            segment_seconds(one, segment) + PAUSE_S
             for one, segment in zip(places, run.path, strict=False)
         ]

@@ -23,7 +23,7 @@ from urllib.parse import parse_qsl
 from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+from sliplab.rigs.core.fake_motion import ON_THE_SPOT_MM, ControllerClock, StraightMotion
 from sliplab.rigs.core.fakes import (
     CLOCK_BACK_S,
     PACKETS_LOST,
@@ -50,10 +50,11 @@ class ProgramError(ValueError):
 
 @dataclass(frozen=True)
 class MoveL:
-    """One straight move."""
+    """One straight move, or a turn on the spot."""
 
     to: Pose
     speed_mm_s: float
+    turn_deg_s: float
 
 
 @dataclass(frozen=True)
@@ -121,9 +122,9 @@ def read_program(data: bytes) -> Program:
         if operation == _MOVE_L:
             to = reader.pose()
             reader.numbers(4 + 6)  # configuration, external axes
-            speed = reader.numbers(4)[0]
+            speed, turn = reader.numbers(4)[:2]
             reader.numbers(7)  # zone: every point is a fine point here
-            commands.append(MoveL(to, speed))
+            commands.append(MoveL(to, speed, turn))
         elif operation == _WAIT:
             commands.append(Wait(reader.number()))
         else:
@@ -348,8 +349,10 @@ class FakeAbb(FakeController):
             self._wait_until_s = t_s + command.seconds
             return
         self._left_from = self.motion.pose(t_s)
-        speed_mm_s = command.speed_mm_s * self.speed_percent / 100
-        self.motion.move(command.to, speed_mm_s, ACCELERATION_MM_S2, t_s)
+        on_the_spot = distance_mm(self._left_from, command.to) < ON_THE_SPOT_MM
+        speed = command.turn_deg_s if on_the_spot else command.speed_mm_s
+        speed *= self.speed_percent / 100  # of a turn in deg/s, as the motion counts it
+        self.motion.move(command.to, speed, ACCELERATION_MM_S2, t_s)
 
     def _packet(self, t_s: float) -> bytes:
         pose = self.motion.pose(t_s)

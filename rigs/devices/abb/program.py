@@ -39,7 +39,8 @@ def motion_program(
     for segment in path:
         place, turn = list(segment.to.xyz_mm), list(quaternion(segment.to))
         target = robtarget(place, turn, confdata(*configuration), _NO_AXES)
-        speed = speeddata(segment.speed_mm_s, _TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S)
+        turn_deg_s = segment.turn_deg_s or _TURN_DEG_S
+        speed = speeddata(segment.speed_mm_s, turn_deg_s, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S)
         program.MoveL(target, speed, fine)
         program.WaitTime(PAUSE_S)
     if not path:

@@ -21,6 +21,7 @@ from sliplab.rigs.core.capabilities import (
     ArmState,
     DeviceHealth,
     Pose,
+    RigError,
     Segment,
 )
 from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
@@ -116,9 +117,11 @@ class AbbSocketArm(ThreadedArm):
         Raises:
             GuardError: a limit forbids the path; nothing was sent.
             ArmFault: no connection, or no answer.
-            RigError: it is still moving, or the path is empty.
+            RigError: it is still moving, the path is empty, or it has a turn on the spot.
         """
         self._refuse(path, moving=not self._run.done)
+        if any(segment.turn_deg_s is not None for segment in path):
+            raise RigError("arm", "rests between pieces and cannot twist evenly: use driver 'abb'")
         if self._lost is not None:
             raise self._fault(self.state(), "cannot move")
         begin = self.pose()

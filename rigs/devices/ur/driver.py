@@ -27,7 +27,7 @@ from sliplab.rigs.core.capabilities import (
     RigError,
     Segment,
 )
-from sliplab.rigs.core.pose import MM_PER_M, distance_mm, to_ur
+from sliplab.rigs.core.pose import MM_PER_M, TURN_PER_M, distance_mm, segment_seconds, to_ur
 from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.ur import ports
@@ -70,6 +70,10 @@ _NEWS_S = 0.1
 """Timeout for a packet with the new state to arrive, s."""
 _UNKNOWN_NS = 1 << 62
 """Marks a move that is being sent, before the time of its acceptance is known."""
+TURN_DEG_S2 = 50.0
+"""Acceleration of a turn on the spot."""
+TURN_SHARE, TURN_LATE_S = 0.1, 0.1
+"""Deviation of the time that a turn takes: share of it, and s."""
 _FULL_SPEED = 0.999
 """Position from which the speed slider counts as fully up."""
 
@@ -408,6 +412,9 @@ class UrArm(ThreadedArm):
         self._stream.wait_for(lambda: not self._moves(), BEGIN_S)
         speed = segment.speed_mm_s / MM_PER_M
         acceleration = self._settings.acceleration_mm_s2 / MM_PER_M
+        if segment.turn_deg_s is not None:
+            speed = math.radians(segment.turn_deg_s) / TURN_PER_M
+            acceleration = math.radians(TURN_DEG_S2) / TURN_PER_M
         with self._commanding:
             if run.cancelled:
                 return False
@@ -449,7 +456,7 @@ class UrArm(ThreadedArm):
         if not begun:  # a move of no length ends before a packet can show it running
             now = self.now_ns()
             return now, now
-        seconds = distance_mm(self.pose(), segment.to) / segment.speed_mm_s
+        seconds = segment_seconds(self.pose(), segment)
         if not self._stream.wait_for(ended, 1.5 * seconds + OVERTIME_S):
             raise ArmFault("arm", f"did not finish a {seconds:.1f} s move in time; it was stopped")
         if not self.state().healthy:
@@ -459,7 +466,19 @@ class UrArm(ThreadedArm):
             self._check_slider("the move was too slow and was aborted")
         if run.cancelled or self._rose_ns is None or self._fell_ns is None:
             return None
+        if segment.turn_deg_s is not None:
+            self._check_turn(seconds, (self._fell_ns - self._rose_ns) / 1e9, segment.turn_deg_s)
         return (self._rose_ns, self._fell_ns) if self._is_at(segment.to) else None
+
+    def _check_turn(self, planned_s: float, took_s: float, turn_deg_s: float) -> None:
+        """Raise ArmFault if a turn on the spot was not at its speed; see `TURN_PER_M`."""
+        ramps_s = turn_deg_s / TURN_DEG_S2
+        if abs(took_s - planned_s - ramps_s) > TURN_SHARE * planned_s + TURN_LATE_S:
+            raise ArmFault(
+                "arm",
+                f"turned in {took_s:.2f} s instead of {planned_s + ramps_s:.2f} s: its controller "
+                "does not turn the tool at the speed that was set",
+            )
 
     def _stop_by_control(self) -> bool:
         """Stop over the control client, after any move in progress there; return success."""

@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import StraightMotion
+from sliplab.rigs.core.fake_motion import ON_THE_SPOT_MM, StraightMotion
 from sliplab.rigs.core.fakes import CLOCK_BACK_S, Fault, FaultPlan, Kind, Stage
-from sliplab.rigs.core.pose import MM_PER_M, distance_mm, from_ur, to_ur
+from sliplab.rigs.core.pose import MM_PER_M, TURN_PER_M, distance_mm, from_ur, to_ur
 
 READY, DONE = 1, 2
 RUNNING_BIT = 1 << 15
@@ -270,7 +270,12 @@ class UrProgram:
         if command == 3:
             self._left_from = self.motion.pose(self._t)
             to, speed = from_ur(values[:6]), values[6] * MM_PER_M
-            self._leg = to, speed, values[7] * MM_PER_M, self.speed_fraction
+            acceleration = values[7] * MM_PER_M
+            if distance_mm(self._left_from, to) < ON_THE_SPOT_MM:  # the motion counts degrees then
+                speed, acceleration = (
+                    math.degrees(value * TURN_PER_M) for value in (values[6], values[7])
+                )
+            self._leg = to, speed, acceleration, self.speed_fraction
             self.motion.move(to, speed * self.speed_fraction, self._leg[2], self._t)
             self._begin(bool(self.ints_in[1]))
         elif command in {33, 34}:

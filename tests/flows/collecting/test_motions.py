@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.files import read_json
@@ -17,13 +19,15 @@ from tests.flows.conftest import tiny, write
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
-def collected(folder: Path, motion: Any) -> Store:
-    """The only trial of a protocol with another motion, labelled."""
+def collected(folder: Path, motion: Any, **factors: Any) -> Store:
+    """The only trial of a protocol with another motion and other factors, labelled."""
     data = tiny()
     data["name"] = "moves"
     collection = data["collection"]
     collection["motion"] = motion
     collection["factors"].pop("direction")
+    collection["factors"] |= factors
+    collection["limits"] |= {"twist": "60 deg", "twist_speed": "20 deg/s"}
     data["analysis"]["split"] = {"method": "ranked", "strata": ["depth"]}
     protocol = write(folder / "moves.yaml", data)
     done = answer("collect", protocol, "--rig", RIG, "--store", folder / "store")
@@ -66,3 +70,64 @@ def test_a_campaign_keeps_its_motion_written_out(tmp_path: Path) -> None:
     ]  # fmt: skip
     # and goes on with the protocol that names the template
     make_request(tmp_path / "moves.yaml", RIG, tmp_path / "store")
+
+
+def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
+    """The outer papillae slip first; gross slip begins with the last besides the centre one."""
+    motion = {
+        "template": "press_twist", "depth": "$depth", "angle": "-40 deg", "speed": "$speed",
+        "settle": "0.5 s", "hold": "1.5 s",
+    }  # fmt: skip
+    store = collected(tmp_path, motion, speed={"unit": "deg/s", "values": [8]})
+    (recording,) = store.campaign("moves").recordings()
+    assert recording.motion_phase == "twist"
+    begin, end = recording.motion_ns
+    assert abs((end - begin) / 1e9 - 5.0) < 0.02
+    found = read_json(next((tmp_path / "store" / "derived" / "labels" / "moves").glob("*.json")))
+    truth = recording.simulation_truth()
+    assert truth is not None
+    for onset in ("incipient_ns", "gross_ns"):
+        assert begin < found[onset] < end
+        assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
+    assert truth["per_papilla_ns"][0] is None  # the centre turns on the spot
+    assert found["gross_ns"] - found["incipient_ns"] > 1e9
+
+    with recording.open() as reader:
+        poses = reader.poses()
+    t_ns = np.asarray(recording.clock("arm").to_reference(poses.t_ns))
+    during = (t_ns > begin + 50_000_000) & (t_ns < end - 50_000_000)
+    turned = Rotation.from_rotvec(poses.rotvec_deg, degrees=True)
+    angle = (turned[0].inv() * turned).as_rotvec(degrees=True)[during]
+    expected = -8e-9 * (t_ns[during] - begin)
+    assert np.abs(angle[:, 2] - expected).max() < 0.05
+    assert np.abs(angle[:, :2]).max() < 1e-3
+    moved = poses.xyz_mm[during] - poses.xyz_mm[during][0]
+    assert np.abs(moved).max() < 0.02  # noise of the poses alone
+
+
+def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
+    data = yaml.safe_load((ROOT / "protocols" / "press_twist.yaml").read_text())
+    collection = data["collection"]
+    collection["factors"] |= {
+        "depth": {"unit": "mm", "values": [2.4]},
+        "speed": {"unit": "deg/s", "values": [10]},
+        "angle": {"unit": "deg", "values": [-40, 35, 40]},
+    }
+    collection["motion"] |= {"settle": "0.5 s", "hold": "1.5 s"}
+    collection |= {"repetitions": 1, "maintenance": {}}
+    data["analysis"]["split"] = {
+        "method": "leave_conditions_out",
+        "validation_levels": {"angle": ["35 deg"]},
+        "test_levels": {"angle": ["40 deg"]},
+    }
+    data["analysis"]["training"] = {"epochs": 2}
+    protocol, store = write(tmp_path / "twists.yaml", data), tmp_path / "store"
+    assert answer("collect", protocol, "--rig", RIG, "--store", store)["committed"] == 3
+    assert answer("label", store)["done"] == 3
+    for step in ("train", "evaluate", "report"):
+        answer(step, store)
+    summary = read_json(store / "report" / "summary.json")
+    (trial,) = summary["trials"]
+    assert trial["trial"].startswith("angle=40deg,")
+    assert trial["outcome"] != "without_onsets"
+    assert summary["kinematic"]["accuracy"]["argmax"] > 0.5

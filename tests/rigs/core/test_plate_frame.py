@@ -70,3 +70,17 @@ def test_a_reading_in_the_arms_base_becomes_the_force_on_the_plate() -> None:
     reaction = -3.0 * frame.axes[2] + 0.5 * frame.axes[0]
     found = np.array(frame.force_matrix(arm)) @ reaction
     assert found == pytest.approx([-0.5, 0.0, 3.0], abs=1e-12)
+
+
+def test_a_twist_turns_the_tool_about_the_normal_and_leaves_it_where_it_is() -> None:
+    frame = PlateFrame.taught([(400.0, 10.0, 300.0), (420.0, 12.0, 300.5), (399.0, 30.0, 301.0)])
+    straight = frame.pose(Position(3.0, -2.0, 1.5))
+    twisted = frame.pose(Position(3.0, -2.0, 1.5, 30.0))
+    assert twisted.xyz_mm == straight.xyz_mm
+    before, after = (
+        Rotation.from_rotvec(pose.rotvec_deg, degrees=True) for pose in (straight, twisted)
+    )
+    turn = (after * before.inv()).as_rotvec(degrees=True)
+    assert turn == pytest.approx(30.0 * frame.axes[2], abs=1e-9)
+    # counterclockwise in the plate's coordinates: from x towards y
+    assert frame.axes[1] @ after.apply([1.0, 0.0, 0.0]) == pytest.approx(0.5)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sliplab.protocols import Plan, Protocol, make_plan
+from sliplab.protocols import Plan, Protocol, load_plan, make_plan
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import (
@@ -287,3 +289,20 @@ def test_a_plate_that_is_not_there_cannot_be_moved() -> None:
     plan = load_plan(ROOT / "protocols" / "pilot_gravity.yaml")
     with pytest.raises(RigError, match="no sliding plate to raise"):
         run(rig, plan, Memory())
+
+
+def test_a_twist_that_is_stopped_comes_straight_out_and_turns_back_in_the_next_trial() -> None:
+    plan, rig = load_plan(Path("press_twist")), make_rig()
+    program = plan.program(plan.trials[0])
+    straight = rig.plate_frame.pose(program.home).rotvec_deg
+    rig.should_stop = lambda: rig._twisted and rig.position().depth_mm > 0
+    with pytest.raises(StopRequested):
+        rig.run_trial(program, Memory(), 7, None, 100)
+    rig.should_stop = lambda: False
+    stood = rig.arm.pose()
+    assert rig.position().depth_mm == pytest.approx(program.home.depth_mm, abs=1e-6)
+    begun = angle_deg(stood, Pose(stood.xyz_mm, straight))
+    assert 0 < begun < 40
+    done = rig.run_trial(program, Memory(), 7, None, 100)
+    assert [step.phase for step, kept in done.steps if kept] == ["hold", "twist"]
+    assert angle_deg(rig.arm.pose(), Pose(stood.xyz_mm, straight)) < 1e-6

@@ -8,10 +8,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import WorkspaceError
+from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices import abb
 from sliplab.rigs.devices.abb import driver
@@ -53,6 +55,27 @@ def test_a_slide_is_straight_and_at_its_speed(abb_pair: MakeAbb, speed: float) -
     assert np.polyfit(t_s, xyz[:, 1], 1)[0] == pytest.approx(speed, rel=0.005)
     assert np.ptp(xyz[:, [0, 2]], axis=0).max() < 0.05
     assert (span[1] - span[0]) / 1e9 == pytest.approx(15 / speed, rel=0.01)
+
+
+def test_a_twist_is_on_the_spot_and_at_its_speed(abb_pair: MakeAbb) -> None:
+    """A turn about the tool's z axis of 20 degrees at 4 deg/s."""
+    arm, _ = abb_pair(rate=5.0, cycle_hz=50)
+    arm.read_poses()
+    turned = Pose(HOME.xyz_mm, turned_about_z(HOME.rotvec_deg, 20.0))
+    arm.start([Segment(turned, 10.0, 4.0)])
+    until(lambda: arm.progress().done, 20.0)
+    (span,) = arm.progress().finished
+    chunk = arm.read_poses()
+    margin = (span[1] - span[0]) // 20
+    inside = (chunk.t_ns >= span[0] + margin) & (chunk.t_ns <= span[1] - margin)
+    t_s = (chunk.t_ns[inside] - span[0]) / 1e9
+    assert np.ptp(chunk.xyz_mm, axis=0).max() < 1e-3
+    begin = Rotation.from_rotvec(HOME.rotvec_deg, degrees=True)
+    angle = begin.inv() * Rotation.from_rotvec(chunk.rotvec_deg[inside], degrees=True)
+    assert np.polyfit(t_s, angle.as_rotvec(degrees=True)[:, 2], 1)[0] == pytest.approx(
+        4.0, rel=0.01
+    )
+    assert (span[1] - span[0]) / 1e9 == pytest.approx(20 / 4.0, rel=0.05)
 
 
 def test_it_is_an_arm_that_sets_its_tool(abb_pair: MakeAbb) -> None:

@@ -7,10 +7,12 @@ import time
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SingularityError, SpeedError, WorkspaceError
+from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.devices import ur
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.storage.streams import PoseChunk
@@ -30,6 +32,25 @@ def follow(arm: UrArm, *segments: Segment, within_s: float = 30.0) -> tuple[tupl
     arm.start(segments)
     until(lambda: arm.progress().done, within_s)
     return arm.progress().finished
+
+
+def test_a_twist_is_on_the_spot_and_at_its_speed(robot_of: MakeRobot, arm_on: MakeArm) -> None:
+    """A turn about the tool's z axis of 20 degrees at 4 deg/s."""
+    arm = arm_on(robot_of(rate=5.0))
+    arm.read_poses()
+    turned = Pose(HOME.xyz_mm, turned_about_z(HOME.rotvec_deg, -20.0))
+    (span,) = follow(arm, Segment(turned, 10.0, 4.0))
+    chunk = arm.read_poses()
+    t_s, xyz = middle(chunk, span)
+    assert np.ptp(xyz, axis=0).max() < 1e-3
+    margin = (span[1] - span[0]) // 20
+    inside = (chunk.t_ns >= span[0] + margin) & (chunk.t_ns <= span[1] - margin)
+    begin = Rotation.from_rotvec(HOME.rotvec_deg, degrees=True)
+    angle = begin.inv() * Rotation.from_rotvec(chunk.rotvec_deg[inside], degrees=True)
+    vector = angle.as_rotvec(degrees=True)
+    assert np.polyfit(t_s, vector[:, 2], 1)[0] == pytest.approx(-4.0, rel=0.01)
+    assert np.abs(vector[:, :2]).max() < 1e-3
+    assert (span[1] - span[0]) / 1e9 == pytest.approx(20 / 4.0, rel=0.05)
 
 
 def middle(chunk: PoseChunk, span: tuple[int, int]) -> tuple[npt.NDArray[np.float64], ...]:
