@@ -230,7 +230,8 @@ class Collection(StrictModel):
                 fail(f"must contain the phase '{name}' exactly once")
         acting = self.acting
         if not acting:
-            fail("must contain a 'slide', 'retract' or 'twist', or a 'move' between press and release")
+            text = "must contain a 'slide', 'retract' or 'twist', or a 'move' between press and"
+            fail(f"{text} release")
         if "hold" not in names[: acting[0]]:
             fail("must have a 'hold' before it moves in contact, where recording starts")
         ordered = [name for name in names if name in {"approach", "press", "release", "return"}]
