@@ -24,8 +24,9 @@ Spikes = Annotated[float, Field(ge=0, le=1e6)]
 class Labelling(StrictModel):
     """Ground truth from the outside video."""
 
-    rule: Literal["paper", "change_point"] = "paper"
-    """Onset rule that later steps use; both are kept (docs/labels.md)."""
+    rule: Literal["paper", "change_point", "force"] = "paper"
+    """Onset rule that later steps use; all are kept (docs/labels.md). `force` needs a rig with a
+    force sensor (docs/force.md)."""
     threshold_px: float = Field(default=2.0, gt=0, le=100)
     """A marker slips when its displacement exceeds this, pixels."""
     reference: Literal["hold_start", "hold_end"] = "hold_start"

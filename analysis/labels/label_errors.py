@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -79,6 +79,34 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
         **{name: by_onset(kinds) for name, kinds in found.items()},
         papillae=Coverage(**dict(spread(errors)), coverage=coverage),
     )
+
+
+def force_compared(
+    store: Store, campaigns: Sequence[Collected]
+) -> dict[tuple[str, Kind], list[float]]:
+    """Onsets by the force less those of the other rules, and less the true crossing, ms.
+
+    By what they are compared with, in words, and onset; trials without forces are left out.
+    """
+    apart: dict[tuple[str, Kind], list[float]] = {}
+    for item in campaigns:
+        labels = Derived.of(store, LABELS, item.name)
+        for trial, recording in item.trials:
+            if not recording.record.streams or labels.key(trial.id) is None:
+                continue
+            label = labels.load(trial.id, TrialLabel)
+            if label.force is None:
+                continue
+            truth = recording.simulation_truth() or {}
+            rules = {"paper's rule": label.paper, "change point": label.change_point}
+            for kind in KINDS:
+                mine = label.force.at_ns(kind)
+                times = {title: rule.known_ns(kind) for title, rule in rules.items() if rule}
+                times["true crossing (simulated)"] = truth.get(_TRUTH["paper"][kind])
+                for title, other in times.items():
+                    if mine is not None and other is not None:
+                        apart.setdefault((title, kind), []).append((mine - other) / 1e6)
+    return apart
 
 
 def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Hold]:

@@ -14,7 +14,14 @@ import numpy.typing as npt
 
 from sliplab.analysis.labels.camera_shift import CameraShift
 from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
-from sliplab.analysis.labels.onsets import Onsets, last_off_axis, paper_onsets, rest_time
+from sliplab.analysis.labels.force_onsets import ForceOnsets, onsets_by_force
+from sliplab.analysis.labels.onsets import (
+    NO_ONSET,
+    Onsets,
+    last_off_axis,
+    paper_onsets,
+    rest_time,
+)
 from sliplab.analysis.labels.places import Places, places_of
 from sliplab.analysis.labels.rest import Reference, offsets
 from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
@@ -65,6 +72,7 @@ class Label:
         hold_slip_px: (m,) float64, how far each marker moved in the hold, from its first to its
             last part; NaN where unknown.
         start_ns, stop_ns: of the slide or retraction.
+        force: by the force along the plate; None where the trial has none.
         rest_ns: where the plate came to rest after that began; None where none moved, or it was
             not seen to rest.
     """
@@ -82,6 +90,7 @@ class Label:
     stop_ns: int
     rest_ns: int | None
     source: str
+    force: ForceOnsets | None = None
 
     @property
     def paper(self) -> Onsets:
@@ -101,11 +110,18 @@ class Label:
     @property
     def onsets(self) -> Onsets:
         """Onsets by the protocol's rule."""
+        if self.rule == "force":
+            found, none = self.force, np.full_like(self.paper.per_marker_ns, NO_ONSET)
+            known = (None, None) if found is None else (found.incipient_ns, found.gross_ns)
+            return Onsets(*known, None, none)
         return self.paper if self.rule == "paper" else self.slips.onsets
 
     @property
     def doubts(self) -> Doubts:
         """Doubts of the onsets by the protocol's rule."""
+        if self.rule == "force":
+            reason = None if self.force is not None else "the trial has no forces of a slide"
+            return Doubts(reason, reason)
         return self.paper_doubts if self.rule == "paper" else self.slip_doubts
 
     @property
@@ -153,7 +169,7 @@ class Label:
     def document(self) -> TrialLabel:
         """Return the stored label: an onset in doubt is null, with its reason in `doubts`."""
         onsets, doubts = self.onsets, self.doubts
-        return TrialLabel(
+        label = TrialLabel(
             rule=self.rule,
             reference=self.reference,
             incipient_ns=None if doubts.incipient else onsets.incipient_ns,
@@ -183,6 +199,9 @@ class Label:
             quality=np.round(self.quality(), 3).tolist(),
             source=self.source,
         )
+        if self.force is None:
+            return label
+        return label.model_copy(update={"force": self.force.document()})
 
     def as_arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return the arrays that are kept; displacements to a thousandth of a pixel."""
@@ -228,6 +247,7 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
         twists=recording.motion_phase == "twist",
         exposure_ns=0 if timing is None else 2 * (timing.mid_exposure_ns or 0),
         source=recording.frame_source,
+        force=onsets_by_force(recording),
     )
 
 
@@ -241,6 +261,7 @@ def label_places(
     exposure_ns: int,
     source: str,
     twists: bool = False,
+    force: ForceOnsets | None = None,
 ) -> Label:
     """Apply both rules to a trial's positions.
 
@@ -253,6 +274,7 @@ def label_places(
         exposure_ns: how long the shutter was open.
         twists: the sensor turned about its centre, which does not slip: gross slip begins with the
             last of the other markers.
+        force: onsets by the force along the plate, if the trial has forces.
 
     Raises:
         ValueError: there is no frame in the hold.
@@ -308,6 +330,7 @@ def label_places(
         stop_ns,
         rest_ns,
         source,
+        force,
     )
 
 

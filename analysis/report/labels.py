@@ -18,7 +18,10 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 RULES = {"paper": "paper's rule", "change_point": "change point"}
-RULING = {"paper": "the paper's rule", "change_point": "the change points"}
+RULING = {
+    "paper": "the paper's rule", "change_point": "the change points",
+    "force": "the force along the plate",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

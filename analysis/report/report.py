@@ -16,6 +16,7 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report import clocks, windows
 from sliplab.analysis.report.campaign import collected_section, quality_section
 from sliplab.analysis.report.detectors import detector_section
+from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.holdout import holdout_section
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.latency import latency_section
@@ -129,9 +130,10 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
     store, campaigns, programs = sources.store, sources.campaigns, sources.programs
     simulated, kinematic = summary.simulated, summary.kinematic
     rows = sources.evaluation.trials
-    trial, outputs = None, None
+    trial, outputs, seen = None, None, None
     if shown.example is not None:
         example, counts = shown.example
+        seen = example.recording
         trial = trial_section(store, example, simulated=simulated)
         rule = sources.evaluation.detection[example.item.name]
         outputs = output_section(example, counts, rule, simulated=simulated)
@@ -147,6 +149,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         collected_section(campaigns, summary),
         quality_section(campaigns, summary.references, simulated=simulated),
         trial,
+        force_section(store, campaigns, seen, simulated=simulated),
         windows.network_section(kinematic, shown.fitted, simulated=simulated),
         windows.where_section(kinematic, simulated=simulated),
         windows.lead_section(kinematic, simulated=simulated),

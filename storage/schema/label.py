@@ -14,8 +14,8 @@ LABELS = "labels"
 """The step's name in stores."""
 Kind = Literal["incipient", "gross"]
 KINDS: tuple[Kind, ...] = ("incipient", "gross")
-Rule = Literal["paper", "change_point"]
-RULES: tuple[Rule, ...] = ("paper", "change_point")
+Rule = Literal["paper", "change_point", "force"]
+RULES: tuple[Rule, ...] = ("paper", "change_point", "force")
 
 
 class OnsetDoubts(Part):
@@ -78,6 +78,8 @@ class TrialLabel(RuleOnsets, Document):
     references: dict[str, RuleOnsets] | None = None
     """By the paper's rule, from either end of the hold; null in older labels."""
     change_point: ChangePoints | None = None
+    force: RuleOnsets | None = None
+    """By the force along the plate; written only for trials that have forces."""
     hold_slip_px: tuple[Number | None, ...] = ()
     """Displacement of each marker in the hold; null where unknown."""
     markers_lost: Int = 0
@@ -97,9 +99,12 @@ class TrialLabel(RuleOnsets, Document):
         """Return the onsets of one rule.
 
         Raises:
-            ValueError: the label is older than the rule.
+            ValueError: the label is older than the rule, or the trial has no forces.
         """
-        found = self.paper if rule == "paper" else self.change_point
+        rules = {"paper": self.paper, "change_point": self.change_point, "force": self.force}
+        found = rules[rule]
+        if found is None and rule == "force":
+            raise ValueError("force: is missing; the trial has no forces, or run `sliplab label`")
         if found is None:
             raise ValueError(f"{rule}: is missing; run `sliplab label`")
         return found

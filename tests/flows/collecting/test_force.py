@@ -8,15 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.force import force_figures, has_forces, plate_forces
+from sliplab.analysis.labels.labelling import label_results
+from sliplab.analysis.labels.reviewed import label_key
+from sliplab.analysis.report.forces import force_section
+from sliplab.analysis.report.page import render_page
 from sliplab.flows.ui import view
 from sliplab.protocols import InputError
+from sliplab.protocols.settings import Labelling
 from sliplab.storage.errors import StoreError
+from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import session, short, take_all
+from tests.flows.conftest import tiny
 from tests.flows.ui.test_view import Read
 
 TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
@@ -166,3 +175,74 @@ def test_forces_are_seen_in_rerun(taken: Recording, tmp_path: Path) -> None:
     times, values = Read(path).curve("/force/normal")
     assert times == forces.t_ns.tolist()
     assert np.allclose(values, forces.normal_n)
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Slides that are long enough to slip, labelled."""
+    folder = tmp_path_factory.mktemp("labelled")
+    data = tiny()
+    data["collection"]["factors"]["direction"]["values"] = [0, 120]
+    data["analysis"]["split"] = {"method": "ranked"}
+    work, campaign = session(folder / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    take_all(work)
+    store = Store.open(folder / "a" / "store")
+    settings = work.plan.protocol.analysis.labelling
+    for recording in campaign.recordings():
+        label, arrays = label_results(recording, settings)
+        key = label_key(recording, settings)
+        derived = Derived.of(store, LABELS, campaign.name)
+        derived.write(recording.trial_id, key, label.to_json(), arrays)
+    return store
+
+
+def test_the_label_has_onsets_by_force(labelled: Store) -> None:
+    (item,) = [Collected(campaign) for campaign in labelled.campaigns()]
+    for _, recording in item.trials:
+        label = Derived.of(labelled, LABELS, item.name).load(recording.trial_id, TrialLabel)
+        truth = recording.simulation_truth() or {}
+        assert label.rule == "paper"
+        force = label.by_rule("force")
+        assert force.incipient_ns is not None
+        assert force.gross_ns is not None
+        assert abs(force.incipient_ns - truth["incipient_ns"]) < 30_000_000
+        assert force.incipient_ns < force.gross_ns < truth["gross_ns"]
+
+
+def test_the_force_may_rule(labelled: Store) -> None:
+    (item,) = [Collected(campaign) for campaign in labelled.campaigns()]
+    recording = item.trials[0][1]
+    settings = item.settings.labelling.model_copy(update={"rule": "force"})
+    label, _ = label_results(recording, settings)
+    assert label.force is not None
+    assert (label.incipient_ns, label.gross_ns) == (
+        label.force.incipient_ns, label.force.gross_ns,
+    )  # fmt: skip
+    assert set(label.per_marker_ns) == {-1}
+
+
+def test_the_report_shows_the_forces(labelled: Store) -> None:
+    items = [Collected(campaign) for campaign in labelled.campaigns()]
+    section = force_section(labelled, items, None, simulated=True)
+    assert section is not None
+    assert section.trials == 2
+    assert 0.5 < section.friction < 1.0
+    page = render_page("report.html", [section], simulated=True, campaigns=["tiny"], headline=[])
+    assert "friction cone" in page
+    assert "simulated" in section.figure.svg
+    rows = {(row[0], row[1]): row for row in section.rules.rows}
+    assert rows["paper's rule", "incipient onset"][2] == "2"
+    assert abs(float(rows["true crossing (simulated)", "incipient onset"][3])) < 30
+    assert len(section.figures.rows) == 4
+
+
+def test_a_report_without_forces_has_no_such_section(tmp_path: Path) -> None:
+    work, campaign = session(tmp_path / "a", short(), frame_camera=TRACKS)
+    take_all(work)
+    store = Store.open(tmp_path / "a" / "store")
+    assert force_section(store, [Collected(campaign)], None, simulated=True) is None
+    label, _ = label_results(next(iter(campaign.recordings())), Labelling())
+    assert "force" not in label.to_json()
+    ruled, _ = label_results(next(iter(campaign.recordings())), Labelling(rule="force"))
+    assert ruled.incipient_ns is None
+    assert ruled.doubts.incipient == "the trial has no forces of a slide"

@@ -1,0 +1,114 @@
+"""Onsets of slip from the force along the plate: where its rise slackens, and where it ends.
+
+While all tips stick, the force along the plate grows in proportion to the motion. With the first
+tips that slide the rise becomes flatter (incipient), and once most of the load slides it ends
+(gross): the drop of the tangential stiffness that is read as slip from a force sensor alone. Either
+is the knee of two straight lines that meet, fitted by least squares to the force along the slide.
+
+Forces are sums over the skin: what one tip does hardly shows in them, and the centre of a skin,
+which slips last, carries a small share. So this gross onset comes before that of the centre's
+marker as a rule (docs/force.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplab.analysis.force import PlateForces, has_forces, plate_forces
+from sliplab.storage.schema.label import RuleOnsets
+from sliplab.storage.streams import F64
+from sliplab.storage.trials.recording import Recording
+
+BINS = 600
+"""Means of neighbouring samples that a line is fitted to, at most."""
+_FEWEST = 20
+FLAT = 0.5
+"""The rise has ended where its slope behind the knee is below this share of the one before."""
+FLATTER = 0.9
+"""It has slackened where it is below this one."""
+
+
+@dataclass(frozen=True)
+class ForceOnsets:
+    """Onsets of one trial by its forces, on its time line; None where there is no such knee."""
+
+    incipient_ns: int | None
+    gross_ns: int | None
+    uncertainty_ns: float
+    """Of a moment of the force against the events'."""
+
+    def document(self) -> RuleOnsets:
+        """Return the part of the stored label."""
+        return RuleOnsets(incipient_ns=self.incipient_ns, gross_ns=self.gross_ns)
+
+
+def force_onsets(forces: PlateForces, start_ns: int, stop_ns: int) -> ForceOnsets:
+    """Find the onsets in the force during a slide.
+
+    Args:
+        start_ns: start of the slide on the time line; stop_ns: its end.
+    """
+    part = forces.between(start_ns, stop_ns)
+    none = ForceOnsets(None, None, forces.uncertainty_ns)
+    if len(part.t_ns) < _FEWEST:
+        return none
+    late = part.force_n[len(part.t_ns) // 2 :, :2].mean(axis=0)
+    size = float(np.hypot(*late))
+    if size == 0.0:
+        return none
+    along = part.force_n[:, :2] @ (late / size)
+    t_s = np.asarray((part.t_ns - start_ns) * 1e-9, np.float64)
+    gross_s = knee_s(t_s, along, FLAT)
+    if gross_s is None:
+        return none
+    before = t_s < gross_s
+    incipient_s = knee_s(t_s[before], along[before], FLATTER)
+    if incipient_s is not None:  # each knee again, of the part that the other one leaves
+        after = t_s >= incipient_s
+        gross_s = knee_s(t_s[after], along[after], FLAT) or gross_s
+        before = t_s < gross_s
+        incipient_s = knee_s(t_s[before], along[before], FLATTER)
+    return ForceOnsets(
+        None if incipient_s is None else start_ns + round(incipient_s * 1e9),
+        start_ns + round(gross_s * 1e9),
+        forces.uncertainty_ns,
+    )
+
+
+def onsets_by_force(recording: Recording) -> ForceOnsets | None:
+    """Find a trial's onsets in its forces; None without forces, or without a slide."""
+    if recording.motion_phase != "slide" or not has_forces(recording):
+        return None
+    return force_onsets(plate_forces(recording), *recording.motion_ns)
+
+
+def knee_s(t_s: F64, values: F64, flatter: float) -> float | None:
+    """Return where two straight lines that meet fit a rising curve best, s.
+
+    Args:
+        t_s, values: (n,), rising times.
+        flatter: largest share of the slope before the knee that may be left behind it.
+
+    Returns:
+        None with fewer than 20 samples, or where the curve does not rise and then bend so.
+    """
+    if len(t_s) < _FEWEST:
+        return None
+    edges = np.linspace(0, len(t_s), min(BINS, len(t_s)) + 1).astype(np.int64)
+    counts = np.diff(edges)
+    t = np.add.reduceat(t_s, edges[:-1]) / counts
+    y = np.add.reduceat(values, edges[:-1]) / counts
+    knots = t[2:-2]
+    hinge = np.maximum(t[:, None] - knots[None, :], 0.0)
+    basis, _ = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))
+    hinge_left = hinge - basis @ (basis.T @ hinge)
+    y_left = y - basis @ (basis.T @ y)
+    gain = (hinge_left.T @ y_left) ** 2 / np.sum(hinge_left**2, axis=0)
+    k = int(np.argmax(gain))
+    design = np.stack([np.ones_like(t), t, hinge[:, k]], axis=1)
+    _, before, bend = np.linalg.lstsq(design, y, rcond=None)[0].tolist()
+    if before <= 0.0 or before + bend >= flatter * before:
+        return None
+    return float(knots[k])
