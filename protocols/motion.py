@@ -70,8 +70,11 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             at = Position(*start_xy, -_value(phase.clearance, condition))
             steps.append(Move("approach", at, _value(phase.speed, condition)))
         elif isinstance(phase, Press):
-            at = replace(at, depth_mm=_value(phase.depth, condition))
-            steps.append(Move("press", at, _value(phase.speed, condition)))
+            deepest = collection.limits.depth if phase.depth is None else phase.depth
+            at = replace(at, depth_mm=_value(deepest, condition))
+            until = None if phase.force is None else _value(phase.force, condition)
+            press = Move("press", at, _value(phase.speed, condition), until_force_n=until)
+            steps.append(press)
         elif isinstance(phase, Hold):
             settle = _value(phase.settle, condition)
             if settle:
@@ -205,7 +208,7 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
             at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
             at_most(phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
-        if isinstance(phase, Press):
+        if isinstance(phase, Press) and phase.depth is not None:
             at_most(phase.depth, f"{base}.depth", limits.depth, "depth", "mm")
         if isinstance(phase, Slide):
             at_most(phase.distance, f"{base}.distance", Decimal(10_000), "workspace", "mm")

@@ -17,6 +17,7 @@ from sliplab.protocols.quantity import (
     DegreesPerSecondOrRef,
     FactorRef,
     MillimetresOrRef,
+    NewtonsOrRef,
     PercentOrRef,
     PositiveSecondsOrRef,
     SecondsOrRef,
@@ -34,11 +35,20 @@ class Approach(StrictModel):
 
 
 class Press(StrictModel):
-    """Straight in along the plate's normal, to an indentation depth."""
+    """Straight in along the plate's normal, to an indentation depth or to a normal force."""
 
     phase: Literal["press"]
-    depth: MillimetresOrRef
+    depth: MillimetresOrRef | None = None
+    """With `force`, the deepest that it may go; left out then, `limits.depth` is."""
+    force: NewtonsOrRef | None = None
+    """Normal force at which it ends, on a rig with a force sensor."""
     speed: SpeedOrRef
+
+    @model_validator(mode="after")
+    def _ends(self) -> Press:
+        if self.depth is None and self.force is None:
+            raise ValueError("must have a 'depth', or a 'force'")
+        return self
 
 
 class Hold(StrictModel):

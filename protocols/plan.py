@@ -263,6 +263,9 @@ class Plan:
         for name in ("twist", "twist_speed"):
             if data["limits"][name] is None:
                 data["limits"].pop(name)
+        for phase in data["motion"]:
+            if phase["phase"] == "press" and phase["force"] is None:
+                phase.pop("force")
         gates = self.protocol.collection.gates
         for name in ("reference", "hold_slip", "normal_force", "hold_force"):
             if getattr(gates, name) is None:  # hashes of protocols from before it came stay

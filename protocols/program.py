@@ -45,12 +45,23 @@ class Position:
 
 @dataclass(frozen=True)
 class Move:
-    """A straight move at constant speed (along the whole path, not per axis)."""
+    """A straight move at constant speed (along the whole path, not per axis).
+
+    Attributes:
+        until_force_n: normal force at which a press ends, N; `to` is then the deepest that it may
+            go, and later places in contact are as much less deep as it was.
+    """
 
     phase: str
     to: Position
     speed_mm_s: float
     recorded: bool = False
+    until_force_n: float | None = None
+
+    def __repr__(self) -> str:
+        force = "" if self.until_force_n is None else f", until_force_n={self.until_force_n!r}"
+        move = f"phase={self.phase!r}, to={self.to!r}, speed_mm_s={self.speed_mm_s!r}"
+        return f"Move({move}, recorded={self.recorded!r}{force})"
 
 
 @dataclass(frozen=True)

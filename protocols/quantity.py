@@ -254,6 +254,7 @@ SecondsOrRef: Any = _quantity("s", "0", False, ref=True)
 PositiveSecondsOrRef: Any = _quantity("s", "0", True, ref=True)
 DegreesOrRef: Any = _quantity("deg", None, False, ref=True)
 DegreesPerSecondOrRef: Any = _quantity("deg/s", "0", True, ref=True)
+NewtonsOrRef: Any = _quantity("N", "0", True, ref=True)
 KilogramsOrRef: Any = _quantity("kg", "0", True, ref=True)
 PercentOrRef: Any = _quantity("percent", "0", False, ref=True)
 

@@ -89,6 +89,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         centre_px=file.calibration.centre_px,
         plate=devices.plate,
         force=devices.force,
+        force_limit_n=force_limit(file),
         simulation=_MockSimulation(devices),
     )
 
@@ -190,6 +191,7 @@ def _driven_rig(
             tail_s=DRIVEN_TAIL_S,
             plate=plate,
             force=_force_sensor(file, devices, arm),
+            force_limit_n=force_limit(file),
             simulation=shown,
         )
         undo.pop_all()
@@ -203,6 +205,11 @@ def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None
         return driver.build(settings, px_per_mm)
     assert driver.fake is not None  # the rig file was held against it
     return driver.fake(settings, px_per_mm, shown, file.scene.frame_camera.exposure_us * 500)
+
+
+def force_limit(file: RigFile) -> float | None:
+    """Return the force at which the arm is stopped, N, if there is a limit."""
+    return None if file.limits.force is None else float(file.limits.force)
 
 
 def _force_sensor(file: RigFile, devices: DeviceSettings, arm: Arm) -> ForceSensor | None:

@@ -13,7 +13,12 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move
-from sliplab.protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
+from sliplab.protocols.quantity import (
+    PositiveMillimetres,
+    PositiveNewtons,
+    PositiveSeconds,
+    PositiveSpeed,
+)
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import Timing
 from sliplab.protocols.yaml_file import (
@@ -44,6 +49,9 @@ class RigLimits(StrictModel):
     speed: PositiveSpeed
     reach: PositiveMillimetres
     """Largest distance of the sensor's centre from the plate's centre."""
+    force: PositiveNewtons | None = None
+    """Largest force on the plate, in any direction, before the arm is stopped; needs a force
+    sensor."""
 
 
 class Skin(StrictModel):
@@ -194,6 +202,13 @@ class RigFile(StrictModel):
                 found = getattr(self.devices, name).driver
                 text = "has no fake for a loopback rig: write driver: devices"
                 raise KeyedError(f"devices.{name}.driver", found, text)
+        return self
+
+    @model_validator(mode="after")
+    def _limited_force_is_measured(self) -> RigFile:
+        if self.limits.force is not None and not self.has_force:
+            text = "needs a force sensor, and this rig has none"
+            raise KeyedError("limits.force", f"{self.limits.force} N", text)
         return self
 
     @model_validator(mode="after")
@@ -377,6 +392,21 @@ def _check_force(rig: RigFile, plan: Plan) -> None:
         if value is not None and not rig.has_force:
             text = f"needs a force sensor, and the rig {rig.name} has none: leave the gate out"
             raise InputError(plan.file, f"collection.gates.{name}", f"{value} N", text)
+    presses = [
+        step.until_force_n
+        for trial in plan
+        for step in plan.program(trial).steps
+        if isinstance(step, Move) and step.until_force_n is not None
+    ]
+    if not presses:
+        return
+    if not rig.has_force:
+        text = f"needs a force sensor, and the rig {rig.name} has none: press to a depth"
+        raise InputError(plan.file, "collection.motion: press.force", f"{max(presses):g} N", text)
+    limit = rig.limits.force
+    if limit is not None and max(presses) > limit:
+        text = f"exceeds limits.force = {limit} N of the rig {rig.name}"
+        raise InputError(plan.file, "collection.motion: press.force", f"{max(presses):g} N", text)
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:

@@ -143,7 +143,9 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
         if item.experiment != "kinematic"
         for phase in item.plan.protocol.collection.motion
         if isinstance(phase, Press)
-        for text in item.plan.level_texts(phase.depth, "mm")
+        for field, unit in ((phase.depth, "mm"), (phase.force, "N"))
+        if field is not None
+        for text in item.plan.level_texts(field, unit)
     }
     differences = tuple(
         Difference(

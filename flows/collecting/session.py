@@ -32,7 +32,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.rig import Rig, StopRequested, TrialRun
+from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
@@ -43,6 +43,7 @@ from sliplab.storage.schema.trial import (
     Quality,
     RecordedTiming,
     Step,
+    StreamRecord,
     TrialRecord,
 )
 from sliplab.storage.streams import Json
@@ -371,7 +372,7 @@ class Session:
         known = {
             "devices": self.rig.describe(),
             "simulation_truth": run.truth,
-            "streams": found.streams,
+            "streams": _with_press(found.streams, run.pressed_mm),
         }
         return record.model_copy(update={name: value for name, value in known.items() if value})
 
@@ -546,6 +547,17 @@ class TrialGate:
             return frozenset(os.listdir(self._store.folder / control.FOLDER))
         except FileNotFoundError:
             return frozenset()
+
+
+def _with_press(
+    streams: dict[str, StreamRecord], pressed_mm: float | None
+) -> dict[str, StreamRecord]:
+    """Add the depth at which a press to a force ended to the figures of the forces."""
+    if pressed_mm is None or FORCE not in streams:
+        return streams
+    known = streams[FORCE]
+    figures = {**known.figures, "pressed_mm": round(pressed_mm, 4)}
+    return {**streams, FORCE: known.model_copy(update={"figures": figures})}
 
 
 def _motion(run: TrialRun) -> Motion:

@@ -13,6 +13,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from sliplab.protocols.motion import UNTWIST_DEG_S
 from sliplab.protocols.program import (
     ACTING,
@@ -42,17 +44,20 @@ from sliplab.rigs.core.capabilities import (
     SyncBox,
     Truth,
 )
-from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.plate_frame import PlateFrame, Vector
 from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.touching import POLL_S, QUIET_S, RateTouch, count_central
-from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
+from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes, WrenchChunk
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """Default time for which cameras are read after the last pulse."""
 FORCE = "force"
 """Name of the force sensor's stream."""
+FORCE_POLL_S = 0.02
+"""Interval at which forces are read, s: what a limit, or the end of a press, may come late."""
+_RECENT_NS = 10_000_000
 _MOVE_GRACE_S = 10.0
 _STOP_RETRIES = 10
 """Attempts at a stop that Ctrl-C interrupts."""
@@ -71,6 +76,7 @@ class TrialRun:
     zero_mm: float
     truth: Truth | None
     path: tuple[PathSegment, ...] = ()
+    pressed_mm: float | None = None
     """Commanded segments of the recorded steps."""
 
     @property
@@ -93,6 +99,7 @@ class Rig:
         tail_s: time for which cameras are read after the last pulse: they send in blocks, and a
             busy host reads them late.
         force: a force/torque sensor, or None.
+        force_limit_n: largest force on the plate, in any direction, before the arm is stopped.
         simulation: the world behind a simulated rig, None on a real one.
         on_close: called last when the rig is closed.
     """
@@ -112,6 +119,7 @@ class Rig:
     tail_s: float = TAIL_S
     plate: Plate | None = None
     force: ForceSensor | None = None
+    force_limit_n: float | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     on_close: tuple[Callable[[], None], ...] = ()
@@ -142,6 +150,11 @@ class Rig:
         """Return arm, cameras, sync box and sensor, as far as the rig has them, the arm first."""
         found = (self.arm, self.event_camera, self.frame_camera, self.sync, self.force)
         return [device for device in found if device is not None]
+
+    _watching: bool = field(default=False, init=False)
+    """Forces are read, whether or not they are recorded."""
+    _normal_n: float = field(default=0.0, init=False)
+    _to_plate: Vector = field(default_factory=lambda: np.eye(3), init=False)
 
     def connect(self) -> None:
         """Connect sync box, arm and force sensor; cameras connect on construction.
@@ -225,9 +238,12 @@ class Rig:
             self.begin_trial(program.home, seed)
             if self.simulation is not None:
                 sink = self.simulation.sink(sink)
+            self._watch_forces()
             steps, path = [], []
             at, recording, reference = program.home, False, 0
-            for index, step in enumerate(program.steps):
+            shallower, pressed = 0.0, None
+            for index, planned in enumerate(program.steps):
+                step = _less_deep(planned, shallower)
                 if step.recorded and not recording:
                     self.start_streams(seed, rate_hz, frame_px is not None, with_events)
                     recording = True
@@ -239,6 +255,9 @@ class Rig:
                 times = self.take_step(index, step, at, sink if recording else None)
                 steps.append((times, step.recorded))
                 began, at = at, step_seconds(step, at)[1]
+                if isinstance(step, Move) and step.until_force_n is not None:
+                    pressed = self.position().depth_mm
+                    shallower, at = step.to.depth_mm - pressed, replace(at, depth_mm=pressed)
                 if step.recorded:
                     speed = step.speed_mm_s if isinstance(step, Move) else 0.0
                     path.append(self._segment(times, began, at, speed))
@@ -246,7 +265,36 @@ class Rig:
             if self.simulation is not None:
                 hold = next(times.start_ns for times, kept in steps if kept)
                 truth = self.simulation.truth(reference, hold)
-            return TrialRun(tuple(steps), self.plate_frame.zero_mm, truth, tuple(path))
+            return TrialRun(tuple(steps), self.plate_frame.zero_mm, truth, tuple(path), pressed)
+
+    def _watch_forces(self) -> None:
+        """Read forces from now on, and hold them against the limit."""
+        if self.force is None:
+            return
+        self._to_plate = np.array(self.plate_frame.force_matrix(self.force.mounting))
+        self.force.start()
+        self._watching, self._normal_n = True, 0.0
+
+    def _read_forces(self) -> WrenchChunk:
+        """Read the force sensor, and hold what it says against the limit.
+
+        Raises:
+            RigError: the limit is exceeded, or the sensor is at fault.
+        """
+        assert self.force is not None
+        chunk = self.force.read()
+        if self._watching and len(chunk):
+            forces = chunk.force_n @ self._to_plate.T
+            recent = chunk.t_ns > chunk.t_ns[-1] - _RECENT_NS
+            self._normal_n = float(forces[recent, 2].mean())
+            most = float(np.linalg.norm(forces, axis=1).max())
+            if self.force_limit_n is not None and most > self.force_limit_n:
+                raise RigError(
+                    "force sensor",
+                    f"{most:.2f} N on the plate, above limits.force = {self.force_limit_n:g} N of "
+                    "the rig; the arm was stopped: press less, or see what it touches",
+                )
+        return chunk
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm up the skin: press at the plate's centre and release, `times` times."""
@@ -332,6 +380,9 @@ class Rig:
             RigError: the step moves a plate, and this rig has none.
         """
         start = self.arm.now_ns()
+        if isinstance(step, Move) and step.until_force_n is not None:
+            end = self._press_to_force(step, step.until_force_n, at)
+            return StepTimes(index, step.phase, start, end)
         if isinstance(step, Move):
             start, end = self.move(step, at, sink)
             return StepTimes(index, step.phase, start, end)
@@ -359,6 +410,35 @@ class Rig:
         seconds = at.distance_mm(step.to) / step.speed_mm_s
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         return self._follow(segment, seconds, step.phase, sink)
+
+    def _press_to_force(self, step: Move, force_n: float, at: Position) -> int:
+        """Press until the normal force is reached, and stop; return the controller's time, ns.
+
+        Raises:
+            StopRequested, ArmFault: as `move`.
+            RigError: there is no force sensor, or the deepest place came first.
+        """
+        if self.force is None:
+            raise RigError("force sensor", f"this rig has none to press to {force_n:g} N")
+        seconds = at.distance_mm(step.to) / step.speed_mm_s
+        self.arm.start([Segment(self.plate_frame.pose(step.to), step.speed_mm_s)])
+        deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
+        while not (progress := self.arm.progress()).done:
+            if not progress.state.healthy:
+                raise arm_fault(progress.state, step.phase)
+            if self.clock.now_ns() > deadline:
+                raise ArmFault("arm", f"did not finish the phase '{step.phase}' in time")
+            self.wait(FORCE_POLL_S)
+            if self._normal_n >= force_n:
+                self.arm.stop()
+                return self.arm.now_ns()
+        if not progress.state.healthy:
+            raise arm_fault(progress.state, step.phase)
+        raise RigError(
+            "force sensor",
+            f"reads {self._normal_n:.2f} N at the deepest place, {step.to.depth_mm:g} mm, not the "
+            f"{force_n:g} N to press to; allow more depth, or ask for less force",
+        )
 
     def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Turn about the plate's normal on the spot; as `move`."""
@@ -396,11 +476,23 @@ class Rig:
         """
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
-            self.clock.wait(min(self.poll_s, left / 1e9))
+            self._pass(min(self.poll_s, left / 1e9), sink)
             if sink is not None:
                 self._drain(sink)
             if self.should_stop():
                 raise StopRequested
+
+    def _pass(self, seconds: float, sink: Sink | None) -> None:
+        """Let time pass; forces are read meanwhile, where there are any."""
+        if not self._watching:
+            self.clock.wait(seconds)
+            return
+        end = self.clock.now_ns() + round(seconds * 1e9)
+        while (left := end - self.clock.now_ns()) > 0:
+            self.clock.wait(min(FORCE_POLL_S, left / 1e9))
+            forces = self._read_forces()
+            if sink is not None:
+                sink.add_stream(FORCE, forces)
 
     def start_streams(
         self, seed: int, rate_hz: int, with_frames: bool, with_events: bool = True
@@ -434,6 +526,7 @@ class Rig:
             self._streaming.stop()
             sink.add_event_pulses(self._streaming.read_pulses())
         if self.force is not None:
+            self._watching = False
             self.force.stop()
             sink.add_stream(FORCE, self.force.read())
         if with_frames:
@@ -456,7 +549,7 @@ class Rig:
         if self.timing.frames == "device time stamps" and self.frame_camera is not None:
             sink.add_frame_camera_reads(self.frame_camera.read_clock())
         if self.force is not None:
-            sink.add_stream(FORCE, self.force.read())
+            sink.add_stream(FORCE, self._read_forces())
 
     def begin_trial(self, home: Position, seed: int) -> None:
         """Move to the start position, then let the simulation draw its random values.
@@ -495,6 +588,7 @@ class Rig:
         try:
             yield
         except BaseException as error:
+            self._watching = False
             fault: RigError | None = None
             try:
                 fault = self._stop_arm() or self._retract(clear)
@@ -567,6 +661,13 @@ class Rig:
         except BaseException:
             self._stop_arm()
             raise
+
+
+def _less_deep(step: Step, by_mm: float) -> Step:
+    """Return a step whose place, where it is in contact, is less deep than planned."""
+    if not by_mm or not isinstance(step, Move | Twist) or step.to.depth_mm <= 0:
+        return step
+    return replace(step, to=replace(step.to, depth_mm=step.to.depth_mm - by_mm))
 
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:

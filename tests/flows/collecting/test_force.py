@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,14 @@ from sliplab.analysis.labels.labelling import label_results
 from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.page import render_page
+from sliplab.flows.collecting.session import Session
 from sliplab.flows.ui import view
-from sliplab.protocols import InputError
+from sliplab.protocols import InputError, Protocol, make_plan
 from sliplab.protocols.settings import Labelling
+from sliplab.protocols.yaml_file import parse_yaml, validate
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.catalogue import catalogue
@@ -24,6 +30,7 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
+from tests.conftest import ROOT
 from tests.flows.collecting.test_session import session, short, take_all
 from tests.flows.conftest import tiny
 from tests.flows.ui.test_view import Read
@@ -246,3 +253,113 @@ def test_a_report_without_forces_has_no_such_section(tmp_path: Path) -> None:
     ruled, _ = label_results(next(iter(campaign.recordings())), Labelling(rule="force"))
     assert ruled.incipient_ns is None
     assert ruled.doubts.incipient == "the trial has no forces of a slide"
+
+
+# -- presses to a force --------------------------------------------------------------------
+
+
+def to_force(**press: Any) -> dict[str, Any]:
+    """Slides that are pressed to a force, a factor of the protocol."""
+    data = short()
+    factors = data["collection"]["factors"]
+    factors["load"] = {**factors.pop("depth"), "values": [1.0, 2.0], "unit": "N"}
+    factors["direction"]["values"] = [0]
+    data["collection"]["motion"][1] = {
+        "phase": "press", "force": "$load", "speed": "1 mm/s", **press,
+    }  # fmt: skip
+    return data
+
+
+def test_a_plan_presses_to_a_force_in_place_of_a_depth(tmp_path: Path) -> None:
+    work, campaign = session(
+        tmp_path / "a", to_force(), TIMING, force={"noise_n": 0.002}, frame_camera=TRACKS
+    )
+    take_all(work)
+    assert campaign.quarantined() == []
+    depths = {}
+    for recording in campaign.recordings():
+        load = float(str(recording.record.condition["load"]).split()[0])
+        figures = recording.record.streams["force"].figures
+        assert recording.trial_id.startswith("direction=0deg,load=")
+        # the skin relaxes in the hold, by a fifth at most
+        assert 0.75 * load < figures["normal_hold_n"] < 1.03 * load
+        assert figures["normal_peak_n"] < 1.05 * load
+        depths[load] = figures["pressed_mm"]
+        poses = depth_of_poses(work, recording)
+        slide = recording.step("slide")
+        held = poses[(poses[:, 0] >= slide[0]) & (poses[:, 0] <= slide[1])]
+        assert held[:, 1] == pytest.approx(figures["pressed_mm"], abs=0.02)
+    assert 1.0 < depths[1.0] < depths[2.0] < 4.0
+
+
+def depth_of_poses(work: Session, recording: Recording) -> np.ndarray:
+    """Time line (ns) and depth (mm) of every pose, (n, 2)."""
+    with recording.open() as reader:
+        poses = reader.poses()
+    times = np.asarray(recording.clock("arm").to_reference(poses.t_ns))
+    depth = [work.rig.plate_frame.position(xyz).depth_mm for xyz in poses.xyz_mm.tolist()]
+    return np.column_stack([times, depth])
+
+
+def test_a_press_that_meets_its_deepest_place_first_is_an_error(tmp_path: Path) -> None:
+    data = to_force(depth="1.2 mm")
+    work, campaign = session(tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    with pytest.raises(RigError, match=r"deepest place, 1.2 mm, not the . N to press to"):
+        take_all(work)
+    assert work.rig.arm.progress().done
+    assert campaign.committed() == set()
+
+
+def test_a_limit_of_force_stops_the_arm_on_its_way(tmp_path: Path) -> None:
+    work, campaign = session(tmp_path / "a", short(), TIMING, force={}, frame_camera=TRACKS)
+    work.rig.force_limit_n = 1.0
+    clear: list[float] = []
+    stop = work.rig.arm.stop
+
+    def stopped() -> None:
+        stop()
+        clear.append(work.rig.position().depth_mm)
+
+    work.rig.arm.stop = stopped  # type: ignore[method-assign]
+    with pytest.raises(RigError, match=r"above limits.force = 1 N of the rig; the arm was stopped"):
+        take_all(work)
+    # before the 2.4 mm to which the trial would press, and clear of the plate afterwards
+    assert 0.5 < max(clear) < 2.0
+    assert work.rig.position().depth_mm < 0
+    assert campaign.committed() == set()
+
+
+def test_a_rig_file_limits_forces_and_presses(tmp_path: Path) -> None:
+    file, _ = load_rig_file(Path("mock-force"))
+    data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
+    limits = {**data["limits"], "force": "3 N"}
+    with pytest.raises(InputError, match=r"limits.force = 3 N: needs a force sensor"):
+        validate(RigFile, {**data, "limits": limits}, "rig.yaml")
+    mock = {**data["mock"], "force": {}}
+    limited = validate(RigFile, {**data, "limits": limits, "mock": mock}, "rig.yaml")
+    assert build_rig(limited).force_limit_n == 3.0
+    assert build_rig(file).force_limit_n is None
+    with pytest.raises(InputError, match="needs a force sensor, and the rig mock has none: press"):
+        session(tmp_path / "a", to_force(), frame_camera=TRACKS)
+    plan = make_plan(validate(Protocol, to_force(), "p.yaml"), "p.yaml")
+    low = {**limits, "force": "1.5 N"}
+    rig = validate(RigFile, {**data, "limits": low, "mock": mock}, "rig.yaml")
+    with pytest.raises(InputError, match=r"2 N: exceeds limits.force = 1.5 N of the rig mock"):
+        check_plan(rig, plan, "rig.yaml")
+
+
+def test_a_press_needs_an_end(tmp_path: Path) -> None:
+    data = short()
+    del data["collection"]["motion"][1]["depth"]
+    with pytest.raises(InputError, match="must have a 'depth', or a 'force'"):
+        session(tmp_path / "a", data, frame_camera=TRACKS)
+
+
+def test_protocols_without_it_keep_their_hash() -> None:
+    plan = make_plan(validate(Protocol, short(), "p.yaml"), "p.yaml")
+    (press,) = [p for p in plan.collection_data["motion"] if p["phase"] == "press"]
+    assert "force" not in press
+    assert {"normal_force", "hold_force"} & set(plan.collection_data["gates"]) == set()
+    forced = make_plan(validate(Protocol, to_force(), "p.yaml"), "p.yaml")
+    (press,) = [p for p in forced.collection_data["motion"] if p["phase"] == "press"]
+    assert press["force"] == "$load"

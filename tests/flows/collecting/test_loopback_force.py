@@ -111,3 +111,22 @@ def test_a_sensor_at_fault_stops_the_arm_first(
 def test_a_loopback_rig_needs_the_scene_of_its_sensor(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"mock.force: .*is needed: it is what the fake"):
         request_in(tmp_path / "a", quick(), force_yaml(tmp_path, force=None))
+
+
+def test_the_arm_presses_to_a_force_through_the_wire(
+    run_request: RunRequest, tmp_path: Path
+) -> None:
+    data = wide()
+    data["collection"]["motion"][1] = {
+        "phase": "press", "force": "1 N", "depth": "3 mm", "speed": "1 mm/s",
+    }  # fmt: skip
+    data["collection"]["factors"].pop("depth")
+    request = request_in(tmp_path / "live", data, run_request.store.parent.parent / "rig.yaml")
+    with stage_of(request.rig) as stage, at_work(request, stage) as (work, campaign):
+        take_all(work)
+        assert [failed["cause"] for failed in campaign.quarantined()] == []
+        (recording,) = campaign.recordings()
+    figures = recording.record.streams["force"].figures
+    # a busy machine reads late, so that it presses a little further; the skin relaxes in the hold
+    assert 0.7 < figures["normal_hold_n"] < 1.5
+    assert 0.8 < figures["pressed_mm"] < 2.6
