@@ -26,6 +26,7 @@ from sliplab.storage.trials.store import Store as TrialStore
 if TYPE_CHECKING:
     import pandas as pd
 
+    from sliplab.analysis.force import PlateForces
     from sliplab.analysis.networks.training import Fitted
     from sliplab.flows.steps import StepResult
 
@@ -127,6 +128,16 @@ class Trial:
             found = reader.poses()
         times = self.recording.clock("arm").to_reference(found.t_ns)
         return Poses(np.asarray(times), found.xyz_mm, found.rotvec_deg)
+
+    def forces(self) -> PlateForces:
+        """Forces on the plate in its axes, and on the time line (see docs/force.md).
+
+        Raises:
+            StoreError: the trial is damaged, or has no forces.
+        """
+        from sliplab.analysis.force import plate_forces
+
+        return plate_forces(self.recording)
 
     def pulses(self) -> I64:
         """Rising edges that the sync box made: nanoseconds on the time line, shape (n,)."""

@@ -15,6 +15,7 @@ from sliplab.analysis.labels.labelling import label_results
 from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.page import render_page
+from sliplab.flows.api import open_store
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.ui import view
 from sliplab.protocols import InputError, Protocol, make_plan
@@ -128,6 +129,13 @@ def test_a_gate_of_force_needs_a_sensor(tmp_path: Path) -> None:
     data["collection"]["gates"] = {"normal_force": "5 N"}
     with pytest.raises(InputError, match=r"gates.normal_force = 5 N: needs a force sensor"):
         session(tmp_path / "a", data, frame_camera=TRACKS)
+
+
+def test_forces_are_read_by_the_public_interface(taken: Recording) -> None:
+    trial = open_store(taken.folder.parents[3]).trial(taken.trial_id)
+    found = trial.forces()
+    assert np.array_equal(found.t_ns, plate_forces(taken).t_ns)
+    assert found.normal_n.mean() > 0.5
 
 
 def test_a_rig_without_a_sensor_says_nothing_of_forces(tmp_path: Path) -> None:
