@@ -229,7 +229,7 @@ def test_a_permanent_server_needs_a_password_too(service: Service, tmp_path: Pat
     try:
         health = f"http://127.0.0.1:{port}/api/health"
         until("an open server", lambda: process.poll() is not None or _answers(health))
-        with pytest.raises(InputError, match=r"PREFECT_API_URL = .* asks for no password"):
+        with pytest.raises(InputError, match=r"PREFECT_API_URL = .* has no password"):
             page_server.refuse_open(f"http://anna:secret@127.0.0.1:{port}/api")
     finally:
         process.kill()
