@@ -57,6 +57,11 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
     if stated != "auto":
         return Choice(int(stated[1]), "set by the rig file (mock.scene.level)")
     slides = slides_of(plan)
+    if not slides and plan.protocol.collection.plate is None:
+        return Choice(
+            HIGHEST,
+            "onsets are compared between levels for slides only, so no effect is left out",
+        )
     if not slides:
         return Choice(
             HIGHEST,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,7 @@ from tests.flows.conftest import tiny, write
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
-def collected(folder: Path, motion: Any, **factors: Any) -> Store:
+def collected(folder: Path, motion: Any, rig: Path = RIG, **factors: Any) -> Store:
     """The only trial of a protocol with another motion and other factors, labelled."""
     data = tiny()
     data["name"] = "moves"
@@ -30,7 +31,7 @@ def collected(folder: Path, motion: Any, **factors: Any) -> Store:
     collection["limits"] |= {"twist": "60 deg", "twist_speed": "20 deg/s"}
     data["analysis"]["split"] = {"method": "ranked", "strata": ["depth"]}
     protocol = write(folder / "moves.yaml", data)
-    done = answer("collect", protocol, "--rig", RIG, "--store", folder / "store")
+    done = answer("collect", protocol, "--rig", rig, "--store", folder / "store")
     assert (done["committed"], done["missing"]) == (1, 0)
     assert answer("label", folder / "store")["done"] == 1
     return Store.open(folder / "store")
@@ -103,6 +104,25 @@ def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
     assert np.abs(angle[:, :2]).max() < 1e-3
     moved = poses.xyz_mm[during] - poses.xyz_mm[during][0]
     assert np.abs(moved).max() < 0.02  # noise of the poses alone
+
+
+@pytest.mark.realtime
+def test_a_twist_of_a_ur_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
+    """The real driver on its fake, which moves the sensor in the simulated scene."""
+    motion = {
+        "template": "press_twist", "depth": "$depth", "angle": "40 deg", "speed": "$speed",
+        "settle": "0.5 s", "hold": "1.5 s", "press": "4 mm/s",
+    }  # fmt: skip
+    speed = {"unit": "deg/s", "values": [10]}
+    store = collected(tmp_path, motion, ROOT / "rigs" / "loopback.yaml", speed=speed)
+    (recording,) = store.campaign("moves").recordings()
+    begin, end = recording.motion_ns
+    assert (end - begin) / 1e9 == pytest.approx(40 / 10 + 0.2, abs=0.1)  # with its ramps
+    found = read_json(next((tmp_path / "store" / "derived" / "labels" / "moves").glob("*.json")))
+    truth = recording.simulation_truth()
+    assert truth is not None
+    for onset in ("incipient_ns", "gross_ns"):
+        assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
 
 
 def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
