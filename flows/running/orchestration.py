@@ -11,6 +11,7 @@ store (`run_records`), from where the next command reports it. One line says so.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import sys
@@ -88,6 +89,17 @@ def configure_prefect(store: Path) -> None:
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)
     _ask_loopback_directly()
+    logging.getLogger("asyncio").addFilter(_is_fault)
+
+
+def _is_fault(record: logging.LogRecord) -> bool:
+    """Return False for a callback of asyncio that found its task cancelled.
+
+    Prefect's watch of a served run looks at the result of its poll, which is cancelled when the
+    run ends while the server does not answer; asyncio prints that with its whole traceback.
+    """
+    kind = record.exc_info[0] if record.exc_info else None
+    return kind is None or not issubclass(kind, asyncio.CancelledError)
 
 
 def _ask_loopback_directly() -> None:

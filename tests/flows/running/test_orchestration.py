@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -132,3 +133,35 @@ def _fill(path: Path, runs: bool = False) -> None:
         file.execute("insert into alembic_version values ('1')")
         if runs:
             file.execute("insert into flow_run values ('1')")
+
+
+@pytest.mark.parametrize(("error", "shown"), [(ValueError("a fault"), 1), (None, 0)])
+def test_a_cancelled_poll_is_no_fault(
+    error: Exception | None,
+    shown: int,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Prefect's watch of a served run ends so while the server does not answer."""
+    monkeypatch.setattr(orchestration, "_store", None)
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
+    orchestration.configure_prefect(tmp_path)
+
+    async def poll() -> None:
+        if error is not None:
+            raise error
+        await asyncio.get_running_loop().create_future()
+
+    async def watch() -> None:
+        task = asyncio.ensure_future(poll())
+        task.add_done_callback(lambda done: done.result())
+        await asyncio.wait([task], timeout=0.01)
+        task.cancel()
+        await asyncio.wait([task])
+        turn = asyncio.get_running_loop().create_future()  # the callback runs in this turn
+        asyncio.get_running_loop().call_soon(turn.set_result, None)
+        await turn
+
+    asyncio.run(watch())
+    assert [record.name for record in caplog.records if record.exc_info] == ["asyncio"] * shown
