@@ -45,7 +45,7 @@ def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
     for rig, prefix in (("rehearsal", "tracks_"), ("mock", "video_")):
         with open_session(rig, trials) as taking:
             taking.take()
-            campaign = taking.session.campaign
+            campaign = taking.collector.campaign
             store = Store.open(campaign.folder.parent.parent)
             found = list(campaign.recordings())
             each = len(found)

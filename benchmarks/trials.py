@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from benchmarks.measure import SEED, peak_mb
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import Trial
 from sliplab.rigs.build import build_rig
@@ -27,29 +27,29 @@ ROOT = Path(__file__).parent.parent
 
 
 @dataclass(frozen=True)
-class OpenSession:
-    """A session at a simulated rig with its store, ready to take trials."""
+class SimulatedSession:
+    """Session at a simulated rig with its store, ready to take trials."""
 
-    session: Session
+    collector: TrialCollector
     trials: list[Trial]
 
     def take(self, count: int | None = None) -> float:
-        """Take the next trials (all by default); returns the seconds of their programs.
+        """Take the next trials (all by default); return the planned seconds of their motion.
 
-        Moving there counts on the other side only.
+        The time of moving to the start is part of the wall time only.
         """
         wanted = self.trials[:count]
         del self.trials[: len(wanted)]
-        self.session.take(wanted)
-        return sum(self.session.plan.seconds(trial) for trial in wanted)
+        self.collector.take(wanted)
+        return sum(self.collector.plan.seconds(trial) for trial in wanted)
 
 
 @contextmanager
-def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[OpenSession]:
-    """A session that can take `count` random trials of a protocol's grid."""
+def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[SimulatedSession]:
+    """Open a session that can take `count` random trials of a protocol's grid."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         text = yaml.safe_load((ROOT / "protocols" / f"{protocol}.yaml").read_text("utf-8"))
-        # a random trial is the first of its stretch: each would be touched off before
+        # random trials are no neighbours: depth zero would be found before each
         del text["collection"]["maintenance"]
         file = Path(folder) / f"{protocol}.yaml"
         file.write_text(yaml.safe_dump(text, sort_keys=False), "utf-8")
@@ -60,15 +60,15 @@ def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[
         device.connect()
         every = list(run_request.plan)
         chosen = np.random.default_rng(SEED).choice(len(every), count, replace=False)
-        session = Session(run_request.plan, run_request.rig, device, campaign)
+        collector = TrialCollector(run_request.plan, run_request.rig, device, campaign)
         try:
-            yield OpenSession(session, [every[index] for index in sorted(chosen)])
+            yield SimulatedSession(collector, [every[index] for index in sorted(chosen)])
         finally:
             device.close()
 
 
 def main(rig: str) -> None:
-    """One trial, and what it took."""
+    """Take one trial and print the peak memory, MB."""
     with open_session(rig, 1) as work:
         work.take()
     print(f"{peak_mb():.1f}")

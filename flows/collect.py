@@ -13,7 +13,7 @@ from prefect.cache_policies import NO_CACHE
 
 from sliplab.flows.collecting.progress import shown
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
-from sliplab.flows.collecting.session import Session, open_session, refresh
+from sliplab.flows.collecting.session import TrialCollector, open_session, refresh
 from sliplab.flows.planning.run_request import CampaignCounts, RunRequest, check_disk
 from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import Opaque, run
@@ -42,11 +42,11 @@ class CollectResult(CampaignCounts):
 
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
-def take_trials(session: Opaque[Session], trials: Opaque[list[Trial]]) -> int:
+def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[Trial]]) -> int:
     """Take trials in their order, `BATCH` at most, until `BATCH_S` are over; return how many."""
     began, count = time.monotonic(), 0
     for trial in trials.content[:BATCH]:
-        session.content.take([trial])
+        collector.content.take([trial])
         count += 1
         if time.monotonic() - began >= BATCH_S:
             break
@@ -59,25 +59,26 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
     request = run_request.content
     with (
         shown(request) as progress,
-        open_session(request) as work,
+        open_session(request) as session,
         timed(Store(request.store), f"collect {request.campaign}"),
     ):
-        session, trials = work.session, work.trials
-        session.on_trial, work.gate.on_pause = progress.on_trial_done, progress.on_pause
-        # Prefect has handlers of its own inside a flow
+        collector, trials = session.collector, session.trials
+        collector.on_trial = progress.on_trial_done
+        session.supervisor.on_pause = progress.on_pause
+        # inside a flow Prefect has installed its own handlers
         with progress.begin(trials), stopping.signals():
-            session.rig.connect()
+            collector.rig.connect()
             while trials:
                 taken = 0
                 while taken < len(trials):
-                    taken += take_trials(Opaque(session), Opaque(trials[taken:]))
-                trials = work.gate.more() if request.most is None else []
+                    taken += take_trials(Opaque(collector), Opaque(trials[taken:]))
+                trials = session.supervisor.more() if request.most is None else []
                 progress.add(trials)
         return {
-            **request.counts(session.campaign),
-            "taken": session.taken,
-            "retaken": session.retaken,
-            "left_out": work.left_out,
+            **request.counts(collector.campaign),
+            "taken": collector.taken,
+            "retaken": collector.retaken,
+            "left_out": session.left_out,
         }
 
 

@@ -28,7 +28,7 @@ from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
 from sliplab.storage.trials.migrate import migrate
 from sliplab.storage.trials.store import Store
 
-LOOK_S = 0.2
+POLL_S = 0.2
 
 
 class CampaignStopped(RuntimeError):
@@ -264,6 +264,6 @@ def _wait(store: Store, title: str, limit_s: float, made: Request | None) -> Non
                     return
             elif control.answered(store, made) is not None or _carry_out_if_free(store) is None:
                 return
-            stopping.wait(LOOK_S)
+            stopping.wait(POLL_S)
             bar.advance(gone - shown)
             shown = gone

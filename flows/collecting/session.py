@@ -1,10 +1,10 @@
-"""One session at a rig: locks, recovery after a crash, the sequence of trials, the trial gate.
+"""One session at a rig: locks, recovery after a crash, the sequence of trials, checks in between.
 
 `open_session` opens a session: it locks the store and the rig, cleans up after a crash, and
-builds the rig. `Session` takes trials and commits the good ones; `TrialGate` decides between two
-trials whether the next one may begin. None of them knows Prefect: `flows.collect` decides in what
-batches trials are taken. The store is the only record of progress, so a session may die at any
-instruction and the next one resumes.
+builds the rig. `TrialCollector` takes trials and commits the good ones; `CollectionSupervisor`
+decides between two trials whether the next one may begin. None of them knows Prefect:
+`flows.collect` decides in what batches trials are taken. The store is the only record of
+progress, so a session may be killed at any instruction and the next one resumes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from sliplab.storage.trials.store import Campaign, SessionRecord, Store
 from sliplab.storage.trials.writer import TrialWriter
 
 PAUSE_LIMIT_S = 12 * 3600.0
-LOOK_S = 0.5
+POLL_S = 0.5
 """Interval at which a paused collection checks for its resumption, s."""
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 
@@ -63,46 +63,47 @@ class WindowOver(CampaignStopped):
 
 
 @dataclass(frozen=True)
-class OpenSession:
-    """An open session and its work.
+class CollectionSession:
+    """An open session at the rig: the objects that run it and the trials to take.
 
     Attributes:
-        trials: those to take.
-        left_out: number of other trials that the store lacks and that were not asked for.
+        trials: pending trials that the run request asks for.
+        left_out: number of pending trials that it does not ask for.
     """
 
-    session: Session
-    gate: TrialGate
+    collector: TrialCollector
+    supervisor: CollectionSupervisor
     trials: list[Trial]
     left_out: int = 0
 
 
 @contextmanager
-def open_session(run_request: RunRequest) -> Iterator[OpenSession]:
+def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
     """Open a session for a collection; the rig is closed when the block ends.
 
     Raises:
-        Locked: somebody else collects into the store, or uses the rig.
+        Locked: another program collects into the store, or uses the rig.
         StoreError: its disk is full, read-only or failing.
         CampaignStopped: reference trials had drifted.
     """
     store = Store.create(run_request.store)
     with store_lock(store, collects=run_request.campaign):
         campaign = _recover(store, run_request)
-        gate = TrialGate(run_request, store, campaign)
-        gate.begin()
+        supervisor = CollectionSupervisor(run_request, store, campaign)
+        supervisor.begin()
         with held(run_request.rig, store.folder):
             rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
             trials = run_request.due_trials(campaign)
             left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
             campaign.add_bench_record(_session_record(run_request))
-            session = Session(
+            collector = TrialCollector(
                 run_request.plan, run_request.rig, rig, campaign, run_request.metadata.operator
             )
-            session.gate, gate.fresh_start = gate, session.fresh_start
+            collector.supervisor = supervisor
+            supervisor.fresh_start = collector.fresh_start
             try:
-                yield OpenSession(session, gate, trials, left_out)
+                yield CollectionSession(collector, supervisor, trials, left_out)
             finally:
                 rig.close()
 
@@ -155,12 +156,12 @@ def _session_record(run_request: RunRequest) -> SessionRecord:
 
 
 @dataclass
-class Session:
+class TrialCollector:
     """Takes the trials of one plan on one rig into one campaign.
 
     Attributes:
         on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
-        gate: asked before each attempt and notified after each trial, if there is one.
+        supervisor: asked before each attempt and notified after each trial, if there is one.
         taken, retaken: attempts so far, and those of them that repeat one.
     """
 
@@ -170,7 +171,7 @@ class Session:
     campaign: Campaign
     operator: str = ""
     on_trial: Callable[[Trial, str], None] = field(default=lambda trial, outcome: None)
-    gate: TrialGate | None = None
+    supervisor: CollectionSupervisor | None = None
     taken: int = 0
     retaken: int = 0
     _previous: Trial | None = None
@@ -183,7 +184,7 @@ class Session:
         Raises:
             RigError: a device failed, or a person did not do what was asked.
             StoreError: the store's disk is full, read-only or failing.
-            CampaignStopped: the trial gate ended the campaign.
+            CampaignStopped: the supervisor ended the campaign.
             KeyboardInterrupt: a stop was requested.
         """
         for trial in trials:
@@ -199,15 +200,15 @@ class Session:
         self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:
-        if self.gate is None or self.gate.may_take(trial):
+        if self.supervisor is None or self.supervisor.may_take(trial):
             return True
         self.on_trial(trial, "skipped")
         return False
 
     def _finish(self, trial: Trial, outcome: str) -> None:
         self.on_trial(trial, outcome)
-        if self.gate is not None:
-            self.gate.after(trial, outcome)
+        if self.supervisor is not None:
+            self.supervisor.after(trial, outcome)
 
     def _prepare(self, trial: Trial) -> None:
         """Do what the protocol asks for before this trial and this session has not done yet."""
@@ -408,7 +409,7 @@ class Session:
         )
 
 
-class TrialGate:
+class CollectionSupervisor:
     """Decides between two trials whether the next may begin; notified after each.
 
     It carries out requests from other terminals, and watches the time window, the disk and the
@@ -525,7 +526,7 @@ class TrialGate:
         """Wait until the pause is over."""
         console.say(
             f"paused before {trial.id} ({self._paused}); `sliplab resume {self._store.folder}` "
-            "goes on"
+            "continues it"
         )
         waited = 0.0
         while request := self._process_requests():
@@ -536,8 +537,8 @@ class TrialGate:
                     f"{console.duration(PAUSE_LIMIT_S)} and nobody resumed it: `sliplab resume "
                     f"{self._store.folder}`, then run the same command to resume"
                 )
-            self.wait(LOOK_S)
-            waited += LOOK_S
+            self.wait(POLL_S)
+            waited += POLL_S
         console.say("resumed")
         self.on_pause(waited)
         self.fresh_start()
@@ -578,7 +579,7 @@ def _installed() -> Json:
 
 def _cause(error: BaseException) -> str:
     """Return why a trial ended early, for its quarantine."""
-    # compiled code that a signal interrupts raises an error of its own
+    # compiled code raises an unrelated error when a signal interrupts it
     if isinstance(error, (KeyboardInterrupt, StopRequested)) or stopping.requested():
         return "stopped by a person"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

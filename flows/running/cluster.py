@@ -32,7 +32,7 @@ CONNECT_S = 15.0
 """Timeout for a scheduler, and for a first worker, s."""
 ALONE_S = 60.0
 """Time without any worker after which the step fails, s."""
-LOOK_S = 0.5
+POLL_S = 0.5
 ANSWER_S = 60.0
 """Timeout for the answers of all workers, s."""
 REPORT_S = 5.0
@@ -109,7 +109,7 @@ class Cluster:
             while left:
                 stopping.check()
                 try:
-                    number = ready.get(timeout=LOOK_S)
+                    number = ready.get(timeout=POLL_S)
                 except queue.Empty:
                     seen = self._still_there(seen)
                     continue

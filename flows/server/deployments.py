@@ -42,7 +42,7 @@ from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import StoreError
 
-LOOK_S = 2.0
+POLL_S = 2.0
 """Interval between attempts to lock a rig that is in use, s."""
 _EXPECTED = (StoreError, RigError, Locked, CampaignStopped, InputError)
 
@@ -131,8 +131,8 @@ def when_free(
                 raise WindowOver(f"the window is over and no trial was taken: {busy}") from None
             if not waited:
                 _report_waiting(run, str(busy))
-        stopping.wait(LOOK_S)
-        waited += LOOK_S
+        stopping.wait(POLL_S)
+        waited += POLL_S
 
 
 def _report_waiting(run: Any, why: str) -> None:

@@ -24,7 +24,7 @@ from sliplab.storage.trials.store import Store
 LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
-LOOK_S = 1.0
+POLL_S = 1.0
 """Longest interval between polls for runs, s: a request to the arm must not wait."""
 
 
@@ -98,7 +98,7 @@ async def _serve(
     # a server that does not answer is asked again at the next look
     limits = {PREFECT_API_REQUEST_TIMEOUT: ANSWER_S, PREFECT_CLIENT_MAX_RETRIES: 0}
     with temporary_settings(updates=limits):
-        carrying_out = asyncio.create_task(served.carry_out(min(poll_s, LOOK_S), stopped))
+        carrying_out = asyncio.create_task(served.carry_out(min(poll_s, POLL_S), stopped))
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
     ending = asyncio.create_task(stopped.wait())
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments */{here.name}")

@@ -158,7 +158,7 @@ def test_an_unknown_name_is_refused(
 def test_a_stretch_takes_whole_trials_and_knows_how_long_they_are() -> None:
     with open_session("rehearsal", 2, "pilot") as work:
         trial = work.trials[0]
-        assert work.take(1) == work.session.plan.seconds(trial)
-        assert work.session.taken == 1
+        assert work.take(1) == work.collector.plan.seconds(trial)
+        assert work.collector.taken == 1
         assert [left.id for left in work.trials] != [trial.id]
-        assert work.session.campaign.committed() == {trial.id}
+        assert work.collector.campaign.committed() == {trial.id}

@@ -53,8 +53,8 @@ def run_request(folder: Path, trials: int, video: bool = False) -> RunRequest:
 def collect(wanted: RunRequest) -> None:
     """Take what the store lacks, as `sliplab collect` does below Prefect."""
     with open_session(wanted) as work:
-        work.session.rig.connect()
-        work.session.take(work.trials)
+        work.collector.rig.connect()
+        work.collector.take(work.trials)
 
 
 def hashes(store: Path) -> dict[str, dict[str, str]]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.rigs.build import loopback_rig
@@ -82,18 +82,18 @@ def stage_of(file: RigFile) -> Iterator[Loopback]:
 @contextmanager
 def at_work(
     run_request: RunRequest, stage: Loopback, file: RigFile | None = None
-) -> Iterator[tuple[Session, Campaign]]:
+) -> Iterator[tuple[TrialCollector, Campaign]]:
     """One session, as the same command begins and ends it: drivers are built anew each time."""
     campaign = describe_campaign(Store.create(run_request.store), run_request)
     rig = loopback_rig(file or run_request.rig, stage)
     try:
         rig.connect()
-        yield Session(run_request.plan, file or run_request.rig, rig, campaign), campaign
+        yield TrialCollector(run_request.plan, file or run_request.rig, rig, campaign), campaign
     finally:
         rig.close()
 
 
-def take_all(work: Session) -> None:
+def take_all(work: TrialCollector) -> None:
     """Take what is pending."""
     work.take(pending_trials(work.plan, work.campaign))
 

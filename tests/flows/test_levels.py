@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from sliplab.analysis.labels.labelling import Label, label_recording
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.rigs.build import build_rig
@@ -53,7 +53,7 @@ def take(folder: Path, data: dict[str, Any], **camera: Any) -> tuple[Recording, 
     rig = build_rig(run_request.rig)
     rig.connect()
     (trial,) = pending_trials(run_request.plan, campaign)
-    Session(run_request.plan, run_request.rig, rig, campaign).take([trial])
+    TrialCollector(run_request.plan, run_request.rig, rig, campaign).take([trial])
     assert verify(Store.open(folder / "store")) == []
     with_plate = run_request.plan.protocol.collection.plate is not None
     return campaign.recording(trial.id), run_request.rig.frame_bytes(with_plate)

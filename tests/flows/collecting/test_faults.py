@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.storage.errors import disk_full
 from sliplab.storage.files import write_json
@@ -35,7 +35,7 @@ def slides(count: int) -> dict[str, Any]:
 
 def begin(
     folder: Path, faults: list[dict[str, Any]], data: dict[str, Any] | None = None
-) -> tuple[Session, Campaign]:
+) -> tuple[TrialCollector, Campaign]:
     """A session on a rig with faults."""
     return session(folder, data or slides(2), faults=faults, frame_camera=TRACKS)
 

@@ -16,7 +16,7 @@ from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.page import render_page
 from sliplab.flows.api import open_store
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.ui import view
 from sliplab.protocols import InputError, Protocol, make_plan
 from sliplab.protocols.settings import Labelling
@@ -300,7 +300,7 @@ def test_a_plan_presses_to_a_force_in_place_of_a_depth(tmp_path: Path) -> None:
     assert 1.0 < depths[1.0] < depths[2.0] < 4.0
 
 
-def depth_of_poses(work: Session, recording: Recording) -> np.ndarray:
+def depth_of_poses(work: TrialCollector, recording: Recording) -> np.ndarray:
     """Time line (ns) and depth (mm) of every pose, (n, 2)."""
     with recording.open() as reader:
         poses = reader.poses()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
@@ -62,7 +62,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Taken:
     other = describe_campaign(Store.create(mock.store), mock)
     rig = build_rig(file)
     rig.connect()
-    take_all(Session(mock.plan, file, rig, other))
+    take_all(TrialCollector(mock.plan, file, rig, other))
     (by_mock,) = other.recordings()
     return Taken(recording, by_mock, sent, events_sent, run_request)
 

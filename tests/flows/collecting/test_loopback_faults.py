@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import pytest
 
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.rigs.build import calibrated_arm
@@ -54,7 +54,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Loopback, 
         yield stage, run_request
 
 
-def take_next(work: Session) -> None:
+def take_next(work: TrialCollector) -> None:
     """Take the campaign's next trial."""
     work.take(pending_trials(work.plan, work.campaign)[:1])
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.force import plate_forces
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.protocols import InputError
 from sliplab.rigs.build import build_rig
@@ -72,7 +72,7 @@ def test_forces_come_through_the_wire_as_the_mock_has_them(
     other = describe_campaign(Store.create(mock.store), mock)
     rig = build_rig(file)
     rig.connect()
-    take_all(Session(mock.plan, file, rig, other))
+    take_all(TrialCollector(mock.plan, file, rig, other))
     (by_mock,) = other.recordings()
     found = []
     for recording in (live, by_mock):

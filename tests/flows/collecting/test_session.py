@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols.yaml_file import parse_yaml
@@ -33,7 +33,7 @@ def short() -> dict[str, Any]:
 
 def session(
     folder: Path, data: dict[str, Any], timing: dict[str, Any] | None = None, **mock: Any
-) -> tuple[Session, Campaign]:
+) -> tuple[TrialCollector, Campaign]:
     """A connected session on a mock rig with other mock settings, and other timing."""
     folder.mkdir(exist_ok=True)
     rig_data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
@@ -48,10 +48,10 @@ def session(
     campaign = describe_campaign(Store.create(folder / "store"), run_request)
     rig = build_rig(run_request.rig)
     rig.connect()
-    return Session(run_request.plan, run_request.rig, rig, campaign), campaign
+    return TrialCollector(run_request.plan, run_request.rig, rig, campaign), campaign
 
 
-def take_all(work: Session) -> None:
+def take_all(work: TrialCollector) -> None:
     """Take what is pending."""
     work.take(pending_trials(work.plan, work.campaign))
 

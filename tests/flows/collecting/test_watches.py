@@ -10,7 +10,7 @@ import pytest
 from sliplab.analysis.quality import hold_rate
 from sliplab.flows.collecting.progress import Remaining
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out
-from sliplab.flows.collecting.session import Session, TrialGate
+from sliplab.flows.collecting.session import CollectionSupervisor, TrialCollector
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
@@ -23,7 +23,7 @@ from tests.flows.collecting.test_session import session, short
 from tests.flows.conftest import tiny, write
 
 
-def begin(folder: Path, data: dict[str, Any]) -> tuple[Session, Campaign, RunRequest]:
+def begin(folder: Path, data: dict[str, Any]) -> tuple[TrialCollector, Campaign, RunRequest]:
     """A session and its run request."""
     work, campaign = session(folder, data)
     return work, campaign, make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
@@ -33,7 +33,9 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
     work, campaign, run_request = begin(tmp_path / "a", short())
     left = [RESERVE + 1e9, RESERVE + 1e9, RESERVE + 1000]
     disk = DiskWatch(run_request, campaign, lambda folder: int(left.pop(0)))
-    work.gate = TrialGate(run_request, Store.open(run_request.store), campaign, disk)
+    work.supervisor = CollectionSupervisor(
+        run_request, Store.open(run_request.store), campaign, disk
+    )
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))
     message = str(stopped.value)
@@ -84,7 +86,7 @@ def test_references_that_drift_apart_stop_the_campaign(
 ) -> None:
     work, campaign, run_request = begin(tmp_path / "a", with_references())
     store = Store.open(run_request.store)
-    work.gate = TrialGate(run_request, store, campaign)
+    work.supervisor = CollectionSupervisor(run_request, store, campaign)
     references = [trial.id for trial in run_request.plan if trial.role == "reference"]
     first, second = references[:2]
     rates = {first: 1000.0, second: 1234.4}
@@ -104,13 +106,13 @@ def test_references_that_drift_apart_stop_the_campaign(
     assert len(campaign.committed()) == 3
     # it does not go on by itself ...
     with pytest.raises(CampaignStopped, match="drifted apart"):
-        TrialGate(run_request, store, campaign).begin()
+        CollectionSupervisor(run_request, store, campaign).begin()
     # ... but when the trial is wanted again
     control.ask(store, "again", campaign="tiny", trials=(second,), why="skin cleaned")
     carry_out(store)
     rates = dict.fromkeys(references, 1100.0) | {first: 1000.0}
-    work.gate = TrialGate(run_request, store, campaign)
-    work.gate.begin()
+    work.supervisor = CollectionSupervisor(run_request, store, campaign)
+    work.supervisor.begin()
     pending = pending_trials(work.plan, campaign)
     assert pending[0].id == second
     work.take(pending)
@@ -119,7 +121,7 @@ def test_references_that_drift_apart_stop_the_campaign(
 
 def test_true_event_rates_in_the_hold_agree_within_some_percent(tmp_path: Path) -> None:
     work, campaign, run_request = begin(tmp_path / "a", with_references())
-    work.gate = TrialGate(run_request, Store.open(run_request.store), campaign)
+    work.supervisor = CollectionSupervisor(run_request, Store.open(run_request.store), campaign)
     work.take(pending_trials(work.plan, campaign))
     rates = [
         hold_rate(campaign.recording(trial.id))
@@ -142,7 +144,7 @@ def test_without_the_gate_nothing_is_compared(
         raise AssertionError("read")
 
     monkeypatch.setattr("sliplab.flows.collecting.watches.hold_rate", never)
-    work.gate = TrialGate(run_request, Store.open(run_request.store), campaign)
+    work.supervisor = CollectionSupervisor(run_request, Store.open(run_request.store), campaign)
     work.take(pending_trials(work.plan, campaign)[:3])
     ReferenceWatch(run_request, campaign).begin()
 

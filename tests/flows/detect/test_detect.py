@@ -15,7 +15,7 @@ from sliplab.analysis.detectors.smoothing_rule import detect as detect_trial
 from sliplab.analysis.networks.training import predict_counts
 from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.windows import bin_events
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.planning.run_request import describe_campaign
@@ -51,7 +51,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     campaign = describe_campaign(Store.create(order.store), order)
     rig = build_rig(order.rig)
     rig.connect()
-    take_all(Session(order.plan, order.rig, rig, campaign))
+    take_all(TrialCollector(order.plan, order.rig, rig, campaign))
     (recording,) = campaign.recordings()
     return recording
 

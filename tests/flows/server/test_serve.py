@@ -171,7 +171,7 @@ def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protoc
 def test_a_rig_that_is_free_again_is_taken(
     service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(deployments, "LOOK_S", 0.01)
+    monkeypatch.setattr(deployments, "POLL_S", 0.01)
     run_request = make_request(protocol, RIG, service.folder)
     answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
     told: list[str] = []

@@ -29,7 +29,7 @@ MakeRobot = Callable[..., FakeUr]
 MakeArm = Callable[..., UrArm]
 MakeAbb = Callable[..., tuple[AbbArm, FakeAbb]]
 ABB_PORT, EGM_PORT = 8080, 6510
-LIMIT_S, LOOK_S = 60.0, 0.002
+LIMIT_S, POLL_S = 60.0, 0.002
 LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 
 
@@ -155,6 +155,6 @@ def wait_until() -> Callable[[Callable[[], bool]], None]:
         end = time.monotonic() + LIMIT_S
         while not done():
             assert time.monotonic() < end, f"it has not happened within {LIMIT_S:g} s"
-            idle.wait(LOOK_S)
+            idle.wait(POLL_S)
 
     return wait

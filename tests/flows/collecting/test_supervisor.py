@@ -11,7 +11,12 @@ import pytest
 
 from sliplab.flows.collecting import session as session_module
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
-from sliplab.flows.collecting.session import Session, TrialGate, WindowOver, open_session
+from sliplab.flows.collecting.session import (
+    CollectionSupervisor,
+    TrialCollector,
+    WindowOver,
+    open_session,
+)
 from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.flows.running import stopping
@@ -34,25 +39,25 @@ def forget() -> Iterator[None]:
         pass
 
 
-def guarded(
+def supervised(
     folder: Path, data: dict[str, Any] | None = None, **mock: Any
-) -> tuple[Session, Campaign, Store]:
-    """A session with a trial gate, whose waits fail unless a test says what happens in them."""
+) -> tuple[TrialCollector, Campaign, Store]:
+    """A collector with a supervisor, whose waits fail unless a test says what happens in them."""
     work, campaign = session(folder, data or short(), **mock)
     store = Store.open(folder / "store")
     run_request = make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
-    work.gate = TrialGate(run_request, store, campaign)
-    work.gate.fresh_start = work.fresh_start
+    work.supervisor = CollectionSupervisor(run_request, store, campaign)
+    work.supervisor.fresh_start = work.fresh_start
 
     def never(seconds: float) -> None:
         raise AssertionError("waits")
 
-    work.gate.wait = never
+    work.supervisor.wait = never
     return work, campaign, store
 
 
-def after_first(work: Session, do: Callable[[], object]) -> list[tuple[str, str]]:
-    """Take what is pending; somebody does something during the first trial; return outcomes."""
+def after_first(work: TrialCollector, do: Callable[[], object]) -> list[tuple[str, str]]:
+    """Take what is pending; `do` is called during the first trial; return outcomes."""
     outcomes: list[tuple[str, str]] = []
 
     def on_trial(trial: Trial, outcome: str) -> None:
@@ -68,7 +73,7 @@ def after_first(work: Session, do: Callable[[], object]) -> list[tuple[str, str]
 def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path) -> None:
     plain, untouched = session(tmp_path / "plain", short())
     plain.take(pending_trials(plain.plan, untouched))
-    work, campaign, store = guarded(tmp_path / "a")
+    work, campaign, store = supervised(tmp_path / "a")
     waits: list[float] = []
     pauses: list[float] = []
     during: list[int] = []
@@ -79,11 +84,11 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
         if len(waits) == 3:
             control.ask(store, "resume", who="ben")
 
-    assert work.gate is not None
-    work.gate.wait, work.gate.on_pause = wait, pauses.append
+    assert work.supervisor is not None
+    work.supervisor.wait, work.supervisor.on_pause = wait, pauses.append
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
-    assert pauses == [3 * session_module.LOOK_S]
+    assert pauses == [3 * session_module.POLL_S]
     asked = control.requests(store)
     assert [(item.kind, item.who, item.why) for item in asked] == [
         ("pause", "anna", "lunch"), ("resume", "ben", ""),
@@ -97,9 +102,9 @@ def test_a_pause_that_nobody_ends_ends_the_stretch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session_module, "PAUSE_LIMIT_S", 2.0)
-    work, campaign, store = guarded(tmp_path / "a")
-    assert work.gate is not None
-    work.gate.wait = lambda seconds: None
+    work, campaign, store = supervised(tmp_path / "a")
+    assert work.supervisor is not None
+    work.supervisor.wait = lambda seconds: None
     with pytest.raises(CampaignStopped, match=r"pause by anna.*nobody resumed it: `sliplab resume"):
         after_first(work, lambda: control.ask(store, "pause", who="anna"))
     assert len(campaign.committed()) == 1
@@ -114,20 +119,20 @@ def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path
     data["collection"]["maintenance"]["warm_up"] = {
         "presses": 1, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm",
     }  # fmt: skip
-    work, campaign, store = guarded(tmp_path / "a", data)
+    work, campaign, store = supervised(tmp_path / "a", data)
     done: list[str] = []
     press, touch_off = work.rig.press, work.rig.touch_off
     work.rig.press = lambda *given: (done.append("warm up"), press(*given))[1]  # type: ignore[method-assign]
     work.rig.touch_off = lambda *given: (done.append("zero"), touch_off(*given))[1]  # type: ignore[method-assign]
-    assert work.gate is not None
-    work.gate.wait = lambda seconds: control.ask(store, "resume") and None
+    assert work.supervisor is not None
+    work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
     assert done == ["warm up", "zero"] * 2
     assert len(campaign.committed()) == 3
 
 
 def test_a_stop_that_came_by_file_is_heeded_at_the_next_boundary(tmp_path: Path) -> None:
-    work, campaign, store = guarded(tmp_path / "a")
+    work, campaign, store = supervised(tmp_path / "a")
     with pytest.raises(KeyboardInterrupt):
         after_first(work, lambda: control.ask(store, "stop", why="smoke"))
     assert stopping.requested()
@@ -140,20 +145,20 @@ def test_a_stop_that_came_by_file_is_heeded_at_the_next_boundary(tmp_path: Path)
 
 
 def test_an_old_stop_stops_nothing_that_begins_later(tmp_path: Path) -> None:
-    work, _, store = guarded(tmp_path / "a")
+    work, _, store = supervised(tmp_path / "a")
     work.rig.close()
     control.ask(store, "stop")
     run_request = make_request(
         tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
     )
     with open_session(run_request) as work_now:
-        work_now.session.rig.connect()
-        work_now.session.take(work_now.trials)
-        assert work_now.session.taken == 3
+        work_now.collector.rig.connect()
+        work_now.collector.take(work_now.trials)
+        assert work_now.collector.taken == 3
 
 
 def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> None:
-    work, campaign, store = guarded(tmp_path / "a")
+    work, campaign, store = supervised(tmp_path / "a")
     first, second, third = (trial.id for trial in work.plan)
     by = {"who": "anna", "why": "cable in the way"}
 
@@ -174,16 +179,16 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert skipped(campaign)[second]["request"] == 1
     (kept,) = campaign.quarantined()
     assert (kept["cause"], kept["asked"]["who"]) == ("again: dust", "ben")
-    assert work.gate is not None
-    again = work.gate.more()
+    assert work.supervisor is not None
+    again = work.supervisor.more()
     assert [trial.id for trial in again] == [first]
     work.take(again)
-    assert work.gate.more() == []
+    assert work.supervisor.more() == []
     assert campaign.recording(first).record.attempt == 1  # another take, another seed
     assert campaign.committed() == {first, third}
     assert verify(store) == []
     control.ask(store, "again", campaign="tiny", trials=(second,), why="cable is gone")
-    work.take(work.gate.more())
+    work.take(work.supervisor.more())
     assert campaign.committed() == {first, second, third}
     assert excluded_trials(work.plan, campaign) == []
 
@@ -192,7 +197,7 @@ def test_a_trial_that_used_its_retakes_up_gets_all_of_them_again(tmp_path: Path)
     data = short()
     data["collection"]["gates"]["retakes"] = 1
     fault = {"kind": "event_gap", "at_s": 0.6, "seconds": 0.2}
-    work, campaign, store = guarded(tmp_path / "a", data, faults=[fault])
+    work, campaign, store = supervised(tmp_path / "a", data, faults=[fault])
     work.take(list(work.plan)[:1])
     (aside,) = excluded_trials(work.plan, campaign)
     assert aside["cause"].startswith("gate: event_gap_s = 0.2")
@@ -209,7 +214,7 @@ def test_a_trial_that_used_its_retakes_up_gets_all_of_them_again(tmp_path: Path)
 
 def test_a_request_is_done_once_even_after_a_crash(tmp_path: Path) -> None:
     """Killed between doing and answering: done again, it changes nothing."""
-    work, campaign, store = guarded(tmp_path / "a")
+    work, campaign, store = supervised(tmp_path / "a")
     work.take(list(work.plan)[:1])
     (first,) = campaign.committed()
     request = control.ask(store, "again", campaign="tiny", trials=(first,), why="dust")
@@ -233,9 +238,9 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
 
     def night() -> None:
         with open_session(replace(wanted, until=500.0)) as work:
-            work.gate.clock = after(3)
-            work.session.rig.connect()
-            work.session.take(work.trials)
+            work.supervisor.clock = after(3)
+            work.collector.rig.connect()
+            work.collector.take(work.trials)
 
     with pytest.raises(WindowOver, match="the next collection continues"):
         night()
@@ -252,9 +257,9 @@ def test_a_pause_ends_with_its_window(tmp_path: Path) -> None:
     wanted = replace(crash.run_request(tmp_path, 2), until=500.0)
     with open_session(wanted) as work:
         control.ask(Store.open(wanted.store), "pause")
-        work.gate.clock, work.gate.wait = after(3), lambda seconds: None
+        work.supervisor.clock, work.supervisor.wait = after(3), lambda seconds: None
         with pytest.raises(WindowOver):
-            work.session.take(work.trials)
+            work.collector.take(work.trials)
     assert control.paused(Store.open(wanted.store)) is not None
 
 
@@ -264,11 +269,11 @@ def test_in_real_time_no_trial_is_begun_that_would_not_be_over(tmp_path: Path) -
     store = Store.create(tmp_path / "store")
     for rig, needed in ((mock.rig, 0.0), (loopback, None)):
         wanted = RunRequest(mock.plan, rig, text, store.folder, "c", (), until=500.0)
-        gate = TrialGate(wanted, store, describe_campaign(store, wanted))
+        supervisor = CollectionSupervisor(wanted, store, describe_campaign(store, wanted))
         trial = wanted.plan.trials[0]
         seconds = wanted.plan.seconds(trial) if needed is None else needed
-        gate.clock = lambda seconds=seconds: 499.9 - seconds
-        assert gate.may_take(trial)
-        gate.clock = lambda seconds=seconds: 500.1 - seconds
+        supervisor.clock = lambda seconds=seconds: 499.9 - seconds
+        assert supervisor.may_take(trial)
+        supervisor.clock = lambda seconds=seconds: 500.1 - seconds
         with pytest.raises(WindowOver, match=trial.id):
-            gate.may_take(trial)
+            supervisor.may_take(trial)
