@@ -78,7 +78,7 @@ def read_rig(path: Path) -> RigSource:
             break
         if not isinstance(parent, str) or "\0" in parent:
             raise InputError(here, KEY, parent, "must be the path of a rig file")
-        there = here.parent / parent
+        there = _parent_file(here, parent)
         if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:
             raise InputError(here, KEY, parent, "is circular, or a chain of more than 8 files")
         try:
@@ -94,6 +94,14 @@ def read_rig(path: Path) -> RigSource:
         text = f"# Merged: {names}\n" + rig_yaml(merged)
     written = {key: each for _, data in reversed(parts) for key, each in data.written.items()}
     return RigSource(path, Document(merged, written), text, tuple(parts))
+
+
+def _parent_file(here: Path, parent: str) -> Path:
+    """Return the file that `extends` names: a path from the file's folder, or a shipped rig."""
+    there = here.parent / parent
+    if there.exists():
+        return there
+    return shipped_rigs().get(parent.replace("-", "_"), there)
 
 
 def rig_yaml(data: dict[str, Any]) -> str:

@@ -64,6 +64,14 @@ def test_the_hash_follows_what_is_extended(base: Path) -> None:
     assert rig_hash(load_rig_file(path)[1]) != before
 
 
+def test_a_name_alone_is_a_rig_that_ships_unless_a_file_has_it(base: Path) -> None:
+    rig, _ = load_rig_file(child(base, "extends: rehearsal\nname: mine\n"))
+    assert (rig.name, rig.frame_source) == ("mine", "tracks")
+    (base / "rehearsal").write_text((base / "mock.yaml").read_text())
+    rig, _ = load_rig_file(child(base, "extends: rehearsal\nname: mine\n"))
+    assert rig.frame_source == "video"
+
+
 def test_a_file_that_extends_nothing_keeps_its_own_text(base: Path) -> None:
     assert load_rig_file(base / "mock.yaml")[1] == MOCK
 
