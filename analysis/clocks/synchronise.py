@@ -128,7 +128,7 @@ class TrialSync:
     Attributes:
         devices: what is known of ``events``, ``arm`` and ``frames``, and of ``streams``.
         refused: why a device has no clock.
-        pieces: of a device whose clock began anew within the trial, each piece by itself, or why
+        pieces: of a device whose clock restarted within the trial, each piece by itself, or why
             it could not be fitted; such a device is refused all the same.
         streams: names of the devices that are named streams, as a force sensor is.
     """

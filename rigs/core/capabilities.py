@@ -282,7 +282,7 @@ class ForceSensor(Protocol):
         """Forces and torques since the last call, sensor's axes and clock.
 
         Raises:
-            RigError: it fell silent, began anew, or says that its readings are not to be trusted.
+            RigError: it fell silent, restarted, or says that its readings are not to be trusted.
         """
 
     def zero(self) -> None:

@@ -677,7 +677,7 @@ def arm_fault(state: ArmState, phase: str) -> ArmFault:
     return ArmFault(
         "arm",
         f"{state.value} in the phase '{phase}'; {where}: {state.advice}, move "
-        "it clear of the plate, then run the same command to go on",
+        "it clear of the plate, then run the same command to resume",
     )
 
 

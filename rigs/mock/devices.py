@@ -53,7 +53,7 @@ def on_cable(device: T, name: Device, world: World) -> T:
             words = name.replace("_", " ")
             text = (
                 "does not answer (simulated fault); check its power and its cable, "
-                "then run the same command to go on"
+                "then run the same command to resume"
             )
             raise ArmFault(words, text) if name == "arm" else RigError(words, text)
 

@@ -129,7 +129,7 @@ class AtiNetFt:
         """Forces and torques since the last call, newtons and newton metres.
 
         Raises:
-            RigError: the sensor fell silent, began anew, or says that it cannot be trusted.
+            RigError: the sensor fell silent, restarted, or says that it cannot be trusted.
         """
         with self._lock:
             taken = list(self._waiting)
@@ -347,7 +347,7 @@ class AtiNetFt:
             return last
         if gone <= 0:
             self._fault = self._fault or (
-                "its sample counter stands still or fell back: it began anew; start the trial again"
+                "its sample counter stopped or fell back: it restarted; start the trial again"
             )
             return last
         self.counts.lost += max(step - 1, 0)

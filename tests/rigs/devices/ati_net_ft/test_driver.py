@@ -255,7 +255,7 @@ def test_a_sensor_that_begins_anew_is_a_fault(make: Make) -> None:
     sensor.start()
     gather(sensor, 5)
     fake.inject(Kind.RESTART)
-    assert "it began anew" in fault_of(sensor, 0.5)
+    assert "it restarted" in fault_of(sensor, 0.5)
 
 
 def test_a_sensor_that_is_not_there_is_named_within_its_bound(make: Make) -> None:
