@@ -70,6 +70,15 @@ class Collected:
             if getattr(recording.record.counts, stream) == 0:
                 raise StoreError(f"campaign '{self.name}' was recorded without {stream}; {use}")
 
+    @property
+    def missing_stream(self) -> str | None:
+        """``events`` or ``frames``, whichever its trials were recorded without; else None."""
+        for _, recording in self.trials[:1]:
+            counts = recording.record.counts
+            if not counts.events or not counts.frames:
+                return "frames" if counts.events else "events"
+        return None
+
     def of_split(self, split: str) -> Iterator[tuple[Trial, Recording]]:
         """Committed trials of one part of the split."""
         return ((trial, recording) for trial, recording in self.trials if trial.split == split)
@@ -100,6 +109,11 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
             )
     names = names or [name for name in campaigns if name not in imported]
     return [Collected(campaigns[name]) for name in names]
+
+
+def missing_stream(campaigns: list[Collected]) -> str | None:
+    """Return ``events`` or ``frames``, whichever some campaign was recorded without; else None."""
+    return next((item.missing_stream for item in campaigns if item.missing_stream), None)
 
 
 def training_campaigns(campaigns: list[Collected]) -> list[Collected]:

@@ -6,12 +6,14 @@ Every figure is also written as `report/figures/NAME.svg`, its data as
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from prefect import flow
 
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.report import against as comparison
+from sliplab.analysis.report import one_camera
 from sliplab.analysis.report import report as content
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.sources import STEP, read_sources, report_folder, report_key
@@ -20,9 +22,11 @@ from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
 from sliplab.flows.steps import StepResult
+from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.files import write_json, write_text
-from sliplab.storage.schema.summary import Summary
+from sliplab.storage.files import read_json, write_json, write_text
+from sliplab.storage.schema.summary import OneCameraSummary, Summary
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -35,7 +39,10 @@ def report(store: Store, campaigns: list[Collected]) -> StepResult:
     Raises:
         StoreError: there is no evaluation of this version yet.
     """
-    key = report_key(store, campaigns)
+    if missing_stream(campaigns) is not None:
+        key = one_camera.one_camera_key(store, campaigns)
+    else:
+        key = report_key(store, campaigns)
     page = report_folder(store) / "index.html"
     stale = not Derived.of(store, STEP).fresh(STEP, key) or not page.exists()
     if stale:
@@ -51,14 +58,27 @@ def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with timed(store, "report"):
         planned = {item.name: _planned_bytes(item) for item in campaigns}
-        sources = read_sources(store, campaigns, planned, step_seconds(store))
-        summary = make_summary(sources)
-        sections = content.make_sections(sources, summary, content.read_shown(sources))
-        write_figures(folder, sections, simulated=summary.simulated)
-        write_text(folder / "index.html", content.render(sources, summary, sections))
-    final = {**summary.to_json(), "timing_s": step_seconds(store)}
-    write_json(folder / SUMMARY, final)
+        if missing_stream(campaigns) is not None:
+            shown = one_camera.one_camera_summary(store, campaigns, planned)
+            parts = one_camera.one_camera_sections(store, campaigns, shown)
+            write_figures(folder, parts, simulated=shown.simulated)
+            write_text(folder / "index.html", one_camera.render(campaigns, shown, parts))
+            numbers = shown.to_json()
+        else:
+            numbers = _two_cameras(store, campaigns, planned)
+    write_json(folder / SUMMARY, {**numbers, "timing_s": step_seconds(store)})
     Derived.of(store, STEP).write(STEP, key, {})
+
+
+def _two_cameras(store: Store, campaigns: list[Collected], planned: Mapping[str, int]) -> Json:
+    """Write the page, and return the numbers, of campaigns with events and frames."""
+    folder = report_folder(store)
+    sources = read_sources(store, campaigns, planned, step_seconds(store))
+    summary = make_summary(sources)
+    sections = content.make_sections(sources, summary, content.read_shown(sources))
+    write_figures(folder, sections, simulated=summary.simulated)
+    write_text(folder / "index.html", content.render(sources, summary, sections))
+    return summary.to_json()
 
 
 def _planned_bytes(item: Collected) -> int:
@@ -77,10 +97,18 @@ def against(store: Store, other: Path) -> tuple[comparison.Comparison, Path]:
     Raises:
         InputError: there is no such report.
     """
+    if read_one_camera(store) is not None:
+        raise InputError("STORE", "", str(store.folder), comparison.ONE_CAMERA)
     compared = comparison.compare(read_summary(store), comparison.load_other(other))
     path = report_folder(store) / comparison.PAGE
     write_text(path, comparison.render(compared, store.folder, other))
     return compared, path
+
+
+def read_one_camera(store: Store) -> OneCameraSummary | None:
+    """Read the numbers of the last report where it is on a rig with one camera; else None."""
+    path = report_folder(store) / SUMMARY
+    return OneCameraSummary.load(path) if "one_camera" in read_json(path) else None
 
 
 def read_summary(store: Store) -> Summary:

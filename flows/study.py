@@ -13,8 +13,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.campaigns import (
+    Collected,
+    collected,
+    missing_stream,
+    training_campaigns,
+)
 from sliplab.analysis.labels.label_errors import CHECK
+from sliplab.analysis.report.one_camera import reason_against
 from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.study_plan import PlannedCampaign, Search, StudyPlan
 from sliplab.analysis.sweeps.detector_grid import Axes
@@ -64,7 +70,8 @@ def study(
     """
     store = Store.create(run_requests[0].store)
     planned = study_plan(run_requests)
-    check = check if check_required(run_requests[0]) else 0
+    one_camera = len(run_requests[0].rig.cameras) == 1
+    check = check if check_required(run_requests[0]) and not one_camera else 0
     holdout = holdout if planned.slides and planned.slides[0].simulated else 0
     ledger = Ledger(store.folder, planned.expected(check, more, holdout))
     taken: list[CollectResult] = []
@@ -75,7 +82,12 @@ def study(
             on_done(taken[-1]["taken"])
     campaigns = collected(store, [run_request.campaign for run_request in run_requests])
 
+    missing = missing_stream(campaigns)
+
     def run(name: str, unit: str, work: Callable[[], StepDone]) -> None:
+        if (reason := reason_against(name, missing)) is not None:
+            ledger.leave_out(name, reason)
+            return
         with ledger.step(name, unit) as on_done:
             steps.append(work())
             on_done(steps[-1]["done"])

@@ -19,6 +19,7 @@ from sliplab.storage.files import read_json, write_json
 
 FILE = "study.json"
 TO_DO, RUNNING, STOPPED, DONE = "to do", "running", "stopped", "done"
+LEFT_OUT = "left out"
 LEAST, MOST = 0.2, 5.0
 """Limits of the pace: the seconds of the steps that are over, by the expected ones."""
 BELIEF_S = 60.0
@@ -31,7 +32,8 @@ class Row:
     """One step of a study.
 
     Attributes:
-        state: `TO_DO`, `RUNNING`, `STOPPED` (in the middle, to be continued) or `DONE`.
+        state: `TO_DO`, `RUNNING`, `STOPPED` (in the middle, to be continued), `DONE` or
+            `LEFT_OUT` (the note says why).
         seconds: taken so far, over all runs.
         expected_s: expected from nothing.
         note: its result in a few words.
@@ -92,6 +94,12 @@ class Ledger:
             spent = 0.0 if counted and not counted[-1] else self._clock() - began
             self._put(before, state=state, seconds=before.seconds + spent, note=note)
 
+    def leave_out(self, name: str, reason: str) -> None:
+        """Mark a step as one that cannot be done, with its reason."""
+        place = list(self._rows).index(name) + 1
+        console.say(f"[{place}/{len(self._rows)}] {name}: left out: {reason}")
+        self._put(self._rows[name], state=LEFT_OUT, note=reason)
+
     def left_s(self) -> float:
         """Return the seconds that the steps to do and to continue are likely to take."""
         over = [r for r in self._rows.values() if r.state == DONE and r.seconds > 0]
@@ -101,7 +109,7 @@ class Ledger:
         return sum(
             max(row.expected_s * pace - row.seconds, 0.0)
             for row in self._rows.values()
-            if row.state != DONE and row.name not in self._known
+            if row.state not in {DONE, LEFT_OUT} and row.name not in self._known
         )
 
     def _times(self) -> str:

@@ -128,6 +128,9 @@ class Comparison:
         }
 
 
+ONE_CAMERA = "is a report on a rig with one camera: there is no network to compare"
+
+
 def load_other(place: Path) -> Summary:
     """Read the summary of another report.
 
@@ -144,6 +147,8 @@ def load_other(place: Path) -> Summary:
         why = f"must be a store with a report, or its report/summary.json ({error})"
     except DocumentError as error:
         why = f"lacks what is compared ({error}); run `sliplab report` on it with this version"
+        if '"one_camera"' in path.read_text(encoding="utf-8", errors="replace"):
+            why = ONE_CAMERA
     except NewerFormat as error:
         why = str(error)
     raise InputError("--against", "", str(place), why) from None

@@ -16,7 +16,14 @@ from sliplab.analysis.report.figures import campaign as figures
 from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.protocols.factors import Level
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.schema.summary import Quality, References, ReferenceTrial, Summary, Trend
+from sliplab.storage.schema.summary import (
+    OneCameraSummary,
+    Quality,
+    References,
+    ReferenceTrial,
+    Summary,
+    Trend,
+)
 from sliplab.storage.schema.trial import Gate
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -50,7 +57,9 @@ class CollectedSection(Content):
         return [figure for *_, figure in self.grids]
 
 
-def collected_section(campaigns: Sequence[Collected], summary: Summary) -> CollectedSection:
+def collected_section(
+    campaigns: Sequence[Collected], summary: Summary | OneCameraSummary
+) -> CollectedSection:
     """Compare plans and committed trials."""
     grids = [grid for item in campaigns if (grid := _grid(item, summary.simulated)) is not None]
     rows = []
@@ -76,8 +85,10 @@ def tracks_words(simulated: bool) -> str:
     return "the camera's own tracks of the markers (no video was kept)"
 
 
-def source_words(summary: Summary) -> str:
+def source_words(summary: Summary | OneCameraSummary) -> str:
     """Return what the labels were read from."""
+    if summary.labels is None:
+        return "nothing, for this rig has no frame camera"
     words = {"video": "the video", "tracks": tracks_words(summary.simulated)}
     return " or ".join(words[name] for name, count in summary.labels.source.items() if count)
 
@@ -124,6 +135,8 @@ class QualitySection(Content):
     """
 
     template: ClassVar[str] = "quality.html"
+    stream: str
+    """The stream whose rate is drawn."""
     wear: Sequence[tuple[str, str, Trend]]
     over: Sequence[tuple[str, Figure]]
     references: Sequence[tuple[str, Figure]]
@@ -139,22 +152,24 @@ def quality_section(
 ) -> QualitySection:
     """Look at every campaign in the order in which it was taken."""
     taken = [item for item in campaigns if item.trials]
+    stream = "frames" if any(item.missing_stream == "events" for item in taken) else "events"
     return QualitySection(
+        stream,
         [
             (name, WEAR[key][0], trend)
             for name, found in references.items()
             for key, trend in found.wear.items()
         ],
-        [(item.name, _over_campaign(item, simulated)) for item in taken],
+        [(item.name, _over_campaign(item, stream, simulated)) for item in taken],
         [(name, _references(name, found.trials, simulated)) for name, found in references.items()],
         [table for item in taken for table in _gates(item)],
     )
 
 
-def _over_campaign(item: Collected, simulated: bool) -> Figure:
+def _over_campaign(item: Collected, stream: str, simulated: bool) -> Figure:
     numbers = [trial.index + 1 for trial, _ in item.trials]
     records = [recording.record for _, recording in item.trials]
-    rates = [record.counts.events / record.recorded_s for record in records]
+    rates = [getattr(record.counts, stream) / record.recorded_s for record in records]
     nearest = [_nearest(record.quality.gates) for record in records]
     places = {trial.id: trial.index + 1 for trial in item.plan}
     failed = Counter(
@@ -162,11 +177,11 @@ def _over_campaign(item: Collected, simulated: bool) -> Figure:
     )
     again = dict(sorted(failed.items()))
     shares = [share for share, _ in nearest]
-    svg = figures.over_campaign(numbers, rates, shares, again, simulated=simulated)
+    svg = figures.over_campaign(numbers, rates, shares, again, stream=stream, simulated=simulated)
     data: dict[str, Sequence[object]] = {
         "trial": [trial.id for trial, _ in item.trials],
         "place in the plan": numbers,
-        "events (1/s)": rates,
+        f"{stream} (1/s)": rates,
         "tightest gate": [name for _, name in nearest],
         "tightest gate (share of its limit)": shares,
         "failed attempts": [again.get(place, 0) for place in numbers],

@@ -13,7 +13,7 @@ from sliplab.analysis.report.figures.trials import label_uncertainty
 from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.storage.schema.evaluation import Coverage, LabelCheck, RuleErrors
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
-from sliplab.storage.schema.summary import Hold, Summary
+from sliplab.storage.schema.summary import Hold, OneCameraSummary, Summary
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -49,7 +49,7 @@ class LabelSection(Content):
 def label_section(
     store: Store,
     campaigns: Sequence[Collected],
-    summary: Summary,
+    summary: Summary | OneCameraSummary,
     distances: Mapping[str, Mapping[str, Sequence[float]]],
 ) -> LabelSection | None:
     """Compare the labels; None where nothing is labelled by both rules.
@@ -57,7 +57,9 @@ def label_section(
     Args:
         distances: of each trial's onset from the truth, ms, by rule and onset.
     """
-    rules, labels = summary.labels.rules_ms, summary.labels
+    if (labels := summary.labels) is None:
+        return None
+    rules = labels.rules_ms
     if not rules.apart.incipient.n:
         return None
     known = rules.paper.incipient.n > 0

@@ -22,6 +22,7 @@ from sliplab.storage.schema.evaluation import (
 )
 from sliplab.storage.schema.summary import (
     Difference,
+    Hashes,
     Paper,
     Planned,
     Quality,
@@ -41,6 +42,19 @@ _WINDOWS = (
     "reliability", "calibration", "by_factor", "by_tenth", "no_slip", "by_trial", "work", "beside",
 )  # fmt: skip
 """Keys that the summary takes over from the evaluation's windows; docs/metrics.md."""
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that figures depend on."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+def protocol_hashes(campaigns: Sequence[Collected]) -> dict[str, Hashes]:
+    """Return the hashes of the campaigns' protocols."""
+    return {
+        item.name: Hashes(collection=item.plan.collection_hash, analysis=item.plan.analysis_hash)
+        for item in campaigns
+    }
 
 
 def make_summary(sources: Sources) -> Summary:
@@ -74,7 +88,7 @@ def make_summary(sources: Sources) -> Summary:
         "labels": {
             "error_ms": evaluation.label_error_ms,
             "rules_ms": evaluation.label_rules_ms,
-            "source": _sources(campaigns),
+            "source": label_sources(campaigns),
             "reviewed": evaluation.reviewed,
             "check": sources.label_check,
             "holds": sources.holds,
@@ -84,18 +98,13 @@ def make_summary(sources: Sources) -> Summary:
         "detectors": evaluation.detectors,
         "holdout": holdout,
         "sync": sync_part(campaigns),
-        "quality": _quality(campaigns),
+        "quality": quality_part(campaigns),
         "planned": {
-            item.name: _planned(item, sources.planned_bytes[item.name]) for item in campaigns
+            item.name: planned_part(item, sources.planned_bytes[item.name]) for item in campaigns
         },
         "timing_s": sources.step_seconds,
-        "versions": {name: version(name) for name in _PACKAGES},
-        "protocols": {
-            item.name: {
-                "collection": item.plan.collection_hash, "analysis": item.plan.analysis_hash
-            }
-            for item in campaigns
-        },
+        "versions": package_versions(),
+        "protocols": protocol_hashes(campaigns),
         "seeds": {
             "network": sources.settings.training.seeds,
             "chosen": evaluation.seed,
@@ -178,7 +187,7 @@ def _in_words(value: Any) -> str:
             return str(value)
 
 
-def _sources(campaigns: Sequence[Collected]) -> dict[str, int]:
+def label_sources(campaigns: Sequence[Collected]) -> dict[str, int]:
     """Count trials with a video, and with tracks in its place."""
     found = Counter(recording.frame_source for item in campaigns for _, recording in item.trials)
     return {name: found[name] for name in ("video", "tracks")}
@@ -204,7 +213,8 @@ def sync_part(campaigns: Sequence[Collected]) -> Sync:
     )
 
 
-def _quality(campaigns: Sequence[Collected]) -> Quality:
+def quality_part(campaigns: Sequence[Collected]) -> Quality:
+    """Count trials and attempts of all campaigns."""
     quarantined = [known for item in campaigns for known in item.campaign.quarantined()]
     broken_off = sum(known["cause"] == "interrupted" for known in quarantined)
     return Quality(
@@ -216,7 +226,7 @@ def _quality(campaigns: Sequence[Collected]) -> Quality:
     )
 
 
-def _planned(item: Collected, planned_bytes: int) -> Planned:
+def planned_part(item: Collected, planned_bytes: int) -> Planned:
     """Compare the plan's seconds and bytes with what the committed trials really took."""
     return Planned(
         seconds=sum(item.plan.seconds(trial) for trial, _ in item.trials),

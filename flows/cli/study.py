@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,9 @@ from sliplab.flows.cli.common import JsonOption, RigOption
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.flows.study_defaults import HELD_OUT, LABELS_CHECKED, study_protocols
+
+if TYPE_CHECKING:
+    from sliplab.storage.schema.summary import OneCameraSummary, Summary
 
 app = typer.Typer()
 
@@ -113,13 +116,15 @@ def _chain(
     run_requests = [make_request(file, rig, folder, enable=on) for file, on in protocols.items()]
     check_disk(run_requests)
     prepare_store(folder)
-    from sliplab.flows.report import read_summary
+    from sliplab.flows.report import read_one_camera, read_summary
     from sliplab.flows.study import searches
     from sliplab.flows.study import study as run
     from sliplab.storage.trials.store import Store
 
     outcome = run(run_requests, check, searches(run_requests) if more else (), holdout)
-    summary = read_summary(Store.open(folder))
+    store = Store.open(folder)
+    one_camera = read_one_camera(store)
+    summary = read_summary(store) if one_camera is None else one_camera
     page = folder / "report" / "index.html"
     if as_json:
         console.print_json(
@@ -132,16 +137,26 @@ def _chain(
             }
         )
         return
-    from sliplab.analysis.report.report import headline
     from sliplab.flows.study_ledger import print_rows
 
     print_rows(outcome.rows)
     simulated = " (simulated)" if summary.simulated else ""
+    console.print_table(f"Results{simulated}", ["figure", "value", "note"], _results(summary))
+    console.show(f"Report{simulated}: {page.resolve()}")
+
+
+def _results(summary: Summary | OneCameraSummary) -> list[list[str]]:
+    """Return the rows of the table of results."""
+    from sliplab.analysis.report import one_camera
+    from sliplab.analysis.report.report import headline
+    from sliplab.storage.schema.summary import Summary
+
+    if not isinstance(summary, Summary):
+        return [[item.name, item.value, item.note] for item in one_camera.headline(summary)]
     rows = [[item.name, item.value, item.note] for item in headline(summary)]
     for name, value in summary.kinematic.baselines.items():
         shown = "-" if value is None else f"{100 * value:.1f} %"
         rows.append([f"baseline: {name.replace('_', ' ')}", shown, "argmax, same windows"])
     argmax = summary.kinematic.accuracy.argmax
     rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
-    console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
-    console.show(f"Report{simulated}: {page.resolve()}")
+    return rows

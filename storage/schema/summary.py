@@ -298,6 +298,43 @@ class SeedsUsed(Part):
     collection: dict[str, Int]
 
 
+class StepLeftOut(Part):
+    """An analysis that a rig with one camera cannot have."""
+
+    name: str
+    reason: str
+
+
+class MotionRate(Part):
+    """Event rate of a campaign's trials, median over trials, events per second."""
+
+    trials: Int
+    hold: Number | None
+    motion: Number | None
+
+
+class OneCameraSummary(Document):
+    """The numbers of a report on a rig with one camera."""
+
+    simulated: Bool
+    one_camera: Literal["events", "frames"]
+    """The stream that was recorded."""
+    left_out: tuple[StepLeftOut, ...]
+    """Analyses that need the other stream."""
+    labels: Labels | None = None
+    """Null without frames."""
+    event_rates: dict[str, MotionRate] | None = None
+    """By campaign; null without events."""
+    clocks_us: dict[str, Number]
+    """Uncertainty of each device's own clock against the sync box, worst trial, microseconds."""
+    sync: Sync
+    quality: Quality
+    planned: dict[str, Planned]
+    timing_s: dict[str, Number] = Field(default_factory=dict)
+    versions: dict[str, str]
+    protocols: dict[str, Hashes]
+
+
 class Summary(Document):
     """A report's numbers."""
 

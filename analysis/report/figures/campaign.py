@@ -69,13 +69,15 @@ def over_campaign(
     used: Sequence[float],
     again: Mapping[int, int],
     *,
+    stream: str = "events",
     simulated: bool,
 ) -> str:
     """Event rate, the gate that was nearest to its limit, and attempts that failed; SVG.
 
     Args:
         numbers: places in the plan of the committed trials, from 1.
-        rates: events a second of each; used: share of a gate's limit, 0..1, of each.
+        rates: events or frames a second of each, as `stream` says.
+        used: share of a gate's limit, 0..1, of each.
         again: attempts that are in quarantine, by place in the plan.
     """
     with plt.rc_context(STYLE):
@@ -83,8 +85,9 @@ def over_campaign(
             3, 1, figsize=(WIDTH, 4.0), sharex=True, height_ratios=(2, 2, 1)
         )
         dots: dict[str, Any] = {"ms": 2.5, "mew": 0, "rasterized": len(numbers) >= DENSE}
-        top.plot(numbers, [rate / 1000 for rate in rates], "o", color=BLUE, **dots)
-        top.set_ylabel("events\n(thousand/s)")
+        unit, of = (1000, "(thousand/s)") if stream == "events" else (1, "(1/s)")
+        top.plot(numbers, [rate / unit for rate in rates], "o", color=BLUE, **dots)
+        top.set_ylabel(f"{stream}\n{of}")
         top.set_ylim(bottom=0)
         middle.plot(numbers, [100 * share for share in used], "o", color=GREEN, **dots)
         middle.axhline(100, color=RED, lw=0.9, ls="--", label="limit")
@@ -98,6 +101,30 @@ def over_campaign(
         if not again:
             low.annotate("none", (0.5, 0.5), xycoords="axes fraction", color=GREY, ha="center")
         low.set_xlabel("trial, in the plan's order")
+        return svg_text(figure, simulated)
+
+
+def rates_over_motion(
+    seconds: Array, curves: Mapping[str, tuple[Array, Array, Array]], *, simulated: bool
+) -> str:
+    """Event rate against the time from the motion's start, SVG.
+
+    Args:
+        seconds: (n,) middles of the intervals.
+        curves: by campaign, lower quartile, median and upper quartile over trials, events a second.
+    """
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(WIDTH, 2.8))
+        for colour, (name, (low, middle, high)) in zip(
+            (BLUE, ORANGE, GREEN) * len(curves), curves.items(), strict=False
+        ):
+            axes.fill_between(seconds, low / 1000, high / 1000, color=colour, alpha=0.2, lw=0)
+            axes.plot(seconds, middle / 1000, color=colour, label=name)
+        axes.axvline(0, color=GREY, lw=0.9, ls="--")
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel("time from the start of the motion (s)")
+        axes.set_ylabel("events\n(thousand/s)")
+        axes.legend(loc="upper right", fontsize=8)
         return svg_text(figure, simulated)
 
 

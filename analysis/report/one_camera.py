@@ -1,0 +1,284 @@
+"""The report on a rig with one camera: what can be said, and what needs the other camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.campaigns import Collected, missing_stream
+from sliplab.analysis.labels import label_errors
+from sliplab.analysis.labels.reviewed import Labels as KeptLabels
+from sliplab.analysis.report import clocks
+from sliplab.analysis.report.campaign import collected_section, quality_section
+from sliplab.analysis.report.figures.campaign import rates_over_motion
+from sliplab.analysis.report.labels import label_section
+from sliplab.analysis.report.page import Content, Figure, Number, Table, number, render_page
+from sliplab.analysis.report.sources import VERSION
+from sliplab.analysis.report.summary import (
+    label_sources,
+    package_versions,
+    planned_part,
+    protocol_hashes,
+    quality_part,
+    sync_part,
+)
+from sliplab.analysis.windows.dataset import recorded_span
+from sliplab.storage.schema.summary import Labels, MotionRate, OneCameraSummary, StepLeftOut
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
+
+F64 = npt.NDArray[np.float64]
+BEFORE_S, BIN_S = 1.0, 0.1
+"""Drawn time before the motion, and the interval over which a rate is taken."""
+CAN_BE_DONE = {
+    "events": {"sync", "label", "report"},
+    "frames": {"sync", "report"},
+}
+"""Steps after collection that need nothing of the missing stream."""
+NO_EVENTS = "the network is trained on windows of events, and there are none"
+NO_FRAMES = "needs labels, which are read from frames"
+NO_LABEL = "a label is the displacement of the markers in frames, and there are none"
+
+
+def reason_against(step: str, missing: str | None) -> str | None:
+    """Return why a step cannot be done without a stream; None where it can.
+
+    Args:
+        missing: ``events`` or ``frames``; None where both were recorded.
+    """
+    if missing is None or step in CAN_BE_DONE[missing]:
+        return None
+    if missing == "events":
+        return NO_EVENTS
+    return NO_LABEL if step == "label" else NO_FRAMES
+
+
+def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
+    """Return the key of all that the report is made of.
+
+    Raises:
+        StoreError: there are frames, and a trial has no label yet.
+    """
+    labels, inputs = KeptLabels(store), []
+    labelled = missing_stream(campaigns) == "events"
+    for item in campaigns:
+        for trial, recording in item.trials:
+            if labelled and not labels.fresh(item, recording):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            label = labels.key(item, recording) if labelled else None
+            inputs.append([item.name, trial.id, recording.checksum, label])
+    plans = [[item.plan.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
+    return make_key("report, one camera", VERSION, [inputs, plans], None)
+
+
+def one_camera_summary(
+    store: Store, campaigns: list[Collected], planned_bytes: Mapping[str, int]
+) -> OneCameraSummary:
+    """Make the summary.
+
+    Args:
+        planned_bytes: of the committed trials, by campaign.
+    """
+    missing = missing_stream(campaigns)
+    frames = missing == "events"
+    labels, rates = None, None
+    if frames:
+        labels = Labels(
+            error_ms=label_errors.label_errors(store, campaigns),
+            rules_ms=label_errors.rules_compared(store, campaigns),
+            source=label_sources(campaigns),
+            holds=label_errors.holds_compared(store, campaigns),
+        )
+    else:
+        rates = {item.name: _rate(item) for item in campaigns}
+    return OneCameraSummary(
+        simulated=store.simulated,
+        one_camera="frames" if frames else "events",
+        left_out=tuple(
+            StepLeftOut(name=name, reason=reason)
+            for name in ("label", "train", "evaluate")
+            if (reason := reason_against(name, missing)) is not None
+        ),
+        labels=labels,
+        event_rates=rates,
+        clocks_us=_clocks(campaigns),
+        sync=sync_part(campaigns),
+        quality=quality_part(campaigns),
+        planned={item.name: planned_part(item, planned_bytes[item.name]) for item in campaigns},
+        versions=package_versions(),
+        protocols=protocol_hashes(campaigns),
+    )
+
+
+def _clocks(campaigns: Sequence[Collected]) -> dict[str, float]:
+    """Return each clock's own uncertainty in the worst trial, microseconds."""
+    worst: dict[str, float] = {}
+    for item in campaigns:
+        for _, recording in item.trials:
+            for device, known in recording.clocks.devices().items():
+                if known.uncertainty_ns is not None:
+                    worst[device] = max(worst.get(device, 0.0), known.uncertainty_ns / 1e3)
+    return worst
+
+
+def headline(summary: OneCameraSummary) -> list[Number]:
+    """Return the numbers on top of the page."""
+    quality = summary.quality
+    found = [Number("trials committed", str(quality.committed), f"of {quality.planned} planned")]
+    if (labels := summary.labels) is not None:
+        both = labels.rules_ms.apart
+        found.append(
+            Number("labelled by both rules", str(both.gross.n), "trials with a known gross onset")
+        )
+    for name, rate in (summary.event_rates or {}).items():
+        found.append(
+            Number(
+                "events in the motion",
+                number(None if rate.motion is None else rate.motion / 1000, 1, "thousand/s"),
+                f"median of {rate.trials} trials of {name}",
+            )
+        )
+    if summary.one_camera == "events":
+        value, device = clocks.worst_clock(summary.sync)
+    else:
+        device = max(
+            summary.clocks_us, key=lambda name: summary.clocks_us[name], default="no clock"
+        )
+        value = number(summary.clocks_us.get(device), 1, "µs")
+    found.append(Number("clock uncertainty", value, f"worst trial, {device}"))
+    return found
+
+
+@dataclass(frozen=True)
+class LeftOutSection(Content):
+    """What this report does not show, and why."""
+
+    template: ClassVar[str] = "left_out.html"
+    camera: str
+    steps: Table
+
+
+@dataclass(frozen=True)
+class OwnClocks(Content):
+    """Clocks of devices, where there are no events to hold them against."""
+
+    template: ClassVar[str] = "own_clocks.html"
+    clocks: Table
+
+
+@dataclass(frozen=True)
+class RateSection(Content):
+    """Event rates in the hold and over the motion."""
+
+    template: ClassVar[str] = "rates.html"
+    figure: Figure
+    rates: Table
+
+
+def one_camera_sections(
+    store: Store, campaigns: list[Collected], summary: OneCameraSummary
+) -> list[Content]:
+    """Make all sections, in order."""
+    simulated = summary.simulated
+    rows = [[each.name, each.reason] for each in summary.left_out]
+    sections: list[Content | None] = [
+        LeftOutSection(summary.one_camera, Table(("step", "why it is left out"), rows)),
+        collected_section(campaigns, summary),
+        quality_section(campaigns, {}, simulated=simulated),
+    ]
+    if summary.labels is not None:
+        distances = label_errors.distances(store, campaigns)
+        sections.append(label_section(store, campaigns, summary, distances))
+    if summary.event_rates is not None:
+        sections.append(_rates(campaigns, summary.event_rates, simulated))
+    if summary.one_camera == "events":
+        page = (store.folder / "report" / clocks.PAGE).exists()
+        sections.append(
+            clocks.clock_section(campaigns, summary.sync, page=page, simulated=simulated)
+        )
+    else:
+        rows = [
+            [device, summary.sync.grades.get(device, "–"), number(uncertainty, 1)]
+            for device, uncertainty in summary.clocks_us.items()
+        ]
+        sections.append(OwnClocks(Table(("clock", "timed by", "uncertainty (µs)"), rows)))
+    return [section for section in sections if section is not None]
+
+
+def render(
+    campaigns: Sequence[Collected], summary: OneCameraSummary, sections: Sequence[Content]
+) -> str:
+    """Render the page."""
+    return render_page(
+        "report.html", sections, simulated=summary.simulated,
+        campaigns=[item.name for item in campaigns], headline=headline(summary),
+    )  # fmt: skip
+
+
+def _rates(
+    campaigns: Sequence[Collected], rates: Mapping[str, MotionRate], simulated: bool
+) -> RateSection:
+    """Draw the event rate around the motion's start."""
+    each = {item.name: [_binned(r) for _, r in item.trials] for item in campaigns if item.trials}
+    longest = max((len(rate) for found in each.values() for rate in found), default=0)
+    seconds = (np.arange(longest) + 0.5) * BIN_S - BEFORE_S
+    curves, data = {}, {"time from the start of the motion (s)": seconds.tolist()}
+    for name, found in each.items():
+        table = np.full((len(found), longest), np.nan)
+        for row, rate in zip(table, found, strict=True):
+            row[: len(rate)] = rate
+        # from where on most trials are over, the median would be of the slow ones alone
+        there = np.isfinite(table).mean(axis=0) >= 0.5
+        low, middle, high = np.full((3, longest), np.nan)
+        low[there], middle[there], high[there] = np.nanquantile(
+            table[:, there], (0.25, 0.5, 0.75), axis=0
+        )
+        curves[name] = (low, middle, high)
+        data[f"{name}: median (events/s)"] = [None if np.isnan(v) else v for v in middle.tolist()]
+    rows = [
+        [name, str(rate.trials), number(rate.hold, 0), number(rate.motion, 0)]
+        for name, rate in rates.items()
+    ]
+    return RateSection(
+        Figure(rates_over_motion(seconds, curves, simulated=simulated), "event-rates", data),
+        Table(("campaign", "trials", "in the hold (events/s)", "in the motion (events/s)"), rows),
+    )
+
+
+def _binned(recording: Recording) -> F64:
+    """Events a second from a second before the motion to its end, by tenths of a second."""
+    begin, end = recording.motion_ns
+    times = _times(recording)
+    first, width = begin - round(BEFORE_S * 1e9), round(BIN_S * 1e9)
+    bins = max((end - first) // width, 1)
+    edges = first + width * np.arange(bins + 1)
+    rate: F64 = np.diff(np.searchsorted(times, edges)) / BIN_S
+    rate[edges[:-1] < recorded_span(recording)[0]] = np.nan
+    return rate
+
+
+def _rate(item: Collected) -> MotionRate:
+    hold, motion = [], []
+    for _, recording in item.trials:
+        times, (begin, end) = _times(recording), recording.motion_ns
+        start = recorded_span(recording)[0]
+        before, middle, after = np.searchsorted(times, (start, begin, end)).tolist()
+        if begin > start:
+            hold.append((middle - before) / (begin - start) * 1e9)
+        motion.append((after - middle) / (end - begin) * 1e9)
+    return MotionRate(
+        trials=len(item.trials),
+        hold=float(np.median(hold)) if hold else None,
+        motion=float(np.median(motion)) if motion else None,
+    )
+
+
+def _times(recording: Recording) -> npt.NDArray[np.int64]:
+    """Times of all events on the time line, ns."""
+    times = recording.clock("events").to_reference(recording.events().t_us * 1000)
+    return np.asarray(times, np.int64)

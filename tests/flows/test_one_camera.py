@@ -1,0 +1,102 @@
+"""A study on a rig with one camera ends in a report that says what it cannot say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sliplab.analysis.report.one_camera import CAN_BE_DONE
+from sliplab.flows.planning.run_request import make_request
+from sliplab.flows.report import read_one_camera, report
+from sliplab.flows.study import Outcome, study
+from sliplab.flows.study_ledger import LEFT_OUT
+from sliplab.protocols.errors import InputError
+from sliplab.storage.trials.store import Store
+from tests.conftest import ROOT
+from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
+
+pytestmark = pytest.mark.programs
+
+
+def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
+    """Three slides and two plates, from protocol to report."""
+    rig = yaml.safe_load((ROOT / "rigs" / "rehearsal.yaml").read_text())
+    rig["extends"] = str(ROOT / "rigs" / rig["extends"])
+    slides = tiny()
+    slides["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
+    slides["analysis"]["split"] = {
+        "method": "leave_conditions_out",
+        "validation_levels": {"direction": ["120 deg"]},
+        "test_levels": {"direction": ["240 deg"]},
+    }
+    path = write(folder / "rig.yaml", {**rig, "name": f"one-{camera}", "cameras": [camera]})
+    protocols = [
+        write(folder / "tiny.yaml", slides),
+        write(folder / "tiny_gravity.yaml", tiny_gravity()),
+    ]
+    requests = [make_request(protocol, path, folder / "store") for protocol in protocols]
+    outcome = study(requests, check=2, holdout=3)
+    return Store.open(requests[0].store), outcome
+
+
+@pytest.mark.parametrize("camera", ["events", "frames"])
+def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path) -> None:
+    store, outcome = take(camera, tmp_path)
+    states = {row.name: (row.state, row.note) for row in outcome.rows}
+    missing = {"events": "frames", "frames": "events"}[camera]
+    for name, (state, note) in states.items():
+        possible = name.startswith("collect") or name in CAN_BE_DONE[missing]
+        assert (state == LEFT_OUT) != possible, name
+        if not possible:
+            assert missing in note
+    assert {"train", "evaluate", "holdout"} <= states.keys()
+
+    summary = read_one_camera(store)
+    assert summary is not None
+    assert (summary.simulated, summary.one_camera) == (True, camera)
+    assert summary.quality.committed == 5
+    assert (summary.labels is None) == (camera == "events")
+    assert (summary.event_rates is None) == (camera == "frames")
+    left_out = [each.name for each in summary.left_out]
+    page = (store.folder / "report" / "index.html").read_text()
+    assert "Every number and figure in this report is simulated." in page
+    assert "What this report leaves out" in page
+    if camera == "events":
+        assert left_out == ["label", "train", "evaluate"]
+        for rate in (summary.event_rates or {}).values():
+            assert rate.hold is not None
+            assert rate.motion is not None
+            assert rate.motion > rate.hold > 0
+        assert "Onsets of slip are read from the markers" in page
+        assert (store.folder / "report" / "figures" / "event-rates.svg").exists()
+    else:
+        assert left_out == ["train", "evaluate"]
+        assert summary.labels is not None
+        assert summary.labels.error_ms.incipient.n == 5
+        assert summary.labels.error_ms.incipient.max_abs is not None
+        assert summary.labels.error_ms.incipient.max_abs < 25
+        assert "Top: frames a second." in page
+    assert "spiking network and its detectors" in page or camera == "events"
+
+
+def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) -> None:
+    from sliplab.analysis.campaigns import collected
+
+    store, _ = take("events", tmp_path)
+    assert report(store, collected(store))["done"] == 0
+    before = summary_json(store)
+    (store.folder / "report" / "index.html").unlink()
+    assert report(store, collected(store))["done"] == 1
+    after = summary_json(store)
+    assert before.pop("timing_s").keys() == after.pop("timing_s").keys()
+    assert before == after
+
+
+def test_a_report_on_one_camera_is_not_compared(tmp_path: Path) -> None:
+    from sliplab.analysis.report.against import load_other
+
+    store, _ = take("events", tmp_path)
+    with pytest.raises(InputError, match="one camera"):
+        load_other(store.folder)
