@@ -17,7 +17,6 @@ from sliplab.analysis.campaigns import (
     Collected,
     collected,
     missing_stream,
-    training_campaigns,
 )
 from sliplab.analysis.labels.label_errors import CHECK
 from sliplab.analysis.report.one_camera import reason_against
@@ -39,10 +38,9 @@ from sliplab.flows.steps import StepDone
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.sync import sync
 from sliplab.flows.tradeoff_detector import tradeoff_detector
-from sliplab.flows.tradeoff_scene import tradeoff_scene
+from sliplab.flows.tradeoff_scene import search_scene
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
-from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
 SCENE_TRIALS = 4
@@ -143,22 +141,8 @@ def run_search(
     elif name == "guesses":
         done = measure_guesses(store, campaigns, names, TRIALS).measured
     elif name == "scene search":
-        done = _scene(store, campaigns)
+        done = search_scene(store, campaigns, SCENE_TRIALS)
     else:
         folder = (store.folder / FILES["detector"]).parent
         done = tradeoff_detector(store, campaigns, folder, SIZE, AXES)["made"]
     return {"step": name, "done": done}
-
-
-def _scene(store: Store, campaigns: list[Collected]) -> int:
-    """Measure the scene of the first campaign of slides, unless that was done as it is."""
-    item = training_campaigns(campaigns)[0]
-    path, kept = store.folder / FILES["scene"], Derived.of(store, "scene-search")
-    made_of = [item.plan.collection_hash, item.info["rig_hash"]]
-    key = make_key("scene search", 1, made_of, SCENE_TRIALS)
-    if path.exists() and kept.fresh("scene", key):
-        return 0
-    rig = item.campaign.folder / "rig.yaml"
-    tradeoff_scene(item.campaign.protocol_file, rig, path.parent, SCENE_TRIALS)
-    kept.write("scene", key, {"file": FILES["scene"]})
-    return 1

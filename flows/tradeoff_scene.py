@@ -12,7 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.report import tradeoff_scene as page
+from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.sweeps import sensitivity as assumed
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.analysis.sweeps.scene_tradeoff import (
@@ -31,6 +33,8 @@ from sliplab.protocols.plan import load_plan
 from sliplab.rigs.levels import at_level, choose_level
 from sliplab.rigs.rig_file import check_plan, load_rig_file
 from sliplab.storage.files import make_folder, write_json, write_text
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -131,3 +135,17 @@ def everywhere(
     task = orchestration.Opaque(("trade-off", work, jobs, keep, cluster))
     orchestration.run(parallel_map_flow, task, cluster)
     return [found[number] for number in range(len(jobs))]
+
+
+def search_scene(store: Store, campaigns: list[Collected], trials: int) -> int:
+    """Measure the scene of the first campaign of slides; return 0 if it had been done, else 1."""
+    item = training_campaigns(campaigns)[0]
+    path, kept = store.folder / FILES["scene"], Derived.of(store, "scene-search")
+    made_of = [item.plan.collection_hash, item.info["rig_hash"]]
+    key = make_key("scene search", 1, made_of, trials)
+    if path.exists() and kept.fresh("scene", key):
+        return 0
+    rig = item.campaign.folder / "rig.yaml"
+    tradeoff_scene(item.campaign.protocol_file, rig, path.parent, trials)
+    kept.write("scene", key, {"file": FILES["scene"]})
+    return 1

@@ -22,7 +22,7 @@ from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.flows.server.serving import LIMIT_S, Page, serving, until
 
-TRIALS = 20
+TRIALS = 40
 BIN = max(Path("/usr/lib/postgresql").glob("*/bin"), default=None)
 
 
