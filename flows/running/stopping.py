@@ -1,9 +1,9 @@
 """Reliable handling of Ctrl-C, SIGTERM and SIGHUP.
 
 Python delivers a signal as an exception wherever it happens to be. Inside a destructor or a weak
-reference's callback that exception is printed and dropped, and the program continues, which an arm
-must not. So the handler also raises a flag: the rig looks at it in every poll, progress bars at
-every step.
+reference's callback that exception is dropped, and the program continues, which an arm must not. So
+the handler also raises a flag: the rig looks at it in every poll, progress bars at every step. The
+trace that Python prints of a dropped one is left out: the request is kept.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -97,6 +98,13 @@ def signals() -> Iterator[None]:
         del before[signal.SIGHUP]
     if before[signal.SIGINT] is not _handle:  # a request stands until the outermost block ends
         _requested.clear()
+    hook = sys.unraisablehook
+
+    def unless_requested(dropped: sys.UnraisableHookArgs) -> None:
+        if not (_requested.is_set() and issubclass(dropped.exc_type, KeyboardInterrupt)):
+            hook(dropped)
+
+    sys.unraisablehook = unless_requested
     for number in before:
         signal.signal(number, _handle)
     try:
@@ -108,3 +116,4 @@ def signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        sys.unraisablehook = hook
