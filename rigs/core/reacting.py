@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
-from sliplab.protocols.program import ACTING, Move, Position, Program, Step, step_seconds
+from sliplab.protocols.program import ACTING, Move, Position, Program, Step
 from sliplab.rigs.core.capabilities import ArmFault
+from sliplab.rigs.core.force_watch import Course
 from sliplab.rigs.core.rig import Rig, arm_fault
 from sliplab.storage.streams import Sink
 
@@ -89,8 +90,9 @@ def run_watched(
     reaction: Reaction | None = None
     with rig.safely(program.home):
         rig.begin_trial(program.home, seed)
-        at, streaming = program.home, False
-        for index, step in enumerate(program.steps):
+        course, streaming = Course(program.home), False
+        for index, planned in enumerate(program.steps):
+            step = course.step(planned)
             if step.recorded and not streaming:
                 rig.start_streams(seed, rate_hz, False)
                 streaming = True
@@ -98,17 +100,17 @@ def run_watched(
                 rig.stop_streams(watcher, False)
                 streaming = False
             if reaction is not None:
-                step = _from_current_position(step, at)
+                step = _from_current_position(step, course.at)
             acting = isinstance(step, Move) and step.phase in ACTING and reflex is not None
             watcher.step(step.phase, acting)
             watcher.armed = acting
             try:
-                rig.take_step(index, step, at, watcher if streaming else None)
-                at = step_seconds(step, at)[1]
+                rig.take_step(index, step, course.at, watcher if streaming else None)
+                course.taken(step, rig.position)
             except SlipDetected:
                 assert reflex is not None
                 reaction = _react(rig, step.phase, reflex, watcher)
-                at = rig.position()
+                course.at = rig.position()
             finally:
                 watcher.armed = False
     return reaction

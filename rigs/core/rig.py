@@ -13,8 +13,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from sliplab.protocols.motion import UNTWIST_DEG_S
 from sliplab.protocols.program import (
     ACTING,
@@ -24,9 +22,9 @@ from sliplab.protocols.program import (
     Program,
     Step,
     Twist,
-    step_seconds,
 )
 from sliplab.protocols.timing import Timing
+from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.capabilities import (
     Arm,
     ArmFault,
@@ -44,20 +42,18 @@ from sliplab.rigs.core.capabilities import (
     SyncBox,
     Truth,
 )
-from sliplab.rigs.core.plate_frame import PlateFrame, Vector
+from sliplab.rigs.core.force_watch import Course, ForceWatch
+from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.touching import POLL_S, QUIET_S, RateTouch, count_central
-from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes, WrenchChunk
+from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """Default time for which cameras are read after the last pulse."""
 FORCE = "force"
 """Name of the force sensor's stream."""
-FORCE_POLL_S = 0.02
-"""Interval at which forces are read, s: what a limit, or the end of a press, may come late."""
-_RECENT_NS = 10_000_000
 _MOVE_GRACE_S = 10.0
 _STOP_RETRIES = 10
 """Attempts at a stop that Ctrl-C interrupts."""
@@ -125,6 +121,8 @@ class Rig:
     on_close: tuple[Callable[[], None], ...] = ()
     _streaming: EventCamera | None = field(default=None, init=False)
     """The event camera while it is recorded."""
+    _forces: ForceWatch | None = field(default=None, init=False)
+    """Forces while they are watched, whether or not they are recorded."""
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _twisted: bool = field(default=False, init=False)
@@ -150,11 +148,6 @@ class Rig:
         """Return arm, cameras, sync box and sensor, as far as the rig has them, the arm first."""
         found = (self.arm, self.event_camera, self.frame_camera, self.sync, self.force)
         return [device for device in found if device is not None]
-
-    _watching: bool = field(default=False, init=False)
-    """Forces are read, whether or not they are recorded."""
-    _normal_n: float = field(default=0.0, init=False)
-    _to_plate: Vector = field(default_factory=lambda: np.eye(3), init=False)
 
     def connect(self) -> None:
         """Connect sync box, arm and force sensor; cameras connect on construction.
@@ -238,12 +231,12 @@ class Rig:
             self.begin_trial(program.home, seed)
             if self.simulation is not None:
                 sink = self.simulation.sink(sink)
-            self._watch_forces()
+            if self.force is not None:
+                self._watch_forces()
             steps, path = [], []
-            at, recording, reference = program.home, False, 0
-            shallower, pressed = 0.0, None
+            course, recording, reference = Course(program.home), False, 0
             for index, planned in enumerate(program.steps):
-                step = _less_deep(planned, shallower)
+                step, began = course.step(planned), course.at
                 if step.recorded and not recording:
                     self.start_streams(seed, rate_hz, frame_px is not None, with_events)
                     recording = True
@@ -252,49 +245,25 @@ class Rig:
                     recording = False
                 if step.phase in ACTING and not reference:
                     reference = self.arm.now_ns()
-                times = self.take_step(index, step, at, sink if recording else None)
+                times = self.take_step(index, step, began, sink if recording else None)
                 steps.append((times, step.recorded))
-                began, at = at, step_seconds(step, at)[1]
-                if isinstance(step, Move) and step.until_force_n is not None:
-                    pressed = self.position().depth_mm
-                    shallower, at = step.to.depth_mm - pressed, replace(at, depth_mm=pressed)
+                course.taken(step, self.position)
                 if step.recorded:
                     speed = step.speed_mm_s if isinstance(step, Move) else 0.0
-                    path.append(self._segment(times, began, at, speed))
+                    path.append(self._segment(times, began, course.at, speed))
             truth = None
             if self.simulation is not None:
                 hold = next(times.start_ns for times, kept in steps if kept)
                 truth = self.simulation.truth(reference, hold)
-            return TrialRun(tuple(steps), self.plate_frame.zero_mm, truth, tuple(path), pressed)
+            return TrialRun(
+                tuple(steps), self.plate_frame.zero_mm, truth, tuple(path), course.pressed_mm
+            )
 
-    def _watch_forces(self) -> None:
+    def _watch_forces(self) -> ForceWatch:
         """Read forces from now on, and hold them against the limit."""
-        if self.force is None:
-            return
-        self._to_plate = np.array(self.plate_frame.force_matrix(self.force.mounting))
-        self.force.start()
-        self._watching, self._normal_n = True, 0.0
-
-    def _read_forces(self) -> WrenchChunk:
-        """Read the force sensor, and hold what it says against the limit.
-
-        Raises:
-            RigError: the limit is exceeded, or the sensor is at fault.
-        """
         assert self.force is not None
-        chunk = self.force.read()
-        if self._watching and len(chunk):
-            forces = chunk.force_n @ self._to_plate.T
-            recent = chunk.t_ns > chunk.t_ns[-1] - _RECENT_NS
-            self._normal_n = float(forces[recent, 2].mean())
-            most = float(np.linalg.norm(forces, axis=1).max())
-            if self.force_limit_n is not None and most > self.force_limit_n:
-                raise RigError(
-                    "force sensor",
-                    f"{most:.2f} N on the plate, above limits.force = {self.force_limit_n:g} N of "
-                    "the rig; the arm was stopped: press less, or see what it touches",
-                )
-        return chunk
+        self._forces = ForceWatch(self.force, self.plate_frame, self.force_limit_n)
+        return self._forces
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm up the skin: press at the plate's centre and release, `times` times."""
@@ -381,7 +350,7 @@ class Rig:
         """
         start = self.arm.now_ns()
         if isinstance(step, Move) and step.until_force_n is not None:
-            end = self._press_to_force(step, step.until_force_n, at)
+            start, end = self._press_to_force(step, step.until_force_n, at)
             return StepTimes(index, step.phase, start, end)
         if isinstance(step, Move):
             start, end = self.move(step, at, sink)
@@ -411,8 +380,8 @@ class Rig:
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         return self._follow(segment, seconds, step.phase, sink)
 
-    def _press_to_force(self, step: Move, force_n: float, at: Position) -> int:
-        """Press until the normal force is reached, and stop; return the controller's time, ns.
+    def _press_to_force(self, step: Move, force_n: float, at: Position) -> tuple[int, int]:
+        """Press until the normal force is reached, and stop; return controller times, ns.
 
         Raises:
             StopRequested, ArmFault: as `move`.
@@ -420,25 +389,17 @@ class Rig:
         """
         if self.force is None:
             raise RigError("force sensor", f"this rig has none to press to {force_n:g} N")
+        forces = self._forces or self._watch_forces()
         seconds = at.distance_mm(step.to) / step.speed_mm_s
-        self.arm.start([Segment(self.plate_frame.pose(step.to), step.speed_mm_s)])
-        deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
-        while not (progress := self.arm.progress()).done:
-            if not progress.state.healthy:
-                raise arm_fault(progress.state, step.phase)
-            if self.clock.now_ns() > deadline:
-                raise ArmFault("arm", f"did not finish the phase '{step.phase}' in time")
-            self.wait(FORCE_POLL_S)
-            if self._normal_n >= force_n:
-                self.arm.stop()
-                return self.arm.now_ns()
-        if not progress.state.healthy:
-            raise arm_fault(progress.state, step.phase)
-        raise RigError(
-            "force sensor",
-            f"reads {self._normal_n:.2f} N at the deepest place, {step.to.depth_mm:g} mm, not the "
-            f"{force_n:g} N to press to; allow more depth, or ask for less force",
-        )
+        segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
+        times = self._follow(segment, seconds, step.phase, None, lambda: forces.normal_n >= force_n)
+        if forces.normal_n < force_n:
+            raise RigError(
+                "force sensor",
+                f"reads {forces.normal_n:.2f} N at the deepest place, {step.to.depth_mm:g} mm, not "
+                f"the {force_n:g} N to press to; allow more depth, or ask for less force",
+            )
+        return times
 
     def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Turn about the plate's normal on the spot; as `move`."""
@@ -447,9 +408,17 @@ class Rig:
         return self._follow(segment, seconds, step.phase, sink)
 
     def _follow(
-        self, segment: Segment, seconds: float, phase: str, sink: Sink | None
+        self,
+        segment: Segment,
+        seconds: float,
+        phase: str,
+        sink: Sink | None,
+        until: Callable[[], bool] | None = None,
     ) -> tuple[int, int]:
-        """Send one segment of known duration, and wait for its end."""
+        """Send one segment of known duration, and wait for its end, or stop once `until` is true.
+
+        What `until` looks at is read every `force_watch.POLL_S`.
+        """
         start = self.arm.now_ns()
         if seconds == 0:
             return start, start
@@ -460,8 +429,12 @@ class Rig:
                 raise arm_fault(progress.state, phase)
             if self.clock.now_ns() > deadline:
                 raise ArmFault("arm", f"did not finish the phase '{phase}' in time")
+            if until is not None and until():
+                self.arm.stop()
+                return start, self.arm.now_ns()
             left = seconds - (self.arm.now_ns() - start) / 1e9
-            self.wait(min(self.poll_s, max(left, 1e-3)), sink)
+            most = self.poll_s if until is None else force_watch.POLL_S
+            self.wait(min(most, max(left, 1e-3)), sink)
         if not progress.state.healthy:
             raise arm_fault(progress.state, phase)
         if not progress.finished:
@@ -484,13 +457,13 @@ class Rig:
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
         """Let time pass; forces are read meanwhile, where there are any."""
-        if not self._watching:
+        if self._forces is None:
             self.clock.wait(seconds)
             return
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
-            self.clock.wait(min(FORCE_POLL_S, left / 1e9))
-            forces = self._read_forces()
+            self.clock.wait(min(force_watch.POLL_S, left / 1e9))
+            forces = self._forces.read()
             if sink is not None:
                 sink.add_stream(FORCE, forces)
 
@@ -526,7 +499,7 @@ class Rig:
             self._streaming.stop()
             sink.add_event_pulses(self._streaming.read_pulses())
         if self.force is not None:
-            self._watching = False
+            self._forces = None
             self.force.stop()
             sink.add_stream(FORCE, self.force.read())
         if with_frames:
@@ -548,8 +521,8 @@ class Rig:
             sink.add_box_reads(self.sync.read_clock())
         if self.timing.frames == "device time stamps" and self.frame_camera is not None:
             sink.add_frame_camera_reads(self.frame_camera.read_clock())
-        if self.force is not None:
-            sink.add_stream(FORCE, self._read_forces())
+        if (forces := self._forces or self.force) is not None:
+            sink.add_stream(FORCE, forces.read())
 
     def begin_trial(self, home: Position, seed: int) -> None:
         """Move to the start position, then let the simulation draw its random values.
@@ -588,7 +561,7 @@ class Rig:
         try:
             yield
         except BaseException as error:
-            self._watching = False
+            self._forces = None
             fault: RigError | None = None
             try:
                 fault = self._stop_arm() or self._retract(clear)
@@ -661,13 +634,6 @@ class Rig:
         except BaseException:
             self._stop_arm()
             raise
-
-
-def _less_deep(step: Step, by_mm: float) -> Step:
-    """Return a step whose place, where it is in contact, is less deep than planned."""
-    if not by_mm or not isinstance(step, Move | Twist) or step.to.depth_mm <= 0:
-        return step
-    return replace(step, to=replace(step.to, depth_mm=step.to.depth_mm - by_mm))
 
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:

@@ -23,9 +23,11 @@ from sliplab.protocols.settings import Labelling
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.reacting import run_watched
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
+from sliplab.storage.streams import NullSink, WrenchChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -298,6 +300,42 @@ def test_a_plan_presses_to_a_force_in_place_of_a_depth(tmp_path: Path) -> None:
         held = poses[(poses[:, 0] >= slide[0]) & (poses[:, 0] <= slide[1])]
         assert held[:, 1] == pytest.approx(figures["pressed_mm"], abs=0.02)
     assert 1.0 < depths[1.0] < depths[2.0] < 4.0
+
+
+class Watch(NullSink):
+    """A watcher that keeps the forces and never asks for a reflex."""
+
+    armed = False
+
+    def __init__(self) -> None:
+        self.forces: list[WrenchChunk] = []
+
+    def step(self, phase: str, acting: bool) -> None:
+        """A step begins."""
+
+    def add_stream(self, name: str, chunk: WrenchChunk) -> None:
+        self.forces.append(chunk)
+
+
+def test_a_watched_trial_presses_to_its_force_and_stays_as_deep(tmp_path: Path) -> None:
+    """Live detection runs a program without a recording; the rule of a press is the same."""
+    work, _ = session(tmp_path / "a", to_force(), TIMING, force={}, frame_camera=TRACKS)
+    rig, trial = work.rig, work.plan.trials[0]
+    level = float(work.plan.describe(trial)["load"].split()[0])
+    sent: list[float] = []
+    start = rig.arm.start
+
+    def started(path: Any) -> None:
+        sent.append(rig.plate_frame.position(path[0].to.xyz_mm).depth_mm)
+        start(path)
+
+    rig.arm.start = started  # type: ignore[method-assign]
+    watch = Watch()
+    run_watched(rig, work.plan.program(trial), watch, 1, 100, None)
+    held = np.concatenate([chunk.force_n[:, 2] for chunk in watch.forces[:20]])
+    assert abs(np.abs(held).mean() - level) < 0.25 * level
+    press = sent.index(max(sent))  # sent to its deepest place, and stopped
+    assert 0 < sent[press + 1] < sent[press] - 0.2
 
 
 def depth_of_poses(work: TrialCollector, recording: Recording) -> np.ndarray:
