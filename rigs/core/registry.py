@@ -17,10 +17,11 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, TypeVar
 
 from sliplab.rigs.core.driver import Driver
 
+DriverT = TypeVar("DriverT", bound=Driver[Any])
 GROUP = "sliplab.drivers"
 BUILT_IN = {
     "ur": "sliplab.rigs.devices.ur:DRIVER",
@@ -74,7 +75,7 @@ def taken() -> list[str]:
     ]
 
 
-def find_driver(name: str, kind: str) -> Driver[Any]:
+def find_driver(name: str, kind: type[DriverT]) -> DriverT:
     """Return a driver by name, importing the package that provides it.
 
     Raises:
@@ -84,16 +85,16 @@ def find_driver(name: str, kind: str) -> Driver[Any]:
     if name not in known:
         raise DriverError(_unknown(name, kind))
     driver = load_driver(known[name])
-    if driver.kind != kind:
-        raise DriverError(f"is the driver of a kind of {driver.kind}, not of {kind}")
+    if not isinstance(driver, kind):
+        raise DriverError(f"is the driver of a kind of {driver.kind}, not of {kind.kind}")
     return driver
 
 
-def _unknown(name: str, kind: str) -> str:
+def _unknown(name: str, kind: type[Driver[Any]]) -> str:
     names, broken = [], []
     for item in listed().values():
         try:
-            if load_driver(item).kind == kind:
+            if isinstance(load_driver(item), kind):
                 names.append(item.name)
         except DriverError as error:
             broken.append(str(error))
@@ -124,12 +125,12 @@ def load_driver(item: Listed) -> Driver[Any]:
     return driver
 
 
-def drivers(kind: str) -> Iterator[Driver[Any]]:
+def drivers(kind: type[DriverT]) -> Iterator[DriverT]:
     """Iterate over the importable drivers of a kind, shipped ones first."""
     for item in listed().values():
         try:
             driver = load_driver(item)
         except DriverError:
             continue
-        if driver.kind == kind:
+        if isinstance(driver, kind):
             yield driver

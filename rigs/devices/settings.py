@@ -29,10 +29,20 @@ from sliplab.rigs.core.registry import DriverError, drivers, find_driver
 register_tags_of("source", "usb", "network")
 
 
+_KINDS: dict[str, type[Driver[Any]]] = {
+    "arm": ArmDriver,
+    "event_camera": EventCameraDriver,
+    "frame_camera": FrameCameraDriver,
+    "sync_box": SyncBoxDriver,
+    "force_sensor": ForceSensorDriver,
+}
+"""Kinds of drivers, by the key of the device in a rig file."""
+
+
 class _OfKind:
     """Settings of any installed driver of a kind; `driver` selects the model of the other keys."""
 
-    def __init__(self, kind: str, default: str | None = None) -> None:
+    def __init__(self, kind: type[Driver[Any]], default: str | None = None) -> None:
         self._kind, self._default = kind, default
 
     def read(self, value: Any) -> DriverSettings:
@@ -84,63 +94,53 @@ class OperatedPlate(StrictModel):
 class DeviceSettings(StrictModel):
     """The `devices:` section of a rig file."""
 
-    arm: Annotated[BaseArmSettings, _OfKind("arm")]
-    event_camera: Annotated[DriverSettings, _OfKind("event camera", "dvxplorer")] | None = Field(
+    arm: Annotated[BaseArmSettings, _OfKind(ArmDriver)]
+    event_camera: Annotated[DriverSettings, _OfKind(EventCameraDriver, "dvxplorer")] | None = Field(
         default={"driver": "dvxplorer"}, validate_default=True
     )
     """null where the rig's `cameras` has no `events`."""
-    frame_camera: Annotated[FrameCameraSettings, _OfKind("frame camera", "basler")] | None = None
+    frame_camera: Annotated[FrameCameraSettings, _OfKind(FrameCameraDriver, "basler")] | None = None
     """Left out where the rig's `cameras` has no `frames`."""
-    sync_box: Annotated[DriverSettings, _OfKind("sync box", "sync_box")] | None = None
+    sync_box: Annotated[DriverSettings, _OfKind(SyncBoxDriver, "sync_box")] | None = None
     """Required by a real rig; a loopback rig has its own."""
-    force_sensor: Annotated[DriverSettings, _OfKind("force sensor")] | None = None
+    force_sensor: Annotated[DriverSettings, _OfKind(ForceSensorDriver)] | None = None
     """If left out, the rig has no force sensor."""
     plate: OperatedPlate | None = None
     """If left out, the rig has no sliding plate, and supports only kinematic protocols."""
 
     def drivers(self) -> Iterator[tuple[Driver[Any], DriverSettings]]:
-        """Iterate over the driver and settings of every device, the arm first."""
-        for kind in ("arm", "event camera", "frame camera", "sync box", "force sensor"):
-            settings = getattr(self, kind.replace(" ", "_"))
+        """The driver of every device, with its settings, the arm first."""
+        for role, kind in _KINDS.items():
+            settings = getattr(self, role)
             if settings is not None:
                 yield find_driver(settings.driver, kind), settings
 
     @property
     def arm_driver(self) -> ArmDriver[Any]:
         """The driver of the arm."""
-        found = find_driver(self.arm.driver, "arm")
-        assert isinstance(found, ArmDriver)
-        return found
+        return find_driver(self.arm.driver, ArmDriver)
 
     @property
     def event_camera_driver(self) -> EventCameraDriver[Any]:
         """The driver of the event camera."""
         assert self.event_camera is not None
-        found = find_driver(self.event_camera.driver, "event camera")
-        assert isinstance(found, EventCameraDriver)
-        return found
+        return find_driver(self.event_camera.driver, EventCameraDriver)
 
     @property
     def frame_camera_driver(self) -> FrameCameraDriver[Any]:
         """The driver of the frame camera."""
         assert self.frame_camera is not None
-        found = find_driver(self.frame_camera.driver, "frame camera")
-        assert isinstance(found, FrameCameraDriver)
-        return found
+        return find_driver(self.frame_camera.driver, FrameCameraDriver)
 
     @property
     def sync_box_driver(self) -> SyncBoxDriver[Any]:
         """The driver of the sync box."""
         name = "sync_box" if self.sync_box is None else self.sync_box.driver
-        found = find_driver(name, "sync box")
-        assert isinstance(found, SyncBoxDriver)
-        return found
+        return find_driver(name, SyncBoxDriver)
 
     @property
     def force_sensor_driver(self) -> ForceSensorDriver[Any] | None:
         """The driver of the force sensor, if the rig has one."""
         if self.force_sensor is None:
             return None
-        found = find_driver(self.force_sensor.driver, "force sensor")
-        assert isinstance(found, ForceSensorDriver)
-        return found
+        return find_driver(self.force_sensor.driver, ForceSensorDriver)

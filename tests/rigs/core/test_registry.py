@@ -12,6 +12,7 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import validate
 from sliplab.rigs.core import registry
+from sliplab.rigs.core.driver import ArmDriver, EventCameraDriver
 from sliplab.rigs.core.registry import DriverError, find_driver, listed
 from sliplab.rigs.devices.settings import DeviceSettings
 
@@ -124,7 +125,7 @@ def test_a_package_that_fails_is_named_in_one_line(
 ) -> None:
     install("lab_broken", code, point)
     with pytest.raises(DriverError) as caught:
-        find_driver("broken", "event camera")
+        find_driver("broken", EventCameraDriver)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
     # all others are there, and whoever looks for one that is not hears of it
@@ -135,5 +136,5 @@ def test_a_package_that_fails_is_named_in_one_line(
 
 def test_the_name_of_a_driver_that_ships_is_not_taken(install: Install) -> None:
     install("lab_ur", CAMERA.format(name="ur"), "ur = lab_ur:DRIVER")
-    assert find_driver("ur", "arm").title == "Universal Robots"
+    assert find_driver("ur", ArmDriver).title == "Universal Robots"
     assert registry.taken() == ["ur of lab_ur 1.2 is not used: sliplab has a driver of that name"]
