@@ -266,3 +266,55 @@ class FakeController(ABC):
     def moving(self) -> bool:
         """Return whether the tool centre point is moving now."""
         return self.motion.moving(self.clock.now_s())
+
+
+class ServedController(FakeController):
+    """A fake controller whose connections are served in one background loop.
+
+    A subclass opens its ports in `_listen`, which may be called again after a cut, and makes a
+    fault happen in `_inject`; both run in the loop.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        motion: StraightMotion | None = None,
+        clock: ControllerClock | None = None,
+        rate: float = 1.0,
+    ) -> None:
+        super().__init__(host, motion, clock, rate)
+        self._connections = Connections()
+        self._thread: LoopThread | None = None
+
+    def start(self) -> None:
+        """Open the ports and run. Raises OSError if one of them is taken."""
+        self._thread = LoopThread(f"fake {self.host}")
+        try:
+            self._thread.call(self._listen)
+        except OSError:
+            self._thread.close()
+            raise
+
+    def close(self) -> None:
+        """Close every connection and release the ports."""
+        if self._thread is not None:
+            self._thread.call(self._connections.cut)
+            self._thread.close()
+            self._thread = None
+
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now. Raises ValueError: this controller does not simulate it."""
+        self._inside(lambda: self._inject(kind))
+
+    @abstractmethod
+    def _listen(self) -> None:
+        """Accept connections at every port."""
+
+    @abstractmethod
+    def _inject(self, kind: Kind) -> None:
+        """Inject a fault, in the loop. Raises ValueError for one that is not simulated."""
+
+    def _inside(self, function: Callable[[], None]) -> None:
+        """Run a function between two of the loop's own steps."""
+        assert self._thread is not None
+        self._thread.call(function)

@@ -290,7 +290,7 @@ class LabStage(ThreadedArm):
                     self._take(line.decode("ascii"))
             self._lose("the controller closed the connection")
         except TimeoutError:
-            self._lose(f"nothing was heard for {SILENCE_S:g} s")
+            self._lose(f"no line came for {SILENCE_S:g} s")
         except (OSError, ValueError) as error:
             self._lose(str(error))
 

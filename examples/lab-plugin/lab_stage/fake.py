@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
-from sliplab.rigs.core.fakes import Connections, FakeController, Kind, LoopThread
+from sliplab.rigs.core.fakes import Kind, ServedController
 
 ACCELERATION_MM_S2 = 500.0
 POSES_HZ = 500
@@ -20,7 +20,7 @@ STATES = {
 }
 
 
-class FakeLabStage(FakeController):
+class FakeLabStage(ServedController):
     """One fake controller.
 
     Args:
@@ -41,35 +41,13 @@ class FakeLabStage(FakeController):
         self.port, self._sync = port, sync
         self._stopped, self._silent = "", False
         self._back_s = 0.0
-        self._connections = Connections()
-        self._thread: LoopThread | None = None
         self._client: asyncio.StreamWriter | None = None
-
-    def start(self) -> None:
-        """Open the port and run. Raises OSError if it is taken."""
-        self._thread = LoopThread(f"fake {self.host}")
-        self._thread.call(self._listen)
-
-    def close(self) -> None:
-        """Cut every connection and give the port back."""
-        if self._thread is not None:
-            self._thread.call(self._connections.cut)
-            self._thread.close()
-            self._thread = None
-
-    def inject(self, kind: Kind) -> None:
-        """Make something go wrong now. Raises ValueError: this controller cannot show it."""
-        assert self._thread is not None
-        if kind not in {*STATES, Kind.LINK_CUT, Kind.SILENCE, Kind.CLOCK_BACK}:
-            raise ValueError(f"{kind.value} is nothing that this controller tells")
-        self._thread.call(lambda: self._inject(kind))
 
     def restore(self) -> None:
         """Put link and safety right, as a person would."""
-        assert self._thread is not None
-        self._thread.call(self._connections.cut)
+        self._inside(self._connections.cut)
         self._stopped, self._silent = "", False
-        self._thread.call(self._listen)
+        self._inside(self._listen)
 
     def _listen(self) -> None:
         self._connections.listen(self.host, self.port, self._talk)
@@ -81,6 +59,8 @@ class FakeLabStage(FakeController):
             self._silent = True
         elif kind is Kind.CLOCK_BACK:
             self._back_s += 5.0
+        elif kind not in STATES:
+            raise ValueError(f"{kind.value} is not simulated: this controller does not report it")
         else:
             self._stopped = STATES[kind]
             self._halt()

@@ -16,12 +16,10 @@ from collections.abc import Sequence
 from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
 from sliplab.rigs.core.fakes import (
-    Connections,
-    FakeController,
     Fault,
     FaultPlan,
     Kind,
-    LoopThread,
+    ServedController,
     Stage,
 )
 from sliplab.rigs.core.pose import distance_mm, from_quaternion, quaternion
@@ -34,7 +32,7 @@ _POLL_S = 0.001
 _DONE, _REFUSED = b"\x00\x01", b"\x00\x00"
 
 
-class FakeRapidServer(FakeController):
+class FakeRapidServer(ServedController):
     """One fake server.
 
     Args:
@@ -64,39 +62,18 @@ class FakeRapidServer(FakeController):
         self._speed_mm_s = 10.0
         self._zone_mm = 0.0
         self._stopped = self._silent = False
-        self._connections = Connections()
-        self._thread: LoopThread | None = None
         self._turn: asyncio.Lock | None = None
-
-    def start(self) -> None:
-        """Open the port and run. Raises OSError if it is taken."""
-        self._thread = LoopThread(f"fake {self.host}")
-        self._thread.call(self._listen)
-
-    def close(self) -> None:
-        """Close every connection and release the port."""
-        if self._thread is not None:
-            self._thread.call(self._connections.cut)
-            self._thread.close()
-            self._thread = None
-
-    def inject(self, kind: Kind) -> None:
-        """Inject a fault now."""
-        assert self._thread is not None
-        self._thread.call(lambda: self._inject(kind))
 
     def drop_connections(self) -> None:
         """Close the open connections; new ones are accepted."""
-        assert self._thread is not None
-        self._thread.call(self._connections.cut)
-        self._thread.call(self._listen)
+        self._inside(self._connections.cut)
+        self._inside(self._listen)
 
     def restore(self) -> None:
         """Clear every fault of connection and safety, as an operator would."""
-        assert self._thread is not None
-        self._thread.call(self._connections.cut)
+        self._inside(self._connections.cut)
         self._stopped = self._silent = False
-        self._thread.call(self._listen)
+        self._inside(self._listen)
 
     def _listen(self) -> None:
         self._turn = asyncio.Lock()

@@ -284,7 +284,7 @@ class UrArm(ThreadedArm):
                 and would wait in vain for an arm without power.
         """
 
-        def has_program() -> bool:  # a program that was just told to end takes a cycle or two
+        def has_program() -> bool:  # ending a program takes a cycle or two
             return self._status is not None and self._status.program
 
         state = self.state()

@@ -19,11 +19,9 @@ from dataclasses import dataclass, field
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
 from sliplab.rigs.core.fakes import (
     PACKETS_LOST,
-    Connections,
-    FakeController,
     Fault,
     Kind,
-    LoopThread,
+    ServedController,
     Stage,
 )
 from sliplab.rigs.devices.ur.fake_program import Safety, UrProgram
@@ -165,11 +163,11 @@ _STALL_S = 0.02
 """Delay of the fake itself above which its watchdog is postponed, s."""
 
 
-class FakeUr(FakeController):
+class FakeUr(ServedController):
     """One fake robot.
 
     Args:
-        host, motion, rate, clock: as in `FakeController`.
+        host, motion, rate, clock: as in `ServedController`.
         cycle_hz: controller cycles per controller second; 500 on the real controller.
         digital_inputs: levels of the digital inputs by controller time in seconds.
         faults: faults to inject.
@@ -196,31 +194,13 @@ class FakeUr(FakeController):
         )
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []
-        self._connections = Connections()
         self._silent = self._cut_off = False
         self._unsent = 0
-        self._thread: LoopThread | None = None
 
     def start(self) -> None:
         """Open the ports and run. Raises OSError if one of them is taken."""
-        self._thread = LoopThread(f"fake {self.host}")
-        try:
-            self._thread.call(self._listen)
-        except OSError:
-            self._thread.close()
-            raise
-        self._thread.call(self._tick)
-
-    def close(self) -> None:
-        """Close every connection and release the ports."""
-        if self._thread is not None:
-            self._thread.call(self._connections.cut)
-            self._thread.close()
-            self._thread = None
-
-    def inject(self, kind: Kind) -> None:
-        """Inject a fault now."""
-        self._inside(lambda: self.program.inject(kind))
+        super().start()
+        self._inside(self._tick)
 
     def plan(self, fault: Fault) -> None:
         """Inject a fault when its stage is reached."""
@@ -228,10 +208,9 @@ class FakeUr(FakeController):
 
     def restore_link(self) -> None:
         """Accept connections again after the link was cut or went silent."""
-        assert self._thread is not None
-        self._thread.call(self._connections.cut)
+        self._inside(self._connections.cut)
         self._silent = self._cut_off = False
-        self._thread.call(self._listen)
+        self._inside(self._listen)
 
     def restore(self) -> None:
         """Clear every fault of power, safety, remote control and link, as an operator would."""
@@ -257,9 +236,8 @@ class FakeUr(FakeController):
         """Unlock a protective stop, or release an emergency or safeguard stop, at the pendant."""
         self._inside(lambda: setattr(self.program, "safety", Safety.NORMAL))
 
-    def _inside(self, function: Callable[[], None]) -> None:
-        assert self._thread is not None
-        self._thread.call(function)
+    def _inject(self, kind: Kind) -> None:
+        self.program.inject(kind)
 
     def _cut(self, kind: Kind) -> None:
         if kind is Kind.SILENCE:
