@@ -63,7 +63,7 @@ def hold_and_slide(
     devices.events.stop()
     parts.append(devices.events.read())
     devices.sync.stop()
-    return _joined(parts)
+    return EventChunk.joined(parts)
 
 
 @cache
@@ -96,14 +96,4 @@ def _go(devices: MockDevices, x_mm: float, depth_mm: float, speed: float) -> Non
 
 def _nothing(devices: MockDevices) -> EventChunk:
     devices.world.advance()
-    empty = np.empty(0, np.uint16)
-    return EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))
-
-
-def _joined(parts: list[EventChunk]) -> EventChunk:
-    return EventChunk(
-        np.concatenate([part.x for part in parts]),
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([part.p for part in parts]),
-        np.concatenate([part.t_us for part in parts]),
-    )
+    return EventChunk.empty()

@@ -78,11 +78,7 @@ class _Memory(NullSink):
 
     def joined(self) -> EventChunk:
         """Return all events in one chunk."""
-        columns = (
-            np.concatenate([getattr(chunk, name) for chunk in self.events])
-            for name in ("x", "y", "p", "t_us")
-        )
-        return EventChunk(*columns)
+        return EventChunk.joined(self.events)
 
 
 def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:

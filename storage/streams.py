@@ -7,6 +7,7 @@ later (docs/decisions/0002). All times are int64.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -35,6 +36,22 @@ class EventChunk:
 
     def __len__(self) -> int:
         return len(self.t_us)
+
+    @staticmethod
+    def empty() -> EventChunk:
+        """Return a chunk without events."""
+        none = np.empty(0, np.uint16)
+        return EventChunk(none, none, np.empty(0, np.uint8), np.empty(0, np.int64))
+
+    @staticmethod
+    def joined(parts: Sequence[EventChunk]) -> EventChunk:
+        """Return chunks that follow each other in time as one; a single one is not copied."""
+        if len(parts) == 1:
+            return parts[0]
+        if not parts:
+            return EventChunk.empty()
+        names = ("x", "y", "p", "t_us")
+        return EventChunk(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ class MockEventCamera:
         done_ns = world.advance()
         loads = self._loads
         if loads is None:
-            return _no_events()
+            return EventChunk.empty()
         # complete and unsent data, in whole blocks of the global grid
         last_ns = done_ns
         if self._running:
@@ -139,7 +139,7 @@ class MockEventCamera:
         if sent_ns < last_ns:
             last_ns = sent_ns - sent_ns % self._sensor.optics.block_ns
         if last_ns <= self._next_ns:
-            return _no_events()
+            return EventChunk.empty()
         row_ns, rows = loads.between(self._next_ns, last_ns)
         t_ns, x, y, p = self._sensor.sense(self._on_skin(row_ns, rows), row_ns)
         t_ns, x, y, p = self._bursts.into(
@@ -186,8 +186,3 @@ class MockEventCamera:
     def close(self) -> None:
         """Close the device."""
         self.stop()
-
-
-def _no_events() -> EventChunk:
-    empty = np.empty(0, np.uint16)
-    return EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))

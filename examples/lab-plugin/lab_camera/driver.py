@@ -78,14 +78,7 @@ class LabCamera:
         with self._changed:
             parts, self._events, self._held = self._events, [], 0
             self._check(news=bool(parts))
-        if not parts:
-            return EventChunk(*(np.empty(0, kind) for kind in ("u2", "u2", "u1", "i8")))
-        return EventChunk(
-            np.concatenate([part.x for part in parts]),
-            np.concatenate([part.y for part in parts]),
-            np.concatenate([part.p for part in parts]),
-            np.concatenate([part.t_us for part in parts]),
-        )
+        return EventChunk.joined(parts)
 
     def read_pulses(self) -> PulseChunk:
         """Return the sync pulses since the last call, camera clock in ns. Raises as `read`."""

@@ -2,7 +2,7 @@
 
 The camera greets with `GREETING`: a magic word, columns and rows, serial number. ``+`` starts the
 stream and ``-`` stops it; each is answered by a packet in the stream, so that what belongs to a run
-can be told from what came before it. A packet is `HEAD` and as many items: a kind and a count.
+can be distinguished from earlier data. A packet is `HEAD` and as many items: a kind and a count.
 """
 
 from __future__ import annotations

@@ -171,16 +171,7 @@ class DvxplorerCamera:
             parts, self._events, self._held = self._events, [], 0
             if not parts:
                 self._check()
-        if len(parts) == 1:
-            return parts[0]
-        empty = np.empty(0, np.uint16)
-        parts = parts or [EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))]
-        return EventChunk(
-            np.concatenate([part.x for part in parts]),
-            np.concatenate([part.y for part in parts]),
-            np.concatenate([part.p for part in parts]),
-            np.concatenate([part.t_us for part in parts]),
-        )
+        return EventChunk.joined(parts)
 
     def read_pulses(self) -> PulseChunk:
         """Return the pulses since the last call, camera clock in ns. Raises RigError as `read`."""

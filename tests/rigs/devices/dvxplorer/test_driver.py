@@ -62,11 +62,7 @@ def all_of(
     until(done)
     chunks.append(camera.read())
     pulses.append(camera.read_pulses().t_ns)
-    whole = EventChunk(
-        *(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in "xyp"),
-        np.concatenate([chunk.t_us for chunk in chunks]),
-    )
-    return whole, np.concatenate(pulses), sent
+    return EventChunk.joined(chunks), np.concatenate(pulses), sent
 
 
 def test_nothing_is_lost_and_all_is_exact(until: Until) -> None:
