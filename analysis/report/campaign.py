@@ -202,6 +202,13 @@ def _nearest(gates: Mapping[str, Gate]) -> tuple[float, str]:
     return max(shares, default=(0.0, ""))
 
 
+def _in_units(gate: str, *values: float) -> list[str]:
+    """Return a gate's name and figures as people read them: seconds in milliseconds."""
+    if gate.endswith("_s"):
+        gate, values = f"{gate.removesuffix('_s')}_ms", tuple(1e3 * value for value in values)
+    return [gate, *(f"{value:,.0f}" if value >= 1e3 else f"{value:.3g}" for value in values)]
+
+
 def _gates(item: Collected) -> list[Table]:
     """List the worst committed trial of every gate, and why attempts are in quarantine."""
     worst: dict[str, tuple[float, float, str]] = {}
@@ -212,7 +219,9 @@ def _gates(item: Collected) -> list[Table]:
                 continue
             if name not in worst or value > worst[name][0]:
                 worst[name] = (value, limit, trial.id)
-    rows = [[name, f"{limit:g}", f"{value:.3g}", of] for name, (value, limit, of) in worst.items()]
+    rows = [
+        [*_in_units(name, limit, value), trial] for name, (value, limit, trial) in worst.items()
+    ]
     caption = f"Campaign {item.name}: the committed trial that came nearest to each gate."
     found = [Table(("gate", "limit", "worst", "trial"), rows, caption)]
     causes = Counter(str(known["cause"]) for known in item.campaign.quarantined())

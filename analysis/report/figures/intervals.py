@@ -84,6 +84,12 @@ def by_condition(
             axes.set_xlabel(panel.label)
             axes.set_ylim(len(rows) - 0.5, -0.5)
             axes.set_xlim(*_room(panel))
+            if not any(len(panel.values.get(row, ())) for row in rows):
+                axes.set_xticks([])  # no scale is read where nothing is drawn
+                axes.annotate(
+                    "none", (0.5, 0.5), xycoords="axes fraction", fontsize=8, color=GREY,
+                    ha="center", va="center", backgroundcolor="white",
+                )  # fmt: skip
         grid[0][0].set_yticks(range(len(rows)), list(rows))
         return svg_text(figure, simulated)
 
