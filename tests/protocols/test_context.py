@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from sliplab.protocols import InputError, Plan, load_plan
+from sliplab.protocols import InputError, load_plan
 from tests.conftest import ROOT, SMALL
+from tests.protocols.planning import plan_of
 
 SKIN: dict[str, Any] = {"values": ["smooth", "ridged"], "changeover": "person"}
 ROOM: dict[str, Any] = {"unit": "degC", "values": [21, 35.5], "changeover": "person"}
@@ -23,12 +23,6 @@ def with_context(**context: Any) -> dict[str, Any]:
     data["collection"]["factors"]["direction"]["values"] = [0, 180]
     data["collection"]["context"] = context
     return data
-
-
-def plan_of(data: dict[str, Any], folder: Path, *enable: str) -> Plan:
-    path = folder / "protocol.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
-    return load_plan(path, enable)
 
 
 def test_context_is_part_of_the_factorial_and_of_ids(tmp_path: Path) -> None:

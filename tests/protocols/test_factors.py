@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.protocols import InputError, Plan, load_plan
+from sliplab.protocols import load_plan
 from tests.conftest import ROOT, SMALL
+from tests.protocols.planning import plan_of, refused
 
 GRAVITY: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot_gravity.yaml").read_text())
 DISTURBANCE: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "disturbance.yaml").read_text())
@@ -51,18 +52,6 @@ def varied(
     collection["motion"][place][field] = "$extra"
     collection["limits"]["duration"] = "200 s"
     return data
-
-
-def plan_of(data: dict[str, Any], folder: Path) -> Plan:
-    path = folder / "protocol.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
-    return load_plan(path)
-
-
-def refused(data: dict[str, Any], folder: Path) -> InputError:
-    with pytest.raises(InputError) as caught:
-        plan_of(data, folder)
-    return caught.value
 
 
 @pytest.mark.parametrize(("source", "place", "field", "unit", "levels", "wrong"), FIELDS)

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.protocols import Dwell, InputError, Move, Plan, Position, load_plan
+from sliplab.protocols import Dwell, Move, Position, load_plan
 from sliplab.protocols.templates import templates, written_out
 from tests.conftest import ROOT, SMALL
+from tests.protocols.planning import plan_of, refused
 
 KINEMATIC = {
     "template": "kinematic", "depth": "$depth", "distance": "9 mm", "speed": "$speed",
@@ -27,18 +28,6 @@ def small(motion: Any, *unused: str) -> dict[str, Any]:
         del data["collection"]["factors"][name]
     data["analysis"]["split"].pop("strata")
     return data
-
-
-def plan_of(data: dict[str, Any], folder: Path) -> Plan:
-    path = folder / "protocol.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
-    return load_plan(path)
-
-
-def refused(data: dict[str, Any], folder: Path) -> InputError:
-    with pytest.raises(InputError) as caught:
-        plan_of(data, folder)
-    return caught.value
 
 
 @pytest.mark.parametrize("name", ["kinematic", "gravity", "disturbance"])

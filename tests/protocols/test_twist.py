@@ -11,20 +11,19 @@ import yaml
 
 from sliplab.protocols import Dwell, InputError, Move, Plan, Position, Twist, load_plan
 from tests.conftest import ROOT
+from tests.protocols.planning import plan_of
 
 PRESS_TWIST: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "press_twist.yaml").read_text())
 
 
-def plan_of(folder: Path, **change: Any) -> Plan:
+def changed(folder: Path, **change: Any) -> Plan:
     """The shipped protocol with other parts of its collection."""
     data = copy.deepcopy(PRESS_TWIST)
     for key, value in change.items():
         known = data["collection"].get(key)
         both = isinstance(known, dict) and isinstance(value, dict)
         data["collection"][key] = {**known, **value} if both else value
-    path = folder / "protocol.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
-    return load_plan(path)
+    return plan_of(data, folder)
 
 
 def test_a_twist_turns_on_the_spot_and_back_where_it_is_clear() -> None:
@@ -52,7 +51,7 @@ def test_a_place_that_is_not_twisted_reads_as_ever() -> None:
 def test_opposite_angles_are_two_conditions(tmp_path: Path) -> None:
     """Two directions that differ by a full turn are one; two twists are not."""
     limits, angles = {"twist": "200 deg"}, {"angle": {"unit": "deg", "values": [-180, 180]}}
-    assert len(plan_of(tmp_path, limits=limits | {"duration": "100 s"}, factors=angles)) == 54
+    assert len(changed(tmp_path, limits=limits | {"duration": "100 s"}, factors=angles)) == 54
 
 
 @pytest.mark.parametrize(
@@ -72,7 +71,7 @@ def test_opposite_angles_are_two_conditions(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_a_wrong_twist_is_named(change: Any, key: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
-        plan_of(tmp_path, **change)
+        changed(tmp_path, **change)
     assert caught.value.key == key
     assert says in caught.value.expected
 
@@ -81,5 +80,5 @@ def test_twists_add_up_to_the_limit(tmp_path: Path) -> None:
     motion = load_plan(Path("press_twist")).protocol.collection.model_dump(mode="json")["motion"]
     motion.insert(4, dict(motion[3]))
     with pytest.raises(InputError, match="reaches a twist of -80 deg, over") as caught:
-        plan_of(tmp_path, motion=motion)
+        changed(tmp_path, motion=motion)
     assert caught.value.key == "collection.motion"

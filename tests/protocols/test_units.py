@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from sliplab.protocols import InputError, Plan, load_plan, units
+from sliplab.protocols import InputError, Plan, units
 from sliplab.protocols.quantity import parse
 from sliplab.protocols.units import TABLE, file_text, find_unit, symbols_of
 from tests.conftest import ROOT, SMALL
+from tests.protocols.planning import plan_of
 
 PRESSURE = '{"kPa": ("pressure", "1"), "Pa": ("pressure", "0.001"), "bar": ("pressure", "100")}'
 INCH = '{"inch": ("length", "25.4"), "inch/s": ("speed", "25.4")}'
@@ -49,13 +49,11 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return installed
 
 
-def plan_of(folder: Path, change: Any = None, enable: tuple[str, ...] = ()) -> Plan:
+def changed(folder: Path, change: Any = None, enable: tuple[str, ...] = ()) -> Plan:
     data = copy.deepcopy(SMALL)
     if change is not None:
         change(data["collection"])
-    path = folder / "protocol.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
-    return load_plan(path, enable)
+    return plan_of(data, folder, *enable)
 
 
 def test_every_unit_has_a_dimension_and_an_exact_factor() -> None:
@@ -89,13 +87,13 @@ def test_a_factor_may_be_in_any_unit_of_its_dimension(tmp_path: Path) -> None:
             "unit": "mm/s", "range": {"from": 0.6, "to": 1.6, "step": 1}, "optional": [1],
         }  # fmt: skip
 
-    same = plan_of(tmp_path, in_millimetres)
-    plan = plan_of(tmp_path, in_micrometres)
+    same = changed(tmp_path, in_millimetres)
+    plan = changed(tmp_path, in_micrometres)
     assert list(plan) == list(same)
     assert plan.collection_hash == same.collection_hash
     assert "depth=2.4mm,direction=0deg,speed=0.6mmps,r=1" in {trial.id for trial in plan}
-    more = plan_of(tmp_path, in_micrometres, ("speed=0.1cm/s",))
-    assert list(more) == list(plan_of(tmp_path, in_millimetres, ("speed=1",)))
+    more = changed(tmp_path, in_micrometres, ("speed=0.1cm/s",))
+    assert list(more) == list(changed(tmp_path, in_millimetres, ("speed=1",)))
 
 
 def test_a_reference_condition_is_in_the_unit_of_its_factor(tmp_path: Path) -> None:
@@ -105,7 +103,7 @@ def test_a_reference_condition_is_in_the_unit_of_its_factor(tmp_path: Path) -> N
         in_micrometres(collection)
         collection["references"] = {"every": 10, "condition": condition}
 
-    reference = plan_of(tmp_path, change).trials[0]
+    reference = changed(tmp_path, change).trials[0]
     assert reference.id == "reference,depth=2.8mm,direction=0deg,speed=1.6mmps,r=1"
 
 
@@ -114,7 +112,7 @@ def test_a_level_in_another_unit_is_held_against_the_limits(tmp_path: Path) -> N
         collection["factors"]["depth"] = {"unit": "um", "values": [2400, 3700]}
 
     with pytest.raises(InputError, match=r"3\.7 mm: exceeds collection\.limits\.depth") as caught:
-        plan_of(tmp_path, change)
+        changed(tmp_path, change)
     assert caught.value.key == "collection.factors.depth.values[1]"
 
 
@@ -127,7 +125,7 @@ def test_a_package_brings_units_and_a_dimension(install: Any, tmp_path: Path) ->
         collection["motion"][1]["speed"] = "0.1 inch/s"
         collection["context"] = {"air": {"unit": "bar", "values": [1, 1.5]}}
 
-    plan = plan_of(tmp_path, change)
+    plan = changed(tmp_path, change)
     assert {dict(trial.condition)["depth"] for trial in plan} == {Decimal("2.54")}
     assert {plan.describe(trial)["air"] for trial in plan} == {"100 kPa", "150 kPa"}
     assert "air=150kPa,depth=2.54mm,direction=0deg,speed=0.6mmps,r=1" in {t.id for t in plan}
@@ -141,7 +139,7 @@ def test_nothing_is_imported_until_a_unit_is_unknown(
     install: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(f"UNITS = {INCH}\n", name="inches")
-    plan_of(tmp_path)
+    changed(tmp_path)
     assert parse("2400 um", "mm") == Decimal("2.4")
     assert "inches" not in sys.modules
     assert find_unit("inch") is not None
@@ -174,7 +172,7 @@ def test_a_broken_package_is_named_in_one_line(
         collection["factors"]["depth"] = {"unit": "furlong", "values": [1]}
 
     with pytest.raises(InputError) as caught:
-        plan_of(tmp_path, change)
+        changed(tmp_path, change)
     assert caught.value.key == "collection.factors.depth.unit"
     assert "must be one of" in caught.value.expected
     assert "the units of lab_units 1.0 cannot be used: " in caught.value.expected
@@ -184,7 +182,7 @@ def test_a_broken_package_is_named_in_one_line(
     def sound(collection: dict[str, Any]) -> None:
         collection["factors"]["depth"] = {"unit": "inch", "values": [0.1]}
 
-    assert len(plan_of(tmp_path, sound)) == 12
+    assert len(changed(tmp_path, sound)) == 12
 
 
 def test_two_packages_may_not_disagree(install: Any, tmp_path: Path) -> None:
