@@ -1,6 +1,6 @@
 """From the command `sliplab collect` to the first motion of a mock rig.
 
-Run as a module it is the command line, but for one thing: when the arm is told to move for the
+Run as a module it is the command line, but for one thing: when the arm is commanded to move for the
 first time it says when that was, and ends.
 """
 
@@ -36,7 +36,7 @@ def startup_seconds(runs: int, protocol: str = "pilot", rig: str = "mock") -> Se
                 command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, timeout=LIMIT_S
             )
             if not done.stdout.strip().isdigit():
-                raise RuntimeError(f"the arm was never told to move ({done.returncode})")
+                raise RuntimeError(f"the arm was never commanded to move ({done.returncode})")
             if number:
                 taken.append((int(done.stdout) - began) / 1e9)
     return taken
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def _moved(*motion: object, **options: object) -> None:
-    """The arm was told to move."""
+    """The arm was commanded to move."""
     os.write(1, f"{time.monotonic_ns()}\n".encode())
     os._exit(0)
 

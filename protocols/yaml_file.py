@@ -468,7 +468,7 @@ def register_tags(*names: str) -> None:
 
 
 def register_tags_of(key: str, *names: str) -> None:
-    """The same for a union that is not a list: its tags stand behind its key."""
+    """The same for a union that is not a list: its tags follow its key."""
     _TAGS_OF[key] = names
 
 

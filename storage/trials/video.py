@@ -1,6 +1,6 @@
 """Lossless video of frames: FFV1 in Matroska, every frame a key frame, reproducible byte for byte.
 
-Matroska files carry random identifiers and dates unless the muxer is told not to; with the
+Matroska files carry random identifiers and dates unless the muxer is configured not to; with the
 bit-exact flag two identical videos are two identical files, so checksums mean something.
 Encoding runs in separate threads behind bounded queues: a full queue is back-pressure that the
 caller sees as time, never as a lost frame. Frames know nothing of each other, so every thread has

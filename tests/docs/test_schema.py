@@ -231,8 +231,8 @@ def test_only_a_file_that_extends_may_leave_keys_out() -> None:
 def test_keys_are_explained() -> None:
     """An editor shows what stands below a field in the models, by the key a file has."""
     models = file_schema("protocol")["definitions"]
-    told = models["Training"]["properties"]["patience"]["description"]
-    assert told.startswith("Epochs without a better validation accuracy")
+    reported = models["Training"]["properties"]["patience"]["description"]
+    assert reported.startswith("Epochs without a better validation accuracy")
     assert models["Range"]["properties"].keys() == {"from", "to", "step"}
 
 

@@ -191,13 +191,13 @@ def test_a_file_of_another_shape_is_named(store: Store) -> None:
 def test_how_it_is_said_on_the_command_line(store: Store) -> None:
     done = here("guesses", store.folder, "--guess", GUESS, "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert list(told) == ["simulated", "trials", "measured", "settings", "file"]
-    assert told["settings"] == {
+    reported = json.loads(done.stdout)
+    assert list(reported) == ["simulated", "trials", "measured", "settings", "file"]
+    assert reported["settings"] == {
         name: figures(setting) for name, setting in scores(store).items()
     }  # fmt: skip
-    assert told["trials"] == {"tiny": 2, "tiny_gravity": 2}
-    assert list(told["settings"]) == list(kept(store))
+    assert reported["trials"] == {"tiny": 2, "tiny_gravity": 2}
+    assert list(reported["settings"]) == list(kept(store))
     table = here("guesses", store.folder, "--guess", GUESS)
     assert "simulated" in table.stdout
     wrong = here("guesses", store.folder, "--guess", "scene.friction.kinetc")

@@ -193,8 +193,8 @@ def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
     write_json(path, {**kept, "clocks": clocks})
     table = catalogue(store)
     assert table["sync_uncertainty_us"].max() == 77.0
-    told = sync_part(collected(store))
-    assert told.worst_against_events_us["events"] == 77.0
+    reported = sync_part(collected(store))
+    assert reported.worst_against_events_us["events"] == 77.0
     write_json(path, kept)
 
 

@@ -202,10 +202,10 @@ def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
                 search.measure(run, stop)
             assert len(list(search.derived.folder.glob("*.state"))) == 1
             assert not search.sweep.done(run)
-        told: list[tuple[str, float]] = []
-        search.measure(run, lambda part, share, note, told=told: told.append((part, share)))
-        assert sum(share for part, share in told if part == "train") == pytest.approx(1)
-        assert sum(share for part, share in told if part == "count") == pytest.approx(1)
+        reported: list[tuple[str, float]] = []
+        search.measure(run, lambda part, share, note, done=reported: done.append((part, share)))
+        assert sum(share for part, share in reported if part == "train") == pytest.approx(1)
+        assert sum(share for part, share in reported if part == "count") == pytest.approx(1)
         assert not list(search.derived.folder.glob("*.state"))
         models.append(search.model_path(run).read_bytes())
     assert models[0] == models[1]
@@ -257,5 +257,5 @@ def test_the_command_takes_one_of_its_two_subjects(store: Store, tmp_path: Path)
         "--step", 1, "--pool", 20, "--width", 0.5, "--width", 1,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert (told["runs"], told["simulated"]) == (3, True)
+    reported = json.loads(done.stdout)
+    assert (reported["runs"], reported["simulated"]) == (3, True)

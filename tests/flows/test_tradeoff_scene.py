@@ -72,11 +72,11 @@ def test_closed_forms_are_near_the_scene_that_they_are_for(protocol: Path, rig_p
     plan, (rig, _) = load_plan(protocol), load_rig_file(rig_path)
     (trial,) = sample_trials(plan, 1)
     even = changed(rig, {"scene": {"friction": {"path_variation": 0.0, "strengthening": 0.0}}})
-    told = closed_form(even, plan, trial)
-    assert told is not None
+    reported = closed_form(even, plan, trial)
+    assert reported is not None
     seen = run(ideal(changed(even, Variant(3, 1).change)), plan, trial, 1)
-    assert None not in (*told.onsets, *seen.slips)
-    assert seen.slips == pytest.approx(told.onsets, rel=0.01)
+    assert None not in (*reported.onsets, *seen.slips)
+    assert seen.slips == pytest.approx(reported.onsets, rel=0.01)
 
 
 def test_the_numbers_say_what_was_asked(result: Any) -> None:

@@ -159,8 +159,12 @@ def test_what_ships_is_the_mock_rig_but_for_one_thing_each() -> None:
     mock, noisy, weak, rehearsal = (
         load_rig_file(Path(name))[0] for name in ("mock", "mock-noisy", "mock-weak", "rehearsal")
     )
-    told = weak.timing
-    assert (told.code, told.frames, told.arm) == ("irregular", "device time stamps", "host time")
+    timing = weak.timing
+    assert (timing.code, timing.frames, timing.arm) == (
+        "irregular",
+        "device time stamps",
+        "host time",
+    )
     assert weak.model_copy(update={"name": "mock", "timing": mock.timing}) == mock
     assert noisy.mock.event_camera.noise_hz == pytest.approx(10 * mock.mock.event_camera.noise_hz)
     same = noisy.mock.event_camera.model_copy(update={"noise_hz": 0.01})

@@ -26,5 +26,5 @@ def test_a_place_that_is_told_has_a_value_on_either_side(places: list[int]) -> N
     at_knots = np.eye(knots.size)
     before = [np.append(at_knots[k], [place < k for place in places]) for k in range(knots.size)]
     behind = [np.append(at_knots[k], [place <= k for place in places]) for k in places]
-    told = np.array([*before, *behind], float)
-    assert found == pytest.approx(told @ covariance @ told.T, rel=1e-6)
+    reported = np.array([*before, *behind], float)
+    assert found == pytest.approx(reported @ covariance @ reported.T, rel=1e-6)

@@ -86,18 +86,18 @@ def test_ends_of_one_trials_trains_look_as_likely_as_they_are(losses: tuple[floa
 @pytest.mark.parametrize("ticks_apart", [6, 12, 24, -6, -12, -24])
 def test_trains_that_begin_apart_are_not_one_trials(ticks_apart: int) -> None:
     rng = np.random.default_rng(3)
-    told, count = 0, 100
+    reported, count = 0, 100
     for seed in range(1, count + 1):
         ticks = np.flatnonzero(code_bits(seed, 1_100)).astype(np.int64)
         one = ticks[(ticks >= 50) & (ticks < 1_050)]
         other = ticks[(ticks >= 50 + ticks_apart) & (ticks < 1_050 + ticks_apart)]
         device, reference = lossy(rng, one, 0.1, 0.0)[0], other
         found = staggered_ends(TickTrains(device - other[0], reference - other[0]))
-        told += found.chance < 1e-3
+        reported += found.chance < 1e-3
         if found.chance < 1e-3:
             assert found.earlier == ("device" if ticks_apart > 0 else "reference")
             assert 1 <= min(found.first, found.last) <= END_TICKS
-    assert told >= 0.9 * count
+    assert reported >= 0.9 * count
 
 
 def test_a_train_that_lies_within_the_other_is_no_other_trials() -> None:

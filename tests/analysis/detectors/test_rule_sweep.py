@@ -56,8 +56,8 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
             rule = Detection(smoothing=smoothing, margin=margin)
             said = [detect(t.counts, t.end_ns, rule) for t in found]
             for k, one in enumerate(said):
-                told = [NEVER if v is None else v for v in (one.incipient_ns, one.gross_ns)]
-                assert each[k, s, m].tolist() == told
+                reported = [NEVER if v is None else v for v in (one.incipient_ns, one.gross_ns)]
+                assert each[k, s, m].tolist() == reported
             scored = [score_trial(one, t.slip, 30 * MS) for one, t in zip(said, found, strict=True)]
             latency, lead = summarise_latency(scored), summarise_lead(scored)
             figures, n = score(each[:, s, m], truth), len(found)

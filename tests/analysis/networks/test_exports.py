@@ -279,8 +279,8 @@ def test_synaptic_operations_are_counted_one_by_one() -> None:
     assert found.events == pytest.approx(x.sum() / 3)
     for name in SPIKING:
         assert found.rates[name] == pytest.approx(spikes[name].mean())
-    told = found.cost()
-    assert told.synaptic_operations["all"] == pytest.approx(sum(found.operations.values()))
+    reported = found.cost()
+    assert reported.synaptic_operations["all"] == pytest.approx(sum(found.operations.values()))
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -299,11 +299,11 @@ def test_a_card_says_where_the_data_are_from(simulated: bool) -> None:
         one, ModelFile(file="m.pt", sha256="c" * 64), data, {"test": part},
         activity(build(SMALL, TINY, 0), sparse(2, TINY, 0, 0.2)), {}, {"torch": "1"}, 2.0,
     )  # fmt: skip
-    told = card.to_json()
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
-    assert told["model"]["network"] == SMALL.model_dump(mode="json")  # the defaults too
-    assert told["figures"]["test"]["accuracy"]["strict"] == 0.75
-    assert told["figures"]["test"]["recall"]["gross"] == 0.5
+    reported = card.to_json()
+    assert json.loads(json.dumps(reported, allow_nan=False)) == reported
+    assert reported["model"]["network"] == SMALL.model_dump(mode="json")  # the defaults too
+    assert reported["figures"]["test"]["accuracy"]["strict"] == 0.75
+    assert reported["figures"]["test"]["recall"]["gross"] == 0.5
     page = card_markdown(card)
     assert ("simulated" in page) == simulated
     assert "not those that the model was trained on" in page

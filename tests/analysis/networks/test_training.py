@@ -195,9 +195,9 @@ def test_a_training_goes_on_to_the_same_bits(stop: int, schedule: str) -> None:
     settings = TRAINING.model_copy(update={"epochs": 4, "schedule": schedule})
     rest = (*TRAIN, *VAL, NETWORK, WINDOWS, settings, 0)
     whole = fit(*rest, on_state=states.append)
-    told: list[EpochRecord] = []
-    again = fit(*rest, on_epoch=told.append, state=states[stop - 1])
-    assert again.history == whole.history == tuple(told)
+    reported: list[EpochRecord] = []
+    again = fit(*rest, on_epoch=reported.append, state=states[stop - 1])
+    assert again.history == whole.history == tuple(reported)
     assert again.chosen_epoch == whole.chosen_epoch
     for name, value in whole.state_dict.items():
         assert torch.equal(again.state_dict[name], value)

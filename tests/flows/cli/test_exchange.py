@@ -31,8 +31,8 @@ def sliplab(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["sliplab", *map(str, arguments)])
         code = _run()
-        told = capsys.readouterr()
-        return code, told.out, told.err
+        reported = capsys.readouterr()
+        return code, reported.out, reported.err
 
     return run
 
@@ -41,21 +41,21 @@ def test_in_and_out(tmp_path: Path, sliplab: Any) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     store, out = tmp_path / "store", tmp_path / "out"
     path = tmp_path / "slide.h5"
-    code, told, _ = sliplab("import", path, "--store", store, "--name", "a", "--json")
+    code, reported, _ = sliplab("import", path, "--store", store, "--name", "a", "--json")
     assert code == 0
-    assert json.loads(told) == {
+    assert json.loads(reported) == {
         "campaign": "a", "imported": ["slide"], "there": [], "events": 50, "frames": 0,
     }  # fmt: skip
-    code, told, said = sliplab("verify", store, "--json")
-    assert (code, json.loads(told)["whole"]) == (0, 1)
-    code, told, said = sliplab("trials", store, "--output", tmp_path / "t.parquet")
+    code, reported, said = sliplab("verify", store, "--json")
+    assert (code, json.loads(reported)["whole"]) == (0, 1)
+    code, reported, said = sliplab("trials", store, "--output", tmp_path / "t.parquet")
     assert code == 0
     assert "left out" not in said
     assert pd.read_parquet(tmp_path / "t.parquet")["trial"].tolist() == ["slide"]
-    code, told, _ = sliplab("export", store, "slide", "--output", out, "--json")
-    assert (code, json.loads(told)["events"]) == (0, 50)
-    code, told, _ = sliplab("import", "aedat4", out, "--store", store, "--name", "b", "--json")
-    assert (code, json.loads(told)["imported"]) == (0, ["slide"])
+    code, reported, _ = sliplab("export", store, "slide", "--output", out, "--json")
+    assert (code, json.loads(reported)["events"]) == (0, 50)
+    code, reported, _ = sliplab("import", "aedat4", out, "--store", store, "--name", "b", "--json")
+    assert (code, json.loads(reported)["imported"]) == (0, ["slide"])
     assert not Store.open(store).simulated
     code, *_ = sliplab("export", store, "a", "--labels", "--output", tmp_path / "l.csv")
     assert code == 0
@@ -81,9 +81,9 @@ def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
     with Aedat4Writer(path, {0: Stream("EVTS", "events", (346, 260), "DAVIS346")}) as file:
         file.events(0, EventChunk(column, column, column.astype(np.uint8) % 2, times))
     store = tmp_path / "store"
-    code, told, said = sliplab("import", path, "--store", store, "--name", "a", "--json")
+    code, reported, said = sliplab("import", path, "--store", store, "--name", "a", "--json")
     assert code == 0
-    assert len(json.loads(told)["warnings"]) == 1
+    assert len(json.loads(reported)["warnings"]) == 1
     assert "warning: a.aedat4: 498,611.1 hours without an event between 0 and" in " ".join(
         said.split()
     )
@@ -116,8 +116,8 @@ def test_wrong_input_is_exit_2(
     for name in ("bad.aedat4", "bad.h5"):
         (tmp_path / name).write_text("hello")
     campaign(tmp_path / "ours")
-    code, told, said = sliplab(*arguments)
-    assert (code, told) == (2, "")
+    code, reported, said = sliplab(*arguments)
+    assert (code, reported) == (2, "")
     assert says in said
     assert not list(tmp_path.glob("s/campaigns/*"))
 

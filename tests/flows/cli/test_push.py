@@ -43,8 +43,8 @@ class Sliplab:
         words = ["sliplab", *map(str, arguments), "--json"]
         self._patch.setattr(sys, "argv", words)
         code = program._run()
-        told = self._capture.readouterr()
-        return code, json.loads(told.out) if told.out else None, told.err
+        reported = self._capture.readouterr()
+        return code, json.loads(reported.out) if reported.out else None, reported.err
 
 
 @pytest.fixture
@@ -77,19 +77,19 @@ def test_a_url_stands_where_a_store_does(sliplab: Sliplab, made: Path, tmp_path:
     here, there = (sliplab("trials", place)[1] for place in (made, url))
     assert here["trials"] == there["trials"]
     assert here["count"] == there["count"] == 2
-    code, _, told = sliplab("trials", "file:///nothing/here")
+    code, _, reported = sliplab("trials", "file:///nothing/here")
     assert code == 2
-    assert "does not contain a pushed store" in told
-    assert "\n" not in told.strip()
+    assert "does not contain a pushed store" in reported
+    assert "\n" not in reported.strip()
 
 
 def test_problems_are_told_and_exit_with_1(sliplab: Sliplab, made: Path, tmp_path: Path) -> None:
     url, store = f"file://{tmp_path}/shared", Path(shutil.copytree(made, tmp_path / "s"))
     record = store / "campaigns/c/trials" / TRIALS[0] / "record.json"
     record.write_bytes(record.read_bytes().replace(b"left", b"rite"))
-    code, sent, told = sliplab("push", store, url)
+    code, sent, reported = sliplab("push", store, url)
     assert (code, sent["pushed"], len(sent["problems"])) == (1, 1, 1)
-    assert "does not match its checksum" in told
+    assert "does not match its checksum" in reported
     (tmp_path / "shared/campaigns/c/objects").rename(tmp_path / "gone")
     code, seen, _ = sliplab("verify", url)
     assert (code, seen["ok"], seen["whole"]) == (1, False, 0)
@@ -99,10 +99,10 @@ def test_problems_are_told_and_exit_with_1(sliplab: Sliplab, made: Path, tmp_pat
         ("pull", "nonsense://lab", tmp_path / "x"), ("verify", url, "--quarantine"),
         ("push", store, url, "--campaign", "other"), ("label", store, "--dask", "nonsense"),
     ):  # fmt: skip
-        code, out, told = sliplab(*words)
-        assert code == 2, told
-        assert out["error"]["message"] in told
-        assert "hunter2" not in told + str(out)
+        code, out, reported = sliplab(*words)
+        assert code == 2, reported
+        assert out["error"]["message"] in reported
+        assert "hunter2" not in reported + str(out)
 
 
 def test_follow_ends_with_the_collection(

@@ -116,8 +116,8 @@ def _suffer(
     else:
         (recording,) = [each for each in campaign.recordings() if each.trial_id in made]
         doubts = label_recording(recording, Labelling()).document().doubts.to_json()
-        told = "; ".join(sorted({str(why) for why in doubts.values() if why is not None}))
-        row = Row(_shown(fault), arm, "good", f"label: {told}" if told else "nothing")
+        reported = "; ".join(sorted({str(why) for why in doubts.values() if why is not None}))
+        row = Row(_shown(fault), arm, "good", f"label: {reported}" if reported else "nothing")
     return row, campaign, made
 
 
@@ -161,11 +161,11 @@ def test_every_fault_once_in_a_campaign_and_the_table_in_the_docs(tmp_path: Path
     row, _, _ = _suffer(tmp_path / "falling", falling, {"kind": "plate_stuck"})
     rows.append(row)
 
-    told = _table()
+    reported = _table()
     for row in rows:
         true = f"| `{row.fault}` | {row.arm} | {row.trial} | {row.reads} |"
-        assert row.fault in told, true
-        said = told[row.fault]
+        assert row.fault in reported, true
+        said = reported[row.fault]
         assert (said.arm, said.trial) == (row.arm, row.trial), true
         assert _numbers_aside(said.reads) == _numbers_aside(row.reads), true
-    assert told.keys() == {row.fault for row in rows}
+    assert reported.keys() == {row.fault for row in rows}

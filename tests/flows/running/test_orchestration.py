@@ -40,21 +40,21 @@ def quick(number: int) -> int:
 
 
 @flow(name="many", validate_parameters=False, persist_result=False)
-def many(told: Opaque[list[str]]) -> None:
+def many(reported: Opaque[list[str]]) -> None:
     """Many quick tasks, of which the last fails."""
-    told.content.append(str(flow_run.id))
+    reported.content.append(str(flow_run.id))
     for number in range(COUNT):
         quick(number)
 
 
 def test_every_quick_task_run_is_kept_with_its_end() -> None:
-    told: list[str] = []
+    reported: list[str] = []
     with pytest.raises(ValueError, match="the last one fails"):
-        run(many, Opaque(told))
-    _drained(told[0], COUNT - 1)
+        run(many, Opaque(reported))
+    _drained(reported[0], COUNT - 1)
     found: list[dict[str, Any]] = []
     for offset in (0, 100):
-        wanted = {"flow_runs": {"id": {"any_": told}}, "limit": 100, "offset": offset}
+        wanted = {"flow_runs": {"id": {"any_": reported}}, "limit": 100, "offset": offset}
         with temporary_settings(embedded().settings()), get_client(sync_client=True) as client:
             found += client.request("POST", "/task_runs/filter", json=wanted).json()
     assert len(found) == COUNT

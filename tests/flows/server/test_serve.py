@@ -174,8 +174,8 @@ def test_a_rig_that_is_free_again_is_taken(
     monkeypatch.setattr(deployments, "POLL_S", 0.01)
     run_request = make_request(protocol, RIG, service.folder)
     answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
-    told: list[str] = []
-    monkeypatch.setattr(deployments, "_report_waiting", lambda run, why: told.append(why))
+    reported: list[str] = []
+    monkeypatch.setattr(deployments, "_report_waiting", lambda run, why: reported.append(why))
 
     def work() -> dict[str, Any]:
         answer = answers.pop(0)
@@ -184,7 +184,7 @@ def test_a_rig_that_is_free_again_is_taken(
         return answer
 
     assert deployments.when_free(run_request, 10.0, work, None) == {"taken": 1}
-    assert told == ["the rig is in use by anna"]
+    assert reported == ["the rig is in use by anna"]
     answers[:] = [Locked("the rig is in use by anna")]
     with pytest.raises(WindowOver, match="no trial was taken: the rig is in use by anna"):
         deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
@@ -220,9 +220,9 @@ def test_runs_of_killed_processes_are_closed_at_the_next_start(
         folder = service.folder / "control" / "runs"
         for number, (pid, host) in enumerate([(gone.pid, None), (gone.pid, "elsewhere")]):
             path = folder / f"{runs[number]}.json"
-            told = read_json(path)
-            told["process"] |= {"pid": pid, "host": host or told["process"]["host"]}
-            write_json(path, told)
+            reported = read_json(path)
+            reported["process"] |= {"pid": pid, "host": host or reported["process"]["host"]}
+            write_json(path, reported)
         run_records.end(service.folder, runs[3], "COMPLETED", "", "flow")
         client.set_flow_run_state(runs[3], Completed(), force=True)
 

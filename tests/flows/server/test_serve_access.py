@@ -170,11 +170,11 @@ def test_the_password_is_its_users_alone(service: Service) -> None:
     assert (stat.S_IMODE(found.st_mode), found.st_uid) == (0o600, os.getuid())
     password = file.read_text().strip()
     assert password == service.page.password
-    told = service.page.log.read_text()
-    assert str(file) in told
+    reported = service.page.log.read_text()
+    assert str(file) in reported
     secret = password.partition(":")[2]
     assert len(secret) > 40
-    assert secret not in told
+    assert secret not in reported
     for path in (path for path in service.store.rglob("*") if path.is_file() and path != file):
         assert secret.encode() not in path.read_bytes(), path
     for line in Path("/proc").glob("[0-9]*/cmdline"):

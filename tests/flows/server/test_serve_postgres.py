@@ -120,8 +120,8 @@ def test_a_campaign_is_paused_and_cancelled_and_goes_on(
     assert not campaign.wrong(store, whole)
     ends = [read_json(path) for path in (store / "control" / "runs").glob("*.end.json")]
     assert sorted(end["state"] for end in ends) == ["CANCELLED", *["COMPLETED"] * 3]
-    told = [path for path in store.rglob("*") if path.is_file()]
-    assert not [path for path in told if password.encode() in path.read_bytes()]
+    reported = [path for path in store.rglob("*") if path.is_file()]
+    assert not [path for path in reported if password.encode() in path.read_bytes()]
 
 
 def page_collects(page: Page, file: Path, committed: Callable[[], int]) -> None:

@@ -33,7 +33,7 @@ class Served:
     """A server of its own process over the 864 trials, and a browser."""
 
     made: Reviewable
-    told: dict[str, Any]
+    reported: dict[str, Any]
     process: subprocess.Popen[str]
     browser: Any
 
@@ -49,9 +49,9 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     )  # fmt: skip
     try:
         assert process.stdout is not None
-        told = json.loads(process.stdout.readline())
+        reported = json.loads(process.stdout.readline())
         with launched() as browser:
-            yield Served(made, told, process, browser)
+            yield Served(made, reported, process, browser)
     finally:
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
@@ -129,7 +129,7 @@ def opened(served: Served) -> Iterator[Tab]:
         "request",
         lambda r: None if r.url.startswith("http://127.0.0.1:") else amiss.append(r.url),
     )
-    page.goto(served.told["url"])
+    page.goto(served.reported["url"])
     found = Tab(page, amiss)
     expect(found.chosen()).to_contain_text("1 of ")
     yield found
@@ -138,7 +138,7 @@ def opened(served: Served) -> Iterator[Tab]:
 
 
 def test_all_trials_are_listed_doubtful_ones_first(served: Served, tab: Tab) -> None:
-    assert served.told["trials"] == served.told["to_decide"] == TRIALS
+    assert served.reported["trials"] == served.reported["to_decide"] == TRIALS
     doubtful = served.made.ids[DOUBTFUL]
     expect(tab.page.get_by_text(f"{TRIALS} trials, {TRIALS} to review")).to_be_visible()
     expect(tab.chosen()).to_have_text(f"{NAME} / {doubtful} · 1 of {TRIALS}")
@@ -209,7 +209,7 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
             tab.drag(known["incipient_ns"] / 1e9, 0.25)
             moved = tab.page.locator("tr", has=tab.page.get_by_text("incipient", exact=True))
             expect(moved.locator("td").nth(1)).to_have_text(re.compile(r"0\.2[45]\d\d s"))
-            told = moved.locator("td").nth(1).inner_text()
+            reported = moved.locator("td").nth(1).inner_text()
             tab.press("s")
             expect(tab.decision(trial)).to_have_text("adjusted")
         else:
@@ -229,7 +229,7 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
         history = tab.page.locator("table.past tr").nth(1)
         if trial == one:
             line = tab.page.locator("tr", has=tab.page.get_by_text("incipient", exact=True))
-            expect(line.locator("td").nth(1)).to_have_text(told)
+            expect(line.locator("td").nth(1)).to_have_text(reported)
         else:
             expect(history.locator("td").last).to_contain_text("<img src=x")
     assert tab.page.title() == "SlipLab review"
@@ -238,7 +238,7 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
     assert made is not None
     assert (made.verdict, made.who, made.label) == ("adjust", "anna", served.made.keys[one])
     assert (made.old.incipient_ns, made.old.gross_ns) == (known["incipient_ns"], known["gross_ns"])
-    assert made.new.incipient_ns == round(float(told.removesuffix(" s")) * 1e9)
+    assert made.new.incipient_ns == round(float(reported.removesuffix(" s")) * 1e9)
     assert made.new.gross_ns == known["gross_ns"]  # not moved: to the nanosecond
     made = review.last(served.made.store, NAME, two)
     assert made is not None
@@ -267,7 +267,7 @@ def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: 
 
 
 def test_nobody_else_gets_in(served: Served) -> None:
-    parts = urlsplit(served.told["url"])
+    parts = urlsplit(served.reported["url"])
     assert parts.hostname == "127.0.0.1"
     assert len(parts.path) > 30
     assert parts.port is not None

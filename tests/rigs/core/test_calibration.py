@@ -105,11 +105,11 @@ def test_a_simulated_rig_has_no_age_unless_its_file_says_so() -> None:
         lens=None, event_crop=None,
     )  # fmt: skip
     assert faults(bare, simulated=True) == []
-    told = calibration(
+    reported = calibration(
         contact_plane={"taught": "2020-01-01"}, depth_zero=None, lens=None,
         max_age={"contact_plane": "30 d", "lens": "90 d"},
     )  # fmt: skip
-    said = faults(told, simulated=True)
+    said = faults(reported, simulated=True)
     assert len(said) == 2
     assert "2020-01-01" in said[0]
     assert "calibration.lens = None: is missing" in said[1]

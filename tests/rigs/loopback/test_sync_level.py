@@ -63,10 +63,10 @@ def test_a_fast_train_has_pulses_of_half_a_tick() -> None:
 @pytest.mark.realtime
 @pytest.mark.parametrize("code", CODES)
 def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code) -> None:
-    told: list[tuple[Train | None, int, int]] = []
+    reported: list[tuple[Train | None, int, int]] = []
 
     def on_train(train: Train | None, sent: int) -> None:
-        told.append((train, sent, time.monotonic_ns()))
+        reported.append((train, sent, time.monotonic_ns()))
 
     with FakeSyncBox(on_train=on_train) as wire:
         box = SerialSyncBox(SyncBoxSettings(port=wire.port))
@@ -77,7 +77,7 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
         box.start(100.0, 7, code)
         wire.reset()
         box.close()
-    (first, none, at_ns), (end, sent, _), (second, _, _), (cut, _, _) = told
+    (first, none, at_ns), (end, sent, _), (second, _, _), (cut, _, _) = reported
     assert first is not None
     assert (first.rate_hz, first.seed, first.code, none) == (200.0, 99, code, 0)
     assert at_ns < first.first_ns
@@ -90,12 +90,12 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
 
 @pytest.mark.realtime
 def test_an_unplugged_box_ticks_no_more() -> None:
-    told: list[Train | None] = []
-    wire = FakeSyncBox(on_train=lambda train, sent: told.append(train))
+    reported: list[Train | None] = []
+    wire = FakeSyncBox(on_train=lambda train, sent: reported.append(train))
     box = SerialSyncBox(SyncBoxSettings(port=wire.port))
     box.start(100.0, 5)
     wire.close()
     wire.close()
     box.close()
-    assert told[0] is not None
-    assert told[1:] == [None]
+    assert reported[0] is not None
+    assert reported[1:] == [None]

@@ -359,9 +359,9 @@ def test_the_labs_pickles(tmp_path: Path, by_columns: bool) -> None:
 
 
 def test_the_labs_hdf5(tmp_path: Path) -> None:
-    told = lab_hdf5(tmp_path / "slide 1.h5")
+    reported = lab_hdf5(tmp_path / "slide 1.h5")
     made = _import(tmp_path / "store", tmp_path / "slide 1.h5")
-    _same(_events(made.campaign("theirs").recording("slide_1")), told)
+    _same(_events(made.campaign("theirs").recording("slide_1")), reported)
     assert verify(made) == []
 
 
@@ -531,9 +531,9 @@ def test_a_manifest_leads_nowhere(tmp_path: Path, store: Store, file: str) -> No
     export_trials([store.campaign("c").recording("depth=2.4mm,r=1")], out, "dsec", "c")
     (tmp_path / "t.h5").write_bytes((out / "depth=2.4mm,r=1.h5").read_bytes())
     os.symlink(tmp_path / "t.h5", out / "link.h5")
-    told = read_json(out / EXPORT_MANIFEST)
-    told["trials"][0]["file"] = file
-    (out / EXPORT_MANIFEST).write_text(json.dumps(told))
+    reported = read_json(out / EXPORT_MANIFEST)
+    reported["trials"][0]["file"] = file
+    (out / EXPORT_MANIFEST).write_text(json.dumps(reported))
     with pytest.raises(InputError):
         _import(tmp_path / "store", out, "dsec")
     assert Store.open(tmp_path / "store").campaigns() == []

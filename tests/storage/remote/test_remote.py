@@ -299,7 +299,7 @@ def test_names_and_objects_of_others_are_refused(
     (trials / f"{TRIALS[1]}.json").write_text((trials / f"{TRIALS[1]}.json").read_text()[:90])
     done = pull(remote, tmp_path / "back")
     assert done.pulled == 1
-    told = " ".join(done.problems)
+    reported = " ".join(done.problems)
     for part in (
         "belongs to another trial or campaign",
         "'a b'",
@@ -307,7 +307,7 @@ def test_names_and_objects_of_others_are_refused(
         "no checksum of data.h5",
         "is incomplete",
     ):
-        assert part in told
+        assert part in reported
     assert len(verify_remote(remote)[1]) == len(done.problems)
 
 
@@ -407,9 +407,9 @@ def test_secrets_are_nowhere(endpoint: str, store: Store, tmp_path: Path) -> Non
         assert not [name for name, data in tree(folder, ".").items() if secret in data]
     assert read_json(tmp_path / "back" / ORIGIN) == {"url": url}
     lost = Remote("s3://no-such-bucket-here/x")
-    with pytest.raises(RemoteError) as told:
+    with pytest.raises(RemoteError) as reported:
         push(store, lost)
-    assert secret.decode() not in str(told.value)
-    with pytest.raises(RemoteError) as told, lost._errors_translated("key", "read"):
+    assert secret.decode() not in str(reported.value)
+    with pytest.raises(RemoteError) as reported, lost._errors_translated("key", "read"):
         raise ValueError(f"signature of {secret.decode()} is wrong")
-    assert f"signature of {MASK} is wrong" in str(told.value)
+    assert f"signature of {MASK} is wrong" in str(reported.value)

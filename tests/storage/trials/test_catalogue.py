@@ -35,11 +35,11 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     names: list[str] = []
     row = module._row
 
-    def told(name: str, recording: Recording) -> dict[str, object]:
+    def reported(name: str, recording: Recording) -> dict[str, object]:
         names.append(recording.folder.name)
         return row(name, recording)
 
-    monkeypatch.setattr(module, "_row", told)
+    monkeypatch.setattr(module, "_row", reported)
     return names
 
 

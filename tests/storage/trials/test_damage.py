@@ -222,8 +222,8 @@ def test_data_that_point_out_of_their_file_are_refused(tmp_path: Path) -> None:
 def test_a_disks_faults_are_said_in_words() -> None:
     assert disk_fault(OSError(28, "x")) == "is full"
     assert disk_fault(OSError(30, "x")) == "is read-only"
-    told = RuntimeError("Can't decrement id ref count (file write failed: errno = 28, ...)")
-    assert disk_fault(told) == "is full"
+    reported = RuntimeError("Can't decrement id ref count (file write failed: errno = 28, ...)")
+    assert disk_fault(reported) == "is full"
     assert disk_fault(RuntimeError("anything else")) is None
     assert disk_fault(FileNotFoundError(2, "x")) is None
 

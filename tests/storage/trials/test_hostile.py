@@ -207,7 +207,7 @@ def test_json_without_numbers_that_are_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "told",
+    "reported",
     [
         '{"key": "k", "raw": RAW, "clocks": 1}',
         '{"key": "k", "raw": RAW, "clocks": {}}',
@@ -216,10 +216,10 @@ def test_json_without_numbers_that_are_none(tmp_path: Path) -> None:
     ],
 )
 def test_refitted_clocks_of_another_shape_are_damage(
-    made: Campaign, tmp_path: Path, told: str
+    made: Campaign, tmp_path: Path, reported: str
 ) -> None:
     recording = made.recording("t")
     file = tmp_path / "t.json"
-    file.write_text(told.replace("RAW", json.dumps(recording.raw_checksum)))
+    file.write_text(reported.replace("RAW", json.dumps(recording.raw_checksum)))
     with pytest.raises(StoreError, match="sliplab sync"):
         _ = Recording(recording.folder, file).clocks

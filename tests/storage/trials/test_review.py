@@ -59,10 +59,10 @@ def test_who_looked_at_an_older_decision_is_told(store: Store) -> None:
 
 def test_of_many_who_decide_at_once_each_is_kept_or_told(store: Store) -> None:
     def insist(name: str) -> int:
-        for told in range(100):
+        for reported in range(100):
             try:
                 decide(store, max(review.counts(store, "c").values(), default=0), who=name)
-                return told
+                return reported
             except review.Overtaken:
                 continue
         raise AssertionError("never kept")
