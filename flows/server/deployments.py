@@ -17,7 +17,7 @@ from prefect import flow
 
 from sliplab.flows.collecting import requests
 from sliplab.flows.collecting.requests import CampaignStopped
-from sliplab.flows.collecting.session import WindowOver
+from sliplab.flows.collecting.supervisor import WindowOver
 from sliplab.flows.planning.run_request import RunRequest, SessionMetadata, check_disk, make_request
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import die_with
@@ -264,7 +264,7 @@ def _collect(wanted: Collect, here: Service, run: Any) -> str:
 
 
 def _chain(wanted: Chain, here: Service, run: Any) -> str:
-    from sliplab.flows.collecting.session import WindowOver
+    from sliplab.flows.collecting.supervisor import WindowOver
 
     try:
         taken = _collect(wanted, here, run)

@@ -9,14 +9,10 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting import session as session_module
+from sliplab.flows.collecting import supervisor as supervising
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
-from sliplab.flows.collecting.session import (
-    CollectionSupervisor,
-    TrialCollector,
-    WindowOver,
-    open_session,
-)
+from sliplab.flows.collecting.session import TrialCollector, open_session
+from sliplab.flows.collecting.supervisor import CollectionSupervisor, WindowOver
 from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.flows.running import stopping
@@ -88,7 +84,7 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
     work.supervisor.wait, work.supervisor.on_pause = wait, pauses.append
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
-    assert pauses == [3 * session_module.POLL_S]
+    assert pauses == [3 * supervising.POLL_S]
     asked = control.requests(store)
     assert [(item.kind, item.who, item.why) for item in asked] == [
         ("pause", "anna", "lunch"), ("resume", "ben", ""),
@@ -101,7 +97,7 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
 def test_a_pause_that_nobody_ends_ends_the_stretch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_module, "PAUSE_LIMIT_S", 2.0)
+    monkeypatch.setattr(supervising, "PAUSE_LIMIT_S", 2.0)
     work, campaign, store = supervised(tmp_path / "a")
     assert work.supervisor is not None
     work.supervisor.wait = lambda seconds: None

@@ -10,7 +10,8 @@ import pytest
 from sliplab.analysis.quality import hold_rate
 from sliplab.flows.collecting.progress import Remaining
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out
-from sliplab.flows.collecting.session import CollectionSupervisor, TrialCollector
+from sliplab.flows.collecting.session import TrialCollector
+from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes

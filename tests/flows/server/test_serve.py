@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from sliplab.flows.collecting.progress import sign_rig
-from sliplab.flows.collecting.session import WindowOver
+from sliplab.flows.collecting.supervisor import WindowOver
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration, run_records
 from sliplab.flows.running.embedded_server import EmbeddedServer

@@ -1,0 +1,168 @@
+"""Between two trials: may the next one begin? Requests, the time window, the disk, references."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from datetime import datetime
+
+from sliplab.flows.collecting.requests import CampaignStopped, carry_out
+from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.running import console, stopping
+from sliplab.protocols import Trial
+from sliplab.storage.streams import Json
+from sliplab.storage.trials import control
+from sliplab.storage.trials.control import Request
+from sliplab.storage.trials.store import Campaign, Store
+
+PAUSE_LIMIT_S = 12 * 3600.0
+POLL_S = 0.5
+"""Interval at which a paused collection checks for its resumption, s."""
+
+
+class WindowOver(CampaignStopped):
+    """The time window of the collection is over; the next collection resumes it."""
+
+
+class CollectionSupervisor:
+    """Decides between two trials whether the next may begin; notified after each.
+
+    It carries out requests from other terminals, and watches the time window, the disk and the
+    reference trials. Nothing is checked while the arm moves, and all of it before it moves again.
+
+    Attributes:
+        wait: waits some seconds, and answers stop requests.
+        on_pause: called with the seconds of a pause when it is over.
+        fresh_start: called after a pause: the rig may have changed.
+        clock: returns seconds since 1970; decides when the window ends.
+    """
+
+    def __init__(
+        self,
+        run_request: RunRequest,
+        store: Store,
+        campaign: Campaign,
+        disk: DiskWatch | None = None,
+    ) -> None:
+        self._run_request, self._store, self._campaign = run_request, store, campaign
+        self.disk = DiskWatch(run_request, campaign) if disk is None else disk
+        self._references = ReferenceWatch(run_request, campaign)
+        self.wait: Callable[[float], None] = stopping.wait
+        self.on_pause: Callable[[float], None] = lambda seconds: None
+        self.fresh_start: Callable[[], None] = lambda: None
+        self.clock: Callable[[], float] = time.time
+        self._seen: frozenset[str] = frozenset()
+        self._paused: Request | None = None
+        self._skipped = frozenset(control.skipped(campaign))
+        self._retakes: set[str] = set()
+
+    def begin(self) -> None:
+        """Check reference trials before the first trial.
+
+        Raises:
+            CampaignStopped: the last reference trial had drifted.
+        """
+        self._references.begin()
+
+    def may_take(self, trial: Trial) -> bool:
+        """Return whether to take `trial` now; waits while the store is paused.
+
+        Raises:
+            KeyboardInterrupt: a stop was requested.
+            CampaignStopped: the disk has no room for it, or a pause was not ended in time.
+            WindowOver: the trial does not fit into the window.
+        """
+        if self._process_requests():
+            self._wait_while_paused(trial)
+        if trial.id in self._skipped:
+            return False
+        self._check_window(trial)
+        self.disk.check(trial)
+        return True
+
+    def after(self, trial: Trial, outcome: str) -> None:
+        """Update the disk estimate and the drift check after a trial.
+
+        Raises:
+            CampaignStopped: it was a reference trial, and drifted.
+        """
+        if outcome == "committed":
+            self.disk.learn(trial)
+            self._references.look(trial)
+
+    def more(self) -> list[Trial]:
+        """Return pending trials that were requested again in the meantime, in the plan's order."""
+        self._process_requests()
+        retakes, self._retakes = self._retakes, set()
+        if not retakes:
+            return []
+        return [
+            t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in retakes
+        ]
+
+    def _process_requests(self) -> Request | None:
+        """Carry out new requests; return the one by which the store is paused, if it is."""
+        names = self._names()
+        if names != self._seen:
+            self._seen = names  # before the answers are written: a request that comes now is seen
+            for request, answer in carry_out(self._store, running=True):
+                self._apply(request, answer)
+            self._paused = control.paused(self._store)
+        return self._paused
+
+    def _apply(self, request: Request, answer: Json) -> None:
+        """Apply an answered request to this session."""
+        if request.kind == "stop":
+            console.say(f"stopped: {request}")
+            stopping.stop()
+        if request.kind in {"pause", "resume"} or request.campaign != self._campaign.name:
+            return
+        self._skipped = frozenset(control.skipped(self._campaign))
+        if request.kind == "again":
+            self._retakes |= set(request.trials)
+        for trial, did in answer["did"].get("trials", {}).items():
+            console.say(f"{request.kind} {trial}: {did}")
+
+    def _check_window(self, trial: Trial) -> None:
+        """Check that the trial's planned time fits: the arm rests when people come."""
+        until = self._run_request.until
+        if until is None:
+            return
+        virtual = self._run_request.rig.in_virtual_time
+        planned = 0.0 if virtual else self._run_request.plan.seconds(trial)
+        if self.clock() + planned > until:
+            raise WindowOver(
+                f"the window of campaign {self._campaign.name} ends "
+                f"{datetime.fromtimestamp(until).astimezone():%Y-%m-%d %H:%M %Z}, too soon for "
+                f"{trial.id}; the next collection continues"
+            )
+
+    def _wait_while_paused(self, trial: Trial) -> None:
+        """Wait until the pause is over."""
+        console.say(
+            f"paused before {trial.id} ({self._paused}); `sliplab resume {self._store.folder}` "
+            "continues it"
+        )
+        waited = 0.0
+        while request := self._process_requests():
+            self._check_window(trial)
+            if waited >= PAUSE_LIMIT_S:
+                raise CampaignStopped(
+                    f"{self._store.folder} was paused ({request}) for "
+                    f"{console.duration(PAUSE_LIMIT_S)} and nobody resumed it: `sliplab resume "
+                    f"{self._store.folder}`, then run the same command to resume"
+                )
+            self.wait(POLL_S)
+            waited += POLL_S
+        console.say("resumed")
+        self.on_pause(waited)
+        self.fresh_start()
+
+    def _names(self) -> frozenset[str]:
+        try:
+            return frozenset(os.listdir(self._store.folder / control.FOLDER))
+        except FileNotFoundError:
+            return frozenset()
