@@ -267,7 +267,7 @@ def _quarantined(campaigns: Sequence[Collected]) -> Table:
                 attempt = known.get("attempt")
                 shown = "–" if attempt is None else str(attempt)
                 rows.append([str(known["trial"]), item.name, shown, reason])
-    return Table(("trial", "campaign", "attempt", "why it was set aside"), rows)
+    return Table(("trial", "campaign", "attempt", "cause"), rows)
 
 
 def _reason(folder: Path, known: QuarantineEntry) -> str:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.fake_motion import STILL, Line, StraightMotion
-from sliplab.rigs.mock.path import EVERY, ArmPath, ContactPlane, Leg, stirred
+from sliplab.rigs.mock.path import EVERY, ArmPath, ContactPlane, Leg, tremor_envelope
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
@@ -97,7 +97,7 @@ class FakeArmPath(ArmPath):
                 result[first:last] = begin + share * (end - begin)
         return result
 
-    def stirred(self, t_ns: I64) -> F64:
+    def tremor(self, t_ns: I64) -> F64:
         """Return the tremor's envelope at increasing times, 0 to 1."""
         with self._lock:
             lines, past_ns = self._lines, self._past_ns
@@ -107,7 +107,7 @@ class FakeArmPath(ArmPath):
             for line, end in zip(lines, ends, strict=True)
             if line.since_ns < min(line.end_ns, end)
         ]
-        return stirred(moves, t_ns)
+        return tremor_envelope(moves, t_ns)
 
     def moving(self, now_ns: int) -> bool:
         """Return whether the tool centre point is moving at a true time of the trial."""

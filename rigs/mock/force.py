@@ -70,12 +70,12 @@ class MockForceSensor:
         self._until_ns: int | None = None
 
     def connect(self) -> None:
-        """It is there."""
+        """Open the connection."""
         if self.zeroing == "session":
             self.zero()
 
     def start(self) -> None:
-        """Begin to stream; what came before is dropped."""
+        """Start streaming; earlier samples are dropped."""
         self._loads, self._until_ns = self._world.keep_wrench(), None
         now = self._cycles.to_reference(self._loads.end_ns)
         self._read = -(-now // self._period_ns)
@@ -142,7 +142,7 @@ class MockForceSensor:
             self._until_ns = self._world.now_ns
 
     def close(self) -> None:
-        """Give the device back."""
+        """Close the device."""
         self.stop()
 
     def _mixed(self, load: F64, true_ns: I64) -> F64:

@@ -43,7 +43,7 @@ _NOISE_FRAMES = 256
 
 
 class MockFrameCamera:
-    """The camera that looks through the plate.
+    """The camera that sees the skin through the plate.
 
     Args:
         trigger: source of its exposures, the sync box or the camera itself.
@@ -148,7 +148,7 @@ class MockFrameCamera:
             images[:] = self._board(world.board)
             return FrameChunk(images, number, stamp, host, sync)
         marked = seen.plate_mm if world.plate_marked else None
-        self._view.draw(images, seen.tips_mm, marked, number, world.seed, seen.ways)
+        self._view.draw(images, seen.tips_mm, marked, number, world.seed, seen.paths)
         return FrameChunk(images, number, stamp, host, sync)
 
     def read_clock(self) -> ClockReads:
@@ -189,8 +189,8 @@ class MockFrameCamera:
             camera = BoardCamera(
                 optics.px_per_mm, *self._size, optics.tilt_deg, (optics.k1,), optics.distance_mm
             )
-            looks = optics.ground_level, optics.tip_level
-            picture = draw_board(camera, place, BoardPrint(), dark=looks[0], bright=looks[1])
+            levels = optics.ground_level, optics.tip_level
+            picture = draw_board(camera, place, BoardPrint(), dark=levels[0], bright=levels[1])
             draw = generator(self._world.settings.seed, "board noise")
             noisy = picture + optics.noise * draw.standard_normal(picture.shape)
             self._shown = (place, self._size), np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
@@ -300,14 +300,14 @@ class FrameFaults:
         hidden = [(papilla, when) for papilla, when in hidden if when.any()]
         if not hidden:
             return seen
-        tips_mm, plate_mm, ways = seen.tips_mm.copy(), seen.plate_mm.copy(), dict(seen.ways)
+        tips_mm, plate_mm, paths = seen.tips_mm.copy(), seen.plate_mm.copy(), dict(seen.paths)
         for papilla, when in hidden:
             _put_away(papilla, tips_mm, plate_mm, when)
-            for index in ways.keys() & set(np.flatnonzero(when).tolist()):
-                way = ExposurePath(ways[index].tips_mm.copy(), ways[index].plate_mm.copy())
-                _put_away(papilla, way.tips_mm, way.plate_mm, slice(None))
-                ways[index] = way
-        return Exposures(tips_mm, plate_mm, ways)
+            for index in paths.keys() & set(np.flatnonzero(when).tolist()):
+                path = ExposurePath(paths[index].tips_mm.copy(), paths[index].plate_mm.copy())
+                _put_away(papilla, path.tips_mm, path.plate_mm, slice(None))
+                paths[index] = path
+        return Exposures(tips_mm, plate_mm, paths)
 
 
 def _put_away(papilla: int | None, tips_mm: F64, plate_mm: F64, when: Mask | slice) -> None:

@@ -251,9 +251,9 @@ class ArmPath:
                 result[ended:last] = leg.end[columns]
         return result
 
-    def stirred(self, t_ns: I64) -> F64:
+    def tremor(self, t_ns: I64) -> F64:
         """Return the tremor's envelope at increasing times, 0 to 1; it decays after a motion."""
-        return stirred([(leg.start_ns, leg.end_ns) for leg in self.legs], t_ns)
+        return tremor_envelope([(leg.start_ns, leg.end_ns) for leg in self.legs], t_ns)
 
     def moving(self, now_ns: int) -> bool:
         """Return whether a leg has not ended."""
@@ -268,7 +268,7 @@ def _unwound(target: F64, state: F64) -> float:
     return float(state[TURN] + math.remainder(target[TURN] - state[TURN], 2.0 * math.pi))
 
 
-def stirred(moves: Sequence[tuple[int, int]], t_ns: I64) -> F64:
+def tremor_envelope(moves: Sequence[tuple[int, int]], t_ns: I64) -> F64:
     """Return the tremor's envelope, 0 to 1, at increasing times (n,), for moves (start, end)."""
     if not len(t_ns):
         return np.zeros(0)

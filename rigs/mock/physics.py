@@ -143,7 +143,7 @@ class Physics:
                     rows.shrink(count - done, int(t_ns[done]))
 
     def _sum_up(self, t_ns: I64, track: F64, load: F64) -> None:
-        """Keep the sum of the tips' forces, if somebody looks at it."""
+        """Keep the sum of the tips' forces if a force sensor reads it."""
         if self.wrench is not None:
             self.wrench.grow(t_ns)[:] = plate_wrench(track, load)
 

@@ -216,7 +216,7 @@ Tilt = Annotated[float, Field(ge=-30, le=30)]
 
 
 class FrameCamera(StrictModel):
-    """The camera that looks through the plate."""
+    """The camera that sees the skin through the plate."""
 
     level: Literal["video", "tracks"] = "video"
     """`video`: images are rendered and stored. `tracks`: every frame has only the marker positions
@@ -296,7 +296,7 @@ class ForceSensor(StrictModel):
     noise_nm: NonNegative = 0.0001
     """The same of its torque about each axis."""
     drift_n_per_min: NonNegative = 0.02
-    """Largest drift of zero along each axis; a trial has a random share of it, either way."""
+    """Largest drift of zero along each axis; a trial has a random share of it, of either sign."""
     drift_nm_per_min: NonNegative = 0.0004
     cross_talk: tuple[Row, Row, Row, Row, Row, Row] | None = None
     """Cross-talk matrix C; a reading is (1 + C) times the load of Fx, Fy,
@@ -308,7 +308,7 @@ class ForceSensor(StrictModel):
     range_n: Positive = 50.0
     """Force along any axis beyond which readings are not to be trusted: a fault."""
     clock_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
-    """Largest drift of its clock, either way; the seed draws it."""
+    """Largest drift of its clock, of either sign; drawn from the seed."""
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 500
     """From a sample to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 1000.0

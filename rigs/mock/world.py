@@ -124,7 +124,7 @@ class World:
         if not sensor[:, 5].any():
             sensor = np.ascontiguousarray(sensor[:, :5])
         if self._vibration:
-            strength = self.path.stirred(t_ns)[:, None]
+            strength = self.path.tremor(t_ns)[:, None]
             sensor[:, :3] += strength * self._vibration.at(t_ns)
         return sensor
 
@@ -199,7 +199,7 @@ class World:
         return self.physics.keep_wrench(self.now_ns)
 
     def drop_wrench(self) -> None:
-        """Nobody looks at the sum of the forces any longer."""
+        """Stop keeping the sum of the forces."""
         self.physics.wrench = None
 
     def drop_loads(self) -> None:

@@ -1,1 +1,1 @@
-"""The simulated scene behind the mock rig and the stand-ins: skin, contact, plate, pictures."""
+"""The simulated scene behind the mock rig and the fake devices: skin, contact, plate, images."""

@@ -35,9 +35,9 @@ _L1, _L2, _L3, _L4, _L5, _L6, _L7 = (
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def decayed(way):  # type: ignore[no-untyped-def]
-    """exp(-way) for a `way` from 0 on; what lies beyond 700 counts as 700."""
-    x = way if way < _LARGEST else _LARGEST
+def exp_minus(exponent):  # type: ignore[no-untyped-def]
+    """Return exp(-exponent) for an `exponent` >= 0; above 700 it counts as 700."""
+    x = exponent if exponent < _LARGEST else _LARGEST
     marked = x * _PER_LN2 + _WHOLE
     whole = marked - _WHOLE
     r = (whole * _LN2_HIGH - x) + whole * _LN2_LOW
@@ -47,15 +47,15 @@ def decayed(way):  # type: ignore[no-untyped-def]
     low = (1.0 + r) + r2 * (0.5 + r * _E3) + r4 * ((_E4 + r * _E5) + r2 * (_E6 + r * _E7))
     high = (_E8 + r * _E9) + r2 * (_E10 + r * _E11) + r4 * (_E12 + r * _E13)
     power = low + r4 * r4 * high
-    exponent = 1023 - (np.float64(marked).view(np.int64) - _WHOLE_BITS)
-    return power * np.int64(exponent << 52).view(np.float64)
+    biased = 1023 - (np.float64(marked).view(np.int64) - _WHOLE_BITS)
+    return power * np.int64(biased << 52).view(np.float64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def logarithm(x):  # type: ignore[no-untyped-def]
     """Natural logarithm of a normal number above 0."""
     bits = np.float64(x).view(np.int64) + (_ONE - _ROOT_HALF)
-    # the exponent as a float, by way of its bits: wide registers have no other conversion
+    # the exponent as a float, from its bits: wide registers have no other conversion
     exponent = np.int64((bits >> 52) + _WHOLE_BITS).view(np.float64) - (_WHOLE + 1023.0)
     f = np.int64((bits & _FRACTION) + _ROOT_HALF).view(np.float64) - 1.0
     s = f / (2.0 + f)

@@ -2,14 +2,14 @@
 
 As in v2e (Hu, Liu and Delbruck, CVPRW 2021). The log intensity u(t) that a pixel sees goes through
 a low pass of first order whose cutoff is proportional to the intensity. The memorised level falls
-at a steady rate, so that a pixel that sees nothing new fires a positive event once in a while. An
+at a steady rate, so that a pixel with constant input fires a positive event once in a while. An
 event moves the memorised level by its threshold.
 
 v2e steps all of this from frame to frame. Here a marker's path is cut into parts on which it moves
 by a tenth of a pixel at most. On each the input is a parabola through three places of the path,
 for which the low pass has a closed form (P(t) + K e^(-t / tau)); where that, less the memorised
 level, meets a threshold is a root in a bracket. Only pixels near rims that move, and those whose
-low pass has not settled yet, are looked at. These pixels are off by default: thresholds and leak
+low pass has not settled yet, are computed. These pixels are off by default: thresholds and leak
 cost about 20 times what `pixels` does, a low pass about 250 times (docs/scene.md).
 """
 
@@ -66,13 +66,13 @@ class Circuit(NamedTuple):
 
 
 def no_circuit() -> Circuit:
-    """Stand-in for pixels that need none; has no cells."""
+    """Return an empty circuit, for pixels that need none."""
     flat, line = np.empty((0, 0), np.int64), np.empty(0, np.int64)
     return Circuit(np.empty((0, 0, 6)), flat, flat, flat, line, line, 0.0, 0.0, False)
 
 
 def new_circuit(on: F64, off: F64, leak_hz: F64, cutoff_hz: float) -> Circuit:
-    """Pixels with thresholds and leak rates, (height, width) each; they have seen nothing yet."""
+    """Return pixels with thresholds and leak rates, (height, width) each; dark so far."""
     cells = np.zeros((*on.shape, 6))
     cells[..., ON], cells[..., OFF], cells[..., LEAK] = on, off, leak_hz * on * 1e-9
     empty = np.zeros(on.shape, np.int64)
@@ -84,8 +84,8 @@ def new_circuit(on: F64, off: F64, leak_hz: F64, cutoff_hz: float) -> Circuit:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def see_image(circuit, discs, contrast, edge, phase):  # type: ignore[no-untyped-def]
-    """Let every cell see the image of `discs`, column, row and radius, (n, 3), settled.
+def memorise_image(circuit, discs, contrast, edge, phase):  # type: ignore[no-untyped-def]
+    """Set every cell to the image of `discs` (column, row, radius; (n, 3)), settled.
 
     Args:
         phase: how much of a threshold each memorised level has leaked already, 0 to 1, (height,
@@ -115,7 +115,7 @@ def see_image(circuit, discs, contrast, edge, phase):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def start_cells(circuit, t_ns):  # type: ignore[no-untyped-def]
-    """Let every cell be at rest from `t_ns` on."""
+    """Set every cell to rest from `t_ns` on."""
     height, width = circuit.since.shape
     for y in range(height):
         for x in range(width):
@@ -159,7 +159,7 @@ def _difference(t, p0, p1, p2, rest, pace, leak):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance(cell, h, middle, end, pace, contrast, fires, head, begin, out, n):  # type: ignore[no-untyped-def]
-    """Let a cell see a parabola for `h` ns.
+    """Apply a parabolic input to a cell for `h` ns.
 
     Args:
         middle, end: its input after half the time and after all of it; at first it is the cell's.
@@ -228,19 +228,19 @@ def _pace(cutoff, level, contrast):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pass_rim(  # type: ignore[no-untyped-def]
-    cell, x, y, first, last, fires, since, until, inverse, curve, ways, cutoff, contrast, edge,
+    cell, x, y, first, last, fires, since, until, inverse, curve, arcs, cutoff, contrast, edge,
     head, out, n,
 ):  # fmt: skip
-    """Let a cell see a marker go by in a block; see `advance`. `ways`: px in each step, at most."""
+    """Apply a passing marker to a cell; see `advance`. `arcs`: largest path in each step, px."""
     for k in range(first, last):
-        parts = max(int(np.ceil(ways[k] / _PART_PX)), 1)
+        parts = max(int(np.ceil(arcs[k] / _PART_PX)), 1)
         h = (until[k] - since[k]) / parts
         for part in range(parts):
             t = since[k] + part * h
             gap = distance_at(x, y, t + h, k, since, inverse, curve)[0]
             end = level_at(gap, contrast, edge)
             middle = 0.5 * (cell[INPUT] + end)
-            if ways[k] > _LINE_PX:
+            if arcs[k] > _LINE_PX:
                 gap = distance_at(x, y, t + 0.5 * h, k, since, inverse, curve)[0]
                 middle = level_at(gap, contrast, edge)
             pace = _pace(cutoff, middle, contrast)
@@ -274,7 +274,7 @@ def events_of_circuit(  # type: ignore[no-untyped-def]
     cells, reach = circuit.cells, CUT * edge
     height, width = cells.shape[0], cells.shape[1]
     steepest, spare = 0.26 * contrast / edge, 1e-9 * contrast
-    ways = np.empty(since.shape[0])
+    arcs = np.empty(since.shape[0])
     for block in range(blocks):
         a, b = first[block], first[block + 1]
         begin_ns, end_ns = row_ns[row + a], row_ns[row + b]
@@ -287,12 +287,12 @@ def events_of_circuit(  # type: ignore[no-untyped-def]
             for k in range(a, b):
                 # no cubic between two rows is longer than its control polygon
                 h = until[k] - since[k]
-                way = 0.0
+                arc = 0.0
                 for c in range(0, 12, 4):
                     v, p, q = curve[c + 1, k], curve[c + 2, k], curve[c + 3, k]
-                    way += h * (abs(v) + abs(v + p) + abs(v + 2.0 * p + 3.0 * q)) / 3.0
-                ways[k] = way
-                whole += way
+                    arc += h * (abs(v) + abs(v + p) + abs(v + 2.0 * p + 3.0 * q)) / 3.0
+                arcs[k] = arc
+                whole += arc
             x0, y0, r0 = path[i, 0, row + a], path[i, 1, row + a], path[i, 2, row + a]
             x1, y1, r1 = path[i, 0, row + b], path[i, 1, row + b], path[i, 2, row + b]
             chord_px = np.sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2)
@@ -331,7 +331,7 @@ def events_of_circuit(  # type: ignore[no-untyped-def]
                 if n + most > events.shape[0]:
                     events = larger(events, 2 * (n + most))
                 n = _pass_rim(
-                    cell, x, y, a, b, fires, since, until, inverse, curve, ways, circuit.cutoff,
+                    cell, x, y, a, b, fires, since, until, inverse, curve, arcs, circuit.cutoff,
                     contrast, edge, start + (x << 13 | y << 1), events, n,
                 )  # fmt: skip
         left = 0

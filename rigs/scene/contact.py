@@ -83,10 +83,10 @@ BLOCK = np.dtype([
         # the search for the bend: bracket, whether it goes on (negative: failed), stretch
         "low high seeks stretch",
         # the force when the slip begins, the cone's radii at both ends; the slip's direction
-        "from_x from_y before after unit_x unit_y top bottom way",
+        "from_x from_y before after unit_x unit_y top bottom arc",
         # the search for the slip (`rigs.scene.slip.slip_step`)
         "bend ahead aside rest_x rest_y soft_x soft_y quick lag grip grip_slope far",
-        # what is not a matter of all lanes at once: kind, share of the drive until the tip lets
+        # for lanes that are prepared one by one: kind, share of the drive until the tip lets
         # go, how long it slides then (s), what it takes from the plate by letting go
         "rare held slides_s kick",
     )
@@ -250,7 +250,7 @@ def _touch(w, law, j, step):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _bend(w):  # type: ignore[no-untyped-def]
-    """Take a step of every tip towards its bend if it sticks; how many have not found it."""
+    """Take a step of every tip towards its bend if it sticks; return how many have not found it."""
     seek = 0
     for j in range(LANES):
         seeks = w.seeks[j] > 0.0
@@ -397,12 +397,12 @@ def _aim(w, law):  # type: ignore[no-untyped-def]
     if law.exact_turns:
         for j in range(LANES):
             from_x, from_y = w.from_x[j], w.from_y[j]
-            w.unit_x[j], w.unit_y[j], w.top[j], w.bottom[j], w.way[j] = tractrix(
+            w.unit_x[j], w.unit_y[j], w.top[j], w.bottom[j], w.arc[j] = tractrix(
                 from_x, from_y, w.end_force_x[j] - from_x, w.end_force_y[j] - from_y, w.before[j],
                 w.after[j],
             )  # fmt: skip
         for j in range(LANES):
-            unit_x, unit_y = tractrix_end(w.unit_x[j], w.unit_y[j], w.top[j], w.bottom[j], w.way[j])
+            unit_x, unit_y = tractrix_end(w.unit_x[j], w.unit_y[j], w.top[j], w.bottom[j], w.arc[j])
             w.unit_x[j], w.unit_y[j] = slip_direction(
                 w.from_x[j], w.from_y[j], w.end_force_x[j], w.end_force_y[j], unit_x, unit_y,
                 w.after[j],
@@ -463,7 +463,7 @@ def _search(w, field, law, first, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _seek(w, law):  # type: ignore[no-untyped-def]
-    """Take a step of every tip towards its slip; how many go on seeking."""
+    """Take a step of every tip towards its slip; return how many are still searching."""
     seek = 0
     for j in range(LANES):
         slip = w.slip[j]
@@ -498,7 +498,7 @@ def _doubtful(w):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _arrive(w):  # type: ignore[no-untyped-def]
-    """Move the tips that slid to their places; how many need another knot."""
+    """Move the tips that slid to their places; return how many need another knot."""
     stale = 0
     for j in range(LANES):
         slides, slip = w.end_mode[j] == SLIDING, w.slip[j]
@@ -637,7 +637,7 @@ def _begin_rare(w, field, law, i, j, rough, step):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _needs_speed(law, cone, slides_s):  # type: ignore[no-untyped-def]
-    """Tell that the speed of a rare slip follows from how its force relaxes."""
+    """Return whether the speed of a rare slip follows from how its force relaxes."""
     return law.strengthening > 0.0 and law.damping_s == 0.0 and cone > 0.0 and slides_s > 0.0
 
 
@@ -664,7 +664,7 @@ def _take_speed(w, field, law, i, j, slip, bend, before, after, cone, more):  # 
     """Take the speed at the end of a slip from `relaxed_speed`.
 
     Args:
-        slip, bend: a state on the way, mm; cone: the cone's radius there, N; more: what speed
+        slip, bend: a state during the slip, mm; cone: the cone's radius there, N; more: what speed
             multiplies friction by there.
         before, after: the cone's radii at both ends if the tip does not slip, N.
     """

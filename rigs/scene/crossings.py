@@ -2,7 +2,7 @@
 
 For pixels whose distance is not known to be monotone on a whole segment; `pixels` has the others.
 
-g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is looked for on a part
+g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is searched on a part
 of time on which g is proven to be monotone: its rate lies between bounds from the control points
 of the path's derivative (a Bezier curve stays in their hull) and from how far the direction to
 the pixel can turn. Where the sign of the rate is not certain, the same bounds say how far g may
@@ -22,7 +22,7 @@ _DONE_PX = 1e-10
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def step_at(t, since, until, guess):  # type: ignore[no-untyped-def]
-    """The step of the path that holds the time `t` of its block, looked for from `guess` on."""
+    """The step of the path that holds the time `t` of its block, searched from `guess` on."""
     k = guess
     while t > until[k]:
         k += 1
@@ -37,7 +37,7 @@ def distance_at(x, y, t, k, since, inverse, curve):  # type: ignore[no-untyped-d
 
     Returns:
         the distance, and the rate as a product of two: the rate times the distance from the
-        centre, and that distance (of which the caller may spare the division).
+        centre, and that distance (so that the caller may avoid the division).
     """
     tau = t - since[k]
     s = tau * inverse[k]
@@ -62,7 +62,7 @@ def turning(share):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore[no-untyped-def]
-    """Tell if a distance from ga to gb in `length` ns can meet a threshold in between.
+    """Return whether a distance from ga to gb in `length` ns can meet a threshold in between.
 
     Its rate lies between `slowest` <= 0 and `fastest` >= 0: both lines from each end bound it.
     """
@@ -164,7 +164,7 @@ def events_of_segment(  # type: ignore[no-untyped-def]
     x, y, on, off, last_one, level, step, ga, segment, base, begin, final, since, until, inverse,
     curve, tree, contrast, edge, head, stack, out, n,
 ):  # fmt: skip
-    """Events of one pixel on a segment of a block, however its distance goes.
+    """Events of one pixel on a segment of a block, for any course of its distance.
 
     Args:
         on, off, last_one, level: the pixel's state, see `edges`; step: its threshold.

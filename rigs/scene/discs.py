@@ -1,8 +1,7 @@
-"""White discs on a dark ground, drawn pixel by pixel: sharp, or smeared along their way.
+"""White discs on a dark ground, drawn pixel by pixel: sharp, or smeared along their path.
 
 Rims are anti-aliased so exactly that a centroid is right to a thousandth of a pixel, and noise is
-only drawn where something is looked at: over the whole picture it would cost more than everything
-else.
+drawn only round discs: over the whole image it would cost more than everything else.
 """
 
 from __future__ import annotations
@@ -123,8 +122,8 @@ def _sharp(image, cx, cy, radius, ground, level, dark, bright, down, along):  # 
 
 
 @njit(cache=True, nogil=True)
-def _smeared(image, way, radius, ground, level, dark, low_x, low_y, high_x, high_y, down, along):  # type: ignore[no-untyped-def]
-    """The mean of one disc over its places `way`, (s, 2)."""
+def _smeared(image, path, radius, ground, level, dark, low_x, low_y, high_x, high_y, down, along):  # type: ignore[no-untyped-def]
+    """Draw the mean of one disc over its positions `path`, (s, 2)."""
     height, width = image.shape
     rows, columns = dark.shape
     left, right = max(low_x, 0), min(high_x + 1, width)
@@ -135,8 +134,8 @@ def _smeared(image, way, radius, ground, level, dark, low_x, low_y, high_x, high
     # each place adds its rim, and +1 and -1 where its whole pixels begin and end
     rim = np.zeros((bottom - top, right - left + 1))
     whole = np.zeros((bottom - top, right - left + 1))
-    for k in range(way.shape[0]):
-        cx, cy = way[k, 0], way[k, 1]
+    for k in range(path.shape[0]):
+        cx, cy = path[k, 0], path[k, 1]
         for y in range(max(int(np.ceil(cy - outer)), 0), min(int(cy + outer) + 1, height)):
             first, last, begin, end = _row(cx, y - cy, outer, inner, width)
             if begin < end:
@@ -146,7 +145,7 @@ def _smeared(image, way, radius, ground, level, dark, low_x, low_y, high_x, high
                 rim[y - top, x - left] += _covered(abs(x - cx), abs(y - cy), radius)
             for x in range(end, last + 1):
                 rim[y - top, x - left] += _covered(abs(x - cx), abs(y - cy), radius)
-    per_place = 1.0 / way.shape[0]
+    per_place = 1.0 / path.shape[0]
     for y in range(top, bottom):
         inside = 0.0
         for x in range(left, right):
@@ -159,14 +158,14 @@ def _smeared(image, way, radius, ground, level, dark, low_x, low_y, high_x, high
 
 
 @njit(cache=True, nogil=True)
-def draw_discs(image, centres, radii, ways, smeared, ground, level, dark, bright, frame_key):  # type: ignore[no-untyped-def]
+def draw_discs(image, centres, radii, paths, smeared, ground, level, dark, bright, frame_key):  # type: ignore[no-untyped-def]
     """Discs with anti-aliased rims, and noise in boxes round them, on an even ground.
 
     Args:
         image: (h, w) uint8, filled.
-        centres: (n, 2) column and row; where a disc stands, or the mean of its way.
+        centres: (n, 2) column and row; positions of still discs, or the mean of their path.
         radii: (n,) px.
-        ways: (s, n, 2) places along the exposure, looked at where `smeared`, (n,), is true.
+        paths: (s, n, 2) positions along the exposure, used where `smeared`, (n,), is true.
         ground, level: grey levels.
         dark, bright: the noise tile on the ground's level and on the discs', uint8, so that most
             pixels are copied.
@@ -180,9 +179,9 @@ def draw_discs(image, centres, radii, ways, smeared, ground, level, dark, bright
         low_x = high_x = centres[i, 0]
         low_y = high_y = centres[i, 1]
         if smeared[i]:
-            for k in range(ways.shape[0]):
-                low_x, high_x = min(low_x, ways[k, i, 0]), max(high_x, ways[k, i, 0])
-                low_y, high_y = min(low_y, ways[k, i, 1]), max(high_y, ways[k, i, 1])
+            for k in range(paths.shape[0]):
+                low_x, high_x = min(low_x, paths[k, i, 0]), max(high_x, paths[k, i, 0])
+                low_y, high_y = min(low_y, paths[k, i, 1]), max(high_y, paths[k, i, 1])
         boxes[i, 0], boxes[i, 1] = int(np.floor(low_x - reach)), int(np.floor(low_y - reach))
         boxes[i, 2], boxes[i, 3] = int(high_x + reach), int(high_y + reach)
         down, along = _shift(frame_key, i + 1)
@@ -194,7 +193,7 @@ def draw_discs(image, centres, radii, ways, smeared, ground, level, dark, bright
         left, top = boxes[i, 0], boxes[i, 1]
         if smeared[i]:
             _smeared(
-                image, ways[:, i], radii[i], ground, level, dark, left, top, boxes[i, 2],
+                image, paths[:, i], radii[i], ground, level, dark, left, top, boxes[i, 2],
                 boxes[i, 3], down, along,
             )  # fmt: skip
         else:

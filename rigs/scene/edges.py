@@ -34,7 +34,7 @@ def level_at(distance, contrast, edge):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rim_of(level, contrast, edge):  # type: ignore[no-untyped-def]
-    """Distance from the rim at which a level is met; far away if it never is.
+    """Distance from the rim at which a level is met; a large number if it never is.
 
     The two flat levels are met where the edge ends, so that what a disc does to a pixel in
     coming is undone, event by event, when it goes.
@@ -63,8 +63,8 @@ def dark_pixels(threshold, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def see_discs(discs, contrast, edge, threshold, state, seen):  # type: ignore[no-untyped-def]
-    """Let the pixels of `state` that see one of `discs` take its image as their reference.
+def memorise_discs(discs, contrast, edge, threshold, state, seen):  # type: ignore[no-untyped-def]
+    """Set the reference of the pixels that see one of `discs` to its image.
 
     Args:
         discs: column, row and radius, px, (n, 3).
@@ -92,7 +92,7 @@ def see_discs(discs, contrast, edge, threshold, state, seen):  # type: ignore[no
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def darken(seen, dark, state):  # type: ignore[no-untyped-def]
-    """Let pixels forget what they saw.
+    """Reset pixels to the dark background.
 
     Args:
         seen: rectangles in which discs have been: left, right, top, bottom, px, (n, 4); emptied.
@@ -112,6 +112,6 @@ def darken(seen, dark, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def widen(i, column, row, reach, seen):  # type: ignore[no-untyped-def]
-    """Let rectangle i of `seen` hold all within `reach` px of a place."""
+    """Widen rectangle i of `seen` to hold all within `reach` px of a place."""
     seen[i, 0], seen[i, 1] = min(seen[i, 0], column - reach), max(seen[i, 1], column + reach)
     seen[i, 2], seen[i, 3] = min(seen[i, 2], row - reach), max(seen[i, 3], row + reach)

@@ -3,8 +3,8 @@
 A pixel of such a camera fires when its log intensity has changed by its threshold. For a disc
 with a known edge that happens when the disc's rim is at a known distance, so the times are roots
 on the disc's path: exact to a microsecond where frames at 1 kHz give half a millisecond (v2e, Hu,
-Liu and Delbruck 2021), and more than a hundred times cheaper. Only pixels that may fire are looked
-at.
+Liu and Delbruck 2021), and more than a hundred times cheaper. Only pixels that may fire are
+computed.
 
 Discs must not come so near to each other that their edges overlap.
 """
@@ -22,12 +22,12 @@ from sliplab.rigs.scene.circuit import (
     RATE_DECADES,
     Circuit,
     events_of_circuit,
+    memorise_image,
     new_circuit,
     no_circuit,
-    see_image,
     start_cells,
 )
-from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, see_discs, widen
+from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, memorise_discs, widen
 from sliplab.rigs.scene.marker_path import (
     SEGMENT,
     cut_block,
@@ -106,7 +106,7 @@ class EventOptics:
 
     @property
     def block_ns(self) -> int:
-        """Length of a block: what the camera hands over together."""
+        """Length of a block: what the camera delivers together."""
         return self.block_ms * 1_000_000
 
     @property
@@ -239,14 +239,14 @@ class MarkerSensor:
         self._trial, self._bins = seed, {}
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
         darken(self._pixels.seen, self._dark, self._pixels.state)
-        see_discs(
+        memorise_discs(
             discs, optics.contrast, optics.edge_px, self.threshold, self._pixels.state,
             self._pixels.seen,
         )  # fmt: skip
         if optics.has_circuit:
-            # a camera that has been running for long: its pixels are somewhere between two leaks
+            # a camera that has run for long: each pixel is at a random point between two leaks
             phase = generator(seed, "leak phases").random(self.threshold.shape)
-            see_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
+            memorise_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
             self._started = False
         self._pixels.fired[:] = NEVER_NS
         self._pending = np.empty(0, np.int64)
@@ -307,12 +307,12 @@ def _between_pixels(seed: int, name: str, shape: tuple[int, int], mean: float, s
 
 
 SPAN_NS = 96_000_000
-"""As long a time is looked at in one go; a packed event has room for 134 ms."""
+"""Largest time computed together; a packed event has room for 134 ms."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
-    """Blocks of a grid of `block_ns` from row `begin` on, as many as are looked at together.
+    """Blocks of a grid of `block_ns` from row `begin` on, as many as are computed together.
 
     Args:
         first: first row of each block, counted from `begin`, then the last row of all; written.
@@ -337,11 +337,11 @@ def trace(  # type: ignore[no-untyped-def]
     loads, layout_mm, projection, row_ns, camera, phase_ns, of_pixels, lists, circuit, noise,
     pending,
 ):  # fmt: skip
-    """Signal and noise under `loads`, as the camera hands them over.
+    """Return signal and noise events under `loads`, as the camera delivers them.
 
     In a block each marker's path is fitted and cut into segments, the pixels that may fire are
     picked from its list, and tiles of them go through the segments. Noise is added, and the block
-    is read out. Blocks lie on a grid of true time and nothing looks past their borders.
+    is read out. Blocks lie on a grid of true time and do not depend on each other.
 
     Args:
         loads, layout_mm, projection: see `marker_path.markers_in_image`.

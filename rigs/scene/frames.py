@@ -1,7 +1,7 @@
-"""Pictures of the tips through the plate, drawn at exact places as cheaply as can be.
+"""Images of the tips through the plate, drawn at exact positions at the least cost.
 
-Papillae are white discs, the sliding plate shows its ArUco marker, and a nuisance of reflections
-may be laid over both.
+Papillae are white discs, the sliding plate shows its ArUco marker, and reflections may be
+added to both.
 
 At the speeds of a slide nothing moves a tenth of a pixel while the shutter is open, and such frames
 cost nothing extra. A falling plate and a tip that jumps are smeared: the picture is the mean over
@@ -163,7 +163,7 @@ def draw_reflections(
     return grey
 
 
-Look = Callable[[I64], tuple[F64, F64]]
+PositionsAt = Callable[[I64], tuple[F64, F64]]
 """From times, ns, (k,), to tips (k, n, 2) and heights of the plate (k,), in mm.
 
 Times rise within an exposure, and from exposure to exposure: none is before the first or after the
@@ -171,16 +171,16 @@ last of them.
 """
 
 STILL_PX = 0.1
-"""Shorter ways than this are drawn at their mean place."""
+"""Shorter paths than this are drawn at their mean position."""
 BEND_PX = 0.025
-"""Unless they bend: of a kink in the way, Simpson's rule misses up to an eighth of the bend."""
+"""Unless they bend: of a kink in the path, Simpson's rule misses up to an eighth of the bend."""
 _STEP_PX = 0.25
 _FEWEST, _MOST = 32, 128
 
 
 @dataclass(frozen=True)
 class ExposurePath:
-    """Places of everything at equal shares of one exposure."""
+    """Positions at equal shares of one exposure."""
 
     tips_mm: F64
     """(s, n, 2)."""
@@ -190,24 +190,24 @@ class ExposurePath:
 
 @dataclass(frozen=True)
 class Exposures:
-    """Mean places over each of m exposures, and the ways of those in which something moved."""
+    """Mean positions over each of m exposures, and the paths of those in which something moved."""
 
     tips_mm: F64
     """(m, n, 2)."""
     plate_mm: F64
     """(m,)."""
-    ways: Mapping[int, ExposurePath] = field(default_factory=dict)
+    paths: Mapping[int, ExposurePath] = field(default_factory=dict)
     """By index of the exposure."""
 
 
-def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Exposures:
-    """Look at the scene during exposures of `exposure_ns` about `mid_ns` (rising, (m,)).
+def expose(positions_at: PositionsAt, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Exposures:
+    """Return positions during exposures of `exposure_ns` about `mid_ns` (increasing, (m,)).
 
-    Places that hardly move are averaged by Simpson's rule over beginning, middle and end.
+    Positions that hardly change are averaged by Simpson's rule over beginning, middle and end.
     """
     half = exposure_ns // 2
-    # one look for everything: what it costs is the call
-    tips, plate = look((mid_ns[:, None] + np.array([-half, 0, half], np.int64)).ravel())
+    # one call for everything: the call is what costs
+    tips, plate = positions_at((mid_ns[:, None] + np.array([-half, 0, half], np.int64)).ravel())
     tips, plate, farthest, bent = _average(
         tips.reshape(-1, 3, *tips.shape[1:]), plate.reshape(-1, 3), px_per_mm
     )
@@ -215,25 +215,25 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
     if not len(smeared):
         return Exposures(tips, plate)
     counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
-    ways: dict[int, ExposurePath] = {}
+    paths: dict[int, ExposurePath] = {}
     for count in np.unique(counts).tolist():
-        # ways of as many places are looked at together
+        # paths with the same number of positions are evaluated together
         here = smeared[counts == count]
         # midpoints of equal shares, to a nanosecond
         shares = (2 * np.arange(count, dtype=np.int64) + 1) * (2 * half) // (2 * count)
-        along, heights = look((mid_ns[here, None] - half + shares).ravel())
+        along, heights = positions_at((mid_ns[here, None] - half + shares).ravel())
         along = along.reshape(-1, count, *along.shape[1:])
         heights = heights.reshape(-1, count)
         tips[here], plate[here] = along.mean(axis=1), heights.mean(axis=1)
-        ways.update(zip(here.tolist(), map(ExposurePath, along, heights), strict=True))
-    return Exposures(tips, plate, ways)
+        paths.update(zip(here.tolist(), map(ExposurePath, along, heights), strict=True))
+    return Exposures(tips, plate, paths)
 
 
-def moved(way_px: F64) -> npt.NDArray[np.bool_]:
-    """Tell which of n things need their path drawn, (n,), from places along it, px, (s, n, 2)."""
-    count = len(way_px)
-    steps = _length(np.diff(way_px, axis=0)).sum(axis=0)
-    # from the first midpoint to the last is less than the whole way
+def moved(path_px: F64) -> npt.NDArray[np.bool_]:
+    """Return which of n discs need their path `path_px`, (s, n, 2), drawn: (n,)."""
+    count = len(path_px)
+    steps = _length(np.diff(path_px, axis=0)).sum(axis=0)
+    # from the first midpoint to the last is less than the whole path
     result: npt.NDArray[np.bool_] = steps * count >= STILL_PX * (count - 1)
     return result
 
@@ -247,11 +247,11 @@ def _length(vector: F64) -> F64:
 def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
     """Simpson's mean of tips (m, 3, n, 2) and plate (m, 3) over beginning, middle and end.
 
-    Also the longest way of anything in each exposure, and its largest bend, px, (m,).
+    Also the longest path in each exposure, and its largest bend, px, (m,).
     """
     m, _, n, _ = tips.shape
     mean, height = np.empty((m, n, 2)), np.empty(m)
-    way, bend = np.empty(m), np.empty(m)
+    travel, bend = np.empty(m), np.empty(m)
     for k in range(m):
         low, middle, high = plate[k]
         height[k] = (low + 4.0 * middle + high) / 6.0
@@ -266,13 +266,13 @@ def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
             farthest = max(farthest, first + second)
             bow_x, bow_y = x0 - 2.0 * x1 + x2, y0 - 2.0 * y1 + y2
             bent = max(bent, math.sqrt(bow_x**2 + bow_y**2))
-        way[k], bend[k] = px_per_mm * farthest, px_per_mm * bent
-    return mean, height, way, bend
+        travel[k], bend[k] = px_per_mm * farthest, px_per_mm * bent
+    return mean, height, travel, bend
 
 
 @dataclass(frozen=True)
 class FrameOptics:
-    """The outside camera and what it looks at. Lengths mm, levels 0 to 255; see `Lens`."""
+    """The outside camera and the markers that it sees. Lengths mm, levels 0 to 255; see `Lens`."""
 
     px_per_mm: float = 20.0
     tip_radius_mm: float = 1.0
@@ -319,7 +319,7 @@ class PlateView:
         plate_mm: F64 | None,
         number: I64,
         seed: int,
-        ways: Mapping[int, ExposurePath] | None = None,
+        paths: Mapping[int, ExposurePath] | None = None,
     ) -> None:
         """Fill `images`, (k, height, width), uint8.
 
@@ -327,25 +327,25 @@ class PlateView:
             tips_mm: places of the tips in the world, (k, n, 2), means over the exposure.
             plate_mm: height of the sliding plate with its marker, (k,); None: a plate without.
             number: the frames' numbers, which with `seed` decide on their noise, (k,).
-            ways: what moved during the exposure, by index of the picture.
+            paths: what moved during the exposure, by index of the image.
         """
         if seed != self._seed:
             self._prepare(seed)
-        optics, ways = self.optics, ways or {}
-        looks = optics.ground_level, optics.tip_level, self._dark, self._bright
+        optics, paths = self.optics, paths or {}
+        levels = optics.ground_level, optics.tip_level, self._dark, self._bright
         keys = np.uint64(self._key) ^ (number.astype(np.uint64) * _GOLDEN)
         centres, radii = self.centre_px(tips_mm), self.radius_px(tips_mm)
         still = np.ones(len(images), np.bool_)
-        still[list(ways)] = False
-        draw_still(images, centres, radii, still, *looks, keys)
-        for index, way in ways.items():
-            path = self.centre_px(way.tips_mm)
+        still[list(paths)] = False
+        draw_still(images, centres, radii, still, *levels, keys)
+        for index, exposed in paths.items():
+            path = self.centre_px(exposed.tips_mm)
             draw_discs(
-                images[index], centres[index], radii[index], path, moved(path), *looks, keys[index]
+                images[index], centres[index], radii[index], path, moved(path), *levels, keys[index]
             )
         if plate_mm is not None:
             for index, image in enumerate(images):
-                heights = ways[index].plate_mm if index in ways else plate_mm[index : index + 1]
+                heights = paths[index].plate_mm if index in paths else plate_mm[index : index + 1]
                 self._stick(image, heights, keys[index])
         if self._light is not None:
             for image in images:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from sliplab.rigs.scene.branchless import decayed, logarithm
+from sliplab.rigs.scene.branchless import exp_minus, logarithm
 from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.skin import Skin
 
@@ -140,7 +140,7 @@ _BETWEEN = 1.0 - 1e-9
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def keeps_sliding(fx, fy, dx, dy, start, end, strengthening):  # type: ignore[no-untyped-def]
-    """Tell that the force f + s d of a sliding tip never enters its cone before it ends outside.
+    """Return whether the force f + s d of a sliding tip stays outside its cone and ends outside.
 
     A tip slides as long as its speed is above zero. Where friction rises with speed, its force then
     lies outside the cone of friction at rest, whose radius goes from `start` to `end`, and may fall
@@ -187,7 +187,7 @@ def tractrix(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
 
     Returns:
         direction of the drive; tan(theta / 2) as a quotient's numerator and denominator, theta
-        being the angle from the drive to the force; and the way over the radius (negative: the
+        being the angle from the drive to the force; and the arc over the radius (negative: the
         force points along the drive at once).
     """
     size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
@@ -195,30 +195,30 @@ def tractrix(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
     ux, uy = (dx * per_drive, dy * per_drive) if drive > 0.0 else (fx * per_size, fy * per_size)
     from_x, from_y = (fx * per_size, fy * per_size) if size > 0.0 else (ux, uy)
     along, across = from_x * ux + from_y * uy, ux * from_y - uy * from_x
-    # the way over the logarithmic mean of the radii; near 1 the series of ratio / log(1 + ratio),
+    # the arc over the logarithmic mean of the radii; near 1 the series of ratio / log(1 + ratio),
     # else the logarithm, with what 1 + ratio rounds away
     ratio = after / before - 1.0
     series = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
     whole = 1.0 + ratio
     log = logarithm(whole) + (ratio - (whole - 1.0))
     even = abs(ratio) < 1e-3
-    way = (drive if even else drive * log) / (series if even else after - before)
-    way = way if after > 0.0 and before > 0.0 else -1.0
+    arc = (drive if even else drive * log) / (series if even else after - before)
+    arc = arc if after > 0.0 and before > 0.0 else -1.0
     # along < 0 beyond a right angle: 1 + along cancels there
     high, low = (across, 1.0 + along) if along > 0.0 else (1.0 - along, across)
-    return ux, uy, high, low, way
+    return ux, uy, high, low, arc
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def tractrix_end(ux, uy, high, low, way):  # type: ignore[no-untyped-def]
+def tractrix_end(ux, uy, high, low, arc):  # type: ignore[no-untyped-def]
     """Direction of a sliding tip's force after the drive: the tractrix. A unit vector."""
-    # straight against the drive it stays so
-    high *= decayed(max(way, 0.0)) if low != 0.0 else 1.0
-    high = high if way >= 0.0 else 0.0
+    # exactly against the drive, the force keeps its direction
+    high *= exp_minus(max(arc, 0.0)) if low != 0.0 else 1.0
+    high = high if arc >= 0.0 else 0.0
     scale = 1.0 / (low * low + high * high)
     cosine, sine = (low * low - high * high) * scale, 2.0 * high * low * scale
     x, y = cosine * ux - sine * uy, sine * ux + cosine * uy
-    return (x, y) if way >= 0.0 else (ux, uy)
+    return (x, y) if arc >= 0.0 else (ux, uy)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -235,13 +235,13 @@ def slip_direction(fx, fy, to_x, to_y, ux, uy, after):  # type: ignore[no-untype
     per_size = 1.0 / size if size > 0.0 else 0.0
     mean_x, mean_y = ux + fx * per_size, uy + fy * per_size
     # what the slip takes away of the force points along the slip, between the two directions of
-    # the force; where rounding or a radius that is only foreseen say otherwise, half-way is right
+    # the force; where rounding or a predicted radius say otherwise, the middle is right
     x, y = to_x - after * ux, to_y - after * uy
     length = np.sqrt(x * x + y * y)
     between = x * mean_x + y * mean_y > length * (ux * mean_x + uy * mean_y) * _BETWEEN
     x, y = (x, y) if between else (mean_x, mean_y)
     square = x * x + y * y
-    # a cone that vanishes lets the force turn right round at once: then there is no half-way
+    # a cone that vanishes lets the force reverse at once: then there is no middle
     x, y, square = (x, y, square) if square > 0.0 else (ux, uy, 1.0)
     scale = 1.0 / np.sqrt(square)
     return x * scale, y * scale

@@ -119,7 +119,7 @@ class BoardPrint:
 class BoardPlace:
     """Pose of a board: its centre in plate coordinates (z away from the camera), turns.
 
-    The board's face looks at the camera; turned by `spin_deg` in its plane, then by `lean_deg`
+    The board faces the camera; turned by `spin_deg` in its plane, then by `lean_deg`
     about the plate's x and y.
     """
 

@@ -2,7 +2,7 @@
 
 The time of an event is as exact as the path. At 3 px/s a microsecond is 3e-6 px, which straight
 lines between rows miss by far; cubic Hermite curves with slopes from four rows are of fourth order.
-A block never looks past its own rows, so that cutting a stream at the borders of blocks changes
+A block never uses rows of another one, so that cutting a stream at the borders of blocks changes
 nothing.
 
 A block is cut into segments on which a pixel's distance from the rim is monotone, or nearly: there
@@ -62,7 +62,7 @@ def largest(values, row, n):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
-    """Tell if marker i is the same, to the bit, in all rows from `begin` up to and with `stop`."""
+    """Return whether marker i is the same, to the bit, in all rows from `begin` to `stop`."""
     for c in range(3):
         if path[i, c, begin] != path[i, c, stop]:
             return False
@@ -75,7 +75,7 @@ def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-untyped-def]
-    """Weigh the rows for the slope at each row of a block, which looks at no other rows.
+    """Weigh the rows for the slope at each row of a block, from its own rows alone.
 
     The slope is that of the cubic through the four nearest rows (Lagrange), at both ends of a
     block a one-sided one; through all of them where a block has fewer.
@@ -181,7 +181,7 @@ def fit_blocks(path, i, row, first, blocks, chord, inverse, weights, inner, curv
             slope, after = curve[4 * c + 1, k], curve[4 * c + 1, k + 1]
             curve[4 * c + 2, k] = 3.0 * rate - 2.0 * slope - after
             curve[4 * c + 3, k] = slope + after - 2.0 * rate
-        # a block's last slope looks at its own rows, not at those of the next block
+        # a block's last slope uses its own rows, not those of the next block
         for block in range(blocks):
             begin, end = first[block], first[block + 1]
             after = _slope(c, end, begin, end, block, weights, curve)
@@ -340,16 +340,16 @@ def cut_block(first, last, block, zero, reach, since, until, curve, spread, segm
         apart, grows = deviation(k0, k1, mean_x, mean_y, mean_r, curve, spread)
         speed = np.sqrt(mean_x * mean_x + mean_y * mean_y) + apart
         if done == first and parts == 1:
-            way = (speed + abs(mean_r) + grows) * length
-            while parts < size and way > parts * _MOST_PX:
+            travel = (speed + abs(mean_r) + grows) * length
+            while parts < size and travel > parts * _MOST_PX:
                 parts *= 2
             if parts > 1:
                 continue
         segment = segments[n]
         segment.k0, segment.k1, segment.begin, segment.end = k0, k1, begin, end
         segment.zero, segment.block = zero, block
-        # on a way that begins and ends as the mean does; and by so much is a pixel that is not
-        # nearer than the edge at both ends of a chord nearer in between
+        # the path begins and ends as the mean does. A pixel that is beyond the edge at both ends of
+        # a chord may come nearer by this much in between
         chord = (mean_x * mean_x + mean_y * mean_y) * (end - begin) ** 2
         bow = 0.5 * (apart + grows) * (end - begin)
         left = min(curve[8, k0], curve[8, k1]) - bow - reach - 0.5 * np.sqrt(chord)

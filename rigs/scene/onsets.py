@@ -2,7 +2,7 @@
 
 While a tip sticks its force is a known function of time, so its slip is one root of one function:
 exact for even friction, at any level of physics, for thousands of tips in a millisecond. Plans
-learn from it what to expect, and whether a scene needs the dearer levels.
+use it for expected onsets, and to decide whether a scene needs a higher level.
 """
 
 from __future__ import annotations

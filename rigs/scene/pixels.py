@@ -66,7 +66,7 @@ def place_pixels(tile, n, column, row, radius):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
-    """Tell what each of n pixels does on a segment.
+    """Classify what each of n pixels does on a segment.
 
     Args:
         reach: distance from the rim beyond which a pixel may be another disc's, px.
@@ -80,7 +80,7 @@ def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
         segment.end - segment.begin,
     )
     # no point of the path is farther from the middle of its ends than half its length
-    way = 0.5 * speed * length
+    half_path = 0.5 * speed * length
     for j in range(n):
         dx, dy = tile[P_X + j] - x1, tile[P_Y + j] - y1
         away = np.sqrt(dx * dx + dy * dy)
@@ -89,7 +89,7 @@ def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
         dx, dy = dx - half_x, dy - half_y
         inverse = 1.0 / max(np.sqrt(dx * dx + dy * dy), 1e-3)
         mean = -(dx * mean_x + dy * mean_y) * inverse - mean_r
-        share = way * inverse
+        share = half_path * inverse
         spread = apart + turning(share) * speed
         slowest, fastest = mean - spread, mean + spread
         turns = (slowest < 0.0) & (fastest > 0.0) & (2.0 * spread * length > _DONE_PX)
@@ -326,7 +326,7 @@ def finish(wait, n, since, until, steps, inverse, curve, out, count):  # type: i
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def move(source, j, target, k):  # type: ignore[no-untyped-def]
-    """Let lane k of `target` hold the root in lane j of `source`."""
+    """Copy the root in lane j of `source` to lane k of `target`."""
     for field in range(9):
         target[STRIDE * field + k] = source[STRIDE * field + j]
 

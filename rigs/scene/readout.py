@@ -81,10 +81,10 @@ def _column_of(where, y_bits, x_bits):  # type: ignore[no-untyped-def]
 def read_each(  # type: ignore[no-untyped-def]
     events, n, other, base_ns, span_ns, refractory_ns, fired, t_ns, xs, ys, ps, kept
 ):
-    """Hand over a block's events with their own times.
+    """Deliver a block's events with their own times.
 
     Args:
-        events: packed (see above), their times ns after `base_ns`, at most `span_ns`; spoilt.
+        events: packed (see above), their times ns after `base_ns`, at most `span_ns`; overwritten.
         other: scratch, as long.
         fired: time (ns) at which each pixel last fired, (height, width), written.
         t_ns, xs, ys, ps: written from `kept` on.
@@ -110,13 +110,13 @@ def read_scans(  # type: ignore[no-untyped-def]
     events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns, refractory_ns, fired, t_ns,
     xs, ys, ps, kept,
 ):  # fmt: skip
-    """Hand over the scans that are read to their last column by `end_ns`; see `read_each`.
+    """Deliver the scans that are read to their last column by `end_ns`; see `read_each`.
 
     Args:
         period_ns, phase_ns, column_ns: see `Scans`.
 
     Returns:
-        how many events are handed over in all, and how many of later scans are left: these stand
+        how many events are delivered in all, and how many of later scans are left: these stand
         at the front of `events`, their times unchanged.
     """
     height, width = fired.shape
@@ -145,7 +145,7 @@ def read_scans(  # type: ignore[no-untyped-def]
     # few events of a scan share a column: insertion puts their rows in order
     sort_packed(keys, inside, other, low + y_bits, low + y_bits + x_bits + bits_for(past))
     for k in range(inside):
-        # all that is not in the cache is asked for at once, and not one pixel after the other
+        # cache misses are requested together, not one pixel after the other
         other[k] = fired[
             _row_of(keys[k] >> low, y_bits), _column_of(keys[k] >> low, y_bits, x_bits)
         ]

@@ -1,4 +1,4 @@
-"""Pixels that have to be looked at in a block: a list of each marker's pixels, and a cheap test.
+"""Pixels that may fire in a block: a list of each marker's pixels, and a cheap test.
 
 When a list is made, every pixel near the rim keeps the direction u to it, its distance rho and how
 far its next thresholds are. Once the marker has moved by D and grown by G, the pixel's distance
@@ -78,7 +78,8 @@ def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[
 def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
     """Distance by which a pixel must fall for a positive, and rise for a negative event, px.
 
-    Outside the edge (`reach`) the pixel may be another marker's: then only the way to it counts.
+    Outside the edge (`reach`) the pixel may be another marker's: only the distance up to the edge
+    counts then.
     """
     if gap >= reach:
         return gap - reach, _NEVER_PX
@@ -126,7 +127,7 @@ def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place): 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def reaches(i, column, row, radius, strays, origin):  # type: ignore[no-untyped-def]
-    """Tell if marker i's list still holds if it strays so far from (column, row, radius), px."""
+    """Return whether marker i's list still holds if it strays so far from (column, row, radius)."""
     dx, dy = column - origin[i, 0], row - origin[i, 1]
     moved = np.sqrt(dx * dx + dy * dy) + abs(radius - origin[i, 2])
     return origin[i, _COUNT] > 0.0 and moved + strays <= REACH_PX
@@ -136,10 +137,10 @@ def reaches(i, column, row, radius, strays, origin):  # type: ignore[no-untyped-
 def may_fire(  # type: ignore[no-untyped-def]
     i, column, row, radius, dx, dy, dr, stray, origin, aim, place, hit, slots, pixels
 ):
-    """Pixels that marker i may let fire on its way from (column, row, radius) by (dx, dy, dr).
+    """Find the pixels that may fire while marker i goes from (column, row, radius) by (dx, dy, dr).
 
     Args:
-        stray: how far the way is from its chord at most, px.
+        stray: largest distance of the path from its chord, px.
         hit: scratch, bytes, a multiple of eight of them, as many as slots.
         slots, pixels: slots and places of these pixels, written.
 
@@ -152,7 +153,7 @@ def may_fire(  # type: ignore[no-untyped-def]
     nearest = origin[i, _NEAREST]
     left = nearest - moved
     # what the second order leaves out: a b^2 / (2 rho (rho - a)) and b^4 / (8 (rho - a)^3) with
-    # a^2 + b^2 = D^2; twice, for a pixel's thresholds may have been renewed on the way
+    # a^2 + b^2 = D^2; twice, for a pixel's thresholds may have been renewed in between
     rest = 0.385 * moved**3 / (2.0 * nearest * left) + moved**4 / (8.0 * left**3)
     # along the chord the bending term is a parabola; this is how far it and a line are apart
     bow = 0.25 * (dx * dx + dy * dy) / nearest
@@ -183,7 +184,7 @@ def may_fire(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def renew(i, column, row, radius, slots, pixels, gaps, count, state, edge, origin, aim):  # type: ignore[no-untyped-def]
-    """Give slots new thresholds after their pixels were looked at.
+    """Give slots new thresholds after their pixels were computed.
 
     Args:
         column, row, radius: where marker i is now.

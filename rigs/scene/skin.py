@@ -76,7 +76,7 @@ class Skin:
 def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
     """A skin with the fabrication scatter that belongs to `seed`.
 
-    The skin without scatter looks the same after a turn by 60 degrees if every ring's count can
+    The skin without scatter is the same after a turn by 60 degrees if every ring's count can
     be divided by 6.
     """
     places, heights, ring = [], [], []

@@ -42,8 +42,8 @@ class SlideRun:
     def slipped_s(self) -> F64:
         """First slip of each tip after the start of the slide, s, (n,); NaN: none."""
         n = self.loads.shape[1] // 3
-        way = self.track[:, 2 * n : 3 * n] - self.track[0, 2 * n : 3 * n]
-        first = np.argmax(way > 0.0, axis=0)
+        slid = self.track[:, 2 * n : 3 * n] - self.track[0, 2 * n : 3 * n]
+        first = np.argmax(slid > 0.0, axis=0)
         times = self.track[first, 3 * n + np.arange(n)] - self.began_s
         return np.where(first > 0, np.maximum(times, 0.0), np.nan)
 
@@ -73,8 +73,8 @@ def run_slide(
     sensor = np.zeros((first + steps, 5))
     sensor[:, 2] = depth_mm
     sensor[:PRESS_STEPS, 2] = depth_mm * np.arange(1, PRESS_STEPS + 1) / PRESS_STEPS
-    angle, way = math.radians(direction_deg), length_mm * share
-    sensor[first:, 0], sensor[first:, 1] = way * math.cos(angle), way * math.sin(angle)
+    angle, distance = math.radians(direction_deg), length_mm * share
+    sensor[first:, 0], sensor[first:, 1] = distance * math.cos(angle), distance * math.sin(angle)
     n = len(springs.table)
     track, loads = np.empty((len(sensor), track_width(n))), np.empty((len(sensor), 3 * n))
     advance(

@@ -81,9 +81,9 @@ def first_slip(  # type: ignore[no-untyped-def]
     moved_x, moved_y, unit_x, unit_y, slides, bent, bending, shortening, compliance, pressed,
     pressing, rough,
 ):  # fmt: skip
-    """Slip and bend at which the search begins, and the longest slip that is believed, mm.
+    """Slip and bend at which the search begins, and the longest plausible slip, mm.
 
-    `slides` and `bent` are as they were foreseen. A tip that slips much farther than its base moved
+    `slides` and `bent` are the predicted ones. A tip that slips much farther than its base moved
     jumped over rough friction: the search may have missed where it is caught first.
     """
     moved = moved_x * unit_x + moved_y * unit_y
@@ -144,8 +144,8 @@ def slip_step(  # type: ignore[no-untyped-def]
             to rise, mm/s.
 
     Returns:
-        slip, bend, whether that is it, whether it may become it, and how fast the force falls to
-        the cone with the slip, N/mm.
+        slip, bend, whether it is the solution, whether it may still converge, and how fast the
+        force falls to the cone with the slip, N/mm.
     """
     left = ahead - slip
     spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, pressing)
@@ -182,9 +182,9 @@ def march_to_slip(  # type: ignore[no-untyped-def]
     guess, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening,
     compliance, field, i, path, quick, lag, law,
 ):  # fmt: skip
-    """The first slip on the way after which friction holds the force; slip, bend, in mm.
+    """Return the first slip after which friction holds the force, and the bend, mm.
 
-    Places are tried one after another, and the one that is too far is approached by regula falsi.
+    Steps forward until the force is below the limit, then regula falsi.
     """
     bent, slip, below, above = guess, 0.0, 0.0, 0.0
     low, high, side = 0.0, -1.0, 0
@@ -228,11 +228,11 @@ def march_to_slip(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def slows_down(slid_s, speed, fx, fy, moved_x, moved_y, h, law):  # type: ignore[no-untyped-def]
-    """Tell that a tip's earlier speeds tell nothing of its next one: see `relaxed_speed`.
+    """Return whether a tip's earlier speeds do not predict its next one: see `relaxed_speed`.
 
     Args:
-        slid_s, speed: of the step before: how long it tells of, s (0: not), and its mean, mm/s.
-        fx, fy: force on the tip's way, N.
+        slid_s, speed: of the step before: its duration, s (0: none), and its mean speed, mm/s.
+        fx, fy: force on the sliding tip, N.
         moved_x, moved_y, h: how far the base moves, mm, in how many seconds.
     """
     along = _STEADY * (fx * moved_x + fy * moved_y)
@@ -243,13 +243,13 @@ def slows_down(slid_s, speed, fx, fy, moved_x, moved_y, h, law):  # type: ignore
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def is_steady(earlier, speed):  # type: ignore[no-untyped-def]
-    """Tell that speeds of two steps, mm/s, foretell the next one."""
+    """Return whether the speeds of two steps, mm/s, predict the next one."""
     return earlier <= _STEADY * speed
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # type: ignore[no-untyped-def]
-    """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds tell nothing, mm/s.
+    """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds predict nothing, mm/s.
 
     With x = (|f| / cone - 1) / strengthening the speed is weak (e^x - 1), and x' = a - b (e^x - 1)
     while rates are constant: a linear equation for e^-x, solved exactly, because a tip that lets go
@@ -258,7 +258,7 @@ def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # 
     Args:
         force, rise: size of the force, and by how much it rises if the tip does not slip, N.
         before, after: the cone's radii at both ends if it does not, N.
-        cone, steepness: the cone's radius and steepness (see `slip_step`) on the way.
+        cone, steepness: the cone's radius and steepness (see `slip_step`) during the slip.
 
     Returns:
         the speed; negative: friction falls with the slip faster than the spring pulls.
@@ -357,7 +357,7 @@ def bend_step(bent, low, high, stretch, bending, shortening, compliance, pressed
     """One guarded Newton step towards the bend at a stretch.
 
     Returns:
-        the bend, the bracket round it, and whether that is it.
+        the bend, its bracket, and whether it is the solution.
     """
     force, _, slope, _ = column(bent, bending, shortening, pressed, pressing)
     miss = bent + compliance * force - stretch

@@ -125,7 +125,7 @@ class Tips:
 
     @property
     def path(self) -> F64:
-        """Length of the way slid since the trial began, mm, (n,)."""
+        """Length of the path slid since the trial began, mm, (n,)."""
         return self.state[:, PATH]
 
     @property

@@ -110,7 +110,7 @@ def test_the_world_can_stop_it_and_nobody_but_the_controller_moves_it() -> None:
 def test_the_arm_trembles_while_it_moves() -> None:
     path = path_of()
     path.motion.move(away(4.0), 4.0, 1e6, at(path, 1.0))
-    strength = path.stirred(np.array([0, 1_100_000_000, 1_900_000_000, 5_000_000_000], np.int64))
+    strength = path.tremor(np.array([0, 1_100_000_000, 1_900_000_000, 5_000_000_000], np.int64))
     assert strength == pytest.approx([0, 0.5, 1, 0], abs=0.01)
 
 

@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from sliplab.rigs.scene.branchless import decayed, logarithm
+from sliplab.rigs.scene.branchless import exp_minus, logarithm
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -12,7 +12,7 @@ EPS = float(np.finfo(np.float64).eps)
 @pytest.mark.parametrize(("low", "high"), [(1e-12, 1e-3), (1e-3, 1.0), (1.0, 50.0), (50.0, 690.0)])
 def test_decayed_is_the_exponential(low: float, high: float) -> None:
     for way in np.geomspace(low, high, 300):
-        assert decayed(way) == pytest.approx(float(mpmath.exp(-mpmath.mpf(way))), rel=3 * EPS)
+        assert exp_minus(way) == pytest.approx(float(mpmath.exp(-mpmath.mpf(way))), rel=3 * EPS)
 
 
 @pytest.mark.parametrize(
@@ -24,6 +24,6 @@ def test_logarithm_is_the_logarithm(low: float, high: float) -> None:
 
 
 def test_their_ends() -> None:
-    assert decayed(0.0) == 1.0
-    assert 0.0 < decayed(np.inf) < 1e-300
+    assert exp_minus(0.0) == 1.0
+    assert 0.0 < exp_minus(np.inf) < 1e-300
     assert logarithm(1.0) == 0.0

@@ -254,11 +254,11 @@ def test_the_mean_is_the_mean_over_the_exposure(name: str) -> None:
 
 def test_only_what_moves_a_tenth_of_a_pixel_has_a_way() -> None:
     # at 1.6 mm/s 0.064 px in 2 ms; at 3 mm/s 0.12 px
-    assert not seen(lambda ms: 1.6e-3 * ms, [10_000_000, 20_000_000]).ways
+    assert not seen(lambda ms: 1.6e-3 * ms, [10_000_000, 20_000_000]).paths
     found = seen(lambda ms: np.where(ms < 15, 0.0, 3e-3 * (ms - 15)), [10_000_000, 20_000_000])
-    assert list(found.ways) == [1]
-    assert len(found.ways[1].tips_mm) == 32
-    path = PX_PER_MM * found.ways[1].tips_mm
+    assert list(found.paths) == [1]
+    assert len(found.paths[1].tips_mm) == 32
+    path = PX_PER_MM * found.paths[1].tips_mm
     assert moved(path).tolist() == [True, False]
 
 
@@ -266,14 +266,14 @@ def test_a_falling_plate_alone_is_a_way_too() -> None:
     found = seen(MOTIONS["standing"], [10_000_000], lambda ms: -0.5 * ms)
     assert found.plate_mm[0] == pytest.approx(-5.0, abs=1e-9)
     # 20 px in steps of a quarter
-    assert len(found.ways[0].plate_mm) == 80
-    assert not moved(PX_PER_MM * found.ways[0].tips_mm).any()
+    assert len(found.paths[0].plate_mm) == 80
+    assert not moved(PX_PER_MM * found.paths[0].tips_mm).any()
 
 
 def test_no_frames_are_no_exposures() -> None:
     found = seen(MOTIONS["fall"], [])
     assert found.tips_mm.shape == (0, 2, 2)
-    assert not found.ways
+    assert not found.paths
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -284,9 +284,9 @@ def test_exposures_seen_together_are_those_seen_one_by_one(name: str) -> None:
         alone = seen(MOTIONS[name], [mid], lambda ms: -0.01 * ms)
         assert np.array_equal(together.tips_mm[index], alone.tips_mm[0])
         assert together.plate_mm[index] == alone.plate_mm[0]
-        assert (index in together.ways) == (0 in alone.ways)
-        if index in together.ways:
-            assert np.array_equal(together.ways[index].tips_mm, alone.ways[0].tips_mm)
+        assert (index in together.paths) == (0 in alone.paths)
+        if index in together.paths:
+            assert np.array_equal(together.paths[index].tips_mm, alone.paths[0].tips_mm)
 
 
 NOTHING = np.empty((2, 0, 2))

@@ -13,7 +13,7 @@ from numba import njit
 from scipy.optimize import brentq
 
 from sliplab.rigs.scene.crossings import events_of_segment
-from sliplab.rigs.scene.edges import CUT, dark_pixels, rim_of, see_discs
+from sliplab.rigs.scene.edges import CUT, dark_pixels, memorise_discs, rim_of
 from sliplab.rigs.scene.marker_path import (
     SEGMENT,
     bound_rates,
@@ -93,7 +93,7 @@ def look(seed: int, px: float, smooth: float) -> Look:
     threshold = 0.2 + 0.03 * rng.uniform(-3, 3, (HEIGHT, WIDTH))
     state = dark_pixels(threshold, CONTRAST, EDGE)
     disc = path[:, :, 0]
-    see_discs(disc, CONTRAST, EDGE, threshold, state, np.tile([np.inf, -np.inf] * 2, (1, 1)))
+    memorise_discs(disc, CONTRAST, EDGE, threshold, state, np.tile([np.inf, -np.inf] * 2, (1, 1)))
     return Look(first, since, since + NS, inverse, curve, segments[:amount], threshold, state)
 
 
