@@ -169,6 +169,14 @@ class Arm(Protocol):
 
 
 @runtime_checkable
+class StoppingArm(Protocol):
+    """An arm that goes on for a while after a stop; any other is taken to stop at once."""
+
+    def stopping_s(self, speed_mm_s: float) -> float:
+        """Time for which it goes on at full speed, or as far: reaction, and half of braking."""
+
+
+@runtime_checkable
 class EventCamera(Protocol):
     """An event camera with an input for sync pulses."""
 

@@ -1,4 +1,9 @@
-"""Forces on the plate while the arm moves: the limit that stops it, and the end of a press."""
+"""Forces on the plate while the arm moves: the limit that stops it, and the end of a press.
+
+A press to a force is stopped ahead of it. The normal force is taken on the straight line through
+its last 10 ms, which filters noise, and that line is followed through all that passes until the arm
+is at rest: the age of the newest sample, and the arm's reaction and braking.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.protocols.program import Move, Position, Step, Twist, step_seconds
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
@@ -14,7 +20,11 @@ from sliplab.storage.streams import WrenchChunk
 
 POLL_S = 0.02
 """Interval at which forces are read, s: how late a limit, or the end of a press, may be seen."""
-_RECENT_NS = 10_000_000
+_LINE_NS = 10_000_000
+_FEWEST = 5
+"""Samples through which a straight line is laid: those of the last 10 ms, at least five."""
+_I64 = npt.NDArray[np.int64]
+_F64 = npt.NDArray[np.float64]
 
 
 class ForceWatch:
@@ -22,16 +32,27 @@ class ForceWatch:
 
     Args:
         limit_n: largest force on the plate, in any direction; None for no limit.
-
-    Attributes:
-        normal_n: normal force on the plate, mean of the last 10 ms that were read.
+        delay_s: shortest time from a load to the host that has its sample.
     """
 
-    def __init__(self, sensor: ForceSensor, plate: PlateFrame, limit_n: float | None) -> None:
-        self._sensor, self._limit_n = sensor, limit_n
+    def __init__(
+        self,
+        sensor: ForceSensor,
+        plate: PlateFrame,
+        limit_n: float | None,
+        delay_s: float = 0.0,
+    ) -> None:
+        self._sensor, self._limit_n, self._delay_s = sensor, limit_n, delay_s
         self._to_plate = np.array(plate.force_matrix(sensor.mounting))
-        self.normal_n = 0.0
+        self._t_ns: _I64 = np.empty(0, np.int64)
+        self._host_ns: _I64 = np.empty(0, np.int64)
+        self._normal_n: _F64 = np.empty(0)
         sensor.start()
+
+    @property
+    def normal_n(self) -> float:
+        """Normal force on the plate, mean of the last 10 ms that were read; 0 before."""
+        return float(self._normal_n.mean()) if len(self._normal_n) else 0.0
 
     def read(self) -> WrenchChunk:
         """Return the forces since the last call.
@@ -43,8 +64,7 @@ class ForceWatch:
         if not len(chunk):
             return chunk
         forces = chunk.force_n @ self._to_plate.T
-        recent = chunk.t_ns > chunk.t_ns[-1] - _RECENT_NS
-        self.normal_n = float(forces[recent, 2].mean())
+        self._keep(chunk, forces[:, 2])
         most = float(np.linalg.norm(forces, axis=1).max())
         if self._limit_n is not None and most > self._limit_n:
             raise RigError(
@@ -53,6 +73,39 @@ class ForceWatch:
                 "the rig; the arm was stopped: press less, or see what it touches",
             )
         return chunk
+
+    def seconds_to(self, force_n: float, now_ns: int) -> float:
+        """Return the time until the normal force will be `force_n`, if it goes on as it does.
+
+        The straight line of least squares through the last 10 ms is followed. A sample's age is
+        known by the one that came fastest among them: what came later waited on its way.
+
+        Args:
+            now_ns: the host's clock.
+
+        Returns:
+            seconds, negative if it is passed; infinite while the force does not rise to it.
+        """
+        if len(self._t_ns) < 2:
+            return np.inf
+        age_s = (self._t_ns - (now_ns - int((self._host_ns - self._t_ns).min()))) * 1e-9
+        age_s -= self._delay_s
+        middle_s, mean_n = age_s.mean(), self._normal_n.mean()
+        off_s = age_s - middle_s
+        rate = float(off_s @ (self._normal_n - mean_n) / (off_s @ off_s))
+        missing_n = force_n - (mean_n - rate * middle_s)
+        if rate <= 0:
+            return -np.inf if missing_n <= 0 else np.inf
+        return float(missing_n / rate)
+
+    def _keep(self, chunk: WrenchChunk, normal_n: _F64) -> None:
+        """Keep what the line is laid through."""
+        t_ns = np.concatenate([self._t_ns, chunk.t_ns])
+        first = int(np.searchsorted(t_ns, t_ns[-1] - _LINE_NS, side="right"))
+        kept = slice(max(min(first, len(t_ns) - _FEWEST), 0), None)
+        self._t_ns = t_ns[kept]
+        self._host_ns = np.concatenate([self._host_ns, chunk.host_ns])[kept]
+        self._normal_n = np.concatenate([self._normal_n, normal_n])[kept]
 
 
 @dataclass

@@ -39,6 +39,7 @@ from sliplab.rigs.core.capabilities import (
     RigError,
     Segment,
     Simulation,
+    StoppingArm,
     SyncBox,
     Truth,
 )
@@ -262,7 +263,9 @@ class Rig:
     def _watch_forces(self) -> ForceWatch:
         """Read forces from now on, and hold them against the limit."""
         assert self.force is not None
-        self._forces = ForceWatch(self.force, self.plate_frame, self.force_limit_n)
+        timing = self.timing.force
+        delay_s = 0.0 if timing is None else timing.delay.shortest_us * 1e-6
+        self._forces = ForceWatch(self.force, self.plate_frame, self.force_limit_n, delay_s)
         return self._forces
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
@@ -378,10 +381,10 @@ class Rig:
         """
         seconds = at.distance_mm(step.to) / step.speed_mm_s
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
-        return self._follow(segment, seconds, step.phase, sink)
+        return self._follow(segment, seconds, step.phase, sink)[:2]
 
     def _press_to_force(self, step: Move, force_n: float, at: Position) -> tuple[int, int]:
-        """Press until the normal force is reached, and stop; return controller times, ns.
+        """Press, and stop where the arm will rest at the normal force; return times as `move`.
 
         Raises:
             StopRequested, ArmFault: as `move`.
@@ -390,22 +393,29 @@ class Rig:
         if self.force is None:
             raise RigError("force sensor", f"this rig has none to press to {force_n:g} N")
         forces = self._forces or self._watch_forces()
+        arm, goes_on_s = self.arm, 0.0
+        if isinstance(arm, StoppingArm):
+            goes_on_s = arm.stopping_s(step.speed_mm_s)
+
+        def left_s() -> float:
+            return forces.seconds_to(force_n, self.clock.now_ns()) - goes_on_s
+
         seconds = at.distance_mm(step.to) / step.speed_mm_s
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
-        times = self._follow(segment, seconds, step.phase, None, lambda: forces.normal_n >= force_n)
-        if forces.normal_n < force_n:
+        start, end, stopped = self._follow(segment, seconds, step.phase, None, left_s)
+        if not stopped and forces.normal_n < force_n:
             raise RigError(
                 "force sensor",
                 f"reads {forces.normal_n:.2f} N at the deepest place, {step.to.depth_mm:g} mm, not "
                 f"the {force_n:g} N to press to; allow more depth, or ask for less force",
             )
-        return times
+        return start, end
 
     def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Turn about the plate's normal on the spot; as `move`."""
         seconds = abs(step.to.twist_deg - at.twist_deg) / step.speed_deg_s
         segment = Segment(self.plate_frame.pose(step.to), RETRACT_SPEED_MM_S, step.speed_deg_s)
-        return self._follow(segment, seconds, step.phase, sink)
+        return self._follow(segment, seconds, step.phase, sink)[:2]
 
     def _follow(
         self,
@@ -413,15 +423,20 @@ class Rig:
         seconds: float,
         phase: str,
         sink: Sink | None,
-        until: Callable[[], bool] | None = None,
-    ) -> tuple[int, int]:
-        """Send one segment of known duration, and wait for its end, or stop once `until` is true.
+        left_s: Callable[[], float] | None = None,
+    ) -> tuple[int, int, bool]:
+        """Send one segment of known duration, and wait for its end, or stop it on the way.
 
-        What `until` looks at is read every `force_watch.POLL_S`.
+        Args:
+            left_s: time until the arm has to be stopped, s; asked every `force_watch.POLL_S`, and
+                again when half of it is over.
+
+        Returns:
+            start and end, controller times in ns, and True where it was stopped on the way.
         """
         start = self.arm.now_ns()
         if seconds == 0:
-            return start, start
+            return start, start, False
         self.arm.start([segment])
         deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
         while not (progress := self.arm.progress()).done:
@@ -429,17 +444,20 @@ class Rig:
                 raise arm_fault(progress.state, phase)
             if self.clock.now_ns() > deadline:
                 raise ArmFault("arm", f"did not finish the phase '{phase}' in time")
-            if until is not None and until():
-                self.arm.stop()
-                return start, self.arm.now_ns()
+            most = self.poll_s
+            if left_s is not None:
+                stop_s = left_s()
+                if stop_s <= 0:
+                    self.arm.stop()
+                    return start, self.arm.now_ns(), True
+                most = min(stop_s / 2, force_watch.POLL_S)
             left = seconds - (self.arm.now_ns() - start) / 1e9
-            most = self.poll_s if until is None else force_watch.POLL_S
-            self.wait(min(most, max(left, 1e-3)), sink)
+            self.wait(max(min(most, left), 1e-3), sink)
         if not progress.state.healthy:
             raise arm_fault(progress.state, phase)
         if not progress.finished:
             raise ArmFault("arm", f"was stopped from outside in the phase '{phase}'")
-        return progress.finished[-1]
+        return *progress.finished[-1], False
 
     def wait(self, seconds: float, sink: Sink | None = None) -> None:
         """Let time pass; read streams and check for stop requests every `poll_s`.

@@ -160,6 +160,10 @@ class AbbSocketArm(ThreadedArm):
         if self._may_move:
             self._confirm_rest()
 
+    def stopping_s(self, speed_mm_s: float) -> float:
+        """Longest time for which it goes on at full speed after a stop: one piece."""
+        return self._settings.segment_s
+
     def close(self) -> None:
         """Send no further piece, and close the connection for the next client.
 
