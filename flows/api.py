@@ -67,6 +67,20 @@ class Poses:
 
 
 @dataclass(frozen=True)
+class Scalars:
+    """Readings of one quantity, n of them."""
+
+    t_ns: I64
+    """Time line, nanoseconds, shape (n,)."""
+    value: F64
+    """Readings in `unit`, shape (n,)."""
+    unit: str
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True)
 class Onsets:
     """Onsets of incipient and gross slip in a trial, on its time line."""
 
@@ -108,14 +122,28 @@ class Trial:
         """True if a simulated rig made this trial."""
         return self.recording.simulated
 
-    def events(self, start_ns: int | None = None, end_ns: int | None = None) -> Events:
+    def streams(self) -> dict[str, str]:
+        """Kinds of the trial's streams by name: ``events``, ``frames``, ``scalar``, ``wrench``.
+
+        Those of the first cameras are named ``events`` and ``frames``, further ones as in the rig
+        file.
+        """
+        kinds = ("events", "frames", "scalar", "wrench")
+        return {name: kind for kind in kinds for name in self.recording.streams(kind)}
+
+    def events(
+        self, start_ns: int | None = None, end_ns: int | None = None, stream: str = "events"
+    ) -> Events:
         """Events from `start_ns` to before `end_ns` of the time line; all of them by default.
 
+        Args:
+            stream: name of a further event camera's stream; the first camera's by default.
+
         Raises:
-            StoreError: the trial is damaged, or has no events.
+            StoreError: the trial is damaged, or has no such events.
         """
-        found = self.recording.events(start_ns, end_ns)
-        times = self.recording.clock("events").to_reference(found.t_us * 1000)
+        found = self.recording.events(start_ns, end_ns, stream)
+        times = self.recording.clock(stream).to_reference(found.t_us * 1000)
         return Events(np.asarray(times), found.x, found.y, found.p)
 
     def poses(self) -> Poses:
@@ -139,36 +167,59 @@ class Trial:
 
         return plate_forces(self.recording)
 
+    def scalars(self, stream: str) -> Scalars:
+        """Readings of a sensor of one quantity, such as a thermometer.
+
+        Raises:
+            StoreError: the trial is damaged, or has no such stream.
+        """
+        found = self.recording.scalars(stream)
+        times = self.recording.clock(stream).to_reference(found.t_ns)
+        return Scalars(np.asarray(times), found.value, found.unit)
+
     def pulses(self) -> I64:
         """Rising edges that the sync box made: nanoseconds on the time line, shape (n,)."""
         with self.recording.open() as reader:
             return reader.pulses("sync_pulses")
 
-    def frame_times(self) -> I64:
-        """Middle of exposure of each frame: nanoseconds on the time line, shape (n,)."""
-        return self.recording.frame_times()
+    def frame_times(self, stream: str = "frames") -> I64:
+        """Middle of exposure of each frame: nanoseconds on the time line, shape (n,).
 
-    def frames(self) -> Iterator[npt.NDArray[np.uint8]]:
+        Args:
+            stream: name of a further frame camera's stream; the first camera's by default.
+        """
+        return self.recording.frame_times(stream)
+
+    def frames(self, stream: str = "frames") -> Iterator[npt.NDArray[np.uint8]]:
         """The video's frames in order, each uint8 of shape (height, width).
 
-        Raises:
-            StoreError: the trial is damaged, or holds no video.
-        """
-        self._check_video()
-        return self.recording.frames()
+        Args:
+            stream: as in `frame_times`.
 
-    def frame(self, index: int) -> npt.NDArray[np.uint8]:
+        Raises:
+            StoreError: the trial is damaged, or holds no such video.
+        """
+        self._check_video(stream)
+        return self.recording.frames(stream=stream)
+
+    def frame(self, index: int, stream: str = "frames") -> npt.NDArray[np.uint8]:
         """One frame of the video, uint8 of shape (height, width).
 
+        Args:
+            stream: as in `frame_times`.
+
         Raises:
-            StoreError: the trial is damaged, or holds no video.
+            StoreError: the trial is damaged, or holds no such video.
             IndexError: the video is not that long.
         """
-        self._check_video()
-        return self.recording.frame(index)
+        self._check_video(stream)
+        return self.recording.frame(index, stream)
 
-    def _check_video(self) -> None:
-        if not self.recording.has_video:
+    def _check_video(self, stream: str) -> None:
+        if stream != "frames":
+            if self.recording.video(stream) is None:
+                raise StoreError(f"{self.recording.folder}: stream '{stream}' has no video")
+        elif not self.recording.has_video:
             raise StoreError(
                 f"{self.recording.folder}: has no video; its camera provided "
                 f"{self.recording.frame_source}"

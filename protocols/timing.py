@@ -66,6 +66,25 @@ class ForceTiming(DeviceClock):
     where the grade is `host time`."""
 
 
+StreamGrade = Literal["trigger input", "hardware trigger", "device time stamps", "host arrival"]
+
+
+class StreamTiming(DeviceClock):
+    """The clock of a further device, whose stream has a name."""
+
+    grade: StreamGrade = "host arrival"
+    """As that of the first cameras: `trigger input` of an event camera, `hardware trigger`,
+    `device time stamps` or `host arrival` of a frame camera, `host arrival` of a scalar sensor."""
+    delay: Delay = Delay(shortest_us=0, longest_us=50_000)
+    """From the end of an exposure, or from the reading, to the host; where the grade is
+    `host arrival`."""
+
+    @property
+    def through_host(self) -> bool:
+        """True if the device has no wire, so that the host has to read clocks."""
+        return self.grade not in WIRED
+
+
 class Timing(StrictModel):
     """The `timing:` section of a rig file."""
 

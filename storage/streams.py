@@ -147,9 +147,39 @@ class WrenchChunk:
         return WrenchChunk(none, none, np.empty((0, 3)), np.empty((0, 3)))
 
 
-StreamChunk = WrenchChunk
-"""Chunks that a named stream may be made of; `storage.trials.hdf5_writer.STREAMS` has the columns
-of each."""
+@dataclass(frozen=True)
+class ScalarChunk:
+    """Readings of one quantity, such as a temperature, n of them; a chunk of a named stream."""
+
+    KIND: ClassVar[str] = "scalar"
+
+    t_ns: I64
+    """Sensor's clock, nanoseconds, shape (n,); `host_ns` again from a sensor without a clock."""
+    host_ns: I64
+    """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
+    value: F64
+    """Readings in `unit`, shape (n,)."""
+    unit: str = ""
+    """Unit of the readings, such as ``degC``; the same over a whole stream."""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @staticmethod
+    def empty(unit: str = "") -> ScalarChunk:
+        """Return a chunk without readings."""
+        none = np.empty(0, np.int64)
+        return ScalarChunk(none, none, np.empty(0), unit)
+
+
+StreamChunk = WrenchChunk | ScalarChunk
+"""Chunks that a named stream in the trial's own file may be made of;
+`storage.trials.hdf5_writer.STREAMS` has the columns of each."""
+CameraChunk = EventChunk | FrameChunk | PulseChunk | ClockReads
+"""Chunks of a further camera, whose stream has a file of its own: its events or frames, the sync
+pulses that it saw, and reads of its clock."""
+EVENTS_KIND, FRAMES_KIND = "events", "frames"
+"""Kinds of the named streams of further cameras."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +237,7 @@ class Sink(Protocol):
     def add_frames(self, chunk: FrameChunk) -> None:
         """Append frames."""
 
-    def add_stream(self, name: str, chunk: StreamChunk) -> None:
+    def add_stream(self, name: str, chunk: StreamChunk | CameraChunk) -> None:
         """Append to the stream of this name, which keeps the kind of its first chunk."""
 
 

@@ -32,6 +32,7 @@ from sliplab.storage.trials.checksums import (
     Checksum,
     Checksums,
     as_json,
+    is_stream_file,
     read_sums,
 )
 from sliplab.storage.trials.control import SKIPPED
@@ -123,7 +124,7 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
         raise RemoteError(f"{where}: lists no files")
     sums: Checksums = {}
     for path, item in files.items():
-        if path not in ALLOWED[kind] and not (kind == "about" and _BENCH.fullmatch(path)):
+        if not _allowed(path, kind):
             raise RemoteError(f"{where}: names the file '{path}', which does not belong there")
         known = Checksum.parse(item)
         if known is None or not _SHA256.fullmatch(known.sha256) or known.bytes < 0:
@@ -132,6 +133,12 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
     if missing := NEEDED[kind] - files.keys():
         raise RemoteError(f"{where}: lacks {', '.join(sorted(missing))}")
     return Manifest(kind, campaign, name, sums, take)
+
+
+def _allowed(path: str, kind: Kind) -> bool:
+    """Return whether a file of this name may be in a manifest of a kind."""
+    further = _BENCH.fullmatch(path) is not None if kind == "about" else is_stream_file(path)
+    return path in ALLOWED[kind] or further
 
 
 def read_manifests(
@@ -205,7 +212,8 @@ def quarantine_manifest(campaign: Campaign, name: str) -> Manifest:
         OSError: it cannot be read, or lacks its cause.
     """
     folder = campaign.folder / "quarantine" / safe_name(name)
-    names = {file for file in ALLOWED["quarantine"] if (folder / file).is_file()} | {CAUSE}
+    found = {path.name for path in folder.iterdir() if path.is_file()}
+    names = {file for file in found if _allowed(file, "quarantine")} | {CAUSE}
     return Manifest("quarantine", campaign.name, name, _measured(folder, sorted(names)))
 
 

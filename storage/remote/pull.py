@@ -34,6 +34,7 @@ from sliplab.storage.trials.checksums import (
     ELSEWHERE,
     FRAMES,
     incomplete,
+    is_stream_file,
     read_sums,
     to_fetch,
 )
@@ -238,7 +239,7 @@ class _Pull:
         """Fetch the big files that a mirror left out."""
         if self.small or not (target / ELSEWHERE).exists():
             return
-        for name in sorted(BIG & manifest.files.keys()):
+        for name in sorted(filter(_big, manifest.files)):
             if to_fetch(target / name):
                 self._count(_get(self.remote, manifest, name, target))
         (target / ELSEWHERE).unlink()
@@ -265,6 +266,11 @@ class _Pull:
             self.on_bytes(size)
 
 
+def _big(name: str) -> bool:
+    """Return whether a mirror leaves out a file of this name until it is read."""
+    return name in BIG or is_stream_file(name)
+
+
 def download(
     remote: Remote,
     manifest: Manifest,
@@ -289,7 +295,7 @@ def download(
     marker = staging / ELSEWHERE
     write_json(marker, {"take": manifest.take})
     for name, known in sorted(manifest.files.items()):
-        if small and name in BIG:
+        if small and _big(name):
             continue
         if known.problem(staging / name) is not None:
             size = _get(remote, manifest, name, staging)

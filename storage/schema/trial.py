@@ -17,10 +17,10 @@ from pydantic import (
     WithJsonSchema,
 )
 
-from sliplab.protocols.timing import Timing
+from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.schema.document import Bool, Document, DocumentError, Int, Number, Part
-from sliplab.storage.streams import Json
+from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, Json
 
 DEVICES = ("events", "frames", "arm")
 """Devices whose clocks have maps onto the time line."""
@@ -220,14 +220,37 @@ class StreamRecord(Part):
     """A named stream of the trial."""
 
     kind: str
-    """Its kind: `wrench`."""
+    """Its kind: `wrench`, `scalar`, and of further cameras `events` or `frames`."""
     rows: Int
+    pulses: Int | None = None
+    """Of events: sync pulses that the camera saw."""
+    size_px: Size | None = None
+    """Of events and frames: columns and rows."""
+    px_per_mm: Number | None = None
+    """Of frames: their scale."""
+    rate_hz: Number | None = None
+    """Of frames of a camera that runs by itself: frames a second."""
+    mid_exposure_ns: Int | None = None
+    """Of frames: from the start of an exposure to its middle."""
+    unit: str | None = None
+    """Of scalars: unit of the readings."""
+    timing: (
+        Annotated[StreamTiming, PlainSerializer(lambda timing: timing.model_dump(mode="json"))]
+        | None
+    ) = None
+    """How the device is timed, from which its clock is fitted again; null for a wrench, which
+    `timing.rig` has."""
     to_plate: tuple[tuple[Number, Number, Number], ...] | None = None
     """Of a wrench: rows of the matrix from its axes to those of the plate (x right, y up, z into
     the plate), such that the product is the force on the plate; null where it is unknown."""
     figures: dict[str, Number] = Field(default_factory=dict)
     """Of forces on the plate: `normal_peak_n`, `normal_hold_n`, `tangential_peak_n` and
-    `friction_peak`; only those that are known."""
+    `friction_peak`; of a scalar: `mean`, `min` and `max`; only those that are known."""
+
+    @property
+    def of_camera(self) -> bool:
+        """True for the stream of a further camera, which has files of its own."""
+        return self.kind in {EVENTS_KIND, FRAMES_KIND}
 
 
 class TrialRecord(Document):

@@ -218,6 +218,11 @@ def _row(campaign: str, recording: Recording) -> Row:
             for name, stream in record.streams.items()
             for figure, value in stream.figures.items()
         },
+        **{
+            f"{name}_{stream.kind}": stream.rows
+            for name, stream in record.streams.items()
+            if stream.of_camera
+        },
     }
 
 

@@ -18,10 +18,23 @@ from sliplab.storage.streams import Json
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
 SPOOL = "frames.raw"
+STREAM_FILE = re.compile(r"stream-(?P<stream>[a-z][a-z0-9_]{0,31})\.(?P<suffix>h5|mkv|raw)")
+"""Names of the files of a further camera: its data, its video, its raw frames until encoded."""
 CHECKSUMS, PROVENANCE = "checksums.json", "provenance.json"
 ELSEWHERE = "elsewhere.json"
 """Marks a trial of a mirror: files that it lacks are fetched when they are read."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def stream_file(name: str, suffix: str = "h5") -> str:
+    """Return the name of a file of a further camera's stream, in its trial's folder."""
+    return f"stream-{name}.{suffix}"
+
+
+def is_stream_file(name: str) -> bool:
+    """Return whether a file's name is that of a further camera's data or video."""
+    found = STREAM_FILE.fullmatch(name)
+    return found is not None and found["suffix"] != "raw"
 
 
 class Checksum(NamedTuple):

@@ -22,6 +22,7 @@ from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
     PoseChunk,
+    ScalarChunk,
     WrenchChunk,
 )
 from sliplab.storage.trials.hdf5_writer import (
@@ -36,6 +37,7 @@ from sliplab.storage.trials.hdf5_writer import (
     TIMES,
     TIMING,
     TRACKS,
+    UNIT_ATTRIBUTE,
     Array,
 )
 
@@ -125,15 +127,12 @@ class RowFile:
     @staticmethod
     def _kind(group: Any) -> str:
         """Return a stream's kind; ``""`` where it says none that is known."""
-        if not h5py.h5a.exists(group, KIND_ATTRIBUTE.encode()):
-            return ""
-        found = h5py.h5a.open(group, KIND_ATTRIBUTE.encode())
-        if found.dtype.kind != "S" or found.shape != () or found.dtype.itemsize > _MOST_KIND:
-            return ""
-        value = np.empty((), found.dtype)
-        found.read(value)
-        kind = bytes(value.item()).decode("ascii", "replace")
+        kind = _text(group, KIND_ATTRIBUTE)
         return kind if kind in STREAMS else ""
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a named stream; ``""`` where it says none."""
+        return _text(self._group(f"{STREAM_GROUP}/{name}"), UNIT_ATTRIBUTE)
 
     def has(self, name: str) -> bool:
         """Return whether there is a column of this name."""
@@ -165,6 +164,18 @@ class RowFile:
         if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
             raise ValueError(f"{self.path}: {name} points outside the file")
         return Rows(data)
+
+
+def _text(group: Any, name: str) -> str:
+    """Return a short text among a group's attributes; ``""`` where there is none."""
+    if not h5py.h5a.exists(group, name.encode()):
+        return ""
+    found = h5py.h5a.open(group, name.encode())
+    if found.dtype.kind != "S" or found.shape != () or found.dtype.itemsize > _MOST_KIND:
+        return ""
+    value = np.empty((), found.dtype)
+    found.read(value)
+    return bytes(value.item()).decode("utf-8", "replace")
 
 
 class Rows:
@@ -331,11 +342,27 @@ class StreamReader:
             return WrenchChunk.empty()
         if kind != WrenchChunk.KIND:
             raise ValueError(f"{self._file.path}: stream '{name}' is of kind '{kind}', no wrench")
-        columns = STREAMS[kind]
-        return WrenchChunk(**{
+        return WrenchChunk(**self._fields(name, kind))
+
+    def scalars(self, name: str) -> ScalarChunk:
+        """Return all readings of a named stream; empty where the trial has none.
+
+        Raises:
+            ValueError: the stream is of another kind.
+        """
+        kind = self._file.streams().get(name)
+        if kind is None:
+            return ScalarChunk.empty()
+        if kind != ScalarChunk.KIND:
+            raise ValueError(f"{self._file.path}: stream '{name}' is of kind '{kind}', no scalar")
+        return ScalarChunk(**self._fields(name, kind), unit=self._file.unit(name))
+
+    def _fields(self, name: str, kind: str) -> dict[str, Array]:
+        """Return the columns of a named stream, by the field of its chunks."""
+        return {
             field: self.column(f"{STREAM_GROUP}/{name}/{part}")
-            for part, (field, _) in columns.items()
-        })  # fmt: skip
+            for part, (field, _) in STREAMS[kind].items()
+        }
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""

@@ -33,6 +33,7 @@ from sliplab.storage.streams import (
     I64,
     EventChunk,
     FrameChunk,
+    ScalarChunk,
     StreamChunk,
 )
 
@@ -88,11 +89,16 @@ STREAMS: dict[str, dict[str, tuple[str, Kind]]] = {
         "force": ("force_n", ("float64", (3,), "N along the sensor's axes")),
         "torque": ("torque_nm", ("float64", (3,), "N m about the sensor's axes")),
     },
+    "scalar": {
+        "t": ("t_ns", ("int64", (), "ns of the sensor's clock")),
+        "host": ("host_ns", ("int64", (), "ns of the host's monotonic clock")),
+        "value": ("value", ("float64", (), "the group's attribute `unit`")),
+    },
 }
 """By kind of a named stream: its columns, each with the field of its chunks. A stream is the group
 ``streams/NAME`` with its kind as an attribute, only there once something came."""
 STREAM_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-STREAM_GROUP, KIND_ATTRIBUTE = "streams", "kind"
+STREAM_GROUP, KIND_ATTRIBUTE, UNIT_ATTRIBUTE = "streams", "kind", "unit"
 TIMES = "events/t"
 WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
 """The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
@@ -295,6 +301,8 @@ class StreamFile:
             for part, (_, column) in columns.items():
                 self._create(f"{group}/{part}", column)
             self._file[group].attrs[KIND_ATTRIBUTE] = np.bytes_(kind)
+            if isinstance(chunk, ScalarChunk):
+                self._file[group].attrs[UNIT_ATTRIBUTE] = np.bytes_(chunk.unit.encode())
         for part, (field, _) in columns.items():
             self._columns[f"{group}/{part}"].append(getattr(chunk, field))
 

@@ -15,7 +15,16 @@ from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.trial import Clocks, SyncResult, TrialRecord
-from sliplab.storage.streams import F64, I64, U8, EventChunk, WrenchChunk
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    F64,
+    FRAMES_KIND,
+    I64,
+    U8,
+    EventChunk,
+    ScalarChunk,
+    WrenchChunk,
+)
 from sliplab.storage.trials.checksums import (
     DATA,
     FRAMES,
@@ -23,6 +32,7 @@ from sliplab.storage.trials.checksums import (
     Checksums,
     Fetch,
     read_sums,
+    stream_file,
     to_fetch,
 )
 from sliplab.storage.trials.hdf5_reader import StreamReader
@@ -237,12 +247,40 @@ class Recording:
         layout[:, 1] *= -1  # rows count downwards
         return layout
 
-    def open(self) -> StreamReader:
-        """The HDF5 file, as a context manager."""
-        return StreamReader(self._sound(DATA))
+    def open(self, stream: str | None = None) -> StreamReader:
+        """The HDF5 file, as a context manager; with `stream` that of a further camera.
+
+        Raises:
+            StoreError: the trial has no such further camera.
+        """
+        if stream is None or stream in {EVENTS_KIND, FRAMES_KIND}:
+            return StreamReader(self._sound(DATA))
+        self._check_stream(stream, EVENTS_KIND, FRAMES_KIND)
+        return StreamReader(self._sound(stream_file(stream)))
+
+    def streams(self, *kinds: str) -> list[str]:
+        """Names of the streams of some kinds, the first cameras' ``events`` and ``frames`` first.
+
+        Args:
+            kinds: of ``events``, ``frames``, ``scalar`` and ``wrench``.
+        """
+        record = self.record
+        with_events, with_frames = record.clocks.events is not None, self.frame_source != "none"
+        first = {EVENTS_KIND: with_events, FRAMES_KIND: with_frames}
+        named = [name for name, stream in record.streams.items() if stream.kind in kinds]
+        return [name for name, there in first.items() if there and name in kinds] + sorted(named)
+
+    def _check_stream(self, name: str, *kinds: str) -> None:
+        stream = self.record.streams.get(name)
+        if stream is None or stream.kind not in kinds:
+            raise StoreError(
+                f"{self.folder}: the trial has no {' or '.join(kinds)} '{name}'; it has: "
+                f"{', '.join(self.streams(*kinds)) or 'none'}"
+            )
 
     def clock(self, device: str) -> ClockMap:
-        """The map from a device's clock (``events``, ``frames``, ``arm``) to the time line.
+        """The map from a device's clock (``events``, ``frames``, ``arm``, a stream's name) to the
+        time line.
 
         Raises:
             StoreError: the trial has no such clock.
@@ -253,14 +291,38 @@ class Recording:
             raise StoreError(f"{self.folder}: the trial has no clock '{device}'; it has: {names}")
         return known[device].map
 
-    def events(self, start_ns: int | None = None, end_ns: int | None = None) -> EventChunk:
-        """Events between two times of the time line, on the camera's own clock."""
-        clock = self.clock("events")
+    def events(
+        self,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        stream: str = EVENTS_KIND,
+    ) -> EventChunk:
+        """Events between two times of the time line, on the camera's own clock.
+
+        Args:
+            stream: name of a further event camera's stream, instead of the first one's.
+
+        Raises:
+            StoreError: the trial has no such stream.
+        """
+        if stream != EVENTS_KIND:
+            self._check_stream(stream, EVENTS_KIND)
+        clock = self.clock(stream)
         bounds = [
             None if t is None else -(-int(clock.to_device(t)) // 1000) for t in (start_ns, end_ns)
         ]
-        with self.open() as reader:
+        with self.open(stream) as reader:
             return reader.events(*bounds)
+
+    def scalars(self, name: str) -> ScalarChunk:
+        """Readings of a named stream, on the sensor's own clock.
+
+        Raises:
+            StoreError: the trial has no such stream; the message lists those that it has.
+        """
+        self._check_stream(name, ScalarChunk.KIND)
+        with self.open() as reader:
+            return reader.scalars(name)
 
     def wrenches(self, name: str = "force") -> WrenchChunk:
         """Forces and torques of a named stream, on the sensor's own clock and in its own axes.
@@ -278,19 +340,42 @@ class Recording:
         with self.open() as reader:
             return reader.wrenches(name)
 
-    def frame_times(self) -> I64:
-        """Middle of exposure of every frame on the time line, ns."""
-        with self.open() as reader:
+    def frame_times(self, stream: str = FRAMES_KIND) -> I64:
+        """Middle of exposure of every frame on the time line, ns.
+
+        Args:
+            stream: name of a further frame camera's stream, instead of the first one's.
+
+        Raises:
+            StoreError: the trial has no such stream.
+        """
+        with self.open(stream) as reader:
             times = reader.column("frames/t")
-        return np.asarray(self.clock("frames").to_reference(times))
+        return np.asarray(self.clock(stream).to_reference(times))
 
-    def frames(self, threads: int = 1) -> Iterator[U8]:
-        """Decoded frames, uint8 of shape (height, width)."""
-        return read_frames(self._sound(FRAMES), threads)
+    def video(self, stream: str = FRAMES_KIND) -> Path | None:
+        """Return the path of a camera's video; None where it returned no frames, or tracks.
 
-    def frame(self, index: int) -> U8:
-        """One decoded frame."""
-        return read_frame(self._sound(FRAMES), index)
+        Raises:
+            StoreError: the trial has no such stream.
+        """
+        name = self._video(stream)
+        return self._sound(name) if name in self._sums else None
+
+    def _video(self, stream: str) -> str:
+        """Return the name of a camera's video."""
+        if stream == FRAMES_KIND:
+            return FRAMES
+        self._check_stream(stream, FRAMES_KIND)
+        return stream_file(stream, "mkv")
+
+    def frames(self, threads: int = 1, stream: str = FRAMES_KIND) -> Iterator[U8]:
+        """Decoded frames, uint8 of shape (height, width); `stream` as in `frame_times`."""
+        return read_frames(self._sound(self._video(stream)), threads)
+
+    def frame(self, index: int, stream: str = FRAMES_KIND) -> U8:
+        """One decoded frame; `stream` as in `frame_times`."""
+        return read_frame(self._sound(self._video(stream)), index)
 
     def frame_reader(self) -> FrameReader:
         """The video, opened for frames in any order; a context manager."""

@@ -21,8 +21,11 @@ from sliplab.storage.trials.checksums import (
     FRAMES,
     PROVENANCE,
     RECORD,
+    STREAM_FILE,
     Checksums,
+    is_stream_file,
     read_sums,
+    stream_file,
     to_fetch,
 )
 from sliplab.storage.trials.hdf5_reader import StreamReader
@@ -118,7 +121,7 @@ def _trial(folder: Path) -> Found:
     found += [
         (path, "does not belong here")
         for path in sorted(folder.iterdir())
-        if path.name not in _KNOWN or (path.name == FRAMES and FRAMES not in sums)
+        if not _belongs(path.name, sums)
     ]
     try:
         Provenance.load(folder / PROVENANCE)
@@ -134,6 +137,13 @@ def _trial(folder: Path) -> Found:
         if own_fault(error):
             raise
         return [(folder, f"cannot be read: {error}")]
+
+
+def _belongs(name: str, sums: Checksums) -> bool:
+    """Return whether a file of this name may be in a trial's folder."""
+    if name == FRAMES or is_stream_file(name):
+        return name in sums
+    return name in _KNOWN
 
 
 def _description(store: Store, campaign: Campaign) -> list[Problem]:
@@ -203,6 +213,7 @@ def _contents(folder: Path) -> Found:
             if np.any(np.diff(reader.column(name)) < 0):
                 problems.append((folder / DATA, f"{name} runs backwards"))
         problems += _stream_problems(folder, reader, record)
+    problems += _camera_problems(folder, record)
     found = {
         "events": counts["events/t"],
         "frames": counts["frames/t"],
@@ -213,7 +224,7 @@ def _contents(folder: Path) -> Found:
         said = getattr(record.counts, name)
         if count != said:
             problems.append((folder / DATA, f"{count} {name}, the record says {said}"))
-    problems += _frame_problems(folder, tracks, counts)
+    problems += _frame_problems(folder / DATA, folder / FRAMES, tracks, counts)
     if not record.quality.passed:
         problems.append((folder / RECORD, "was committed although a gate failed"))
     return problems
@@ -222,10 +233,11 @@ def _contents(folder: Path) -> Found:
 def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) -> Found:
     """Check the named streams: those that the record counts, whole, and in order of time."""
     kinds, counts = reader.streams(), reader.stream_counts()
+    stated = {name: said for name, said in record.streams.items() if not said.of_camera}
     problems: Found = []
-    for name in sorted(kinds.keys() | record.streams.keys()):
+    for name in sorted(kinds.keys() | stated.keys()):
         path = f"{STREAM_GROUP}/{name}"
-        said = record.streams.get(name)
+        said = stated.get(name)
         if said is None or name not in kinds:
             where = "the record" if said is None else "the file"
             problems.append((folder / DATA, f"{path} is not in {where}"))
@@ -244,18 +256,52 @@ def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) ->
     return problems
 
 
-def _frame_problems(folder: Path, tracks: list[str], counts: dict[str, int]) -> Found:
-    """Check for a row of tracks, or a picture in the video, for every frame."""
-    frames, video = counts["frames/t"], (folder / FRAMES).exists()
+def _camera_problems(folder: Path, record: TrialRecord) -> Found:
+    """Check the streams of further cameras: those that the record counts, in order of time."""
+    stated = {name for name, said in record.streams.items() if said.of_camera}
+    found = {
+        match["stream"] for path in folder.iterdir() if (match := STREAM_FILE.fullmatch(path.name))
+    }
     problems: Found = [
-        (folder / DATA, f"{counts[name]} rows of {name}, not {frames}")
+        (folder / stream_file(name), "is of a stream that is not in the record")
+        for name in sorted(found - stated)
+    ]
+    for name in sorted(stated):
+        data, video = folder / stream_file(name), folder / stream_file(name, "mkv")
+        said = record.streams[name]
+        if not data.is_file():
+            problems.append((data, "is missing, the record has its stream"))
+            continue
+        with StreamReader(data) as reader:
+            counts = reader.counts()
+            tracks = [track for track in TRACKS if reader.has(track)]
+            problems += [
+                (data, f"{column} runs backwards")
+                for column in ("events/t", "event_pulses/t", "frames/t")
+                if np.any(np.diff(reader.column(column)) < 0)
+            ]
+        stated_rows = {f"{said.kind}/t": said.rows, "event_pulses/t": said.pulses or 0}
+        problems += [
+            (data, f"{counts[column]} rows of {column}, the record says {rows}")
+            for column, rows in stated_rows.items()
+            if counts[column] != rows
+        ]
+        problems += _frame_problems(data, video, tracks, counts)
+    return problems
+
+
+def _frame_problems(data: Path, video: Path, tracks: list[str], counts: dict[str, int]) -> Found:
+    """Check for a row of tracks, or a picture in the video, for every frame."""
+    frames, encoded = counts["frames/t"], video.exists()
+    problems: Found = [
+        (data, f"{counts[name]} rows of {name}, not {frames}")
         for name in tracks
         if counts[name] != frames
     ]
-    if frames and not video and "tracks/markers" not in tracks:
-        problems.append((folder / DATA, "has frames, but neither video nor tracks"))
-    if video and count_frames(folder / FRAMES) != frames:
-        problems.append((folder / FRAMES, f"does not hold {frames} frames"))
+    if frames and not encoded and "tracks/markers" not in tracks:
+        problems.append((data, "has frames, but neither video nor tracks"))
+    if encoded and count_frames(video) != frames:
+        problems.append((video, f"does not hold {frames} frames"))
     return problems
 
 

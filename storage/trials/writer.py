@@ -1,28 +1,26 @@
 """Writing of a trial: in `incoming` until every file is complete, then visible by one rename.
 
-Raw frames of a rig that cannot encode as fast as its camera delivers wait in a spool file. The
-caller never waits for the disk while the spool's queue has room. What was written is sent on to the
-disk at once: an operating system that gathers gigabytes first stops every writer when it has
-enough of them, the one with the events too.
+The first event camera, the first frame camera, arm, sync box and small sensors share one HDF5 file.
+Each further camera has files of its own, made with its first chunk, in the same layout.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import threading
-from collections import deque
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-
-import numpy as np
 
 from sliplab.storage.errors import masked
 from sliplab.storage.files import sync_file, sync_folder, write_json_aside
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import (
+    EVENTS_KIND,
+    FRAMES_KIND,
     I64,
     U8,
+    CameraChunk,
     ClockReads,
     EventChunk,
     FrameChunk,
@@ -40,15 +38,11 @@ from sliplab.storage.trials.checksums import (
     SPOOL,
     Checksum,
     as_json,
+    is_stream_file,
+    stream_file,
 )
-from sliplab.storage.trials.hdf5_writer import StreamFile
-from sliplab.storage.trials.video import VideoWriter
-
-QUEUE_BYTES = 1 << 29
-"""The most that waits in memory, bytes: five seconds of 1000 x 1000 px at 100/s."""
-WAIT_S = 60.0
-"""The longest that a full queue, and the end of the file, are waited for, s."""
-_AHEAD_BYTES = 1 << 24
+from sliplab.storage.trials.frame_writer import FrameWriter
+from sliplab.storage.trials.hdf5_writer import STREAM_NAME, StreamFile
 
 
 class TrialWriter:
@@ -60,7 +54,7 @@ class TrialWriter:
         frame_px: (width, height) of the frames, or None without a frame camera. Whether there will
             be a video shows with the first frame: a camera may return tracks instead.
         spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
-            encode as fast as their camera delivers.
+            encode as fast as their cameras deliver.
     """
 
     def __init__(
@@ -75,10 +69,12 @@ class TrialWriter:
         self.folder, self.target = folder, target
         folder.mkdir(parents=True)
         self._streams = StreamFile(folder / DATA)
-        self._frame_px = frame_px
-        self._rate_hz = rate_hz
-        self._spool = Spool(folder / SPOOL) if spool and frame_px else None
-        self._video: VideoWriter | None = None
+        self._rate_hz, self._spool = rate_hz, spool
+        self._frames: FrameWriter | None = None
+        if frame_px is not None:
+            raw = folder / SPOOL if spool else None
+            self._frames = FrameWriter(self._streams, folder / FRAMES, raw, rate_hz, frame_px)
+        self._further: dict[str, CameraWriter] = {}
         self._sealed = False
 
     @property
@@ -129,23 +125,23 @@ class TrialWriter:
 
     def add_frames(self, chunk: FrameChunk) -> None:
         """Append frames, or the tracks in place of them, and their times."""
-        if self._frame_px is None or not len(chunk):
-            return
-        self._streams.append(
-            "frames", number=chunk.number, t=chunk.t_ns, host=chunk.host_ns, sync=chunk.sync
-        )
-        if chunk.markers_px is not None:
-            self._streams.add_tracks(chunk)
-        elif self._spool is not None:
-            self._spool.write(chunk.images)
-        else:
-            if self._video is None:
-                self._video = VideoWriter(self.folder / FRAMES, *self._frame_px, self._rate_hz)
-            self._video.write(chunk.images)
+        if self._frames is not None:
+            self._frames.add(chunk)
 
-    def add_stream(self, name: str, chunk: StreamChunk) -> None:
-        """Append to a named stream. Raises ValueError for another kind than it began with."""
-        self._streams.add_stream(name, chunk)
+    def add_stream(self, name: str, chunk: StreamChunk | CameraChunk) -> None:
+        """Append to a named stream; that of a further camera has files of its own.
+
+        Raises:
+            ValueError: the name is not a small identifier, or the stream is of another kind.
+        """
+        if isinstance(chunk, StreamChunk):
+            self._streams.add_stream(name, chunk)
+            return
+        if name not in self._further:
+            if not STREAM_NAME.fullmatch(name):
+                raise ValueError(f"stream '{name}': a name must match {STREAM_NAME.pattern}")
+            self._further[name] = CameraWriter(self.folder, name, self._rate_hz, self._spool)
+        self._further[name].add(chunk)
 
     def seal(self) -> Path:
         """Finish data and video files, so that they can be read before the commit.
@@ -157,23 +153,11 @@ class TrialWriter:
             return self.folder
         self._sealed = True
         self._streams.finish()
-        if self._spool is not None and self._frame_px is not None:
-            self._spool.close()
-            self._encode_spool(self._spool.path, *self._frame_px)
-        if self._video is not None:
-            self._video.close()
+        if self._frames is not None:
+            self._frames.seal()
+        for camera in self._further.values():
+            camera.seal()
         return self.folder
-
-    def _encode_spool(self, spool: Path, width: int, height: int) -> None:
-        empty = spool.stat().st_size == 0  # which cannot be mapped
-        levels = np.empty(0, np.uint8) if empty else np.memmap(spool, np.uint8, "r")
-        frames = levels.reshape(-1, height, width)
-        self._video = VideoWriter(self.folder / FRAMES, width, height, self._rate_hz)
-        for start in range(0, len(frames), 64):
-            self._video.write(frames[start : start + 64])
-        self._video.close()
-        del frames, levels
-        spool.unlink()
 
     def commit(self, record: TrialRecord, provenance: Provenance) -> Path:
         """Write record and checksums, flush everything, and make the trial visible.
@@ -207,27 +191,31 @@ class TrialWriter:
     def _finish_folder(self, record: TrialRecord, provenance: Provenance) -> None:
         write_json_aside(self.folder / RECORD, record.to_json())
         write_json_aside(self.folder / PROVENANCE, provenance.to_json())
-        for name in (DATA, FRAMES):
-            if (self.folder / name).exists():
-                sync_file(self.folder / name)
-        sums = {
-            name: Checksum.of(self.folder / name)
-            for name in (DATA, FRAMES, RECORD)
-            if (self.folder / name).exists()
-        }
+        data = [name for name in (DATA, FRAMES) if (self.folder / name).exists()]
+        data += self._stream_files()
+        for name in data:
+            sync_file(self.folder / name)
+        sums = {name: Checksum.of(self.folder / name) for name in (*data, RECORD)}
         write_json_aside(self.folder / CHECKSUMS, as_json(sums))
         sync_folder(self.folder)
+
+    def _stream_files(self) -> Iterator[str]:
+        """Yield the names of the files of further cameras."""
+        if self._further:
+            yield from sorted(filter(is_stream_file, os.listdir(self.folder)))
 
     def abandon(self) -> None:
         """Close what is open and leave the folder as it is, for quarantine."""
         if not self._sealed:
             self._sealed = True
-            self._streams.abandon()
-            if self._spool is not None:
-                with suppress(OSError):
-                    self._spool.close()
-            if self._video is not None:
-                self._video.close()
+            try:
+                self._streams.abandon()
+                if self._frames is not None:
+                    self._frames.abandon()
+            finally:
+                for camera in self._further.values():
+                    with suppress(OSError, RuntimeError):
+                        camera.abandon()
 
     def discard(self) -> None:
         """Close what is open and delete it; for motions that are no trial."""
@@ -235,85 +223,58 @@ class TrialWriter:
         shutil.rmtree(self.folder)
 
 
-class Spool:
-    """A file of grey frames, one after the other; bounded in memory."""
+class CameraWriter:
+    """Writes the files of one further camera: an HDF5 file as the trial's own, and a video.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file = path.open("wb", buffering=0)
-        self._waiting: deque[U8] = deque()
-        self._bytes = 0
-        self._changed = threading.Condition()
-        self._error: OSError | None = None
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="spool", daemon=True)
-        self._thread.start()
+    Args:
+        folder: the trial's folder while it is written.
+        name: the stream's name.
+        spool: as that of `TrialWriter`.
+    """
 
-    def write(self, images: U8) -> None:
-        """Append frames, which must not change afterwards; waits only where the queue is full.
+    def __init__(self, folder: Path, name: str, rate_hz: int, spool: bool) -> None:
+        self._folder, self._name, self._rate_hz, self._spool = folder, name, rate_hz, spool
+        self._streams = StreamFile(folder / stream_file(name))
+        self._frames: FrameWriter | None = None
+        self._kind: str | None = None
 
-        Raises:
-            OSError: the disk refused these or earlier ones, or has stood still for `WAIT_S`.
-        """
-        if not images.size:
-            return
-        images = np.ascontiguousarray(images)
-        with self._changed:
-            done = self._changed.wait_for(
-                lambda: self._error or self._bytes < QUEUE_BYTES, timeout=WAIT_S
+    def add(self, chunk: CameraChunk) -> None:
+        """Append what the camera sent. Raises ValueError for another kind than it began with."""
+        if isinstance(chunk, ClockReads):
+            self._streams.append(
+                "frame_camera_reads",
+                t=chunk.device_ns,
+                before=chunk.before_ns,
+                after=chunk.after_ns,
             )
-            self._check()
-            if not done:
-                raise OSError(f"{self.path}: the disk has hung for {WAIT_S:g} s")
-            self._waiting.append(images)
-            self._bytes += images.nbytes
-            self._changed.notify_all()
+            return
+        kind = FRAMES_KIND if isinstance(chunk, FrameChunk) else EVENTS_KIND
+        self._kind = self._kind or kind
+        if self._kind != kind:
+            raise ValueError(f"stream '{self._name}': is of kind '{self._kind}', not '{kind}'")
+        if isinstance(chunk, EventChunk):
+            self._streams.add_events(chunk)
+        elif isinstance(chunk, PulseChunk):
+            self._streams.append("event_pulses", t=chunk.t_ns)
+        else:
+            if self._frames is None:
+                video, raw = (
+                    self._folder / stream_file(self._name, suffix) for suffix in ("mkv", "raw")
+                )
+                raw_file = raw if self._spool else None
+                self._frames = FrameWriter(self._streams, video, raw_file, self._rate_hz)
+            self._frames.add(chunk)
 
-    def close(self) -> None:
-        """Write what waits, and close the file; safe to call more than once.
+    def seal(self) -> None:
+        """Finish its files."""
+        self._streams.finish()
+        if self._frames is not None:
+            self._frames.seal()
 
-        Raises:
-            OSError: not all of it could be written.
-        """
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join(WAIT_S)
-        if self._thread.is_alive():
-            raise OSError(f"{self.path}: the disk has hung for {WAIT_S:g} s")
-        self._file.close()
-        self._check()
-
-    def _check(self) -> None:
-        if self._error is not None:
-            raise self._error
-
-    def _run(self) -> None:
-        written = sent_on = 0
+    def abandon(self) -> None:
+        """Close its files, as far as the disk takes them."""
         try:
-            while (images := self._next()) is not None:
-                left = images.reshape(-1).data
-                while left:
-                    left = left[self._file.write(left) or 0 :]
-                written += images.nbytes
-                if written - sent_on >= _AHEAD_BYTES:
-                    self._send_on(written)
-                    sent_on = written
-                with self._changed:
-                    self._bytes -= images.nbytes
-                    self._changed.notify_all()
-        except OSError as error:
-            with self._changed:
-                self._error = error
-                self._waiting.clear()
-                self._changed.notify_all()
-
-    def _next(self) -> U8 | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._closed)
-            return self._waiting.popleft() if self._waiting else None
-
-    def _send_on(self, end: int) -> None:
-        """Begin to write to the disk, and drop what is there from memory, where the system can."""
-        if hasattr(os, "posix_fadvise"):
-            os.posix_fadvise(self._file.fileno(), 0, end, os.POSIX_FADV_DONTNEED)
+            self._streams.abandon()
+        finally:
+            if self._frames is not None:
+                self._frames.abandon()

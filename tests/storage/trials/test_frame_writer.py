@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.storage.trials import writer as spooling
-from sliplab.storage.trials.writer import Spool
+from sliplab.storage.trials import frame_writer as spooling
+from sliplab.storage.trials.frame_writer import Spool
 
 
 def frames(count: int, begin: int = 0) -> np.ndarray[Any, np.dtype[np.uint8]]:
