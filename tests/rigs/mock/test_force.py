@@ -10,6 +10,7 @@ import pytest
 
 from sliplab.analysis.clocks.synchronise import streams_of, synchronise
 from sliplab.analysis.force import step_ns
+from sliplab.protocols.timing import Delay
 from sliplab.protocols.yaml_file import validate
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
@@ -265,13 +266,22 @@ def test_the_rig_that_ships_has_it() -> None:
 TORN_S = 0.9
 
 
-def torn_rig(seed: int) -> Rig:
-    """The shipped rig; in every recording a papilla tears off, which both streams show."""
+def torn_rig(seed: int, delay: Delay | None = None) -> Rig:
+    """The shipped rig; in every recording a papilla tears off, which both streams show.
+
+    Args:
+        delay: what is promised of the sensor's delay in place of what the rig file says.
+    """
     file, _ = load_rig_file(Path("mock-force"))
     fault = {"kind": "papilla_torn", "papilla": 0, "at_s": TORN_S}
     changes = {"faults": [fault], "frame_camera": {"level": "tracks"}, "seed": seed}
     scene = MockSettings.model_validate(file.scene.model_dump() | changes)
-    rig = build_rig(file.model_copy(update={"mock": scene}))
+    timing = file.timing
+    if delay is not None:
+        assert timing.force is not None
+        force = timing.force.model_copy(update={"delay": delay})
+        timing = timing.model_copy(update={"force": force})
+    rig = build_rig(file.model_copy(update={"mock": scene, "timing": timing}))
     rig.connect()
     return rig
 
@@ -314,10 +324,12 @@ class Taken:
         return both + PERIOD_NS / 2
 
 
-def steps_within(folder: Path, trials: int) -> tuple[int, int]:
+def steps_within(
+    folder: Path, trials: int, delay: Delay | None = None, most_ns: int = 4_000_000
+) -> tuple[int, int]:
     """Trials whose force step is timed against events as stated; and whose clock map is."""
     steps = maps = 0
-    rigs = [torn_rig(seed) for seed in (1, 2)]
+    rigs = [torn_rig(seed, delay) for seed in (1, 2)]
     for seed in range(1, trials + 1):
         found = Taken(rigs[seed % 2], folder / str(seed), seed)
         off = abs(found.force_step_ns - found.event_step_ns)
@@ -327,13 +339,19 @@ def steps_within(folder: Path, trials: int) -> tuple[int, int]:
         force = found.sync.devices["force"]
         error = np.abs(np.asarray(force.map.to_reference(pairs[:, 0])) - pairs[:, 1])
         maps += bool(error.max() <= force.uncertainty_ns)
-        assert found.stated_ns < 4_000_000
+        assert found.stated_ns < most_ns
     return steps, maps
 
 
 def test_a_force_step_is_timed_against_the_events(tmp_path: Path) -> None:
     steps, maps = steps_within(tmp_path, 24)
     assert (steps, maps) == (24, 24)
+
+
+def test_a_true_promise_of_the_delay_is_a_tight_bound(tmp_path: Path) -> None:
+    """What is stated is a bound from the promise: its width is that of the promise."""
+    delay = Delay(shortest_us=500, longest_us=1500)
+    assert steps_within(tmp_path, 8, delay, 1_000_000) == (8, 8)
 
 
 @pytest.mark.long
