@@ -113,7 +113,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
 
 
 def _place(phase: Travel, at: Position, condition: Condition) -> Position:
-    """Where a move from `at` ends."""
+    """Return where a move from `at` ends."""
     absolute = phase.to is not None
     place = phase.to if phase.to is not None else phase.by
 

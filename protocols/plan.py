@@ -112,7 +112,7 @@ class Plan:
 
     def table(self) -> pd.DataFrame:
         """The trials as a table, in the order in which they are taken; units in the headers."""
-        import pandas as pd  # most plans are never looked at as a table
+        import pandas as pd  # most plans are never read as a table
 
         rows = [
             {

@@ -463,7 +463,7 @@ _TAGS_OF: dict[str, tuple[str, ...]] = {}
 
 
 def register_tags(*names: str) -> None:
-    """Tell the error messages which location parts are tags of a union and not keys."""
+    """Register location parts that are tags of a union, so that error messages leave them out."""
     _TAGS.update(names)
 
 

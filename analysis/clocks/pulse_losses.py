@@ -196,7 +196,7 @@ def on_ticks(predicted: Floats, reference: Floats, tick: float, slack_ns: float)
 
 @dataclass(frozen=True)
 class Ends:
-    """What one train has before the other, and the other behind it.
+    """Pulses of one train before the other one, and of the other one behind it.
 
     Attributes:
         earlier, later: which is which, ``device`` or ``reference``.

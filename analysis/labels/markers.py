@@ -248,7 +248,7 @@ class MarkerTracker:
             apart = np.hypot(*np.moveaxis(places[:, None] - taken[None], -1, 0))
             places = places[(apart > self._radius).all(axis=1)]
         distance = np.hypot(*(places - self._xy[i]).T)
-        # less than half the way to a neighbour's place: it cannot be the neighbour
+        # less than half the distance to a neighbour's place: it cannot be the neighbour
         if len(distance) and distance.min() < 0.45 * self._spacing:
             expected = self._xy[i].copy()
             self._xy[i] = places[int(distance.argmin())]

@@ -66,7 +66,7 @@ def plane_of(corners: Floats, seen: NDArray[np.bool_], size_px: tuple[int, int])
         return None
     centre = (np.array(size_px, np.float64) - 1) / 2
     places = corners[here].mean(axis=1)
-    # spread along the plate's way: most frames stand where it hung before it fell
+    # spread along the plate's path: in most frames it hangs where it was before it fell
     way = np.hypot(*(places - places[0]).T)
     order = np.argsort(way, kind="stable")
     targets = np.linspace(way[order[0]], way[order[-1]], _FRAMES)

@@ -70,7 +70,7 @@ def parse(data: bytes, name: str) -> Fitted:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            spoilt = archive.testzip()  # torch does not look at the checksums
+            spoilt = archive.testzip()  # torch does not check the checksums
         if spoilt is not None:
             raise ValueError(f"{spoilt} in it is damaged")
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)

@@ -166,7 +166,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
         press_mm = float("nan")
     if not 0 < press_mm < float("inf"):
         raise InputError("--reflex", "", text, "must be 'stop' or 'press:MM', such as press:0.4")
-    # a retraction gets shallower all the way, and what presses on is cut off at the limit
+    # a retraction gets shallower throughout, and a continued press is cut off at the limit
     depth = _shallowest_mm(program)
     if depth + press_mm > deepest + 1e-9:
         origin = "the protocol's" if deepest == float(limits.depth) else f"the rig {file.name}'s"

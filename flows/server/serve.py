@@ -95,7 +95,7 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
     served = ServedRuns(here.folder, on_rig, control)
-    # a server that does not answer is asked again at the next look
+    # a server that does not answer is queried again next time
     limits = {PREFECT_API_REQUEST_TIMEOUT: ANSWER_S, PREFECT_CLIENT_MAX_RETRIES: 0}
     with temporary_settings(updates=limits):
         carrying_out = asyncio.create_task(served.carry_out(min(poll_s, POLL_S), stopped))

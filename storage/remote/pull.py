@@ -150,7 +150,7 @@ class _Pull:
     def run(self, quarantine: bool, on_trial: Callable[[str], None] | None) -> None:
         name = self.campaign.name
         about = read_manifests(self.remote, name, "about").get("")
-        if about is None:  # its first push is still on its way
+        if about is None:  # its first push has not ended
             return
         if isinstance(about, RemoteError):
             self.done.problems.append(str(about))

@@ -50,7 +50,7 @@ class TrialAtSetting(TrialScore):
     """One trial at a setting of the scene."""
 
     depth_zero_mm: Number | None
-    """Where the rig found the plate."""
+    """The plate's position as the rig measured it."""
 
 
 class SettingScores(Part):

@@ -109,7 +109,7 @@ class QuarantineEntry(TypedDict):
 
 
 class SessionRecord(TypedDict):
-    """Who stood at the rig, with what, for one session."""
+    """Operator, devices and versions of one session."""
 
     began: str
     operator: str
