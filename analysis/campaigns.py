@@ -116,6 +116,18 @@ def missing_stream(campaigns: list[Collected]) -> str | None:
     return next((item.missing_stream for item in campaigns if item.missing_stream), None)
 
 
+def kinematic_campaigns(campaigns: list[Collected]) -> list[Collected]:
+    """The kinematic campaigns, with any streams.
+
+    Raises:
+        StoreError: there is none.
+    """
+    found = [item for item in campaigns if item.experiment == "kinematic"]
+    if not found:
+        raise StoreError("no kinematic campaign to train on; collect one first")
+    return found
+
+
 def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
     """The kinematic campaigns, whose trials train, choose and test the network.
 
@@ -123,9 +135,7 @@ def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
         StoreError: there is none.
         InputError: they disagree on how windows are made.
     """
-    found = [item for item in campaigns if item.experiment == "kinematic"]
-    if not found:
-        raise StoreError("no kinematic campaign to train on; collect one first")
+    found = kinematic_campaigns(campaigns)
     for item in found:
         item.need("events", "the network is trained on windows of them")
     for other in found[1:]:

@@ -15,6 +15,7 @@ from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.report import against as comparison
 from sliplab.analysis.report import one_camera
 from sliplab.analysis.report import report as content
+from sliplab.analysis.report.marker_network import read_judged
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.sources import STEP, read_sources, report_folder, report_key
 from sliplab.analysis.report.summary import make_summary
@@ -58,9 +59,10 @@ def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with timed(store, "report"):
         planned = {item.name: _planned_bytes(item) for item in campaigns}
-        if missing_stream(campaigns) is not None:
-            shown = one_camera.one_camera_summary(store, campaigns, planned)
-            parts = one_camera.one_camera_sections(store, campaigns, shown)
+        if (missing := missing_stream(campaigns)) is not None:
+            judged = read_judged(store, campaigns) if missing == "events" else None
+            shown = one_camera.one_camera_summary(store, campaigns, planned, judged)
+            parts = one_camera.one_camera_sections(store, campaigns, shown, judged)
             write_figures(folder, parts, simulated=shown.simulated)
             write_text(folder / "index.html", one_camera.render(campaigns, shown, parts))
             numbers = shown.to_json()

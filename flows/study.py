@@ -80,10 +80,10 @@ def study(
             on_done(taken[-1]["taken"])
     campaigns = collected(store, [run_request.campaign for run_request in run_requests])
 
-    missing = missing_stream(campaigns)
+    missing, slides = missing_stream(campaigns), bool(planned.slides)
 
     def run(name: str, unit: str, work: Callable[[], StepDone]) -> None:
-        if (reason := reason_against(name, missing)) is not None:
+        if (reason := reason_against(name, missing, slides=slides)) is not None:
             ledger.leave_out(name, reason)
             return
         with ledger.step(name, unit) as on_done:

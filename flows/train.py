@@ -1,4 +1,7 @@
-"""Training: the network of every seed, from the labelled trials of the kinematic campaigns."""
+"""Training: the network of every seed, from the labelled trials of the kinematic campaigns.
+
+Campaigns without events train a classifier on marker displacements instead (`flows.markers`).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import TYPE_CHECKING
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, missing_stream, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import gradients, model_file, training
 from sliplab.analysis.networks.models import Model, begun, comparison_models, wanted_models
@@ -17,6 +20,7 @@ from sliplab.analysis.trial_work import Done, EachTrial, Make, TrialWork, in_ord
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.label import report_states
+from sliplab.flows.markers import train_on_markers
 from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.parallel_map import each_trial
@@ -109,6 +113,8 @@ def train(
         StoreError: labels or samples are missing.
         InputError: there is no such device to train on.
     """
+    if missing_stream(campaigns) == "events":
+        return train_on_markers(store, campaigns, reviewed)
     labels = Labels(store, reviewed)
     models = [
         *wanted_models(store, campaigns, reviewed),

@@ -7,7 +7,7 @@ computes. Everything that is fitted here is fitted on training or validation tri
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -80,7 +80,8 @@ def score_windows(
         },
     )  # fmt: skip
     cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
-    by_tenth, no_slip = _phases(labels, known, test, trial, hits, settings.windows.length_ms)
+    middle = test.start_ns + settings.windows.length_ms * 500_000
+    by_tenth, no_slip = phases(labels, known, middle, test.y, trial, hits)
     return WindowScores(
         **dict(metrics.score(counts, test.y, margin)),
         interval=window_groups.share(hits, trial),
@@ -96,8 +97,14 @@ def score_windows(
         ),
         by_tenth=by_tenth,
         no_slip=no_slip,
-        by_trial=tuple(window_groups.by_trial(counts, test.y, trial, lambda k: _named(known[k]))),
-        seeds=_seeds(models, chosen, test, margin),
+        by_trial=tuple(window_groups.by_trial(counts, test.y, trial, lambda k: named(known[k]))),
+        seeds=seed_scores(
+            models,
+            chosen,
+            test.y,
+            margin,
+            lambda model: training.predict_counts(model_file.load(model.path), test.windows),
+        ),
         work=synaptic.count_work(fitted, test.windows),
         baselines={name: score.argmax for name, score in cheap.items()},
         beside={
@@ -107,41 +114,44 @@ def score_windows(
     )
 
 
-def _named(of: TrialRef) -> tuple[str, str, dict[str, str]]:
+def named(of: TrialRef) -> tuple[str, str, dict[str, str]]:
+    """Return campaign, id and condition of a trial."""
     item, trial, _ = of
     return item.name, trial.id, item.plan.describe(trial)
 
 
-def _phases(
+def phases(
     labels: Labels,
     known: Sequence[TrialRef],
-    test: SampleSet,
+    place_ns: npt.NDArray[np.int64],
+    y: npt.NDArray[np.int64],
     trial: npt.NDArray[np.int64],
     hits: npt.NDArray[np.float64],
-    length_ms: int,
 ) -> tuple[dict[str, tuple[Tenth, ...]], NoSlip]:
     """Recall by tenths of each class's phase, and of no slip before and during motion.
 
-    A phase ends with the recording or where the next begins; a window belongs where its middle is.
+    A phase ends with the recording or where the next begins.
+
+    Args:
+        place_ns: (n,) where each window belongs, such as its middle.
     """
-    middle = test.start_ns + length_ms * 500_000
-    fraction = np.full(len(test), np.nan)
-    moving = np.zeros(len(test), bool)
+    fraction = np.full(len(y), np.nan)
+    moving = np.zeros(len(y), bool)
     for k in np.unique(trial).tolist():
         item, _, recording = known[k]
         label = labels.read(item, recording)
         start, end = recorded_span(recording)
         edges = [start, label.incipient_ns, label.gross_ns, end]
         there = trial == k
-        moving |= there & (middle >= recording.motion_ns[0])
+        moving |= there & (place_ns >= recording.motion_ns[0])
         for phase, (begin, over) in enumerate(itertools.pairwise(edges)):
             if begin is not None and over is not None and over > begin:
-                ours = there & (test.y == phase)
-                fraction[ours] = (middle[ours] - begin) / (over - begin)
-    still = test.y == metrics.NO_SLIP
+                ours = there & (y == phase)
+                fraction[ours] = (place_ns[ours] - begin) / (over - begin)
+    still = y == metrics.NO_SLIP
     hold, loading = still & ~moving, still & moving
     return (
-        window_groups.by_tenth(hits, test.y, trial, fraction),
+        window_groups.by_tenth(hits, y, trial, fraction),
         NoSlip(
             hold=window_groups.share(hits[hold], trial[hold]),
             loading=window_groups.share(hits[loading], trial[loading]),
@@ -149,12 +159,17 @@ def _phases(
     )
 
 
-def _seeds(models: Sequence[Model], chosen: Model, test: SampleSet, margin: float) -> Seeds:
+def seed_scores(
+    models: Sequence[Model],
+    chosen: Model,
+    y: npt.NDArray[np.int64],
+    margin: float,
+    counts_of: Callable[[Model], npt.NDArray[np.int64]],
+) -> Seeds:
     """Every trained seed on the same windows: each, and mean, lowest and highest."""
     rows = []
     for model in models:
-        counts = training.predict_counts(model_file.load(model.path), test.windows)
-        found = metrics.accuracy(counts, test.y, margin)
+        found = metrics.accuracy(counts_of(model), y, margin)
         rows.append(
             SeedScores(
                 seed=model.seed,

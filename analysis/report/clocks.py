@@ -35,6 +35,8 @@ def unwired(sync: Sync) -> bool:
 
 def latency_note(sync: Sync) -> str:
     """Return what is under every table of latencies: the grade, and how far off it may be."""
+    if "events" not in sync.grades:
+        return "Onsets and detections are both read from the frames: no clock lies between them."
     note = (
         f"Frames: {frames_grade(sync)}; events against them within {frames_uncertainty(sync)}, "
         "worst trial."
@@ -48,7 +50,7 @@ def latency_note(sync: Sync) -> str:
 
 def figure_note(sync: Sync) -> str:
     """Return the same for a figure of latencies, where it can be seen in it; else nothing."""
-    return f" {latency_note(sync)}" if unwired(sync) else ""
+    return f" {latency_note(sync)}" if unwired(sync) and "events" in sync.grades else ""
 
 
 def short_note(sync: Sync) -> str:

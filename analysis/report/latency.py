@@ -15,7 +15,14 @@ from sliplab.analysis.report.outcomes import OUTCOMES, TIMES, WORDS, Conditions,
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
 from sliplab.storage.schema.evaluation import TrialScore
-from sliplab.storage.schema.summary import Accounts, Experiment, Span, Summary, TrialOutcome
+from sliplab.storage.schema.summary import (
+    Accounts,
+    Experiment,
+    OneCameraSummary,
+    Span,
+    Summary,
+    TrialOutcome,
+)
 
 AXES = {
     "duration_ms": ("incipient slip lasts (ms)", GREEN, ""),
@@ -92,7 +99,10 @@ class LatencySection(Content):
 
 
 def latency_section(
-    experiment: str, campaigns: Sequence[Collected], rows: Sequence[TrialScore], summary: Summary
+    experiment: str,
+    campaigns: Sequence[Collected],
+    rows: Sequence[TrialScore],
+    summary: Summary | OneCameraSummary,
 ) -> LatencySection | None:
     """Show an experiment's detections by condition; None without trials, unless kinematic.
 

@@ -16,7 +16,21 @@ from sliplab.analysis.report import clocks
 from sliplab.analysis.report.campaign import collected_section, quality_section
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
-from sliplab.analysis.report.page import Content, Figure, Number, Table, number, render_page
+from sliplab.analysis.report.marker_network import (
+    Judged,
+    marker_sections,
+    read_judged,
+    with_classifier,
+)
+from sliplab.analysis.report.page import (
+    Content,
+    Figure,
+    Number,
+    Table,
+    number,
+    percent,
+    render_page,
+)
 from sliplab.analysis.report.sources import VERSION
 from sliplab.analysis.report.summary import (
     label_sources,
@@ -36,21 +50,26 @@ F64 = npt.NDArray[np.float64]
 BEFORE_S, BIN_S = 1.0, 0.1
 """Drawn time before the motion, and the interval over which a rate is taken."""
 CAN_BE_DONE = {
-    "events": {"sync", "label", "report"},
+    "events": {"sync", "label", "train", "evaluate", "report"},
     "frames": {"sync", "report"},
 }
 """Steps after collection that need nothing of the missing stream."""
-NO_EVENTS = "the network is trained on windows of events, and there are none"
+NO_EVENTS = "works with the spiking network on events, and there are none"
+NO_SLIDES = "the classifier is trained on slides, and without events nothing else is evaluated"
+NO_CLASSIFIER = "not done yet; run `sliplab train`, then `sliplab evaluate`"
 NO_FRAMES = "needs labels, which are read from frames"
 NO_LABEL = "a label is the displacement of the markers in frames, and there are none"
 
 
-def reason_against(step: str, missing: str | None) -> str | None:
+def reason_against(step: str, missing: str | None, *, slides: bool = True) -> str | None:
     """Return why a step cannot be done without a stream; None where it can.
 
     Args:
         missing: ``events`` or ``frames``; None where both were recorded.
+        slides: there is a kinematic campaign, whose trials train and test.
     """
+    if missing == "events" and step in {"train", "evaluate"} and not slides:
+        return NO_SLIDES
     if missing is None or step in CAN_BE_DONE[missing]:
         return None
     if missing == "events":
@@ -72,17 +91,24 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
             label = labels.key(item, recording) if labelled else None
             inputs.append([item.name, trial.id, recording.checksum, label])
+    judged = read_judged(store, campaigns) if labelled else None
+    if judged is not None:
+        inputs.append([judged.evaluation.key])
     plans = [[item.plan.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
     return make_key("report, one camera", VERSION, [inputs, plans], None)
 
 
 def one_camera_summary(
-    store: Store, campaigns: list[Collected], planned_bytes: Mapping[str, int]
+    store: Store,
+    campaigns: list[Collected],
+    planned_bytes: Mapping[str, int],
+    judged: Judged | None = None,
 ) -> OneCameraSummary:
     """Make the summary.
 
     Args:
         planned_bytes: of the committed trials, by campaign.
+        judged: the classifier on marker displacements.
     """
     missing = missing_stream(campaigns)
     frames = missing == "events"
@@ -96,13 +122,13 @@ def one_camera_summary(
         )
     else:
         rates = {item.name: _rate(item) for item in campaigns}
-    return OneCameraSummary(
+    summary = OneCameraSummary(
         simulated=store.simulated,
         one_camera="frames" if frames else "events",
         left_out=tuple(
             StepLeftOut(name=name, reason=reason)
             for name in ("label", "train", "evaluate")
-            if (reason := reason_against(name, missing)) is not None
+            if (reason := reason_against(name, missing) or _not_done(name, judged)) is not None
         ),
         labels=labels,
         event_rates=rates,
@@ -113,6 +139,12 @@ def one_camera_summary(
         versions=package_versions(),
         protocols=protocol_hashes(campaigns),
     )
+    return summary if judged is None else with_classifier(summary, store, campaigns, judged)
+
+
+def _not_done(step: str, judged: Judged | None) -> str | None:
+    """Return the reason for a step that can be done and was not; None where it was."""
+    return NO_CLASSIFIER if judged is None and step in {"train", "evaluate"} else None
 
 
 def _clocks(campaigns: Sequence[Collected]) -> dict[str, float]:
@@ -134,6 +166,27 @@ def headline(summary: OneCameraSummary) -> list[Number]:
         both = labels.rules_ms.apart
         found.append(
             Number("labelled by both rules", str(both.gross.n), "trials with a known gross onset")
+        )
+    if (kinematic := summary.kinematic) is not None:
+        accuracy, latency = kinematic.accuracy, kinematic.latency_ms.incipient
+        found += [
+            Number("window accuracy", percent(accuracy.strict), f"strict, n = {accuracy.n}"),
+            Number(
+                "incipient latency",
+                number(latency.median, 0, "ms"),
+                f"median of {latency.n}; {latency.missed} missed, {latency.late} late, "
+                f"{latency.false_early} false early",
+            ),
+        ]
+    if summary.gravity is not None and summary.gravity.trials:
+        lead = summary.gravity.lead_ms
+        found.append(
+            Number(
+                "gravity lead",
+                number(lead.median, 0, "ms"),
+                f"median; smallest {number(lead.min, 0, 'ms')}, n = {lead.n}, "
+                f"{lead.missed} missed, {lead.late} late",
+            )
         )
     for name, rate in (summary.event_rates or {}).items():
         found.append(
@@ -181,7 +234,10 @@ class RateSection(Content):
 
 
 def one_camera_sections(
-    store: Store, campaigns: list[Collected], summary: OneCameraSummary
+    store: Store,
+    campaigns: list[Collected],
+    summary: OneCameraSummary,
+    judged: Judged | None = None,
 ) -> list[Content]:
     """Make all sections, in order."""
     simulated = summary.simulated
@@ -191,6 +247,8 @@ def one_camera_sections(
         collected_section(campaigns, summary),
         quality_section(campaigns, {}, simulated=simulated),
     ]
+    if judged is not None:
+        sections += marker_sections(store, campaigns, summary, judged)
     if summary.labels is not None:
         distances = label_errors.distances(store, campaigns)
         sections.append(label_section(store, campaigns, summary, distances))

@@ -17,8 +17,11 @@ from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.schema.evaluation import (
+    Evaluation,
     Experiments,
     OtherEvaluation,
+    TrainedBaseline,
+    WindowIntervals,
 )
 from sliplab.storage.schema.summary import (
     Difference,
@@ -64,15 +67,7 @@ def make_summary(sources: Sources) -> Summary:
         StoreError: another program's result is of another shape.
     """
     campaigns, evaluation = sources.campaigns, sources.evaluation
-    trials = tuple(trial_outcome(row) for row in evaluation.trials)
-    judged = _judged(campaigns, trials, evaluation.experiments)
-    windows, spans = evaluation.windows.to_json(), sources.window_intervals
-    kinematic = {
-        **{name: windows[name] for name in _WINDOWS},
-        "trained_baselines": sources.baselines,
-        "window_intervals": {} if spans is None else spans.to_json(),
-        **judged["kinematic"],
-    }
+    judged = judged_part(campaigns, evaluation, sources.window_intervals, sources.baselines)
     holdout = None
     if "holdout" in sources.programs:
         kept = parse_program("holdout", HoldoutResult, sources.programs["holdout"])
@@ -80,10 +75,8 @@ def make_summary(sources: Sources) -> Summary:
     return Summary.model_validate({
         "simulated": sources.store.simulated,
         **judged,
-        "kinematic": kinematic,
         "networks": {name: _network(campaigns, of) for name, of in sources.networks.items()},
         "paper": _paper(sources.settings, campaigns),
-        "trials": trials,
         "references": references_of(sources.store, campaigns),
         "labels": {
             "error_ms": evaluation.label_error_ms,
@@ -93,7 +86,7 @@ def make_summary(sources: Sources) -> Summary:
             "check": sources.label_check,
             "holds": sources.holds,
         },
-        "detection": _plain(evaluation.detection),
+        "detection": plain_rules(evaluation.detection),
         "choices": evaluation.choices,
         "detectors": evaluation.detectors,
         "holdout": holdout,
@@ -111,6 +104,25 @@ def make_summary(sources: Sources) -> Summary:
             "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
         },
     })  # fmt: skip
+
+
+def judged_part(
+    campaigns: Sequence[Collected],
+    evaluation: Evaluation,
+    spans: WindowIntervals | None,
+    baselines: Mapping[str, TrainedBaseline],
+) -> dict[str, Any]:
+    """Return `kinematic`, `gravity`, `disturbance` and `trials` of an evaluation."""
+    trials = tuple(trial_outcome(row) for row in evaluation.trials)
+    judged = _judged(campaigns, trials, evaluation.experiments)
+    windows = evaluation.windows.to_json()
+    kinematic = {
+        **{name: windows[name] for name in _WINDOWS},
+        "trained_baselines": baselines,
+        "window_intervals": {} if spans is None else spans.to_json(),
+        **judged["kinematic"],
+    }
+    return {**judged, "kinematic": kinematic, "trials": trials}
 
 
 def _judged(
@@ -134,13 +146,14 @@ def _network(campaigns: Sequence[Collected], found: OtherEvaluation) -> Json:
     judged = _judged(campaigns, trials, found.experiments)
     return {
         **{key: getattr(found, key) for key in ("title", "preset", "seed", "engine", "exact")},
-        "detection": _plain(found.detection),
+        "detection": plain_rules(found.detection),
         **judged,
         "kinematic": {**found.windows.to_json(), **judged["kinematic"]},
     }
 
 
-def _plain(rules: Mapping[str, Detection]) -> dict[str, Json]:
+def plain_rules(rules: Mapping[str, Detection]) -> dict[str, Json]:
+    """Return the rules of detection as plain data."""
     return {name: rule.model_dump(mode="json") for name, rule in rules.items()}
 
 

@@ -38,6 +38,8 @@ METHODS = {
     "cnn_frame": "ordinary convolutions on the summed frame",
     "cnn_volume": "ordinary convolutions on space and time",
     "gru": "gated recurrent unit over the steps",
+    "mean_displacement": "two thresholds on the mean displacement",
+    "largest_displacement": "two thresholds on the largest displacement",
 }
 """Other methods as text, by name."""
 WORST = 10
@@ -73,7 +75,7 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
     accuracy, baselines = kinematic.accuracy, kinematic.trained_baselines
     own = [percent(value) for value in (accuracy.argmax, accuracy.strict, accuracy.margin)]
     methods = [
-        [METHODS[name], percent(found.argmax), "", "", _points(found.network_ahead)]
+        [METHODS[name], percent(found.argmax), "", "", points_words(found.network_ahead)]
         for name, found in {**kinematic.beside, **baselines}.items()
     ]
     confusion = np.asarray(kinematic.confusion)
@@ -340,7 +342,8 @@ def share_words(row: Share) -> str:
     return f"{percent(row.share)} ({percent(row.low)} to {percent(row.high)})"
 
 
-def _points(row: Share) -> str:
+def points_words(row: Share) -> str:
+    """Return a difference of shares in percentage points, with its interval."""
     if row.share is None or row.low is None or row.high is None:
         return number(None if row.share is None else 100 * row.share)
     return f"{100 * row.share:+.1f} ({100 * row.low:+.1f} to {100 * row.high:+.1f})"

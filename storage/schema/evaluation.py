@@ -477,6 +477,21 @@ Experiments = dict[str, ExperimentScores]
 """By `kinematic`, `gravity`, `disturbance`."""
 
 
+class MarkerClassifier(Part):
+    """The classifier of a store without events: it sees the displacement of markers in frames."""
+
+    title: str
+    frames: Int
+    """Frames of a window, whose newest one has the class."""
+    markers: Int
+    points: Int
+    """Points of a class that is certain; counts, leads and margins are in points, not spikes."""
+    weights: Int
+    """Weights and biases."""
+    multiply_adds: Int
+    """Of one window."""
+
+
 class Evaluation(Document):
     """Results that `evaluate` keeps of the store's network."""
 
@@ -498,6 +513,8 @@ class Evaluation(Document):
     choices: dict[str, Choice | None]
     """By campaign; null where the protocol sets smoothing and margin."""
     detectors: DetectorComparison | None
+    classifier: MarkerClassifier | None = None
+    """Written only where there are no events: the network then sees marker displacements."""
 
 
 class OtherEvaluation(Document):

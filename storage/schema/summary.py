@@ -25,6 +25,7 @@ from sliplab.storage.schema.evaluation import (
     LatencyByOnset,
     LeadFigures,
     LeadShare,
+    MarkerClassifier,
     NoSlip,
     RuleErrors,
     SampleCounts,
@@ -325,6 +326,15 @@ class OneCameraSummary(Document):
     """Null without frames."""
     event_rates: dict[str, MotionRate] | None = None
     """By campaign; null without events."""
+    classifier: MarkerClassifier | None = None
+    """Trained on marker displacements; this key and the next six are written only where frames
+    alone were recorded and the store is evaluated, with the meaning that they have in `Summary`."""
+    kinematic: Kinematic | None = None
+    gravity: Experiment | None = None
+    disturbance: Experiment | None = None
+    trials: tuple[TrialOutcome, ...] = ()
+    detection: dict[str, DetectionRule] = Field(default_factory=dict)
+    choices: dict[str, Choice | None] = Field(default_factory=dict)
     clocks_us: dict[str, Number]
     """Uncertainty of each device's own clock against the sync box, worst trial, microseconds."""
     sync: Sync

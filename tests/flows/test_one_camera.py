@@ -7,13 +7,16 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.one_camera import CAN_BE_DONE
+from sliplab.flows.evaluate import evaluate
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import read_one_camera, report
 from sliplab.flows.study import Outcome, study
 from sliplab.flows.study_ledger import LEFT_OUT
+from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
 
@@ -72,7 +75,17 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
         assert "Onsets of slip are read from the markers" in page
         assert (store.folder / "report" / "figures" / "event-rates.svg").exists()
     else:
-        assert left_out == ["train", "evaluate"]
+        assert left_out == []
+        assert summary.classifier is not None
+        assert summary.kinematic is not None
+        assert summary.kinematic.samples.test > 50
+        assert summary.kinematic.accuracy.strict is not None
+        assert summary.kinematic.accuracy.strict > 0.8
+        assert summary.kinematic.work is None
+        assert len(summary.trials) == 3
+        assert "The classifier on marker displacements" in page
+        assert "no clock lies between them" in page
+        assert (store.folder / "report" / "figures" / "confusion.svg").exists()
         assert summary.labels is not None
         assert summary.labels.error_ms.incipient.n == 5
         assert summary.labels.error_ms.incipient.max_abs is not None
@@ -81,9 +94,43 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
     assert "spiking network and its detectors" in page or camera == "events"
 
 
-def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) -> None:
-    from sliplab.analysis.campaigns import collected
+def test_training_and_evaluation_repeat_and_say_what_is_stale(tmp_path: Path) -> None:
+    """The same bytes and figures from the same seed; nothing is made twice."""
+    store, _ = take("frames", tmp_path)
+    campaigns = collected(store)
+    model = store.folder / "models" / "markers-seed0.model"
+    first, before = model.read_bytes(), summary_json(store)
+    assert b"multilayer perceptron on marker displacements" in first
+    assert train(store, campaigns)["done"] == 0
+    assert evaluate(store, campaigns)["done"] == 0
+    assert report(store, campaigns)["done"] == 0
 
+    model.unlink()
+    with pytest.raises(StoreError, match="missing or stale"):
+        evaluate(store, campaigns)
+    assert report(store, campaigns)["done"] == 1
+    without = read_one_camera(store)
+    assert without is not None
+    assert [each.name for each in without.left_out] == ["train", "evaluate"]
+    assert without.kinematic is None
+
+    assert train(store, campaigns)["done"] == 1
+    assert model.read_bytes() == first
+    assert evaluate(store, campaigns)["done"] == 0
+    assert report(store, campaigns)["done"] == 1
+    after = summary_json(store)
+    assert before.pop("timing_s").keys() == after.pop("timing_s").keys()
+    assert before == after
+
+    assert evaluate(store, campaigns, margin=90.0)["done"] == 1
+    report(store, campaigns)
+    told = read_one_camera(store)
+    assert told is not None
+    assert {rule.margin for rule in told.detection.values()} == {90.0}
+    assert {rule.choose for rule in told.detection.values()} == {"protocol"}
+
+
+def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) -> None:
     store, _ = take("events", tmp_path)
     assert report(store, collected(store))["done"] == 0
     before = summary_json(store)

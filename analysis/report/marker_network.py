@@ -1,0 +1,160 @@
+"""The classifier on marker displacements in the report, where there are no events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.evaluation.evaluation import NAME, STEP, evaluation_of
+from sliplab.analysis.evaluation.markers import make_marker_job
+from sliplab.analysis.evaluation.windows import window_intervals
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks import marker_net
+from sliplab.analysis.networks.marker_net import MarkerNet
+from sliplab.analysis.report.figures import windows as figures
+from sliplab.analysis.report.figures.style import CLASS_WORDS
+from sliplab.analysis.report.latency import latency_section
+from sliplab.analysis.report.outcomes import failure_section
+from sliplab.analysis.report.page import Content, Figure, Table, percent
+from sliplab.analysis.report.summary import judged_part, plain_rules
+from sliplab.analysis.report.windows import METHODS, points_words, share_words, where_section
+from sliplab.storage.schema.evaluation import (
+    Accuracy,
+    Evaluation,
+    MarkerClassifier,
+    Seeds,
+    Share,
+)
+from sliplab.storage.schema.summary import Kinematic, OneCameraSummary
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A store's classifier and its evaluation."""
+
+    net: MarkerNet
+    evaluation: Evaluation
+
+
+def read_judged(store: Store, campaigns: list[Collected]) -> Judged | None:
+    """Read the classifier and its evaluation; None where either is missing or stale."""
+    kept = Derived.of(store, STEP)
+    if kept.key(NAME) is None:
+        return None
+    try:
+        evaluation = evaluation_of(store)
+        rules = evaluation.detection.values()
+        said = next((rule for rule in rules if rule.choose == "protocol"), None)
+        labels = Labels(store, evaluation.reviewed is not None)
+        jobs = [make_marker_job(labels, campaigns)]
+        if said is not None:  # the rule was given on the command line
+            jobs.append(make_marker_job(labels, campaigns, said.margin, said.smoothing))
+        for job in jobs:
+            if kept.fresh(NAME, job.key):
+                return Judged(marker_net.load(job.model.path), evaluation)
+    except StoreError:
+        return None
+    return None
+
+
+def with_classifier(
+    summary: OneCameraSummary, store: Store, campaigns: list[Collected], judged: Judged
+) -> OneCameraSummary:
+    """Add the classifier's figures, under the names that the spiking network's have."""
+    evaluation = judged.evaluation
+    parts = judged_part(campaigns, evaluation, window_intervals(store, evaluation.key), {})
+    return OneCameraSummary.model_validate({
+        **summary.to_json(),
+        **parts,
+        "classifier": evaluation.classifier,
+        "detection": plain_rules(evaluation.detection),
+        "choices": evaluation.choices,
+    })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MarkerNetworkSection(Content):
+    """Accuracy on windows of test trials, compared with simple methods."""
+
+    template: ClassVar[str] = "marker_network.html"
+    classifier: MarkerClassifier
+    accuracy: Accuracy
+    interval: Share
+    seeds: Seeds
+    rules: Sequence[str]
+    confusion: Figure
+    training: Figure
+    methods: Table
+    classes: Table
+
+    @property
+    def strict(self) -> str:
+        """Strict accuracy with its interval."""
+        return share_words(self.interval)
+
+
+def _network_section(
+    kinematic: Kinematic, summary: OneCameraSummary, net: MarkerNet
+) -> MarkerNetworkSection:
+    assert summary.classifier is not None
+    simulated, accuracy = summary.simulated, kinematic.accuracy
+    confusion = np.asarray(kinematic.confusion)
+    called = {
+        f"called {word} (windows)": confusion[:, k].tolist()
+        for k, word in enumerate((*CLASS_WORDS, "undecided"))
+    }
+    history = [asdict(epoch) for epoch in net.history]
+    own = [percent(value) for value in (accuracy.argmax, accuracy.strict, accuracy.margin)]
+    return MarkerNetworkSection(
+        summary.classifier, accuracy, kinematic.interval, kinematic.seeds,
+        sorted({
+            f"the mean of {rule.smoothing} frames leads by {rule.margin:g} points"
+            for rule in summary.detection.values()
+        }),
+        Figure(
+            figures.confusion(confusion, simulated=simulated), name="confusion",
+            data={"true class": list(CLASS_WORDS), **called},
+        ),
+        Figure(
+            figures.training_curves(history, net.chosen_epoch, simulated=simulated),
+            name="training", data={key: [row[key] for row in history] for key in history[0]},
+        ),
+        Table(
+            ["method", "argmax", "strict", "margin", "classifier ahead by (points)"],
+            [["marker classifier", *own, ""]]
+            + [
+                [METHODS[name], percent(found.argmax), "", "", points_words(found.network_ahead)]
+                for name, found in kinematic.beside.items()
+            ],
+        ),
+        Table(
+            ["class", "precision", "recall"],
+            [[word, percent(kinematic.precision[name]), percent(kinematic.recall[name])]
+             for name, word in zip(CLASSES, CLASS_WORDS, strict=True)],
+        ),
+    )  # fmt: skip
+
+
+def marker_sections(
+    store: Store, campaigns: list[Collected], summary: OneCameraSummary, judged: Judged
+) -> list[Content]:
+    """Make the sections about the classifier, in order."""
+    assert summary.kinematic is not None
+    rows = judged.evaluation.trials
+    sections = [
+        _network_section(summary.kinematic, summary, judged.net),
+        where_section(summary.kinematic, simulated=summary.simulated),
+        *(
+            latency_section(experiment, campaigns, rows, summary)
+            for experiment in ("kinematic", "gravity", "disturbance")
+        ),
+        failure_section(store.folder, summary.trials),
+    ]
+    return [section for section in sections if section is not None]
