@@ -99,7 +99,7 @@ def detector_section(
         Figure(
             latency_over_rate(panels, simulated=simulated),
             name="detectors",
-            data=points.to_dict("list"),
+            data={str(name): column for name, column in points.to_dict("list").items()},
         ),
         _tables(entries, compared.trials.validation),
     )

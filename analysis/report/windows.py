@@ -166,7 +166,7 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
         Figure(
             figures.recall_by_tenth(kinematic.by_tenth, simulated=simulated),
             name="recall-by-tenth",
-            data=tenths.to_dict("list"),
+            data={str(name): column for name, column in tenths.to_dict("list").items()},
         ),
         _factors(kinematic, simulated) if kinematic.by_factor else None,
         Table(["factor", "level", "trials", "windows", "right"], levels),

@@ -50,7 +50,7 @@ def trials(
     table = catalogue(opened, unreadable)
     whole = None
     if not unreadable and len(table):  # else what is whole may be more than what can be read
-        whole = {name: set(part) for name, part in table.groupby("campaign")["trial"]}
+        whole = {str(name): set(part) for name, part in table.groupby("campaign")["trial"]}
     excluded = all_excluded(opened, unreadable, whole)
     for problem in unreadable:
         console.say(f"left out: {problem}")
