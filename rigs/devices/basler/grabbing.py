@@ -124,6 +124,7 @@ class Grab:
         self._fault: RigError | None = None
         self._last = -1
         self._shortest_ns: int | None = None
+        self._latest_ns: int | None = None
         self._before: tuple[int, int] | None = None
         self._asked_ns = time.monotonic_ns()
         self._stall = StallTimer()
@@ -284,9 +285,15 @@ class Grab:
                 if stamp is None:
                     self._counts.unstamped += 1
                     continue
+                middle = settings.stamping.middle_ns(stamp, settings.mid_exposure_ns)
+                if self._latest_ns is not None and middle < self._latest_ns:
+                    back_s = (self._latest_ns - middle) / 1e9
+                    raise RigError(
+                        DEVICE, f"its clock jumped back by {back_s:.3f} s; begin a new trial"
+                    )
+                self._latest_ns = middle
                 self._counts.grabbed += 1
                 self._counts.late += self._is_late(frame, stamp)
-                middle = settings.stamping.middle_ns(stamp, settings.mid_exposure_ns)
                 self._ready.append(
                     Frame(frame.image, frame.number, middle, frame.host_ns, frame.sync)
                 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,6 +127,16 @@ def test_dropped_frames_are_a_gap_in_the_numbers(scene: FakeScene, camera: Basle
     scene.on_frames(frames(2, 6))
     assert read(camera, 3).number.tolist() == [5, 6, 7]
     assert camera.counts.lost == camera.counts.skipped == 3
+
+
+def test_a_clock_that_falls_back_is_a_fault(scene: FakeScene, camera: BaslerCamera) -> None:
+    camera.start()
+    scene.on_frames(frames(0, 3))
+    read(camera, 3)
+    later = frames(3, 3)
+    scene.on_frames(replace(later, t_ns=later.t_ns - 2_000_000_000))
+    with pytest.raises(RigError, match=r"its clock jumped back by 1\.990 s"):
+        until(lambda: bool(len(camera.read())), ARRIVE_S)
 
 
 def test_an_unplugged_camera_is_noticed_with_what_to_do(

@@ -116,10 +116,13 @@ def test_without_block_ids_what_pylon_overwrote_is_counted(until: Until) -> None
 
 
 def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on(until: Until) -> None:
-    now = time.monotonic_ns()
-    slow = SimpleNamespace(Value=now - 10**9)
-    device = Device(Result(0), Result(1, ChunkTimestamp=slow))
+    first = Result(0)
+    device = Device(first)
     with grabbing(device) as grab:
+        until(lambda: grab.counts.grabbed == 1)
+        threading.Event().wait(1.5 * CHUNKS.late_ns / 1e9)
+        exposed = SimpleNamespace(Value=first.ChunkTimestamp.Value + 1000)
+        device.results.append(Result(1, ChunkTimestamp=exposed))
         until(lambda: grab.counts.grabbed == 2)
         assert grab.counts.late == 1
 
