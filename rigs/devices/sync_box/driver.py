@@ -141,7 +141,7 @@ class SerialSyncBox:
         self._early: list[str] = []
         self._pulses: list[int] = []
         self._exposures: list[int] = []
-        self._asked_ns = self._heard_ns = self._questions = self._clock_us = 0
+        self._asked_ns = self._heard_ns = self._clock_us = 0
 
     def connect(self) -> None:
         """Open the port and check that a sync box answers; reconnects after a fault.
@@ -257,9 +257,7 @@ class SerialSyncBox:
         port = self._open()
         with port.news:
             self._check(port)
-        # numbered, because a late answer must not be taken for the next one
-        self._questions += 1
-        found, before_ns, after_ns = port.ask(f"T? {self._questions}", f"T {self._questions} ")
+        found, before_ns, after_ns = port.ask("T?", "T", numbered=True)
         us = int(found)
         with port.news:
             fell_us, self._clock_us = self._clock_us - us, us

@@ -68,6 +68,7 @@ class SyncPort:
         self.read_to_ns = now_ns()
         self._answers: deque[tuple[str, int]] = deque(maxlen=MOST_ANSWERS)
         self._greeted = False
+        self._tries = 0
         self._closing = threading.Event()
         try:
             self._serial = serial.Serial(
@@ -96,8 +97,11 @@ class SyncPort:
         self._thread.join(JOIN_S)
         self._serial.close()
 
-    def ask(self, question: str, answer: str) -> tuple[str, int, int]:
+    def ask(self, question: str, answer: str, numbered: bool = False) -> tuple[str, int, int]:
         """Send a request until an answer begins with `answer`, at most `TRIES` times.
+
+        Args:
+            numbered: number each try, because a late answer must not be taken for the next one.
 
         Returns:
             the text after `answer`, and the host's times before the request and at the answer, ns.
@@ -106,7 +110,11 @@ class SyncPort:
             SyncBoxFault: no answer, or the box refuses.
         """
         for _ in range(TRIES):
-            found = self._try(question, answer)
+            if numbered:
+                self._tries += 1
+                found = self._try(f"{question} {self._tries}", f"{answer} {self._tries} ")
+            else:
+                found = self._try(question, answer)
             if found is not None:
                 return found
         fault = SyncBoxFault(
