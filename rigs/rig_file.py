@@ -190,7 +190,7 @@ class RigFile(StrictModel):
             "arm": self.devices.arm_driver.fake,
             "event_camera": self.devices.event_camera_driver.reach,
             "frame_camera": self.devices.frame_camera_driver.fake,
-            "sync_box": self.devices.sync_box_driver.reach,
+            "sync_box": self.devices.sync_box_driver.fake,
         }
         if self.devices.force_sensor_driver is not None:
             fakes["force_sensor"] = self.devices.force_sensor_driver.fake

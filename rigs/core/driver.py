@@ -16,6 +16,7 @@ from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings
 
 if TYPE_CHECKING:
+    from sliplab.protocols.timing import Code
     from sliplab.rigs.core.capabilities import Arm, EventCamera, ForceSensor, FrameCamera, SyncBox
     from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
     from sliplab.rigs.core.fakes import FakeController
@@ -133,6 +134,46 @@ class FrameCameraDriver(Driver[SettingsT]):
     """Open the device, not grabbing yet, with its scale in px per mm. Raises RigError."""
     fake: Callable[[SettingsT, float, SceneFrames, int], FrameCamera] | None = None
     """Open the driver on frames of a scene: settings, px per mm, frames, half the exposure (ns)."""
+    unplug: Callable[[FrameCamera], None] | None = None
+    """Unplug a camera that `fake` has opened, for tests."""
+
+
+@dataclass(frozen=True)
+class PulseTrain:
+    """A train of pulses that a fake box started, for the rest of a simulated scene."""
+
+    first_ns: int
+    """Tick 0 on the clock that drives the box, ns."""
+    rate_hz: float
+    seed: int
+    code: Code
+
+
+class FakeBox(Protocol):
+    """A fake sync box, which sends its pulses by itself."""
+
+    pulses: int
+    """Number of pulses of the running or last train."""
+
+    @property
+    def address(self) -> Any:
+        """Address for the driver, used by `SyncBoxDriver.reach`; it can be pickled."""
+
+    def reset(self) -> None:
+        """Restart as after a brown-out: no train, and a clock that begins anew."""
+
+    def silence(self) -> None:
+        """Hang: send and answer nothing from now on."""
+
+    def answer_late(self) -> None:
+        """Hold the answer to the next request back until the one after it."""
+
+    def close(self) -> None:
+        """Unplug it; safe to call more than once."""
+
+
+OnTrain = Callable[[PulseTrain | None, int], None]
+"""Called with every train before its first tick, and at its end with None and the ticks sent."""
 
 
 @dataclass(frozen=True)
@@ -142,9 +183,11 @@ class SyncBoxDriver(Driver[SettingsT]):
     kind = "sync box"
     build: Callable[[SettingsT], SyncBox] = field(kw_only=True)
     """Make the device, not connected yet."""
-    reach: Callable[[SettingsT | None, str], SettingsT] | None = None
-    """Return settings that reach the fake box of a loopback rig, which speaks the firmware's
-    protocol at a serial port; the rest from a rig file's settings where it has some."""
+    fake: Callable[[Callable[[], int], OnTrain], FakeBox] | None = None
+    """Build a fake from the clock that drives it, ns, and a receiver of its trains."""
+    reach: Callable[[SettingsT | None, Any], SettingsT] | None = None
+    """Return settings that reach a fake at an address; the rest from a rig file's settings where
+    it has some."""
 
 
 class FakeForceSensor(Protocol):

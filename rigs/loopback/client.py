@@ -43,7 +43,7 @@ class Loopback:
         on_frames: called in a thread with the frames of the outside camera.
 
     Attributes:
-        sync_port: name of the sync box's serial port.
+        sync_address: address of the sync box.
         event_address: where the event camera's driver finds its fake.
         force_address: where that of the force sensor does; None without one.
 
@@ -64,7 +64,7 @@ class Loopback:
         theirs.close()
         their_frames.close()
         try:
-            self.sync_port, self.event_address, self.force_address = self._answer(READY_S)
+            self.sync_address, self.event_address, self.force_address = self._answer(READY_S)
         except BaseException:
             self.close()
             raise
@@ -87,7 +87,7 @@ class Loopback:
         assert box is not None
         update = {
             "event_camera": camera(devices.event_camera, self.event_address),
-            "sync_box": box(devices.sync_box, self.sync_port),
+            "sync_box": box(devices.sync_box, self.sync_address),
         }
         force = devices.force_sensor_driver
         if force is not None and force.reach is not None and devices.force_sensor is not None:
@@ -143,7 +143,7 @@ class Loopback:
 
     def restore(self, device: str) -> None:
         """Clear a device's faults; see `SimulationServer.restore`. Drivers must be rebuilt."""
-        self.sync_port, self.event_address, self.force_address = self._ask("restore", device)
+        self.sync_address, self.event_address, self.force_address = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
         """Return the true position of the sensor: right and up on the plate, and depth, mm."""

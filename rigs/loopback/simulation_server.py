@@ -20,12 +20,11 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, Truth
-from sliplab.rigs.core.driver import ArmScene, FakeForceSensor
+from sliplab.rigs.core.driver import ArmScene, FakeForceSensor, PulseTrain
 from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.devices.sync_box.fake import FakeSyncBox, Train
 from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.devices import build_mock
@@ -90,13 +89,16 @@ class SimulationServer:
         self._plate = MockPlate(self.world)
         self._operator = SimulatedOperator(self.world)
         self._on_frames, self._grabbing = on_frames, False
-        self._trains: deque[tuple[Train | None, int]] = deque()
-        self._train: Train | None = None
+        self._trains: deque[tuple[PulseTrain | None, int]] = deque()
+        self._train: PulseTrain | None = None
         self._level = SyncLevel(self._box_clock)
         self._sent: Counter[str] = Counter()
         self._stamps_us: list[I64] = []
         self._size = settings.event_camera.width, settings.event_camera.height
-        self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
+        fake_box = devices.sync_box_driver.fake
+        assert fake_box is not None  # the rig file was held against it
+        self._make_box = partial(fake_box, self._box_now_ns, self._on_train)
+        self.sync_box = self._make_box()
         fake_arm, fake_camera = devices.arm_driver.fake, devices.event_camera_driver.fake
         assert fake_arm is not None  # the rig file was held against it
         assert fake_camera is not None
@@ -122,9 +124,9 @@ class SimulationServer:
         self._events.start()
 
     @property
-    def addresses(self) -> tuple[str, Any, Any]:
-        """The sync box's port, and the addresses of event camera and force sensor."""
-        return self.sync_box.port, self.camera.address, self.force and self.force.address
+    def addresses(self) -> tuple[Any, Any, Any]:
+        """The addresses of sync box, event camera and force sensor."""
+        return self.sync_box.address, self.camera.address, self.force and self.force.address
 
     def close(self) -> None:
         """Close every fake."""
@@ -184,12 +186,12 @@ class SimulationServer:
 
     # -- the sync box ----------------------------------------------------------------------
 
-    def _on_train(self, train: Train | None, sent: int) -> None:
+    def _on_train(self, train: PulseTrain | None, sent: int) -> None:
         """Receive a train; called in the box's thread."""
         self._level.follow(train, sent)
         self._trains.append((train, sent))
 
-    def _tick(self, train: Train | None, sent: int) -> None:
+    def _tick(self, train: PulseTrain | None, sent: int) -> None:
         if train is not None:
             self._train = train
             first = self._box_clock.to_device(train.first_ns) - self.world.past_ns
@@ -325,7 +327,7 @@ class SimulationServer:
             raise RigError(device, f"its fake cannot simulate '{kind}'") from None
         what()
 
-    def restore(self, device: str) -> tuple[str, Any, Any]:
+    def restore(self, device: str) -> tuple[Any, Any, Any]:
         """A person puts right whatever is wrong with a device.
 
         A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
@@ -345,7 +347,7 @@ class SimulationServer:
                 self._path.motion.move(clear, PENDANT_MM_S, PENDANT_MM_S2, now_s)
         elif device == "sync_box":
             self.sync_box.close()
-            self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
+            self.sync_box = self._make_box()
         elif device == "event_camera":
             self.camera.close()
             self.camera = self._make_camera()
@@ -366,11 +368,11 @@ class SyncLevel:
 
     def __init__(self, box: ClockMap) -> None:
         self._box = box
-        self._train: Train | None = None
+        self._train: PulseTrain | None = None
         self._bits = CodeBits(1)
         self._ticks: int | None = None
 
-    def follow(self, train: Train | None, sent: int) -> None:
+    def follow(self, train: PulseTrain | None, sent: int) -> None:
         """Record the start of a train, or with None its end after `sent` ticks."""
         if train is None:
             self._ticks = sent

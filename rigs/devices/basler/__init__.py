@@ -34,6 +34,13 @@ def _fake(
     return BaslerCamera(settings.model_copy(update={"px_per_mm": px_per_mm}), device)
 
 
+def _unplug(camera: FrameCamera) -> None:
+    from sliplab.rigs.devices.basler.driver import BaslerCamera
+
+    assert isinstance(camera, BaslerCamera)
+    camera.device.unplug()
+
+
 DRIVER = FrameCameraDriver(
     name="basler",
     title="Basler",
@@ -42,4 +49,5 @@ DRIVER = FrameCameraDriver(
     ping=_ping,
     build=_build,
     fake=_fake,
+    unplug=_unplug,
 )

@@ -9,7 +9,10 @@ from sliplab.rigs.core.driver import SyncBoxDriver
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from sliplab.rigs.core.capabilities import SyncBox
+    from sliplab.rigs.core.driver import FakeBox, OnTrain
 
 
 def _build(settings: SyncBoxSettings) -> SyncBox:
@@ -36,6 +39,12 @@ def _reach(settings: SyncBoxSettings | None, port: str) -> SyncBoxSettings:
     return known.model_copy(update={"port": port})
 
 
+def _fake(now_ns: Callable[[], int], on_train: OnTrain) -> FakeBox:
+    from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
+
+    return FakeSyncBox(now_ns, on_train=on_train)
+
+
 DRIVER = SyncBoxDriver(
     name="sync_box",
     title="SlipLab sync box",
@@ -45,5 +54,6 @@ DRIVER = SyncBoxDriver(
     address=lambda settings: settings.port,
     locks=_locks,
     build=_build,
+    fake=_fake,
     reach=_reach,
 )

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import get_args
 
 from sliplab.protocols.timing import Code
+from sliplab.rigs.core.driver import OnTrain, PulseTrain
 from sliplab.rigs.core.pulse_code import SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
 
@@ -43,17 +44,6 @@ class _Plan:
         return CodeBits(self.seed, self.code)
 
 
-@dataclass(frozen=True)
-class Train:
-    """A train of pulses that the box started, for the rest of a simulated scene."""
-
-    first_ns: int
-    """Tick 0 on the clock that drives the box, ns."""
-    rate_hz: float
-    seed: int
-    code: Code
-
-
 class FakeSyncBox:
     """A fake sync box on the pty `port`; a context manager that ends its thread.
 
@@ -73,7 +63,7 @@ class FakeSyncBox:
         self,
         now_ns: Callable[[], int] = time.monotonic_ns,
         exposure_us: int | None = None,
-        on_train: Callable[[Train | None, int], None] = lambda train, sent: None,
+        on_train: OnTrain = lambda train, sent: None,
     ) -> None:
         self._now_ns, self._exposure_us, self._on_train = now_ns, exposure_us, on_train
         self._master, self._slave = os.openpty()
@@ -83,6 +73,7 @@ class FakeSyncBox:
         self._lock = threading.RLock()
         self._ending = threading.Event()
         self._silent, self._corrupt, self._drop = False, 0, 0
+        self._late, self._held = False, b""
         self._train: _Plan | None = None
         self._sent = self.pulses = 0
         self._power_on()
@@ -106,6 +97,11 @@ class FakeSyncBox:
                     os.close(handle)
             self._master = self._slave = -1
 
+    @property
+    def address(self) -> str:
+        """The port, for `reach` of the driver."""
+        return self.port
+
     # -- faults ----------------------------------------------------------------------------
 
     def reset(self) -> None:
@@ -118,6 +114,11 @@ class FakeSyncBox:
         """Hang: neither read nor send until `silent` is False again."""
         with self._lock:
             self._silent = silent
+
+    def answer_late(self) -> None:
+        """Hold the answer to the next request back until the one after it."""
+        with self._lock:
+            self._late = True
 
     def corrupt(self, lines: int) -> None:
         """Garble the next `lines` sent lines."""
@@ -133,7 +134,7 @@ class FakeSyncBox:
 
     def _announce(self, plan: _Plan) -> None:
         first_ns = self._origin_ns + self._first_us * 1000
-        self._on_train(Train(first_ns, plan.millihertz / 1000, plan.seed, plan.code), 0)
+        self._on_train(PulseTrain(first_ns, plan.millihertz / 1000, plan.seed, plan.code), 0)
 
     def _end(self) -> None:
         if self._train is not None:
@@ -158,6 +159,11 @@ class FakeSyncBox:
         if self._corrupt:
             self._corrupt -= 1
             line = line[:-3] + b"??\n"
+        if body[0] not in "PXDB":  # an answer
+            if self._late:
+                self._late, self._held = False, line
+                return
+            line, self._held = self._held + line, b""
         try:
             os.write(self._master, line)
         except BlockingIOError:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.timing import Code
+from sliplab.rigs.core.driver import PulseTrain
 from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
-from sliplab.rigs.devices.sync_box.fake import FakeSyncBox, Train
+from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.rigs.loopback.simulation_server import PULSE_NS, SyncLevel
 from sliplab.storage.clockmap import ClockMap
@@ -29,7 +30,7 @@ def true_ns(box_ns: int) -> int:
 def test_the_line_is_high_for_a_pulse_where_the_code_has_a_1(code: Code) -> None:
     level = SyncLevel(BOX)
     assert not level.high(true_ns(FIRST_NS))
-    level.follow(Train(FIRST_NS, 100.0, 77, code), 0)
+    level.follow(PulseTrain(FIRST_NS, 100.0, 77, code), 0)
     bits = code_bits(77, 5000, code)
     # 4,999 is beyond the bits that are made at first
     for tick in (*range(40), 4_094, 4_999):
@@ -41,7 +42,7 @@ def test_the_line_is_high_for_a_pulse_where_the_code_has_a_1(code: Code) -> None
 
 def test_before_and_after_its_train_it_is_low() -> None:
     level = SyncLevel(BOX)
-    level.follow(Train(FIRST_NS, 100.0, 77, "regular"), 0)
+    level.follow(PulseTrain(FIRST_NS, 100.0, 77, "regular"), 0)
     assert not level.high(true_ns(FIRST_NS - 1_000))
     assert level.high(true_ns(FIRST_NS + 1_000))
     ones = np.flatnonzero(code_bits(77, 1000, "regular"))
@@ -49,13 +50,13 @@ def test_before_and_after_its_train_it_is_low() -> None:
     level.follow(None, last)  # so many ticks were sent: this one was not
     assert not level.high(true_ns(FIRST_NS + last * PERIOD_NS + 1_000))
     assert level.high(true_ns(FIRST_NS + int(ones[19]) * PERIOD_NS + 1_000))
-    level.follow(Train(5 * FIRST_NS, 100.0, 78, "regular"), 0)
+    level.follow(PulseTrain(5 * FIRST_NS, 100.0, 78, "regular"), 0)
     assert not level.high(true_ns(FIRST_NS + 1_000))
 
 
 def test_a_fast_train_has_pulses_of_half_a_tick() -> None:
     level = SyncLevel(BOX)
-    level.follow(Train(FIRST_NS, 500.0, 77, "regular"), 0)
+    level.follow(PulseTrain(FIRST_NS, 500.0, 77, "regular"), 0)
     assert level.high(true_ns(FIRST_NS + 999_000))
     assert not level.high(true_ns(FIRST_NS + 1_001_000))
 
@@ -63,9 +64,9 @@ def test_a_fast_train_has_pulses_of_half_a_tick() -> None:
 @pytest.mark.realtime
 @pytest.mark.parametrize("code", CODES)
 def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code) -> None:
-    reported: list[tuple[Train | None, int, int]] = []
+    reported: list[tuple[PulseTrain | None, int, int]] = []
 
-    def on_train(train: Train | None, sent: int) -> None:
+    def on_train(train: PulseTrain | None, sent: int) -> None:
         reported.append((train, sent, time.monotonic_ns()))
 
     with FakeSyncBox(on_train=on_train) as wire:
@@ -90,7 +91,7 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
 
 @pytest.mark.realtime
 def test_an_unplugged_box_ticks_no_more() -> None:
-    reported: list[Train | None] = []
+    reported: list[PulseTrain | None] = []
     wire = FakeSyncBox(on_train=lambda train, sent: reported.append(train))
     box = SerialSyncBox(SyncBoxSettings(port=wire.port))
     box.start(100.0, 5)

@@ -208,6 +208,18 @@ def test_no_answer_is_a_fault(wire: FakeSyncBox, box: SerialSyncBox, ask: str) -
     assert "start the trial again" in text
 
 
+def test_a_late_answer_is_not_taken_for_that_of_the_next_try(
+    wire: FakeSyncBox, box: SerialSyncBox
+) -> None:
+    box.connect()
+    first = box.read_clock()
+    wire.answer_late()
+    second = box.read_clock()
+    passed_ns = int(second.device_ns[0] - first.device_ns[0])
+    assert passed_ns >= int(second.before_ns[0] - first.after_ns[0]) - 1000
+    assert passed_ns <= int(second.after_ns[0] - first.before_ns[0]) + 1000
+
+
 def test_one_garbled_answer_is_asked_for_again(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.connect()
     wire.corrupt(1)
