@@ -161,6 +161,8 @@ class Kind(Enum):
     """The controller's clock jumps back by `CLOCK_BACK_S`."""
     PACKETS_LOST = "packets lost"
     """The next `PACKETS_LOST` packets of poses are not sent."""
+    LATE_ANSWER = "late answer"
+    """The answer to the next request comes only with the answer to the one after it."""
 
 
 class Stage(Enum):

@@ -61,7 +61,7 @@ class FakeRapidServer(ServedController):
         self.speed_percent = 100.0
         self._speed_mm_s = 10.0
         self._zone_mm = 0.0
-        self._stopped = self._silent = False
+        self._stopped = self._silent = self._late = False
         self._turn: asyncio.Lock | None = None
 
     def drop_connections(self) -> None:
@@ -72,7 +72,7 @@ class FakeRapidServer(ServedController):
     def restore(self) -> None:
         """Clear every fault of connection and safety, as an operator would."""
         self._inside(self._connections.cut)
-        self._stopped = self._silent = False
+        self._stopped = self._silent = self._late = False
         self._inside(self._listen)
 
     def _listen(self) -> None:
@@ -84,6 +84,8 @@ class FakeRapidServer(ServedController):
             self._connections.cut()
         elif kind is Kind.SILENCE:
             self._silent = True
+        elif kind is Kind.LATE_ANSWER:
+            self._late = True
         elif kind in {Kind.CLOCK_BACK, Kind.PACKETS_LOST}:
             raise ValueError(f"{kind.value} is not simulated: this server reports no time")
         else:
@@ -95,6 +97,7 @@ class FakeRapidServer(ServedController):
         async with self._turn:
             while self.moving() or self._stopped:
                 await self._tick()
+            held = b""
             while True:
                 (number,) = struct.unpack(">H", await reader.readexactly(2))
                 if number == Command.CLOSE:
@@ -109,7 +112,11 @@ class FakeRapidServer(ServedController):
                 reply = await self._do(command, values)
                 if self._silent:
                     await asyncio.get_running_loop().create_future()
-                writer.write(reply)
+                if self._late:
+                    self._late, held = False, reply
+                    continue
+                writer.write(held + reply)
+                held = b""
 
     async def _do(self, command: Command, values: tuple[float, ...]) -> bytes:
         if command is Command.INFO:

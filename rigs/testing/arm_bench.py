@@ -1,0 +1,188 @@
+"""Bench of an arm: its driver on its fake controller, whose true motion is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sliplab.rigs.core.arm_settings import BaseArmSettings, Limits
+from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, Progress, Segment
+from sliplab.rigs.core.driver import ArmDriver, ArmScene
+from sliplab.rigs.core.fake_motion import StraightMotion, running_clock
+from sliplab.rigs.core.fakes import HOME, FakeController, Kind
+from sliplab.rigs.core.pose import distance_mm
+from sliplab.rigs.testing.bench import Bench
+from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
+
+REACH_MM = 5_000.0
+SPEED_MM_S = 40.0
+"""Speed of the bench's moves, where the limits allow it."""
+SHORT_MM = 3.0
+LONG_SHARE = 0.8
+"""Length of a long move, as a share of the way from the centre of the workspace to its side."""
+BEGUN_MM = 0.5
+"""A motion has begun after this way."""
+
+
+class ArmBench(Bench):
+    """An arm in the centre of its workspace, which is at rest and not connected yet.
+
+    Args:
+        settings: settings of a rig file, with limits in the base frame; the fake listens at its
+            address.
+    """
+
+    def __init__(self, driver: ArmDriver[Any], settings: BaseArmSettings, bounds: Bounds) -> None:
+        super().__init__(bounds)
+        if driver.fake is None:
+            raise NotTried(f"{driver.name} declares no fake")
+        self.driver, self.settings, self.limits = driver, settings, settings.limits
+        if self.limits.frame != "base":
+            raise ValueError("limits.frame: must be base for a conformance test, not plate")
+        self.home = Pose(_centre(self.limits), HOME.rotvec_deg)
+        scene = ArmScene(StraightMotion(self.home), running_clock(), lambda t_s: False, REACH_MM)
+        self.fake: FakeController = driver.fake(settings, scene)
+        self.fake.start()
+        self.arm: Arm = driver.build(settings)
+
+    def open(self) -> None:
+        """Connect the arm. Raises ArmFault."""
+        self.arm.connect()
+
+    def close_device(self) -> None:
+        """Close the arm; one that is lost while it may move says so, which is right."""
+        self.arm.close()
+
+    def close_fake(self) -> None:
+        """Close the fake controller."""
+        self.fake.close()
+
+    def connect(self) -> None:
+        """Connect within the bound. Raises Seen or RigError."""
+        self.call("connect", self.open, self.bounds.connect_s)
+
+    def inject(self, kind: Kind) -> None:
+        """Inject a fault now. Raises NotTried: the fake does not simulate it."""
+        try:
+            self.fake.inject(kind)
+        except ValueError as error:
+            raise NotTried(f"the fake cannot simulate '{kind.value}': {error}") from None
+
+    def restore(self) -> None:
+        """Clear every fault, as a person would at the pendant."""
+        self.fake.restore()
+
+    def place(self) -> Pose:
+        """Return where the tool centre point truly is."""
+        return self.fake.pose()
+
+    def moving(self) -> bool:
+        """Return whether the arm truly moves."""
+        return self.fake.moving()
+
+    # -- paths -----------------------------------------------------------------------------
+
+    @property
+    def speed_mm_s(self) -> float:
+        """Speed of the moves."""
+        return min(SPEED_MM_S, self.limits.speed_mm_s)
+
+    def to(self, y_mm: float) -> Segment:
+        """Return a move to a place beside the centre of the workspace, without turning."""
+        x, y, z = self.home.xyz_mm
+        turn = self.arm.pose().rotvec_deg
+        return Segment(Pose((x, y + y_mm, z), turn), self.speed_mm_s)
+
+    @property
+    def long_mm(self) -> float:
+        """Way of a long move from the centre."""
+        return LONG_SHARE * (self.limits.high_mm[1] - self.limits.low_mm[1]) / 2
+
+    def start(self, *path: Segment) -> None:
+        """Start a path. Raises Seen or RigError."""
+        self.call("start", lambda: self.arm.start(path))
+
+    def start_long(self) -> Segment:
+        """Start a long move, and wait until the arm moves. Raises Seen or RigError."""
+        segment = self.to(self.long_mm)
+        self.start(segment)
+        begun = self.until(
+            lambda: distance_mm(self.place(), self.home) > BEGUN_MM, self.bounds.call_s
+        )
+        if not begun:
+            raise Seen(f"the arm had not moved {self.bounds.call_s:g} s after start")
+        return segment
+
+    def end(self, within_s: float) -> Progress:
+        """Wait for the end of a path. Raises Seen: it takes longer; RigError: it was aborted."""
+        last: list[Progress] = []
+
+        def done() -> bool:
+            last[:] = [self.call("progress", self.arm.progress)]
+            return last[0].done
+
+        if not self.until(done, within_s):
+            raise Seen(f"progress was not done {within_s:g} s later, its state {last[0].state}")
+        return last[0]
+
+    def arrive(self, segment: Segment) -> Progress:
+        """Make a move to its end. Raises Seen or RigError."""
+        seconds = distance_mm(self.place(), segment.to) / segment.speed_mm_s
+        self.start(segment)
+        return self.end(seconds + self.bounds.news_s)
+
+    # -- faults ----------------------------------------------------------------------------
+
+    def state(self) -> ArmState:
+        """Return the state that the driver reports."""
+        return self.call("state", self.arm.state)
+
+    def now_ns(self) -> int:
+        """Return the controller's clock that the driver reports, ns."""
+        return self.call("now_ns", self.arm.now_ns)
+
+    def healthy(self) -> bool:
+        """Return whether the driver still takes the arm for one that can move."""
+        return self.state().healthy
+
+    def fault_noticed(self) -> bool:
+        """Return whether state, progress or pose report a fault now."""
+
+        def seen(work: Callable[[], object], name: str) -> bool:
+            return self.refusal(name, work) is not None
+
+        return (
+            not self.healthy()
+            or seen(self.arm.progress, "progress")
+            or seen(self.arm.pose, "pose")
+            or seen(self.arm.read_poses, "read_poses")
+        )
+
+    def check_at_rest(self, quiet_s: float) -> None:
+        """Raise Seen if the arm moves now, or within a time."""
+        if self.moving():
+            raise Seen("the arm was still moving when the call returned")
+        before = self.place()
+        self.wait(quiet_s)
+        moved = distance_mm(before, self.place())
+        if moved > 0.05 or self.moving():
+            raise Seen(f"the arm moved on by {moved:.2f} mm within {quiet_s:g} s")
+
+    def stop(self) -> ArmFault | None:
+        """Stop the arm; return the ArmFault of a stop that cannot be confirmed."""
+        error = self.refusal("stop", self.arm.stop)
+        if error is not None and not isinstance(error, ArmFault):
+            raise Seen(f"stop raised {error!r}, which is no ArmFault") from error
+        return error
+
+    def read_times(self) -> tuple[list[int], list[int]]:
+        """Return times of the poses since the last call, and of their arrival, ns."""
+        poses = self.call("read_poses", self.arm.read_poses)
+        return poses.t_ns.tolist(), poses.host_ns.tolist()
+
+
+def _centre(limits: Limits) -> tuple[float, float, float]:
+    x, y, z = ((np.array(limits.low_mm) + np.array(limits.high_mm)) / 2).tolist()
+    return float(x), float(y), float(z)

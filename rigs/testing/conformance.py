@@ -1,0 +1,135 @@
+"""Conformance of a driver as pytest cases, or as a report.
+
+A package with a driver tries every rule that applies to its kind by two lines of a test module:
+
+    from sliplab.testing import conformance
+    test_driver = conformance(DRIVER, MySettings(host="127.0.0.30"))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+from sliplab.rigs.core.arm_settings import BaseArmSettings
+from sliplab.rigs.core.device_settings import DriverSettings
+from sliplab.rigs.core.driver import (
+    ArmDriver,
+    Driver,
+    EventCameraDriver,
+    ForceSensorDriver,
+    FrameCameraDriver,
+    SyncBoxDriver,
+)
+from sliplab.rigs.testing import arm_rules, stream_rules
+from sliplab.rigs.testing.arm_bench import ArmBench
+from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules
+from sliplab.rigs.testing.stream_bench import (
+    ArmForceBench,
+    EventBench,
+    ForceBench,
+    FrameBench,
+    SyncBench,
+)
+
+Make = Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One rule for one driver; every try has a device and a fake of its own."""
+
+    driver: str
+    rule: Rule[Any]
+    make: Make
+
+    def __call__(self) -> None:
+        """Try the rule.
+
+        Raises:
+            RuleBroken: the driver breaks it.
+            NotTried: it cannot be tried on this driver.
+        """
+        if self.rule.warm:
+            with self.make() as bench:
+                bench.refusal("connect", bench.open, bench.bounds.connect_s)
+        with self.make() as bench:
+            self.rule.hold(self.driver, bench)
+
+
+def cases(
+    driver: Driver[Any],
+    settings: DriverSettings,
+    bounds: Bounds | None = None,
+    *,
+    arm: tuple[ArmDriver[Any], BaseArmSettings] | None = None,
+) -> list[Case]:
+    """Return the cases of a driver; its kind decides which rules apply.
+
+    Args:
+        settings: settings of a rig file; the fake of an arm listens at their address.
+        bounds: time limits of the driver's calls.
+        arm: driver and settings of the arm, for a force sensor that the arm's controller measures.
+    """
+    limits, common = bounds or Bounds(), stream_rules.RULES
+
+    def of(make: Make, *rules: Rules[Any]) -> list[Case]:
+        return [Case(driver.name, rule, make) for part in rules for rule in part.all]
+
+    if isinstance(driver, ArmDriver):
+        own = cast(BaseArmSettings, settings)
+        return of(lambda: ArmBench(driver, own, limits), arm_rules.RULES)
+    if isinstance(driver, EventCameraDriver):
+        return of(lambda: EventBench(driver, settings, limits), common)
+    if isinstance(driver, FrameCameraDriver):
+        return of(lambda: FrameBench(driver, settings, limits), common, stream_rules.FRAME_RULES)
+    if isinstance(driver, SyncBoxDriver):
+        return of(lambda: SyncBench(driver, settings, limits), common, stream_rules.SYNC_RULES)
+    if not isinstance(driver, ForceSensorDriver):
+        raise TypeError(f"{driver.name}: there are no rules for a {driver.kind}")
+    rules = common, stream_rules.FORCE_RULES
+    if arm is None:
+        return of(lambda: ForceBench(driver, settings, limits), *rules)
+    return of(
+        lambda: ArmForceBench(driver, settings, limits, ArmBench(*arm, limits)),
+        *rules,
+    )
+
+
+def conformance(
+    driver: Driver[Any],
+    settings: DriverSettings,
+    bounds: Bounds | None = None,
+    *,
+    arm: tuple[ArmDriver[Any], BaseArmSettings] | None = None,
+) -> Callable[..., None]:
+    """Return a pytest test of a driver, with one case a rule; arguments as in `cases`.
+
+    A rule that the fake cannot simulate is skipped with the reason.
+    """
+    import pytest
+
+    found = cases(driver, settings, bounds, arm=arm)
+
+    @pytest.mark.parametrize("case", found, ids=[case.rule.name for case in found])
+    def test(case: Case) -> None:
+        try:
+            case()
+        except NotTried as reason:
+            pytest.skip(str(reason))
+
+    return test
+
+
+def broken_rules(cases: list[Case]) -> dict[str, str]:
+    """Return what was seen of each rule that is broken, by its name."""
+    broken = {}
+    for case in cases:
+        try:
+            case()
+        except RuleBroken as error:
+            broken[error.rule] = error.seen
+        except NotTried:
+            continue
+    return broken

@@ -1,0 +1,1 @@
+"""Example drivers, one folder a kind of device: what `sliplab new driver` starts from."""
