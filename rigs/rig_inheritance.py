@@ -1,4 +1,4 @@
-"""Inheritance of rig files: `extends: mock.yaml`, overridden by the file's own keys.
+"""Inheritance of rig files: `extends: mock`, overridden by the file's own keys.
 
 A rehearsal's rig file differs from the real rig's by a line or two; full copies would diverge. The
 merged content, which is self-contained, is stored with the data.
@@ -79,6 +79,9 @@ def read_rig(path: Path) -> RigSource:
         if not isinstance(parent, str) or "\0" in parent:
             raise InputError(here, KEY, parent, "must be the path of a rig file")
         there = _parent_file(here, parent)
+        if not there.exists():
+            known = ", ".join(shipped_rigs())
+            raise InputError(here, KEY, parent, f"no such file, nor a shipped rig ({known})")
         if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:
             raise InputError(here, KEY, parent, "is circular, or a chain of more than 8 files")
         try:
