@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.plan import Plan
-from sliplab.protocols.program import Move
+from sliplab.protocols.program import Move, Twist
 from sliplab.protocols.quantity import (
     PositiveMillimetres,
     PositiveNewtons,
@@ -192,8 +192,8 @@ class RigFile(StrictModel):
             "frame_camera": self.devices.frame_camera_driver.fake,
             "sync_box": self.devices.sync_box_driver.fake,
         }
-        if self.devices.force_sensor_driver is not None:
-            fakes["force_sensor"] = self.devices.force_sensor_driver.fake
+        if (sensor := self.devices.force_sensor_driver) is not None:
+            fakes["force_sensor"] = sensor.of_arm or sensor.fake
             if self.mock.force is None:
                 text = "is needed: it is what the fake of devices.force_sensor shows"
                 raise KeyedError("mock.force", None, text)
@@ -235,7 +235,8 @@ class RigFile(StrictModel):
     def _clocks_meet_timing(self) -> RigFile:
         """Check that the simulated clocks are no worse than `timing` states."""
         if self.mock is not None:
-            check_timing(self.mock, self.timing)
+            sensor = None if self.devices is None else self.devices.force_sensor_driver
+            check_timing(self.mock, self.timing, sensor is not None and sensor.of_arm)
         return self
 
     @property
@@ -429,6 +430,7 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     _check_cameras(rig, plan)
     _check_exposure(rig, plan, file)
     _check_force(rig, plan)
+    _check_twist(rig, plan, file)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")
@@ -456,6 +458,22 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
         who = plan.file, "in collection.maintenance.rezero"
         _check_limit(rig, file, who, "depth", float(upkeep.rezero.search))
         _check_limit(rig, file, who, "speed", float(upkeep.rezero.speed))
+
+
+def _check_twist(rig: RigFile, plan: Plan, file: str) -> None:
+    """Check that the arm can twist, if the plan does."""
+    if rig.devices is None or rig.devices.arm_driver.twists:
+        return
+    for trial in plan:
+        if any(isinstance(step, Twist) for step in plan.program(trial).steps):
+            driver = rig.devices.arm_driver
+            raise InputError(
+                file,
+                "devices.arm.driver",
+                driver.name,
+                f"cannot turn the tool evenly on the spot, and trial {trial.id} of {plan.file} "
+                "does; use another driver, such as 'abb'",
+            )
 
 
 def _check_limit(

@@ -8,7 +8,7 @@ library is loaded when a device is built, not when a rig file is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -69,6 +69,10 @@ class ArmScene:
     """Level of the sync line at a time of the controller's clock, s."""
     reach_mm: float
     """Reach of the fake from its base; the driver enforces the rig file's limits."""
+    load: Callable[[float], Sequence[float] | None] | None = None
+    """Force (N) and torque (N m) on the tool in the axes of the base at a time of the controller's
+    clock, s, where the arm measures them (`ForceSensorDriver.of_arm`); returns None while the
+    scene has not come to that time."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class ArmDriver(Driver[ArmSettingsT]):
     kind = "arm"
     build: Callable[[ArmSettingsT], Arm] = field(kw_only=True)
     """Make the device, not connected yet."""
+    twists: bool = True
+    """It can turn the tool on the spot at a speed (`Segment.turn_deg_s`)."""
     fake: Callable[[ArmSettingsT, ArmScene], FakeController] | None = None
     """Build a fake controller, not started yet; None: not available on a loopback rig."""
 
@@ -220,7 +226,9 @@ class ForceSensorDriver(Driver[SettingsT]):
 
     Raises RigError where that arm has none.
     """
+    of_arm: bool = False
+    """The arm's controller measures and sends it, so the arm's fake does, by `ArmScene.load`."""
     fake: Callable[[SettingsT], FakeForceSensor] | None = None
-    """Make a fake; None: no loopback rig can have this sensor."""
+    """Make a fake; None: no loopback rig can have this sensor, unless it is the arm's."""
     reach: Callable[[SettingsT, Any], SettingsT] | None = None
     """Return settings that reach a fake at an address."""

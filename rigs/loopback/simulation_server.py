@@ -8,6 +8,7 @@ move never lies in the world's past.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.loopback.arm_path import FakeArmPath
+from sliplab.rigs.loopback.tool_load import ToolLoad
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.event_camera import MockEventCamera
@@ -104,22 +106,35 @@ class SimulationServer:
         assert fake_camera is not None
         self._make_camera = partial(fake_camera, self._size)
         self.camera = self._make_camera()
-        scene = ArmScene(
-            self._path.motion, ControllerClock(self._arm_now_s), self._arm_input, REACH_MM
-        )
-        self.arm = fake_arm(devices.arm, scene)
         self._force: MockForceSensor | None = None
         self._make_force = None
         self.force: FakeForceSensor | None = None
-        if devices.force_sensor_driver is not None:
+        self._tool_load: ToolLoad | None = None
+        if (driver := devices.force_sensor_driver) is not None:
             assert settings.force is not None  # the rig file was held against it
-            assert devices.force_sensor_driver.fake is not None
             # the sensor on the wire takes its load for zero itself
             alone = settings.force.model_copy(update={"bias": "never"})
-            self._force = MockForceSensor(self.world, alone)
-            self._make_force = partial(devices.force_sensor_driver.fake, devices.force_sensor)
-            self.force = self._make_force()
+            if driver.of_arm:
+                self._force = MockForceSensor(
+                    self.world, alone.model_copy(update={"range_n": math.inf})
+                )
+                self._tool_load = ToolLoad(
+                    self.world, self._force, clocks.arm, settings.force.range_n
+                )
+            else:
+                assert driver.fake is not None
+                self._force = MockForceSensor(self.world, alone)
+                self._make_force = partial(driver.fake, devices.force_sensor)
+                self.force = self._make_force()
             self._force.start()
+        scene = ArmScene(
+            self._path.motion,
+            ControllerClock(self._arm_now_s),
+            self._arm_input,
+            REACH_MM,
+            None if self._tool_load is None else self._tool_load.at,
+        )
+        self.arm = fake_arm(devices.arm, scene)
         self.arm.start()
         self._events.start()
 
@@ -169,6 +184,8 @@ class SimulationServer:
             self._stamps_us.append(chunk.t_us)
         if self._force is not None and self.force is not None:
             self._send_forces(self._force, self.force)
+        if self._tool_load is not None and self._tool_load.follow():
+            self.arm.inject(Kind.PROTECTIVE_STOP)
         if self._grabbing:
             self._send_frames()
 

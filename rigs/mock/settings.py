@@ -383,8 +383,11 @@ def skin_of(settings: MockSettings) -> scene_skin.Skin:
     return scene_skin.make_skin(geometry, settings.seed if made.seed is None else made.seed)
 
 
-def check_timing(mock: MockSettings, timing: Timing) -> None:
+def check_timing(mock: MockSettings, timing: Timing, force_of_arm: bool = False) -> None:
     """Check a simulated rig's clocks and delays against `timing`.
+
+    Args:
+        force_of_arm: forces come with the arm's poses, by its clock.
 
     Raises:
         KeyedError: the first setting beyond it.
@@ -410,7 +413,7 @@ def check_timing(mock: MockSettings, timing: Timing) -> None:
             "frame_camera", camera.latency_us, camera.arrival_jitter_us,
             "frame_delay", timing.frame_delay,
         )  # fmt: skip
-    if mock.force is not None:
+    if mock.force is not None and not force_of_arm:
         _check_force(mock.force, timing)
     if timing.arm == "host time":
         _check_delay(

@@ -25,7 +25,7 @@ def _fake(settings: UrSettings, scene: ArmScene) -> FakeController:
     from sliplab.rigs.devices.ur.fake import FakeUr
 
     bit = 1 << settings.sync_input
-    return FakeUr(
+    fake = FakeUr(
         settings.host,
         scene.motion,
         cycle_hz=settings.frequency_hz,
@@ -33,6 +33,9 @@ def _fake(settings: UrSettings, scene: ArmScene) -> FakeController:
         reach_mm=scene.reach_mm,
         clock=scene.clock,
     )
+    if scene.load is not None:
+        fake.program.tool_load = scene.load
+    return fake
 
 
 DRIVER = ArmDriver(
@@ -64,4 +67,5 @@ WRENCH_DRIVER = ForceSensorDriver(
     settings=UrWrenchSettings,
     ping=lambda settings: None,  # the arm is looked for already
     build=_build_wrench,
+    of_arm=True,
 )

@@ -60,6 +60,8 @@ STILL_S = 1.0
 """Timeout from a stop command to the arm at rest, for each channel, s."""
 STOP_DECELERATION_MM_S2 = 1000.0
 """Deceleration of a stop."""
+REACTION_S = 0.002
+"""Time from a stop to the start of braking: one cycle of the controller, s."""
 ARRIVED_MM = 0.1
 """A move that ends farther than this from its target was stopped from outside."""
 STILL_MM_S = 0.01
@@ -229,6 +231,10 @@ class UrArm(ThreadedArm):
         self._moved_ns = None
         run.join(STILL_S)
         run.done = True
+
+    def stopping_s(self, speed_mm_s: float) -> float:
+        """Time for which it goes on at full speed after a stop, or as far: see `StoppingArm`."""
+        return REACTION_S + speed_mm_s / (2 * STOP_DECELERATION_MM_S2)
 
     def close(self) -> None:
         """Stop the arm, end the control program and close every connection.

@@ -13,7 +13,8 @@ import argparse
 import asyncio
 import struct
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
@@ -67,6 +68,10 @@ _LAYOUT = TYPES | {"VECTOR3D": "3d", "VECTOR6INT32": "6i"}
 _COUNT = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
 
 
+FELT = "actual_TCP_force"
+Value = int | float | list[float]
+
+
 @dataclass(eq=False)
 class Client:
     """One RTDE connection."""
@@ -77,13 +82,16 @@ class Client:
     streaming: bool = False
     _names: list[str] = field(default_factory=list)
     _kinds: list[str] = field(default_factory=list)
-    _readers: list[Callable[[float], int | float | list[float]]] = field(default_factory=list)
+    _readers: list[Callable[[float], Value]] = field(default_factory=list)
+    _unsent: deque[tuple[float, list[Value]]] = field(default_factory=deque)
+    """Times and values of packets that wait for the load on the tool."""
     _layout: struct.Struct = field(default_factory=lambda: struct.Struct(">"))
     _recipes: dict[int, list[str]] = field(default_factory=dict)
 
     def ask_outputs(self, body: bytes, cycle_hz: int) -> bytes:
         """Answer a request for outputs: recipe 1, or 0 if one is unknown, and types."""
         (hz,) = struct.unpack_from(">d", body)
+        self._unsent.clear()
         self._names = [name for name in body[8:].decode().split(",") if name]
         self._kinds, self._readers = [_kind(name) for name in self._names], []
         if _UNKNOWN in self._kinds:
@@ -117,13 +125,27 @@ class Client:
         for name, value in sorted(zip(names, values, strict=True), key=_command_last):
             program.write(name, value)
 
-    def packet(self, program: UrProgram, t_s: float) -> bytes:
-        """Build the body of one packet of outputs."""
+    def cycle(self, program: UrProgram, t_s: float) -> None:
+        """Take the outputs of one cycle."""
         if len(self._readers) != len(self._names):
             self._readers = [program.reader(name) for name in self._names]
+        self._unsent.append((t_s, [read(t_s) for read in self._readers]))
+
+    def packets(self, program: UrProgram) -> Iterator[bytes]:
+        """Build the bodies of the packets whose outputs are all known, in order."""
+        while self._unsent:
+            t_s, values = self._unsent[0]
+            if FELT in self._names:
+                felt = program.felt(t_s)
+                if felt is None:
+                    return
+                values[self._names.index(FELT)] = felt
+            self._unsent.popleft()
+            yield self._packed(values)
+
+    def _packed(self, values: list[Value]) -> bytes:
         flat: list[int | float] = []
-        for read, kind in zip(self._readers, self._kinds, strict=True):
-            value = read(t_s)
+        for value, kind in zip(values, self._kinds, strict=True):
             if kind in _COUNT:
                 flat.extend(value if isinstance(value, list) else [0] * _COUNT[kind])
             else:
@@ -279,7 +301,10 @@ class FakeUr(ServedController):
                 continue
             for client in self._clients:
                 if client.streaming and self._cycle % client.every == 0:
-                    send(client.writer, DATA, client.packet(self.program, t_s))
+                    client.cycle(self.program, t_s)
+        for client in () if self._silent else self._clients:
+            for body in client.packets(self.program):
+                send(client.writer, DATA, body)
 
     async def _rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         client = Client(writer)

@@ -74,9 +74,12 @@ class UrProgram:
         self.remote = True
         self.runtime = Runtime.STOPPED
         self.tcp = [0.0] * 6
-        self.tool_load: Callable[[float], Sequence[float]] = lambda t_s: (0.0,) * 6
-        """Force and torque on the tool by controller time, base axes, N and N m."""
-        self._zero_load = [0.0] * 6
+        self.tool_load: Callable[[float], Sequence[float] | None] = lambda t_s: (0.0,) * 6
+        """Force and torque on the tool by controller time, base axes, N and N m; None while they
+        are not known yet, which holds up the packets that have them."""
+        self._zero_load: Sequence[float] = (0.0,) * 6
+        self._zeroed_s: float | None = None
+        """Time of a request to take the load for zero, until the load of that time is known."""
         self.payload_kg = 0.0
         self.uploads = 0
         self.faults = FaultPlan(faults, self.inject)
@@ -238,12 +241,16 @@ class UrProgram:
             "runtime_state": lambda _: int(self.runtime),
             "robot_mode": lambda _: 7 if self.powered else 3,
             "payload": lambda _: self.payload_kg,
-            "actual_TCP_force": self._felt,
         }
         return known.get(name, lambda _: 0)
 
-    def _felt(self, t_s: float) -> list[float]:
-        return [a - b for a, b in zip(self.tool_load(t_s), self._zero_load, strict=True)]
+    def felt(self, t_s: float) -> list[float] | None:
+        """Return force and torque on the tool since it was zeroed; None if not known yet."""
+        load = self.tool_load(t_s)
+        if load is not None and self._zeroed_s is not None and self._zeroed_s <= t_s:
+            self._zero_load = self.tool_load(self._zeroed_s) or self._zero_load
+            self._zeroed_s = None
+        return None if load is None else [a - b for a, b in zip(load, self._zero_load, strict=True)]
 
     def _velocity(self) -> list[float]:
         """Return the tool centre point's linear velocity in the last cycle, m/s."""
@@ -285,7 +292,7 @@ class UrProgram:
             self.motion.stop(values[0] * MM_PER_M, self._t)
             self._begin(bool(self.ints_in[1]))
         elif command == 8:
-            self._zero_load = list(self.tool_load(self._t))
+            self._zeroed_s = self._t
         elif command == 17:
             self.payload_kg = values[0]
         elif command == 29:

@@ -1,4 +1,4 @@
-"""Trials with a force sensor through the real drivers: an ATI Net F/T on the wire."""
+"""Trials with forces through the real drivers: an ATI Net F/T on the wire, and a UR's wrench."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from sliplab.analysis.force import plate_forces
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.protocols import InputError
+from sliplab.protocols.timing import Delay, ForceTiming
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
@@ -28,17 +30,22 @@ LONGEST_US = 400_000
 AGREE_N = 0.3
 
 
-def force_yaml(folder: Path, **mock: Any) -> Path:
-    """The shipped loopback rig with a fake of an ATI Net F/T."""
-    host = own_address()
+def force_yaml(folder: Path, sensor: str = "ati_net_ft", **mock: Any) -> Path:
+    """The shipped loopback rig with a fake of an ATI Net F/T, or the wrench of its UR."""
+    kinds: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+        "ati_net_ft": ({"host": own_address()}, {"delay": {"shortest_us": 0}}),
+        "ur_wrench": ({}, {"grade": "arm clock", "delay": {"shortest_us": 20_000}}),
+    }
+    settings, timing = kinds[sensor]
+    timing["delay"]["longest_us"] = LONGEST_US
     data = {
         "extends": str(ROOT / "rigs" / "loopback.yaml"),
         "name": "loopback",
         "devices": {
             "arm": {"host": own_address()},
-            "force_sensor": {"driver": "ati_net_ft", "host": host},
+            "force_sensor": {"driver": sensor, **settings},
         },
-        "timing": {"force": {"delay": {"shortest_us": 0, "longest_us": LONGEST_US}}},
+        "timing": {"force": timing},
         "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}, "force": {}, **mock},
     }
     return write(folder / "rig.yaml", data)
@@ -67,8 +74,15 @@ def test_forces_come_through_the_wire_as_the_mock_has_them(
     assert verify(Store.open(run_request.store)) == []
     counts = (live.record.devices or {})["force_sensor"]["counts"]
     assert (counts["lost"], counts["late"], counts["malformed"]) == (0, 0, 0)
+    agree(live, run_request, tmp_path)
+
+
+def agree(live: Recording, run_request: RunRequest, tmp_path: Path) -> None:
+    """Hold a trial's forces against those that the mock rig records in the same trial."""
     mock = request_in(tmp_path / "mock", wide(), run_request.store.parent.parent / "rig.yaml")
-    file = run_request.rig.model_copy(update={"driver": "mock", "devices": None})
+    force = ForceTiming(delay=Delay(shortest_us=0, longest_us=4000))
+    timing = run_request.rig.timing.model_copy(update={"force": force})
+    file = run_request.rig.model_copy(update={"driver": "mock", "devices": None, "timing": timing})
     other = describe_campaign(Store.create(mock.store), mock)
     rig = build_rig(file)
     rig.connect()
@@ -113,16 +127,58 @@ def test_a_loopback_rig_needs_the_scene_of_its_sensor(tmp_path: Path) -> None:
         request_in(tmp_path / "a", quick(), force_yaml(tmp_path, force=None))
 
 
-def test_the_arm_presses_to_a_force_through_the_wire(
-    run_request: RunRequest, tmp_path: Path
+@pytest.fixture(scope="module")
+def by_the_arm(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
+    folder = tmp_path_factory.mktemp("loopback-wrench")
+    return request_in(folder / "live", wide(), force_yaml(folder, "ur_wrench"))
+
+
+def test_a_trial_has_the_arms_own_wrench_by_its_clock(
+    by_the_arm: RunRequest, tmp_path: Path
 ) -> None:
+    with stage_of(by_the_arm.rig) as stage, at_work(by_the_arm, stage) as (work, campaign):
+        take_all(work)
+        assert [failed["cause"] for failed in campaign.quarantined()] == []
+        (live,) = campaign.recordings()
+    assert verify(Store.open(by_the_arm.store)) == []
+    clock = live.record.clocks.streams["force"]
+    assert (clock.grade, clock.uncertainty_ns) == (
+        "arm clock", live.record.clocks.arm.uncertainty_ns,
+    )  # fmt: skip
+    assert (live.record.devices or {})["force_sensor"] == {"dropped": 0}
+    agree(live, by_the_arm, tmp_path)
+    # stamped by the controller: what came 20 ms late is not dated late
+    forces = plate_forces(live)
+    start, _ = live.step("slide")
+    held = forces.between(*live.step("hold")).tangential_n
+    slid = forces.between(start - 100_000_000, start + 200_000_000)
+    rises = slid.t_ns[slid.tangential_n > held.max() + 0.02][0]
+    print(f"simulated: friction rises {(rises - start) / 1e6:.1f} ms after the slide begins")
+    assert -5e6 < rises - start < 18e6
+
+
+def test_a_load_beyond_the_range_is_a_protective_stop(tmp_path: Path) -> None:
+    rig = force_yaml(tmp_path, "ur_wrench", force={"range_n": 1.5})
+    request = request_in(tmp_path / "live", wide(), rig)
+    with stage_of(request.rig) as stage, at_work(request, stage) as (work, campaign):
+        with pytest.raises(RigError, match=r"arm: .*protective stop"):
+            take_all(work)
+        assert stage.at_rest()
+        assert campaign.committed() == set()
+
+
+@pytest.mark.parametrize("sensor", ["run_request", "by_the_arm"])
+def test_the_arm_presses_to_a_force_through_the_wire(
+    sensor: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    run_request: RunRequest = request.getfixturevalue(sensor)
     data = wide()
     data["collection"]["motion"][1] = {
         "phase": "press", "force": "1 N", "depth": "3 mm", "speed": "1 mm/s",
     }  # fmt: skip
     data["collection"]["factors"].pop("depth")
-    request = request_in(tmp_path / "live", data, run_request.store.parent.parent / "rig.yaml")
-    with stage_of(request.rig) as stage, at_work(request, stage) as (work, campaign):
+    live = request_in(tmp_path / "live", data, run_request.store.parent.parent / "rig.yaml")
+    with stage_of(live.rig) as stage, at_work(live, stage) as (work, campaign):
         take_all(work)
         assert [failed["cause"] for failed in campaign.quarantined()] == []
         (recording,) = campaign.recordings()

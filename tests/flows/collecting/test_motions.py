@@ -11,11 +11,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from sliplab.flows.planning.run_request import make_request
+from sliplab.protocols import InputError
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
+from tests.flows.live import free_udp_port
+from tests.rigs.waiting import own_address
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
@@ -125,11 +128,29 @@ def test_a_twist_of_a_ur_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
         assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
 
 
-def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
-    data = yaml.safe_load((ROOT / "protocols" / "press_twist.yaml").read_text())
+def abb_yaml(folder: Path, driver: str = "abb") -> Path:
+    """The loopback rig with the arm of rigs/irb120.yaml, whose poses are timed by their arrival."""
+    loopback = yaml.safe_load((ROOT / "rigs" / "loopback.yaml").read_text())["devices"]["arm"]
+    irb120 = yaml.safe_load((ROOT / "rigs" / "irb120.yaml").read_text())
+    reached: dict[str, Any] = {"driver": driver, "host": own_address()}
+    if driver == "abb":
+        reached |= {"rws_port": 8080, "egm_bind": "127.0.0.1", "egm_port": free_udp_port()}
+    arm = {**reached, "tool": irb120["devices"]["arm"]["tool"], "limits": loopback["limits"]}
+    data = {
+        "extends": str(ROOT / "rigs" / "loopback.yaml"),
+        "name": "loopback",
+        "devices": {"arm": arm},
+        "timing": {**irb120["timing"], "pose_delay": {"shortest_us": 0, "longest_us": 200_000}},
+    }
+    return write(folder / "abb.yaml", data)
+
+
+def twists(depth_mm: float = 2.4) -> dict[str, Any]:
+    """Three press-twists of one depth and speed: one to learn from, two to judge by."""
+    data: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "press_twist.yaml").read_text())
     collection = data["collection"]
     collection["factors"] |= {
-        "depth": {"unit": "mm", "values": [2.4]},
+        "depth": {"unit": "mm", "values": [depth_mm]},
         "speed": {"unit": "deg/s", "values": [10]},
         "angle": {"unit": "deg", "values": [-40, 35, 40]},
     }
@@ -141,6 +162,47 @@ def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
         "test_levels": {"angle": ["40 deg"]},
     }
     data["analysis"]["training"] = {"epochs": 2}
+    return data
+
+
+@pytest.mark.realtime
+def test_twists_of_an_abb_arm_are_labelled_and_judged(tmp_path: Path) -> None:
+    """A small campaign through the real driver, motion programs and EGM, on its fake."""
+    data = twists()
+    data["collection"]["motion"]["press"] = "4 mm/s"
+    data["collection"]["gates"] = {"sync_uncertainty": {"host_time": "0.5 s"}}
+    protocol, store = write(tmp_path / "twists.yaml", data), tmp_path / "store"
+    done = answer("collect", protocol, "--rig", abb_yaml(tmp_path), "--store", store)
+    assert (done["committed"], done["missing"]) == (3, 0)
+    assert answer("label", store)["done"] == 3
+    labels = tmp_path / "store" / "derived" / "labels" / "press_twist"
+    for recording in Store.open(store).campaign("press_twist").recordings():
+        begin, end = recording.motion_ns
+        angle = abs(float(str(recording.record.condition["angle"]).split()[0]))
+        assert (end - begin) / 1e9 == pytest.approx(angle / 10, abs=0.3)
+        (label,) = labels.glob(f"{recording.trial_id}*.json")
+        found, truth = read_json(label), recording.simulation_truth()
+        assert truth is not None
+        for onset in ("incipient_ns", "gross_ns"):
+            assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
+    for step in ("train", "evaluate", "report"):
+        answer(step, store)
+    summary = read_json(store / "report" / "summary.json")
+    (trial,) = summary["trials"]
+    assert trial["trial"].startswith("angle=40deg,")
+    assert trial["outcome"] != "without_onsets"
+
+
+def test_an_arm_that_rests_between_pieces_is_refused_a_twist_beforehand(tmp_path: Path) -> None:
+    protocol, rig = write(tmp_path / "twists.yaml", twists()), abb_yaml(tmp_path, "abb_socket")
+    with pytest.raises(
+        InputError, match=r"devices.arm.driver = abb_socket: cannot turn the tool evenly.*'abb'"
+    ):
+        make_request(protocol, rig, tmp_path / "store")
+
+
+def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
+    data = twists()
     protocol, store = write(tmp_path / "twists.yaml", data), tmp_path / "store"
     assert answer("collect", protocol, "--rig", RIG, "--store", store)["committed"] == 3
     assert answer("label", store)["done"] == 3

@@ -119,7 +119,8 @@ def test_a_stop_waits_for_one_piece_and_no_more(pair: MakePair) -> None:
     began = robot.pose().xyz_mm[1]
     arm.stop()
     assert not robot.moving()
-    assert robot.pose().xyz_mm[1] - began < 3 * 1.6 * 0.25  # three pieces, on a busy machine
+    # three pieces, on a busy machine
+    assert robot.pose().xyz_mm[1] - began < 3 * 1.6 * arm.stopping_s(1.6)
     assert arm.progress().finished == ()
     assert arm.state() is ArmState.READY
 

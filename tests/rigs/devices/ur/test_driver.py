@@ -9,7 +9,15 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import (
+    Arm,
+    ArmFault,
+    ArmState,
+    Pose,
+    RigError,
+    Segment,
+    StoppingArm,
+)
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SingularityError, SpeedError, WorkspaceError
 from sliplab.rigs.core.plate_frame import turned_about_z
@@ -153,6 +161,24 @@ def test_a_stop_in_a_slide_stands_still_soon_and_says_so(
     assert arm.state() is ArmState.READY
     arm.stop()  # more than once
     assert len(follow(arm, Segment(at(0.0), 20.0))) == 1  # and it can go on
+
+
+def test_a_stop_goes_on_as_far_as_it_says(robot_of: MakeRobot, arm_on: MakeArm) -> None:
+    """From 40 mm/s at 1 m/s2: 0.8 mm of braking, and a cycle or more on a busy machine."""
+    robot = robot_of(cycle_hz=500)
+    arm = arm_on(robot, acceleration_mm_s2=1000.0)
+    assert isinstance(arm, StoppingArm)
+    assert arm.stopping_s(40.0) == pytest.approx(0.022)
+    gone = []
+    for _ in range(5):
+        arm.start([Segment(at(20.0), 40.0)])
+        until(lambda: robot.pose().xyz_mm[1] > 5.0, 5.0)
+        began = robot.pose().xyz_mm[1]
+        arm.stop()
+        gone.append(robot.pose().xyz_mm[1] - began)
+        follow(arm, Segment(at(0.0), 40.0))
+    assert min(gone) > 0.8
+    assert min(gone) < 40.0 * (arm.stopping_s(40.0) + 0.01)
 
 
 def test_no_move_follows_a_stop_however_short_the_segments(
