@@ -108,6 +108,14 @@ class Recording:
         except ValueError as error:
             raise self._damaged(str(error)) from None
 
+    def files(self) -> dict[str, Path]:
+        """Return the trial's files that are under checksums, by name, each checked against its own.
+
+        Raises:
+            StoreError: one is damaged.
+        """
+        return {name: self._sound(name) for name in sorted(self._sums)}
+
     def _sound(self, name: str) -> Path:
         """Return one of the trial's files, once it has been checked against its checksum.
 

@@ -1,0 +1,176 @@
+"""The data card of a publication, `README.md`: what is in it, how it was made, its limits."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+import pyarrow as pa
+
+from sliplab.storage.formats.publication import Publication
+from sliplab.storage.trials.hdf5_writer import COLUMNS, STREAMS, TIMING, TRACKS
+from sliplab.storage.trials.store import IMPORTED
+
+_LOAD = """\
+```python
+import mlcroissant
+
+data = mlcroissant.Dataset("croissant.json")
+for record in data.records("trials"):
+    print(record["trials/trial"], record["trials/folder"])
+```
+
+Events, poses and clocks are in `data.h5` of each trial's folder (HDF5 with the filters of the
+package `hdf5plugin`), the maps of its clocks in `record.json`. The folder is also a store of
+SlipLab: `sliplab.open_store(".")`.
+"""
+_LIMITS = (
+    "Labels follow from the rule that they name; they are measurements with doubts, not a truth.",
+    "An onset that is missing is unknown or in doubt, or the slip did not happen; the label's "
+    "document in `derived/labels` says which.",
+    "Review decisions of people, operators and host names are not published.",
+    "Trials that failed a gate, and interrupted ones, are left out.",
+)
+_SIMULATED_LIMITS = (
+    "The physics of simulated trials is a model with assumed parameters; nothing here shows how a "
+    "real skin slips.",
+    "The truth in a simulated trial's record is for reports of errors; training on it would be "
+    "training on the answer.",
+)
+_IMPORTED_LIMITS = (
+    "Imported trials have no protocol, and clocks of unknown relation; `imported.unknown` in their "
+    "record lists what else is not known.",
+)
+
+
+def data_card(publication: Publication, tables: Mapping[str, pa.Table]) -> str:
+    """Return the card as Markdown; of simulated data, its first line says so."""
+    about = publication.about
+    simulated = sum(recording.simulated for _, recording in publication.recordings)
+    part = (
+        "."
+        if simulated == publication.count
+        else f" in part: {simulated} of {publication.count} trials."
+    )
+    first = [f"Simulated data{part}", ""] if simulated else []
+    licence = f"{about.licence}" if about.licence else (
+        "None was given: nobody but the authors may use these data until they choose one."
+    )  # fmt: skip
+    if about.licence_url:
+        licence = f"[{about.licence}]({about.licence_url})"
+    sections = [
+        [f"# {about.title}", "", publication.description, ""],
+        ["## Licence", "", licence, ""],
+        ["## Citation", "", publication.citation, ""],
+        ["## Load", "", _LOAD],
+        ["## How it was made", "", *_made(publication), ""],
+        ["## Splits", "", *_splits(publication), ""],
+        ["## Clocks", "", *_clocks(publication), ""],
+        *(
+            [f"## `{name}.parquet`", "", *_columns_of(table), ""]
+            for name, table in sorted(tables.items(), reverse=True)
+        ),
+        ["## `data.h5`", "", *_hdf5(), ""],
+        ["## Known limits", "", *(f"- {text}" for text in _limits(publication)), ""],
+        ["## Checksums", "", "`sha256sum -c checksums.sha256` checks every file; each trial's "
+         "`checksums.json` is the one that it was committed with.", ""],
+    ]  # fmt: skip
+    return "\n".join([*first, *(line for section in sections for line in section)])
+
+
+def _made(publication: Publication) -> list[str]:
+    rows = []
+    for campaign in publication.campaigns:
+        info = campaign.info
+        origin = "simulated" if info["simulated"] else "a real rig"
+        rows.append([
+            campaign.name, str(len(campaign.committed())),
+            "imported" if IMPORTED in info else info.get("protocol", ""),
+            info.get("collection_hash", ""), info.get("rig", ""), info.get("rig_hash", ""),
+            f"{origin}, scene level {info['scene_level']}" if info.get("scene_level") else origin,
+        ])  # fmt: skip
+    header = ("campaign", "trials", "protocol", "hash of its collection", "rig", "hash", "by")
+    versions = [
+        f"{name} {', '.join(found)}" for name, found in sorted(publication.versions.items())
+    ]
+    return [
+        *_rows(header, rows), "",
+        "Protocol and rig of a campaign are in its folder: `protocol.yaml`, `rig.yaml`.", "",
+        f"Software: {'; '.join(versions) or 'unknown'}.",
+    ]  # fmt: skip
+
+
+def _splits(publication: Publication) -> list[str]:
+    counts = Counter(
+        (campaign.name, publication.split(campaign.name, recording.folder.name))
+        for campaign, recording in publication.recordings
+    )
+    rows = [
+        [campaign.name, *(str(counts[campaign.name, part]) for part in publication.parts)]
+        for campaign in publication.campaigns
+    ]
+    text = "By trial, a function of its condition alone, fixed by the protocol (`analysis.split`)."
+    return [text, "", *_rows(("campaign", *publication.parts), rows)]
+
+
+def _clocks(publication: Publication) -> list[str]:
+    found: dict[tuple[str, str, str], list[float | None]] = {}
+    lines: set[str] = set()
+    for campaign, recording in publication.recordings:
+        lines.add(str(recording.clocks.reference))
+        for device, clock in recording.clocks.devices().items():
+            grade = f"{clock.grade}{f' ({clock.kind})' if clock.kind else ''}"
+            found.setdefault((campaign.name, device, grade), []).append(clock.uncertainty_ns)
+    rows = []
+    for key, every in sorted(found.items()):
+        known = [value / 1000 for value in every if value is not None]
+        spread = [f"{np.median(known):.3g}", f"{max(known):.3g}"] if known else ["unknown"] * 2
+        rows.append([*key, str(len(every)), *spread])
+    header = ("campaign", "device", "timed by", "trials", "uncertainty, median, us", "largest, us")
+    return [
+        f"Every trial has one time line, in integer ns; its clock: {', '.join(sorted(lines))}. "
+        "Raw times are in each device's own clock; `clocks` in `record.json` has the maps onto the "
+        "time line: a line with `device_ns`, `reference_ns` and `drift` (parts in 10^18) for each "
+        "piece.", "",
+        *_rows(header, rows),
+    ]  # fmt: skip
+
+
+def _columns_of(table: pa.Table) -> list[str]:
+    rows = [
+        [f"`{field.name}`", str(field.type), field.metadata[b"description"].decode()]
+        for field in table.schema
+    ]
+    return _rows(("column", "type", "meaning and unit"), rows)
+
+
+def _hdf5() -> list[str]:
+    rows = [
+        [f"`{name}`", f"{kind}{_shape(shape)}", unit]
+        for name, (kind, shape, unit) in {**COLUMNS, **TRACKS, **TIMING}.items()
+    ]
+    rows += [
+        [f"`streams/NAME/{part}`, kind `{stream}`", f"{kind}{_shape(shape)}", unit]
+        for stream, columns in STREAMS.items()
+        for part, (_, (kind, shape, unit)) in columns.items()
+    ]
+    text = "A trial has the first fifteen columns, and of the others those that its rig recorded."
+    return [text, "", *_rows(("column", "type", "unit"), rows)]
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return f" x {' x '.join('n' if size < 0 else str(size) for size in shape)}" if shape else ""
+
+
+def _limits(publication: Publication) -> Iterable[str]:
+    yield from _LIMITS
+    if publication.simulated:
+        yield from _SIMULATED_LIMITS
+    if any(IMPORTED in campaign.info for campaign in publication.campaigns):
+        yield from _IMPORTED_LIMITS
+
+
+def _rows(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = [header, ["---"] * len(header), *rows]
+    return [f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |" for line in lines]

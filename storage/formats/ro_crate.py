@@ -1,0 +1,93 @@
+"""RO-Crate 1.1 metadata of a publication: files with checksums, and what made them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+
+from sliplab.storage.formats.publication import Publication
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import PROTOCOL, RIG
+
+_CONTEXT = "https://w3id.org/ro/crate/1.1/context"
+_KINDS = {
+    ".h5": "application/x-hdf5",
+    ".mkv": "video/x-matroska",
+    ".json": "application/json",
+    ".yaml": "application/yaml",
+    ".parquet": "application/x-parquet",
+    ".npz": "application/zip",
+    ".md": "text/markdown",
+}
+
+
+def ro_crate(publication: Publication, sums: Mapping[str, str], sizes: Mapping[str, int]) -> Json:
+    """Return the content of ``ro-crate-metadata.json``.
+
+    Args:
+        sums: SHA-256 of every file, by its path in the publication.
+        sizes: bytes of each.
+    """
+    about = publication.about
+    people = [{"@id": f"#creator-{n}", "@type": "Person", "name": name}
+              for n, name in enumerate(about.creators, 1)]  # fmt: skip
+    programs = [
+        {"@id": f"#sliplab-{version}", "@type": "SoftwareApplication", "name": "SlipLab",
+         "version": version}
+        for version in publication.versions.get("sliplab", ())
+    ]  # fmt: skip
+    runs = [_run(publication, campaign.name, [item["@id"] for item in programs])
+            for campaign in publication.campaigns]  # fmt: skip
+    files = [
+        {
+            "@id": name,
+            "@type": "File",
+            "name": PurePosixPath(name).name,
+            "contentSize": str(sizes[name]),
+            "encodingFormat": _KINDS.get(PurePosixPath(name).suffix, "application/octet-stream"),
+            "sha256": digest,
+        }
+        for name, digest in sorted(sums.items())
+    ]
+    root: Json = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": about.title,
+        "description": publication.description,
+        "datePublished": about.date,
+        "hasPart": [{"@id": item["@id"]} for item in files],
+        "mentions": [{"@id": item["@id"]} for item in runs],
+    }
+    if people:
+        root["creator"] = [{"@id": item["@id"]} for item in people]
+    licences: list[Json] = []
+    if about.licence is not None:
+        known = about.licence_url or f"#{about.licence}"
+        root["license"] = {"@id": known}
+        licences = [{"@id": known, "@type": "CreativeWork", "name": about.licence}]
+    descriptor = {
+        "@id": "ro-crate-metadata.json",
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+        "about": {"@id": "./"},
+    }
+    # the context of 1.1 is older than schema.org's word for this
+    context = [_CONTEXT, {"sha256": "https://schema.org/sha256"}]
+    graph = [descriptor, root, *people, *licences, *programs, *runs, *files]
+    return {"@context": context, "@graph": graph}
+
+
+def _run(publication: Publication, campaign: str, programs: list[str]) -> Json:
+    """Describe how a campaign's trials were made: by which program, protocol and rig."""
+    kept = {item.name: item for item in publication.campaigns}[campaign]
+    folder = f"campaigns/{campaign}"
+    return {
+        "@id": f"#collection-{campaign}",
+        "@type": "CreateAction",
+        "name": f"collection of {campaign}{' (simulated)' if kept.info['simulated'] else ''}",
+        "instrument": [{"@id": name} for name in programs],
+        "object": [{"@id": f"{folder}/{name}"} for name in (PROTOCOL, RIG)],
+        "result": [
+            {"@id": f"{folder}/trials/{trial}/data.h5"} for trial in sorted(kept.committed())
+        ],
+    }
