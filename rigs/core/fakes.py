@@ -21,6 +21,7 @@ from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion, runni
 
 T = TypeVar("T")
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+LOOPBACK = "127.0.0.1"
 START_S = 5.0
 """Time limit for a fake to open its ports, or to close them, s."""
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
@@ -58,6 +59,16 @@ class LoopThread:
 
         return self.run(work())
 
+    def post(self, function: Callable[[], object]) -> None:
+        """Let a plain function run in the loop's thread, and return at once; in order of calls."""
+        if self.alive:
+            self._loop.call_soon_threadsafe(function)
+
+    @property
+    def alive(self) -> bool:
+        """True until it is closed."""
+        return self._thread.is_alive()
+
     def close(self) -> None:
         """End every coroutine; safe to call more than once."""
         if self._thread.is_alive():
@@ -85,8 +96,14 @@ class Connections:
         self._tasks: dict[asyncio.Task[None], socket.socket] = {}
         self._waiting: set[socket.socket] = set()
 
-    def listen(self, host: str, port: int, handler: Handler) -> None:
+    def listen(self, host: str, port: int, handler: Handler) -> int:
         """Accept connections on a port; `handler` serves each, and may end with a lost connection.
+
+        Args:
+            port: 0 for a free one.
+
+        Returns:
+            the port.
 
         Raises:
             OSError: the port is taken.
@@ -95,6 +112,8 @@ class Connections:
         listener.setblocking(False)
         self._listeners.append(listener)
         asyncio.get_running_loop().add_reader(listener, self._accept, listener, handler)
+        found: int = listener.getsockname()[1]
+        return found
 
     def cut(self) -> None:
         """Close every connection and accept no new one."""
@@ -133,6 +152,57 @@ class Connections:
         if connection in self._waiting:  # cut before it began
             self._waiting.discard(connection)
             connection.close()
+
+
+class FakeStream(ABC):
+    """Base class of fake devices that stream to one client, on a free port of this computer.
+
+    A subclass takes commands in `_serve`, and sends by `write`.
+
+    Attributes:
+        address: host and port, for `reach` of the driver.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._silent = False
+        self._client: asyncio.StreamWriter | None = None
+        self._connections = Connections()
+        self._thread = LoopThread(name)
+        self.address = LOOPBACK, self._thread.call(self._listen)
+
+    def _listen(self) -> int:
+        return self._connections.listen(LOOPBACK, 0, self._accept)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._client = writer
+        try:
+            await self._serve(reader)
+        finally:
+            if self._client is writer:
+                self._client = None
+
+    @abstractmethod
+    async def _serve(self, reader: asyncio.StreamReader) -> None:
+        """Serve a client until it leaves, in the loop."""
+
+    def write(self, data: bytes) -> None:
+        """Send data to the client, from any thread; nothing while silent, or without one."""
+        self._thread.post(lambda: self._write(data))
+
+    def _write(self, data: bytes) -> None:
+        """Send data to the client, in the loop."""
+        if self._client is not None and not self._silent:
+            self._client.write(data)
+
+    def silence(self) -> None:
+        """Send and answer nothing from now on; the connection stays."""
+        self._silent = True
+
+    def close(self) -> None:
+        """Unplug it: the connection breaks. Safe to call more than once."""
+        if self._thread.alive:
+            self._thread.call(self._connections.cut)
+            self._thread.close()
 
 
 CLOCK_BACK_S = 5.0

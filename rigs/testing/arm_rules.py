@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 
 from sliplab.rigs.core.capabilities import Arm, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fakes import Kind
+from sliplab.rigs.core.fakes import CLOCK_BACK_S, Kind
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.testing.arm_bench import SHORT_MM, ArmBench
 from sliplab.rigs.testing.bench import QUIET_S, check_close, check_methods
@@ -95,11 +95,13 @@ def _clock_back(bench: ArmBench) -> None:
         return bool(times)
 
     bench.until(seen, bench.bounds.call_s)
+    last_ns = max(times)
     bench.inject(Kind.CLOCK_BACK)
 
     def noticed() -> bool:
-        times.extend(_times_left(bench))
-        check_order("poses", times)
+        for time_ns in _times_left(bench):
+            if time_ns < last_ns - CLOCK_BACK_S * 0.5e9:
+                raise Seen(f"a pose of {time_ns} ns came after one of {last_ns} ns")
         return bench.fault_noticed()
 
     if not bench.until(noticed, bench.bounds.news_s):
@@ -193,11 +195,10 @@ def _protective(bench: ArmBench) -> None:
     _check_aborted(bench)
     for _ in range(2):
         bench.stop()
+    bench.until(lambda: not bench.moving(), bench.bounds.call_s)
     if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
-        bench.wait(QUIET_S)
         raise Seen("start took a path during a protective stop")
-    if bench.moving():
-        raise Seen("the arm moved during a protective stop")
+    bench.check_at_rest(QUIET_S)
 
 
 @RULES.add(
@@ -212,6 +213,20 @@ def _silent_moving(bench: ArmBench) -> None:
     _check_aborted(bench)
     bench.stop()
     bench.refusal("close", bench.arm.close)
+
+
+@RULES.add(
+    "silent when a path starts",
+    "start of a path returns or raises a RigError in time, the path is reported as ended and not "
+    "finished, and stop returns",
+)
+def _silent_path(bench: ArmBench) -> None:
+    bench.connect()
+    target = bench.to(SHORT_MM)
+    bench.inject(Kind.SILENCE)
+    if bench.refusal("start", lambda: bench.arm.start([target])) is None:
+        _check_aborted(bench)
+    bench.stop()
 
 
 @RULES.add(

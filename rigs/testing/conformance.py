@@ -8,6 +8,7 @@ A package with a driver tries every rule that applies to its kind by two lines o
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -52,10 +53,16 @@ class Case:
             NotTried: it cannot be tried on this driver.
         """
         if self.rule.warm:
-            with self.make() as bench:
-                bench.refusal("connect", bench.open, bench.bounds.connect_s)
+            self._warm()
         with self.make() as bench:
             self.rule.hold(self.driver, bench)
+
+    def _warm(self) -> None:
+        """Open and close a device, and forget it."""
+        with self.make() as bench:
+            bench.refusal("connect", bench.open, bench.bounds.connect_s)
+        del bench
+        gc.collect()
 
 
 def cases(

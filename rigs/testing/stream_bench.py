@@ -57,6 +57,7 @@ class StreamBench(Bench):
         self.fed: list[Any] = []
         self.came: list[Any] = []
         self._next_ns = FIRST_NS
+        self._mark = 0
 
     # -- the fake, by kind -----------------------------------------------------------------
 
@@ -125,7 +126,7 @@ class StreamBench(Bench):
         """Feed and read some batches; return all times that came.
 
         Raises:
-            Seen: nothing comes, or something else than what was fed.
+            Seen: nothing comes, or not all.
             RigError: the driver reports a fault.
         """
         got: list[int] = []
@@ -138,8 +139,8 @@ class StreamBench(Bench):
 
         if not self.until(first, self.bounds.call_s):
             raise Seen(f"read returned nothing within {self.bounds.call_s:g} s of start")
-        mark = self.mark()
         self.fed.clear()
+        self._mark = self.mark()
         for _ in range(BATCHES):
             self.feed()
 
@@ -149,7 +150,6 @@ class StreamBench(Bench):
 
         if not self.until(complete, self.bounds.call_s):
             raise Seen(f"not all that was sent had been read after {self.bounds.call_s:g} s")
-        self.check_content(mark)
         return got
 
     def mark(self) -> int:
@@ -161,13 +161,13 @@ class StreamBench(Bench):
         last: int = getattr(self.fed[-1], self.clock_field)[-1]
         return bool(times) and times[-1] >= last
 
-    def check_content(self, mark: int) -> None:
-        """Raise Seen if what came differs from what was fed since a time."""
+    def check_content(self) -> None:
+        """Raise Seen if what came differs from what `gather` fed last."""
         for name in self.fields:
             sent = np.concatenate([getattr(chunk, name) for chunk in self.fed])
             found = np.concatenate(
                 [
-                    getattr(chunk, name)[getattr(chunk, self.clock_field) >= mark]
+                    getattr(chunk, name)[getattr(chunk, self.clock_field) >= self._mark]
                     for chunk in self.came
                 ]
             )
@@ -242,10 +242,10 @@ class EventBench(StreamBench):
         pulses = bool(self.pulses) and self.pulses[-1] >= self.fed_pulses[-1]
         return pulses and super().complete(times)
 
-    def check_content(self, mark: int) -> None:
+    def check_content(self) -> None:
         """Raise Seen if events or pulses came otherwise than they were sent."""
-        super().check_content(mark)
-        found = [pulse for pulse in self.pulses if pulse >= mark * 1000]
+        super().check_content()
+        found = [pulse for pulse in self.pulses if pulse >= self._mark * 1000]
         if found != self.fed_pulses:
             raise Seen(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
 
@@ -397,7 +397,7 @@ class ArmForceBench(StreamBench):
         """Return whether a few samples have come."""
         return len(times) > BATCHES
 
-    def check_content(self, mark: int) -> None:
+    def check_content(self) -> None:
         """The load is the controller's own."""
 
     def silence(self) -> None:
@@ -460,7 +460,7 @@ class SyncBench(StreamBench):
         """Return whether a few pulses have come."""
         return len(times) > BATCHES
 
-    def check_content(self, mark: int) -> None:
+    def check_content(self) -> None:
         """Raise Seen if pulses are not those of the code."""
         found = np.concatenate([chunk.t_ns for chunk in self.came])
         ticks = int(found[-1] * self.RATE_HZ / 1e9) + 2

@@ -28,10 +28,12 @@ SYNC_RULES = Rules[SyncBench]()
 @RULES.add("declaration", "the device has every method of its capability, and ping finds the fake")
 def _declaration(bench: StreamBench) -> None:
     bench.connect()
+    check_methods(bench.device, bench.capability)
+    if isinstance(bench, FrameBench):
+        return  # a fake that the driver opens has no address of its own
     problem = bench.call("ping", lambda: bench.driver.ping(bench.settings), bench.bounds.connect_s)
     if problem is not None:
         raise Seen(f"ping of a fake that answers returned '{problem}'")
-    check_methods(bench.device, bench.capability)
 
 
 @RULES.add("data", "everything that the device sends is read once, unchanged, in order of time")
@@ -39,6 +41,7 @@ def _data(bench: StreamBench) -> None:
     bench.connect()
     bench.start()
     _check_order(bench.gather())
+    bench.check_content()
 
 
 @RULES.add(

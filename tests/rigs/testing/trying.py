@@ -11,7 +11,7 @@ from typing import Any
 from sliplab.rigs.testing.conformance import Case
 from sliplab.rigs.testing.rule import NotTried, RuleBroken
 
-AT_ONCE = 10
+AT_ONCE = 16
 
 
 def try_rule(case: Case) -> tuple[str, str]:

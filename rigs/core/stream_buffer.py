@@ -1,0 +1,99 @@
+"""Buffer between the thread that receives a device's data and the rig that reads them.
+
+A common part of drivers of cameras and sensors, as `threaded_arm` is of those of arms: times never
+fall back, the buffer is bounded, and what goes wrong in the thread, or a silence, is a `RigError`
+of the next read, once all that came before has been read.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.storage.streams import I64
+
+MOST_PARTS = 100_000
+"""Parts of a stream that wait to be read; a device that sends more is a fault."""
+
+
+class StreamBuffer:
+    """Parts of one or more named streams of a device.
+
+    Args:
+        device: the device's part in the rig, for `RigError`.
+        stall_s: silence of a running device that is a fault, s.
+    """
+
+    def __init__(self, device: str, stall_s: float) -> None:
+        self._device, self._stall_s = device, stall_s
+        self._lock = threading.Lock()
+        self._fault: str | None = None
+        self._running = False
+        self._forget()
+
+    def _forget(self) -> None:
+        self._parts: dict[str, list[Any]] = {}
+        self._last: dict[str, int] = {}
+        self._count = 0
+        self._stall = StallTimer()
+
+    def begin(self) -> None:
+        """Begin a run: drop all that came before it."""
+        with self._lock:
+            self._forget()
+            self._running = True
+
+    def end(self) -> None:
+        """End a run: what came can still be read, what comes is dropped."""
+        with self._lock:
+            self._running = False
+
+    def add(self, stream: str, part: Any, times: I64) -> None:
+        """Add a part with its times, shape (n,); in the receiving thread.
+
+        Raises:
+            ValueError: times fall back, or nobody reads.
+        """
+        with self._lock:
+            if not self._running or not len(times):
+                return
+            last = self._last.get(stream, int(times[0]))
+            if int(times[0]) < last or bool((times[1:] < times[:-1]).any()):
+                raise ValueError(f"its clock fell back after {last}")
+            waiting = self._parts.setdefault(stream, [])
+            if len(waiting) == MOST_PARTS:
+                raise ValueError(f"nobody read it: {MOST_PARTS} packets are waiting")
+            waiting.append(part)
+            self._last[stream] = int(times[-1])
+            self._count += 1
+
+    def fail(self, why: str) -> None:
+        """Note why nothing more comes; the first reason is kept, those after it follow from it."""
+        with self._lock:
+            self._fault = self._fault or why
+
+    def take(self, stream: str) -> list[Any]:
+        """Remove and return the parts of a stream.
+
+        Raises:
+            RigError: the device has failed or fallen silent, and all parts were read.
+        """
+        with self._lock:
+            taken = self._parts.pop(stream, [])
+            if not taken and not self._parts:
+                self._check()
+        return taken
+
+    def check(self) -> None:
+        """Raise RigError if the device has failed or fallen silent."""
+        with self._lock:
+            self._check()
+
+    def _check(self) -> None:
+        if self._fault is not None:
+            raise RigError(self._device, f"{self._fault}; look at its cable, then open it again")
+        silent_s = self._stall.waited_s(self._count) if self._running else 0.0
+        if silent_s > self._stall_s:
+            raise RigError(self._device, f"silent for {silent_s:.1f} s; look at its cable")

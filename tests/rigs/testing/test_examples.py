@@ -1,0 +1,54 @@
+"""Example drivers keep every rule; broken ones break the rule that is about their defect."""
+
+from __future__ import annotations
+
+import gc
+import re
+from typing import Any
+
+import pytest
+
+from sliplab.rigs.core.driver import Driver
+from sliplab.rigs.testing.broken import BROKEN, Broken
+from sliplab.rigs.testing.conformance import Case, cases
+from sliplab.rigs.testing.examples import arm, events, force, frames, sync
+from sliplab.rigs.testing.rule import Bounds
+from tests.rigs.testing.trying import LIMITS, each_apart, try_all
+from tests.rigs.waiting import own_address
+
+pytestmark = pytest.mark.realtime
+BOUNDS = Bounds(connect_s=2.5, call_s=1.5, news_s=2.5)
+SETTINGS: dict[str, Any] = {
+    "event camera": events.ExampleEventsSettings(stall_s=0.4),
+    "frame camera": frames.ExampleFramesSettings(stall_s=0.4),
+    "force sensor": force.ExampleForceSettings(stall_s=0.4),
+    "sync box": sync.ExampleSyncSettings(stall_s=0.4),
+}
+EXAMPLES = [kind.DRIVER for kind in (arm, events, force, frames, sync)]
+
+
+def cases_of(driver: Driver[Any]) -> list[Case]:
+    def make() -> list[Case]:
+        settings = SETTINGS.get(driver.kind)
+        own = arm.ExampleArmSettings(host=own_address(), limits=LIMITS)
+        return cases(driver, settings or own, BOUNDS)
+
+    return each_apart(make)
+
+
+@pytest.mark.parametrize("driver", EXAMPLES, ids=lambda driver: driver.name)
+def test_an_example_keeps_every_rule(driver: Driver[Any]) -> None:
+    broken, not_tried = try_all(cases_of(driver))
+    assert not broken, "\n".join(broken.values())
+    assert not not_tried
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("broken", BROKEN, ids=lambda broken: broken.driver.name)
+def test_a_broken_driver_is_caught_by_the_rules_about_its_defect(broken: Broken) -> None:
+    found, _ = try_all(cases_of(broken.driver))
+    assert set(found) == set(broken.rules), "\n".join(found.values())
+    message = found[broken.rules[0]]
+    assert message.startswith(f"{broken.driver.name} breaks the rule '{broken.rules[0]}'")
+    assert re.search(broken.seen, message.split("right:")[0])
+    gc.collect()  # what a broken driver leaves open is closed here, where nobody minds
