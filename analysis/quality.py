@@ -8,7 +8,7 @@ still reports it as done.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from sliplab.analysis.clocks.synchronise import TrialSync, streams_of, synchronise
+from sliplab.analysis.clocks.synchronise import (
+    TrialSync,
+    further_clocks,
+    streams_of,
+    synchronise,
+)
 from sliplab.analysis.force import STREAM as FORCE
 from sliplab.analysis.force import force_figures
 from sliplab.analysis.labels.places import handed_over
@@ -25,8 +30,16 @@ from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
 from sliplab.storage.schema.trial import Clocks, Counts, Gate, StreamRecord
-from sliplab.storage.streams import F64, I64, PathSegment, WrenchChunk
-from sliplab.storage.trials.checksums import DATA
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    F64,
+    FRAMES_KIND,
+    I64,
+    PathSegment,
+    ScalarChunk,
+    WrenchChunk,
+)
+from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import TRACKS
 from sliplab.storage.trials.recording import Recording
@@ -106,6 +119,7 @@ def assess(
     mid_exposure_ns: int | None,
     with_events: bool = True,
     to_plate: Rows | None = None,
+    further: Mapping[str, StreamRecord] | None = None,
 ) -> Assessment:
     """Fit the clocks of a sealed trial and apply the protocol's gates.
 
@@ -114,15 +128,24 @@ def assess(
         mid_exposure_ns: from a frame's trigger to its time; None without a video.
         with_events: events were recorded.
         to_plate: rows of the matrix from the force sensor's axes to the plate's, if there is one.
+        further: what is known of the streams of further devices, by name.
     """
+    further = further or {}
+    clocks = further_clocks(folder, further)
     with StreamReader(folder / DATA) as reader:
-        streams = streams_of(reader, mid_exposure_ns)
+        streams = streams_of(reader, mid_exposure_ns, clocks)
         event_us = reader.event_times()
         pose_mm = reader.column("poses/xyz")
         tracks = [reader.column(name) for name in TRACKS if reader.has(name)]
         named = {
             name: StreamRecord(kind=kind, rows=reader.stream_counts()[name]["t"])
             for name, kind in reader.streams().items()
+            if name not in further
+        }
+        readings = {
+            name: reader.scalars(name)
+            for name, about in further.items()
+            if about.kind == ScalarChunk.KIND
         }
         wrenches = reader.wrenches(FORCE) if FORCE in named and to_plate is not None else None
     sync = synchronise(streams, timing, rate_hz, with_events=with_events)
@@ -133,7 +156,7 @@ def assess(
         lost = _frames_lost(streams.frame_number, motion.recorded_ns, rate_hz)
         results["frames_lost"] = _gate(lost, gates.frames_lost)
     if with_events:
-        gap_s = _event_gap(event_us, sync, motion.moving_ns)
+        gap_s = _event_gap(event_us, sync, "events", motion.moving_ns)
         results["event_gap_s"] = _gate(gap_s, float(gates.event_gap))
         results["event_burst"] = _gate(_event_burst(event_us), gates.event_burst)
     if gates.hold_slip is not None and tracks:
@@ -151,6 +174,15 @@ def assess(
         )
     elif gates.normal_force is not None or gates.hold_force is not None:
         results |= _force_gates({}, gates)
+    for name, about in further.items():
+        if about.of_camera:
+            with StreamReader(folder / stream_file(name)) as reader:
+                named[name], gated = _further_camera(
+                    name, about, reader, sync, motion, gates, rate_hz
+                )
+            results |= gated
+        else:
+            named[name] = _scalar_record(about, readings[name])
     counts = Counts(
         events=len(event_us),
         frames=len(streams.frame_ns),
@@ -158,6 +190,45 @@ def assess(
         pulses=len(streams.sync_pulses),
     )
     return Assessment(sync.record(), results, counts, named)
+
+
+def _further_camera(
+    name: str,
+    about: StreamRecord,
+    reader: StreamReader,
+    sync: TrialSync,
+    motion: Motion,
+    gates: Gates,
+    rate_hz: int,
+) -> tuple[StreamRecord, dict[str, Gate]]:
+    """Count what a further camera sent, and apply the gates of losses as to a first one."""
+    if about.kind == EVENTS_KIND:
+        event_us = reader.event_times()
+        pulses = len(reader.pulses("event_pulses"))
+        gap_s = _event_gap(event_us, sync, name, motion.moving_ns)
+        found = {
+            f"event_gap_{name}_s": _gate(gap_s, float(gates.event_gap)),
+            f"event_burst_{name}": _gate(_event_burst(event_us), gates.event_burst),
+        }
+        return about.model_copy(update={"rows": len(event_us), "pulses": pulses}), found
+    numbers = reader.column(f"{FRAMES_KIND}/number")
+    lost = _frames_lost(numbers, motion.recorded_ns, about.rate_hz or rate_hz)
+    gate = _gate(lost, gates.frames_lost)
+    return about.model_copy(update={"rows": len(numbers)}), {f"frames_lost_{name}": gate}
+
+
+def _scalar_record(about: StreamRecord, readings: ScalarChunk) -> StreamRecord:
+    """Count the readings of a scalar sensor, with their figures, to seven digits."""
+    figures: dict[str, float] = {}
+    if len(readings):
+        values = readings.value
+        figures = {
+            name: float(f"{value:.7g}")
+            for name, value in (
+                ("mean", values.mean()), ("min", values.min()), ("max", values.max())
+            )
+        }  # fmt: skip
+    return about.model_copy(update={"rows": len(readings), "figures": figures})
 
 
 def _force_figures(
@@ -209,7 +280,7 @@ def _sync_gates(
         if known is None:
             results[name] = Gate(value=sync.refused[device], limit=None, passed=False)
             continue
-        grade = "digital input" if device == "events" else known.grade
+        grade = "digital input" if known.grade == "trigger input" else known.grade
         grade = timing.arm if grade == "arm clock" else grade
         # a latency is a difference: both maps count, where there are events
         both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
@@ -237,7 +308,7 @@ def _unvouched_s(sync: TrialSync, recorded_ns: tuple[int, int]) -> float:
     return beyond / 1e9
 
 
-def _frames_lost(numbers: I64, recorded_ns: tuple[int, int], rate_hz: int) -> int:
+def _frames_lost(numbers: I64, recorded_ns: tuple[int, int], rate_hz: float) -> int:
     """Count frames missing between the first and the last, and against the recorded time."""
     start, end = recorded_ns
     expected = int((end - start) / 1e9 * rate_hz)
@@ -247,14 +318,14 @@ def _frames_lost(numbers: I64, recorded_ns: tuple[int, int], rate_hz: int) -> in
     return max(gaps, expected - 1 - len(numbers), 0)
 
 
-def _event_gap(event_us: I64, sync: TrialSync, moving_ns: tuple[int, int]) -> float:
-    """Return the longest silence of the event camera while the arm moved in contact, seconds.
+def _event_gap(event_us: I64, sync: TrialSync, camera: str, moving_ns: tuple[int, int]) -> float:
+    """Return the longest silence of an event camera while the arm moved in contact, seconds.
 
     -1 when it is unknown, because a clock has no map or there are no events.
     """
-    if "events" not in sync.devices or "arm" not in sync.devices or not len(event_us):
+    if camera not in sync.devices or "arm" not in sync.devices or not len(event_us):
         return -1.0
-    arm, events = (sync.devices[name].map for name in ("arm", "events"))
+    arm, events = (sync.devices[name].map for name in ("arm", camera))
     start, end = (int(events.to_device(int(arm.to_reference(t)))) // 1000 for t in moving_ns)
     inside = event_us[np.searchsorted(event_us, start) : np.searchsorted(event_us, end, "right")]
     edges = np.concatenate([[start], inside, [end]])

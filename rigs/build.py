@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sliplab.protocols.timing import ForceTiming
 from sliplab.rigs.core.arm_settings import BaseArmSettings, PlaneSettings
@@ -17,6 +17,13 @@ from sliplab.rigs.core.capabilities import (
     RigError,
     Truth,
 )
+from sliplab.rigs.core.driver import EventCameraDriver, FrameCameraDriver, ScalarSensorDriver
+from sliplab.rigs.core.further import (
+    FurtherEvents,
+    FurtherFrames,
+    FurtherScalars,
+    FurtherStream,
+)
 from sliplab.rigs.core.host_clock import HostClock
 from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
 from sliplab.rigs.core.plate_frame import PlateFrame
@@ -25,6 +32,8 @@ from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.discovery import need_libraries
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.stream_settings import EventStream, FrameStream, Stream, simulated_streams
+from sliplab.storage.schema.trial import StreamRecord
 from sliplab.storage.streams import Sink
 
 if TYPE_CHECKING:
@@ -64,9 +73,10 @@ def build_rig(file: RigFile) -> Rig:
         ModuleNotFoundError: a maker's library is not installed.
     """
     if file.driver == "mock":
-        return simulated_rig(file, build_mock(file.scene, file.timing))
+        further = simulated_streams(file.streams)
+        return simulated_rig(file, build_mock(file.scene, file.timing, further))
     assert file.devices is not None
-    need_libraries(file.devices)
+    need_libraries(file.devices, file.streams)
     if file.driver == "loopback":
         return _loopback_rig(file, file.devices)
     return _real_rig(file, file.devices)
@@ -90,6 +100,10 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         plate=devices.plate,
         force=devices.force,
         force_limit_n=force_limit(file),
+        further=tuple(
+            further_stream(name, file.streams[name], device)
+            for name, device in devices.further.items()
+        ),
         simulation=_MockSimulation(devices),
     )
 
@@ -132,7 +146,7 @@ def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     from sliplab.rigs.loopback.client import Loopback
 
     with ExitStack() as undo:
-        stage = Loopback(file.scene, file.timing, devices)
+        stage = Loopback(file.scene, file.timing, devices, file.streams)
         undo.callback(stage.close)
         rig = loopback_rig(file, stage)
         rig.on_close = (stage.close,)
@@ -171,11 +185,15 @@ def _driven_rig(
         if "frames" in file.cameras:
             frames = _frame_camera(file, devices, shown)
             undo.callback(frames.close)
-            _check_grade(file, frames)
+            _check_grade(file.timing.frames, frames, "timing.frames")
         if "events" in file.cameras:
             events = devices.event_camera_driver.build(devices.event_camera)
             undo.callback(events.close)
         arm = devices.arm_driver.build(calibrated_arm(file, devices))
+        further = []
+        for name, stream in file.streams.items():
+            further.append(_driven_stream(name, stream, shown))
+            undo.callback(further[-1].close)
         rig = Rig(
             name=file.name,
             clock=HostClock(),
@@ -192,6 +210,7 @@ def _driven_rig(
             plate=plate,
             force=_force_sensor(file, devices, arm),
             force_limit_n=force_limit(file),
+            further=tuple(further),
             simulation=shown,
         )
         undo.pop_all()
@@ -205,6 +224,55 @@ def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None
         return driver.build(settings, px_per_mm)
     assert driver.fake is not None  # the rig file was held against it
     return driver.fake(settings, px_per_mm, shown, file.scene.frame_camera.exposure_us * 500)
+
+
+def _driven_stream(name: str, stream: Stream, shown: Loopback | None) -> FurtherStream:
+    """Build a further device by its driver.
+
+    Raises:
+        RigError: it is missing, or delivers other time stamps than the rig file says.
+    """
+    driver, settings = stream.driver, stream.device
+    device: Any = None
+    if isinstance(driver, EventCameraDriver):
+        if shown is not None and settings is not None:
+            settings = shown.reached_stream(name, settings)
+        device = driver.build(settings)
+    elif isinstance(driver, FrameCameraDriver) and isinstance(stream, FrameStream):
+        device = driver.build(settings, stream.scale_px_per_mm)
+    elif isinstance(driver, ScalarSensorDriver):
+        device = driver.build(settings)
+    assert device is not None  # the rig file was checked against its driver
+    with ExitStack() as undo:
+        undo.callback(device.close)
+        if isinstance(stream, FrameStream):
+            _check_grade(stream.timing.grade, device, f"streams.{name}.timing.grade")
+        made = further_stream(name, stream, device)
+        undo.pop_all()
+    return made
+
+
+def further_stream(name: str, stream: Stream, device: Any) -> FurtherStream:
+    """Return a further device of a rig with what a trial's record says of its stream.
+
+    Raises:
+        RigError: a frame camera cannot record the region that the rig file says.
+    """
+    said: dict[str, Any] = {"kind": stream.kind, "rows": 0, "timing": stream.timing}
+    if isinstance(stream, EventStream):
+        said["size_px"] = (device.width, device.height)
+        return FurtherEvents(name, device, StreamRecord(**said))
+    if isinstance(stream, FrameStream):
+        device.set_region(*stream.region_px)
+        said["size_px"], said["px_per_mm"] = stream.region_px, stream.scale_px_per_mm
+        said["mid_exposure_ns"] = device.mid_exposure_ns
+        if stream.rate_hz is not None:
+            said["rate_hz"] = stream.rate_hz
+        return FurtherFrames(name, device, StreamRecord(**said))
+    if device.unit != stream.unit:
+        text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
+        raise RigError(f"{name} (scalar sensor)", text)
+    return FurtherScalars(name, device, StreamRecord(**said, unit=stream.unit))
 
 
 def force_limit(file: RigFile) -> float | None:
@@ -232,17 +300,17 @@ def _force_sensor(file: RigFile, devices: DeviceSettings, arm: Arm) -> ForceSens
     return sensor
 
 
-def _check_grade(file: RigFile, frames: FrameCamera) -> None:
+def _check_grade(grade: str, frames: FrameCamera, key: str) -> None:
     """Check that the rig file states the grade of time stamps that the camera delivers.
 
     Raises:
         RigError: it states another grade.
     """
     stamping = getattr(frames, "stamping", None)
-    if stamping is not None and stamping.grade != file.timing.frames:
+    if stamping is not None and stamping.grade != grade:
         raise RigError(
             "frame camera",
             f"its time stamps are of grade '{stamping.grade}' ({stamping.means}), but the rig file "
-            f"says timing.frames: {file.timing.frames}; wire and configure the camera for that, or "
-            f"write timing.frames: {stamping.grade}",
+            f"says {key}: {grade}; wire and configure the camera for that, or "
+            f"write {key}: {stamping.grade}",
         )

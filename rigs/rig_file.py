@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,9 +33,12 @@ from sliplab.protocols.yaml_file import (
 )
 from sliplab.rigs.core.arm_settings import check_units
 from sliplab.rigs.core.calibration import Calibration, without_taught
+from sliplab.rigs.core.driver import Driver, EventCameraDriver
 from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.mock.fault_settings import StreamGone
 from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
+from sliplab.rigs.stream_settings import Streams, check_streams, named_drivers, stream_drivers
 
 CAMERAS = {"events": "event camera", "frames": "frame camera"}
 """Streams by name in rig files and protocols, and the devices that give them."""
@@ -133,6 +137,8 @@ class RigFile(StrictModel):
     """Drivers of the devices; not for `mock`."""
     mock: MockSettings | None = None
     """The simulated scene and devices; not for `devices`."""
+    streams: Streams = Field(default={})
+    """Further devices, each under the name of its stream: a second event camera, a thermometer."""
 
     @field_validator("cameras")
     @classmethod
@@ -167,6 +173,16 @@ class RigFile(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _streams_are_complete(self) -> RigFile:
+        check_streams(self.streams, self.driver)
+        for index, fault in enumerate(() if self.mock is None else self.mock.faults):
+            if isinstance(fault, StreamGone) and fault.stream not in self.streams:
+                known = ", ".join(self.streams) or "none"
+                text = f"is no further device of the rig; it has: {known}"
+                raise KeyedError(f"mock.faults[{index}].stream", fault.stream, text)
+        return self
+
+    @model_validator(mode="after")
     def _loopback_can_show_it(self) -> RigFile:
         if self.driver != "loopback" or self.mock is None or self.devices is None:
             return self
@@ -197,11 +213,14 @@ class RigFile(StrictModel):
             if self.mock.force is None:
                 text = "is needed: it is what the fake of devices.force_sensor shows"
                 raise KeyedError("mock.force", None, text)
+        text = "has no fake for a loopback rig: write driver: devices"
         for name, fake in fakes.items():
             if fake is None:
                 found = getattr(self.devices, name).driver
-                text = "has no fake for a loopback rig: write driver: devices"
                 raise KeyedError(f"devices.{name}.driver", found, text)
+        for name, driver, _ in stream_drivers(self.streams):
+            if not isinstance(driver, EventCameraDriver) or driver.reach is None:
+                raise KeyedError(f"streams.{name}.device.driver", driver.name, text)
         return self
 
     @model_validator(mode="after")
@@ -272,6 +291,10 @@ class RigFile(StrictModel):
             return self.scene.force is not None
         return self.devices is not None and self.devices.force_sensor is not None
 
+    def drivers(self) -> Iterator[tuple[str, Driver[Any], Any]]:
+        """Return the part in the rig, driver and settings of every device, the arm first."""
+        return named_drivers(self.devices, self.streams)
+
     @property
     def frame_source(self) -> str:
         """Output of the outside camera: ``video`` or ``tracks``."""
@@ -326,10 +349,15 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
 def _check_secrets(rig: RigFile) -> None:
     if rig.simulated or rig.devices is None:
         return
-    for driver, settings in rig.devices.drivers():
+    further = [(f"streams.{name}.device", *found) for name, *found in stream_drivers(rig.streams)]
+    first = [
+        (f"devices.{driver.kind.replace(' ', '_')}", driver, settings)
+        for driver, settings in rig.devices.drivers()
+    ]
+    for where, driver, settings in (*first, *further):
         for name in driver.settings.model_fields:
             if is_secret(name) and getattr(settings, name) == MASK:
-                key = f"devices.{driver.kind.replace(' ', '_')}.{name}"
+                key = f"{where}.{name}"
                 text = "is masked, as in a store's copy of a rig file: write the rig's password"
                 raise KeyedError(key, MASK, text)
 

@@ -30,11 +30,11 @@ def lock_names(file: RigFile) -> dict[str, str]:
 
     Each simulated rig has its own devices or fakes.
     """
-    if file.simulated or file.devices is None:
+    if file.simulated:
         return {}
     return {
         f"{_plain(name)}.lock": f"{what} (rig {file.name})"
-        for driver, settings in file.devices.drivers()
+        for _, driver, settings in file.drivers()
         for name, what in driver.locks(settings).items()
     }
 

@@ -7,9 +7,11 @@ was timed is its grade, and it goes wherever the result goes (docs/clocks.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,11 +31,12 @@ from sliplab.analysis.clocks.clocks import (
     fit_numbered,
 )
 from sliplab.analysis.clocks.counters import split_at_restarts
-from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, Timing
+from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTiming, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
-from sliplab.storage.schema.trial import Clocks, DeviceRecord
-from sliplab.storage.streams import WrenchChunk
+from sliplab.storage.schema.trial import Clocks, DeviceRecord, StreamRecord
+from sliplab.storage.streams import EVENTS_KIND, WrenchChunk
+from sliplab.storage.trials.checksums import stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 from sliplab.storage.trials.recording import Recording
@@ -57,6 +60,23 @@ class ClockReadings:
 
 
 @dataclass(frozen=True)
+class FurtherClock:
+    """Raw clock data of a further device, ns.
+
+    Attributes:
+        pulses: sync pulses on the device's clock; of a frame camera the starts of the exposures
+            during which the sync line was high.
+        reads: the device's clock as the host read it.
+    """
+
+    kind: str
+    timing: StreamTiming
+    pulses: I64
+    reads: ClockReadings
+    mid_exposure_ns: int = 0
+
+
+@dataclass(frozen=True)
 class SyncStreams:
     """Raw clock data of a trial, ns; empty where there are none.
 
@@ -68,6 +88,7 @@ class SyncStreams:
         box_reads, frame_camera_reads: clocks read by the host.
         mid_exposure_ns: from the start of an exposure to its middle; None without frames.
         wrenches: of every force sensor by its name: its own and the host's time of each sample.
+        further: of every other named stream.
     """
 
     sync_pulses: I64
@@ -83,6 +104,7 @@ class SyncStreams:
     frame_camera_reads: ClockReadings
     mid_exposure_ns: int | None
     wrenches: dict[str, tuple[I64, I64]] = field(default_factory=dict)
+    further: dict[str, FurtherClock] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -162,8 +184,51 @@ class TrialSync:
         return self.devices["events"].uncertainty_ns + self.devices[device].uncertainty_ns
 
 
-def streams_of(reader: StreamReader, mid_exposure_ns: int | None) -> SyncStreams:
-    """Read the clock data of a trial's file."""
+def further_clock(about: StreamRecord, reader: StreamReader | None) -> FurtherClock | None:
+    """Read the clock data of a further device; None of one that `timing.rig` times.
+
+    Args:
+        about: what the record says of its stream.
+        reader: of a camera, its own file.
+    """
+    if about.timing is None:
+        return None
+    none = np.empty(0, np.int64)
+    pulses, reads = none, ClockReadings(none, none, none)
+    if reader is not None and about.kind == EVENTS_KIND:
+        pulses = reader.column("event_pulses/t")
+    elif reader is not None:
+        lit = reader.column("frames/sync") > 0
+        pulses = reader.column("frames/t")[lit] - (about.mid_exposure_ns or 0)
+        found = reader.clock_reads("frame_camera_reads")
+        reads = ClockReadings(found.device_ns, found.before_ns, found.after_ns)
+    return FurtherClock(about.kind, about.timing, pulses, reads, about.mid_exposure_ns or 0)
+
+
+def further_clocks(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, FurtherClock]:
+    """Read the clock data of the further devices of a sealed trial."""
+    found: dict[str, FurtherClock] = {}
+    for name, stream in about.items():
+        if stream.of_camera:
+            with StreamReader(folder / stream_file(name)) as reader:
+                clock = further_clock(stream, reader)
+        else:
+            clock = further_clock(stream, None)
+        if clock is not None:
+            found[name] = clock
+    return found
+
+
+def streams_of(
+    reader: StreamReader,
+    mid_exposure_ns: int | None,
+    further: Mapping[str, FurtherClock] | None = None,
+) -> SyncStreams:
+    """Read the clock data of a trial's file.
+
+    Args:
+        further: clock data of its further devices, by name.
+    """
 
     def column(name: str) -> I64:
         return reader.column(name) if reader.has(name) else np.empty(0, np.int64)
@@ -189,6 +254,7 @@ def streams_of(reader: StreamReader, mid_exposure_ns: int | None) -> SyncStreams
             for name, kind in reader.streams().items()
             if kind == WrenchChunk.KIND
         },
+        further=dict(further or {}),
     )
 
 
@@ -201,8 +267,15 @@ def synchronise_recording(recording: Recording) -> TrialSync:
     timing = recording.record.timing
     if timing is None:
         raise StoreError(f"{recording.folder}: timing: is missing; its clocks cannot be fitted")
+    further: dict[str, FurtherClock] = {}
+    for name, about in recording.record.streams.items():
+        with ExitStack() as opened:
+            own = opened.enter_context(recording.open(name)) if about.of_camera else None
+            clock = further_clock(about, own)
+        if clock is not None:
+            further[name] = clock
     with recording.open() as reader:
-        streams = streams_of(reader, timing.mid_exposure_ns)
+        streams = streams_of(reader, timing.mid_exposure_ns, further)
     with_events = recording.record.geometry.event_px is not None
     return synchronise(streams, timing.rig, timing.rate_hz, with_events=with_events)
 
@@ -216,7 +289,8 @@ def synchronise(
         rate_hz: ticks of the box a second.
         with_events: an event camera was recorded.
     """
-    found = TrialSync(timing.code, {}, {}, {}, frozenset(streams.wrenches))
+    names = frozenset({*streams.wrenches, *streams.further})
+    found = TrialSync(timing.code, {}, {}, {}, names)
     events, arm = timing.event_camera, timing.arm_controller
     pulses = _Pulses(streams.sync_pulses, timing, rate_hz, found)
     if with_events:
@@ -230,7 +304,21 @@ def synchronise(
         _synchronise_frames(found, pulses, streams, streams.mid_exposure_ns)
     for name in streams.wrenches:
         _try(found, name, partial(_force, found, name, streams, timing))
+    for name, device in streams.further.items():
+        _try(found, name, partial(_further, pulses, name, device, streams))
     return found
+
+
+def _further(pulses: _Pulses, name: str, device: FurtherClock, streams: SyncStreams) -> DeviceSync:
+    """Fit the clock of a further device by the means of its grade."""
+    how, timing = device.timing, pulses.timing
+    if how.grade in {"trigger input", "hardware trigger"}:
+        return pulses.fit(name, device.pulses, how, how.grade)
+    if how.grade == "device time stamps":
+        what = f"readings of the clock of {name}"
+        bounded = _bounded(device.reads, how.drift_ppm + HOST_PPM, what)
+        return _through_host(bounded, streams, timing, how.grade)
+    return _by_arrival(how.delay, device.mid_exposure_ns, how.grade, streams, timing)
 
 
 def _synchronise_frames(
@@ -364,11 +452,19 @@ def _frames_by_reads(streams: SyncStreams, timing: Timing) -> DeviceSync:
 
 def _frames_by_arrival(streams: SyncStreams, timing: Timing) -> DeviceSync:
     """A frame's time is its arrival; the middle of its exposure was some known time before."""
-    delay, box = timing.frame_delay, _box(streams, timing)
-    earlier = round(500 * (delay.shortest_us + delay.longest_us)) + (streams.mid_exposure_ns or 0)
+    before_ns = streams.mid_exposure_ns or 0
+    return _by_arrival(timing.frame_delay, before_ns, timing.frames, streams, timing)
+
+
+def _by_arrival(
+    delay: Delay, before_ns: int, grade: str, streams: SyncStreams, timing: Timing
+) -> DeviceSync:
+    """The host's time of arrival is the device's clock; data are `before_ns` and a delay older."""
+    box = _box(streams, timing)
+    earlier = round(500 * (delay.shortest_us + delay.longest_us)) + before_ns
     to_box = ClockMap.line(earlier, 0).then(box.map.inverse)
     spread = 500 * (delay.longest_us - delay.shortest_us)
-    return DeviceSync(timing.frames, to_box, spread + box.uncertainty_ns, None, box)
+    return DeviceSync(grade, to_box, spread + box.uncertainty_ns, None, box)
 
 
 def _through_host(

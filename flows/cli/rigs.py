@@ -179,7 +179,7 @@ def _ask(file: RigFile) -> dict[str, str | None]:
     assert file.devices is not None
     try:
         with held(file):
-            return ping_devices(file.devices)
+            return ping_devices(file.devices, file.streams)
     except (Locked, RigError) as error:
         return {"rig": str(error)}
 
@@ -202,10 +202,10 @@ def _arm(file: RigFile) -> str:
 def _cameras(file: RigFile) -> str:
     if file.devices is None:
         words = {"events": "events", "frames": file.frame_source}
-        return f"simulated, {', '.join(words[name] for name in file.cameras)}"
+        return ", ".join(["simulated", *(words[name] for name in file.cameras), *file.streams])
     suffix = " (fakes)" if file.simulated else ""
     cameras = [driver.title for driver, _ in file.devices.drivers() if "camera" in driver.kind]
-    return f"{', '.join(cameras)}{suffix}"
+    return f"{', '.join([*cameras, *file.streams])}{suffix}"
 
 
 class By(StrEnum):

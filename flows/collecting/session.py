@@ -289,6 +289,7 @@ class TrialCollector:
                 mid_exposure_ns,
                 with_events=with_events,
                 to_plate=self._to_plate(),
+                further={device.name: device.about for device in self.rig.further},
             )
             record = self._record(trial, number, run, found, frame_px)
             provenance = self._provenance(started)

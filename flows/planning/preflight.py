@@ -204,14 +204,14 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
 
     return [
         Check(name, False, why)
-        for name, why in ping_devices(run_request.rig.devices).items()
+        for name, why in ping_devices(run_request.rig.devices, run_request.rig.streams).items()
         if why is not None
     ]
 
 
 def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's clocks are fitted."""
-    from sliplab.analysis.clocks.synchronise import streams_of, synchronise
+    from sliplab.analysis.clocks.synchronise import further_clocks, streams_of, synchronise
     from sliplab.storage.trials.checksums import DATA
     from sliplab.storage.trials.hdf5_reader import StreamReader
     from sliplab.storage.trials.writer import TrialWriter
@@ -221,8 +221,10 @@ def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
         check = Path(folder) / "check"
         writer = TrialWriter(check, check.with_name("none"), None, rate)
         rig.listen(LISTEN_S, writer, rate)
-        with StreamReader(writer.seal() / DATA) as reader:
-            streams = streams_of(reader, None)
+        sealed = writer.seal()
+        further = further_clocks(sealed, {device.name: device.about for device in rig.further})
+        with StreamReader(sealed / DATA) as reader:
+            streams = streams_of(reader, None, further)
     fitted = synchronise(streams, rig.timing, rate)
     found = [
         Check(

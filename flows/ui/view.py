@@ -11,6 +11,7 @@ camera, camera/markers     frames (JPEG), the markers in them; camera/plate the 
 arm                        tool centre point as a transform; arm/path; arm/x, y, z in mm
 pulses/sync_box, events, arm
 force/normal, tangential   N on the plate, where the rig measures it; force/x, y along it
+streams/NAME               a further camera, as events and camera above, or a curve of readings
 displacement/marker_N      px
 onsets/NAME                0 before, 1 after the incipient, 2 after the gross onset, of the label,
                            the review and (simulated) the truth; onset_log as text
@@ -24,7 +25,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +44,7 @@ from sliplab.flows.ui.review import event_rate
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import I64, EventChunk
+from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, EventChunk, ScalarChunk
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
@@ -106,7 +107,9 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
         )
         try:
             forces = has_forces(subject.recording)
-            stream.save(unfinished, default_blueprint=blueprint(library, forces=forces))
+            further = {name: about.kind for name, about in subject.recording.record.streams.items()}
+            shown = blueprint(library, forces=forces, further=further)
+            stream.save(unfinished, default_blueprint=shown)
             counts = send(library, stream, subject)
             stream.flush()
         finally:
@@ -269,6 +272,7 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
     _arm(to, subject)
     _pulses(to, subject)
     _forces(to, subject)
+    _further(to, recording)
     if "displacement_px" in arrays:
         for marker, values in enumerate(arrays["displacement_px"].T):
             there = np.isfinite(values)
@@ -280,18 +284,58 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
 
 def _events(to: _Columns, subject: Subject) -> None:
     recording = subject.recording
-    events = recording.events()
-    clock = recording.clock("events")
-    time_ns = np.asarray(clock.to_reference(events.t_us * 1000))
-    to.sent["events"] = len(events)
-    if len(events) <= MOST_POINTS:
-        for name, polarity in (("on", 1), ("off", 0)):
-            _points(to, f"events/{name}", events, time_ns, events.p == polarity)
-    else:
-        _count_images(to, recording.event_px, events, time_ns)
+    to.sent["events"] = _event_camera(to, recording, "events", "events")
     start, end = recorded_span(recording)
     rate_s, rate = event_rate(recording, start, end)
     to.scalars("events/rate", np.round(rate_s * 1e9).astype(np.int64), rate)
+
+
+def _event_camera(to: _Columns, recording: Recording, stream: str, path: str) -> int:
+    """Send the events of one camera; return their number."""
+    events = recording.events(stream=stream)
+    time_ns = np.asarray(recording.clock(stream).to_reference(events.t_us * 1000))
+    if len(events) <= MOST_POINTS:
+        for name, polarity in (("on", 1), ("off", 0)):
+            _points(to, f"{path}/{name}", events, time_ns, events.p == polarity)
+    else:
+        about = recording.record.streams.get(stream)
+        size = None if about is None else about.size_px
+        _count_images(to, path, size or recording.event_px, events, time_ns)
+    return len(events)
+
+
+def _further(to: _Columns, recording: Recording) -> None:
+    """Send the streams of further devices; rows of wrenches are sent as forces, if at all."""
+    for name, about in sorted(recording.record.streams.items()):
+        path, count = f"streams/{name}", f"{name}_{about.kind}"
+        if about.kind == EVENTS_KIND:
+            to.sent[count] = _event_camera(to, recording, name, path)
+        elif about.kind == FRAMES_KIND:
+            _pictures(to, recording, name, path)
+            to.sent[count] = about.rows
+        elif about.kind == ScalarChunk.KIND:
+            found = recording.scalars(name)
+            time_ns = np.asarray(recording.clock(name).to_reference(found.t_ns))
+            to.once(path, to.rr.SeriesLines(names=f"{name} ({found.unit})"))
+            to.scalars(path, time_ns, found.value, count)
+
+
+def _pictures(to: _Columns, recording: Recording, stream: str, path: str, count: str = "") -> None:
+    """Send the video of one frame camera, if it has one: every so manieth frame of a long one."""
+    if recording.video(stream) is None:
+        return
+    import cv2
+
+    time_ns = recording.frame_times(stream)
+    every = -(-len(time_ns) // MOST_FRAMES) or 1
+    for index, image in enumerate(recording.frames(threads=2, stream=stream)):
+        if index % every or index >= len(time_ns):
+            continue
+        done, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        if not done:
+            raise RuntimeError(f"frame {index} cannot be packed")
+        columns = to.rr.EncodedImage.columns(blob=[packed.tobytes()], media_type=["image/jpeg"])
+        to.send(path, time_ns[index : index + 1], columns, count)
 
 
 def _points(to: _Columns, path: str, events: EventChunk, time_ns: I64, which: Any) -> None:
@@ -307,7 +351,9 @@ def _points(to: _Columns, path: str, events: EventChunk, time_ns: I64, which: An
     to.send(path, times[first], columns)
 
 
-def _count_images(to: _Columns, size: tuple[int, int], events: EventChunk, time_ns: I64) -> None:
+def _count_images(
+    to: _Columns, path: str, size: tuple[int, int], events: EventChunk, time_ns: I64
+) -> None:
     """Send counts of events on pooled pixels, uint16, in bins of equal length."""
     shape = (-(-size[1] // POOL), -(-size[0] // POOL))
     length = max(BIN_NS, -(-int(time_ns[-1] - time_ns[0] + 1) // MOST_IMAGES))
@@ -321,7 +367,7 @@ def _count_images(to: _Columns, size: tuple[int, int], events: EventChunk, time_
             width=shape[1], height=shape[0], color_model="L", channel_datatype="U16"
         )
         columns = to.rr.Image.columns(buffer=[picture.tobytes()], format=[form])
-        to.send("events/counts", np.array([edge], np.int64), columns, "event_pictures")
+        to.send(f"{path}/counts", np.array([edge], np.int64), columns, "event_pictures")
 
 
 def _frames(to: _Columns, subject: Subject, arrays: Arrays) -> None:
@@ -329,18 +375,7 @@ def _frames(to: _Columns, subject: Subject, arrays: Arrays) -> None:
     if recording.frame_source == "none":
         return
     time_ns = recording.frame_times()
-    every = -(-len(time_ns) // MOST_FRAMES) or 1
-    if recording.has_video:
-        import cv2
-
-        for index, image in enumerate(recording.frames(threads=2)):
-            if index % every or index >= len(time_ns):
-                continue
-            done, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-            if not done:
-                raise RuntimeError(f"frame {index} cannot be packed")
-            columns = to.rr.EncodedImage.columns(blob=[packed.tobytes()], media_type=["image/jpeg"])
-            to.send("camera", time_ns[index : index + 1], columns, "frames")
+    _pictures(to, recording, FRAMES_KIND, "camera", "frames")
     places, plate = arrays.get("xy_px"), arrays.get("plate_px")
     if places is None and recording.has_tracks:
         tracks = recording.tracks()
@@ -449,8 +484,14 @@ def _network(to: _Columns, subject: Subject) -> None:
     to.sent["windows"] = len(arrays["end_ns"])
 
 
-def blueprint(library: ModuleType, *, forces: bool = False) -> Any:
-    """Arrange the viewer; with a panel of the forces, where there are any."""
+def blueprint(
+    library: ModuleType, *, forces: bool = False, further: Mapping[str, str] | None = None
+) -> Any:
+    """Arrange the viewer; with a panel of the forces, where there are any.
+
+    Args:
+        further: kinds of the streams of further devices by name, each of which gets a panel.
+    """
     views = library.blueprint
     force = [("force", "force on the plate (N)")] if forces else []
     curves = [
@@ -459,12 +500,17 @@ def blueprint(library: ModuleType, *, forces: bool = False) -> Any:
             ("displacement", "displacement (px)"), ("events/rate", "events (1/s)"),
             ("onsets", "onsets: 1 incipient, 2 gross"), ("network", "network, spikes a window"),
             *force, ("pulses", "sync pulses"),
+            *((f"streams/{name}", name) for name in _named(further, ScalarChunk.KIND)),
         )
     ]  # fmt: skip
     pictures = [
         views.Spatial2DView(origin="/camera", name="outside camera, markers"),
         views.Spatial2DView(origin="/events", name="events"),
         views.Spatial3DView(origin="/arm", name="arm (mm)"),
+        *(
+            views.Spatial2DView(origin=f"/streams/{name}", name=name)
+            for name in _named(further, FRAMES_KIND, EVENTS_KIND)
+        ),
     ]
     words = views.Horizontal(
         views.TextDocumentView(origin="/trial"), views.TextLogView(origin="/onset_log")
@@ -476,3 +522,8 @@ def blueprint(library: ModuleType, *, forces: bool = False) -> Any:
         views.TimePanel(timeline=TIMELINE),
         collapse_panels=True,
     )
+
+
+def _named(further: Mapping[str, str] | None, *kinds: str) -> list[str]:
+    """Return the names of the streams of some kinds."""
+    return [name for name, kind in sorted((further or {}).items()) if kind in kinds]

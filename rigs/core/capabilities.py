@@ -20,6 +20,7 @@ from sliplab.storage.streams import (
     FrameChunk,
     PoseChunk,
     PulseChunk,
+    ScalarChunk,
     Sink,
     WrenchChunk,
 )
@@ -301,6 +302,33 @@ class ForceSensor(Protocol):
 
     def close(self) -> None:
         """Give the device back."""
+
+
+@runtime_checkable
+class ScalarSensor(Protocol):
+    """A sensor of one quantity, such as a temperature, which the host times by arrival."""
+
+    unit: str
+    """Unit of its readings."""
+
+    def connect(self) -> None:
+        """Open the connection; bounded. Raises RigError."""
+
+    def start(self) -> None:
+        """Start streaming; earlier readings are discarded."""
+
+    def read(self) -> ScalarChunk:
+        """Readings since the last call, `t_ns` the host's clock at reception.
+
+        Raises:
+            RigError: it fell silent.
+        """
+
+    def stop(self) -> None:
+        """Stop streaming; what has come can still be read."""
+
+    def close(self) -> None:
+        """Close the connection."""
 
 
 @runtime_checkable

@@ -17,7 +17,14 @@ from sliplab.rigs.core.device_settings import DriverSettings
 
 if TYPE_CHECKING:
     from sliplab.protocols.timing import Code
-    from sliplab.rigs.core.capabilities import Arm, EventCamera, ForceSensor, FrameCamera, SyncBox
+    from sliplab.rigs.core.capabilities import (
+        Arm,
+        EventCamera,
+        ForceSensor,
+        FrameCamera,
+        ScalarSensor,
+        SyncBox,
+    )
     from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
     from sliplab.rigs.core.fakes import FakeController
     from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
@@ -39,7 +46,8 @@ class Driver(Generic[SettingsT]):
     """The declaration of one type of device. `name` is the value of `driver:` in rig files."""
 
     kind: ClassVar[str]
-    """``arm``, ``event camera``, ``frame camera``, ``sync box`` or ``force sensor``."""
+    """``arm``, ``event camera``, ``frame camera``, ``sync box``, ``force sensor`` or ``scalar
+    sensor``."""
     name: str
     title: str
     """Make and model for people, such as ``Universal Robots``."""
@@ -232,3 +240,12 @@ class ForceSensorDriver(Driver[SettingsT]):
     """Make a fake; None: no loopback rig can have this sensor, unless it is the arm's."""
     reach: Callable[[SettingsT, Any], SettingsT] | None = None
     """Return settings that reach a fake at an address."""
+
+
+@dataclass(frozen=True)
+class ScalarSensorDriver(Driver[SettingsT]):
+    """A kind of sensor of one quantity."""
+
+    kind = "scalar sensor"
+    build: Callable[[SettingsT], ScalarSensor] = field(kw_only=True)
+    """Make the device, not connected yet."""

@@ -94,7 +94,7 @@ def run_watched(
         for index, planned in enumerate(program.steps):
             step = course.step(planned)
             if step.recorded and not streaming:
-                rig.start_streams(seed, rate_hz, False)
+                rig.start_streams(seed, rate_hz, False, with_further=False)
                 streaming = True
             if streaming and not step.recorded:
                 rig.stop_streams(watcher, False)

@@ -44,6 +44,7 @@ from sliplab.rigs.core.capabilities import (
     Truth,
 )
 from sliplab.rigs.core.force_watch import Course, ForceWatch
+from sliplab.rigs.core.further import FurtherStream
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.pulse_code import SEEDS
@@ -97,6 +98,7 @@ class Rig:
             busy host reads them late.
         force: a force/torque sensor, or None.
         force_limit_n: largest force on the plate, in any direction, before the arm is stopped.
+        further: devices with streams of their own names.
         simulation: the world behind a simulated rig, None on a real one.
         on_close: called last when the rig is closed.
     """
@@ -117,11 +119,14 @@ class Rig:
     plate: Plate | None = None
     force: ForceSensor | None = None
     force_limit_n: float | None = None
+    further: tuple[FurtherStream, ...] = ()
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     on_close: tuple[Callable[[], None], ...] = ()
     _streaming: EventCamera | None = field(default=None, init=False)
     """The event camera while it is recorded."""
+    _reading: tuple[FurtherStream, ...] = field(default=(), init=False)
+    """The further devices while they are recorded."""
     _forces: ForceWatch | None = field(default=None, init=False)
     """Forces while they are watched, whether or not they are recorded."""
     _reported: str = field(default="", init=False)
@@ -146,12 +151,12 @@ class Rig:
         return self.frame_camera
 
     def _devices(self) -> list[Any]:
-        """Return arm, cameras, sync box and sensor, as far as the rig has them, the arm first."""
+        """Return arm, cameras, sync box and sensors, as far as the rig has them, the arm first."""
         found = (self.arm, self.event_camera, self.frame_camera, self.sync, self.force)
-        return [device for device in found if device is not None]
+        return [*(device for device in found if device is not None), *self.further]
 
     def connect(self) -> None:
-        """Connect sync box, arm and force sensor; cameras connect on construction.
+        """Connect sync box, arm and sensors; cameras connect on construction.
 
         Raises:
             RigError: one of them does not answer.
@@ -160,6 +165,8 @@ class Rig:
         self.arm.connect()
         if self.force is not None:
             self.force.connect()
+        for device in self.further:
+            device.connect()
 
     def close(self) -> None:
         """Stop the arm, then close every device; safe to call more than once.
@@ -190,7 +197,8 @@ class Rig:
         Raises:
             RigError: a device does not answer.
         """
-        return [device.health() for device in self._devices() if hasattr(device, "health")]
+        found = [device.health() for device in self._devices() if hasattr(device, "health")]
+        return [report for report in found if report is not None]
 
     def describe(self) -> dict[str, Json]:
         """Return settings, counts and losses of the trial that just ran, by device."""
@@ -202,6 +210,9 @@ class Rig:
         for name, device in devices.items():
             if (describe := getattr(device, "describe", None)) is not None:
                 described[name] = describe()
+        for further in self.further:
+            if (settings := further.describe()) is not None:
+                described[further.name] = settings
         losses = getattr(self.sync, "losses", None)
         if losses is not None:
             described["sync_box"] = {"losses": vars(losses)}
@@ -317,6 +328,8 @@ class Rig:
             stopping.callback(self.sync.stop)
             if self.force is not None:
                 stopping.callback(self.force.stop)
+            for device in self.further:
+                stopping.callback(device.stop)
             self.start_streams(0, rate_hz, False)
             self.wait(seconds, sink)
             self.stop_streams(sink, False)
@@ -486,7 +499,12 @@ class Rig:
                 sink.add_stream(FORCE, forces)
 
     def start_streams(
-        self, seed: int, rate_hz: int, with_frames: bool, with_events: bool = True
+        self,
+        seed: int,
+        rate_hz: int,
+        with_frames: bool,
+        with_events: bool = True,
+        with_further: bool = True,
     ) -> None:
         """Start the streams; earlier data are discarded. Raises RigError."""
         self.arm.read_poses()
@@ -496,6 +514,9 @@ class Rig:
             self._streaming.start()
         if self.force is not None:
             self.force.start()
+        self._reading = self.further if with_further else ()
+        for device in self._reading:
+            device.start()
         free_running = with_frames and self.timing.frames == "exposure line"
         if with_frames and not free_running:
             self.frames.start()
@@ -523,6 +544,9 @@ class Rig:
         if with_frames:
             self.frames.stop()
             sink.add_frames(self.frames.read())
+        for device in self._reading:
+            device.finish(sink)
+        self._reading = ()
 
     def _drain(self, sink: Sink) -> None:
         if self._streaming is not None:
@@ -535,12 +559,14 @@ class Rig:
             sink.add_frames(self.frame_camera.read())
         if self.timing.frames == "exposure line":
             sink.add_exposures(self.sync.read_exposures())
-        if self.timing.reads_clocks:
+        if self.timing.reads_clocks or any(device.through_host for device in self._reading):
             sink.add_box_reads(self.sync.read_clock())
         if self.timing.frames == "device time stamps" and self.frame_camera is not None:
             sink.add_frame_camera_reads(self.frame_camera.read_clock())
         if (forces := self._forces or self.force) is not None:
             sink.add_stream(FORCE, forces.read())
+        for device in self._reading:
+            device.drain(sink)
 
     def begin_trial(self, home: Position, seed: int) -> None:
         """Move to the start position, then let the simulation draw its random values.
@@ -579,7 +605,7 @@ class Rig:
         try:
             yield
         except BaseException as error:
-            self._forces = None
+            self._forces, self._reading = None, ()
             fault: RigError | None = None
             try:
                 fault = self._stop_arm() or self._retract(clear)

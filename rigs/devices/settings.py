@@ -39,7 +39,7 @@ _KINDS: dict[str, type[Driver[Any]]] = {
 """Kinds of drivers, by the key of the device in a rig file."""
 
 
-class _OfKind:
+class OfKind:
     """Settings of any installed driver of a kind; `driver` selects the model of the other keys."""
 
     def __init__(self, kind: type[Driver[Any]], default: str | None = None) -> None:
@@ -77,6 +77,8 @@ class _OfKind:
     ) -> JsonSchemaValue:
         """One choice a driver, of those that are installed."""
         models = tuple(driver.settings for driver in drivers(self._kind))
+        if not models:  # none is installed; a package may bring one
+            return handler(TypeAdapter(DriverSettings).core_schema)
         if len(models) == 1:
             return handler(TypeAdapter(models[0]).core_schema)
         choice: Any = Annotated[Union[models], Field(discriminator="driver")]  # noqa: UP007
@@ -94,16 +96,16 @@ class OperatedPlate(StrictModel):
 class DeviceSettings(StrictModel):
     """The `devices:` section of a rig file."""
 
-    arm: Annotated[BaseArmSettings, _OfKind(ArmDriver)]
-    event_camera: Annotated[DriverSettings, _OfKind(EventCameraDriver, "dvxplorer")] | None = Field(
+    arm: Annotated[BaseArmSettings, OfKind(ArmDriver)]
+    event_camera: Annotated[DriverSettings, OfKind(EventCameraDriver, "dvxplorer")] | None = Field(
         default={"driver": "dvxplorer"}, validate_default=True
     )
     """null where the rig's `cameras` has no `events`."""
-    frame_camera: Annotated[FrameCameraSettings, _OfKind(FrameCameraDriver, "basler")] | None = None
+    frame_camera: Annotated[FrameCameraSettings, OfKind(FrameCameraDriver, "basler")] | None = None
     """Left out where the rig's `cameras` has no `frames`."""
-    sync_box: Annotated[DriverSettings, _OfKind(SyncBoxDriver, "sync_box")] | None = None
+    sync_box: Annotated[DriverSettings, OfKind(SyncBoxDriver, "sync_box")] | None = None
     """Required by a real rig; a loopback rig has its own."""
-    force_sensor: Annotated[DriverSettings, _OfKind(ForceSensorDriver)] | None = None
+    force_sensor: Annotated[DriverSettings, OfKind(ForceSensorDriver)] | None = None
     """If left out, the rig has no force sensor."""
     plate: OperatedPlate | None = None
     """If left out, the rig has no sliding plate, and supports only kinematic protocols."""

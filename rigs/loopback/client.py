@@ -12,7 +12,7 @@ import pickle
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -21,8 +21,13 @@ from typing import Any
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import RigError, Truth
+from sliplab.rigs.core.device_settings import DriverSettings
+from sliplab.rigs.core.driver import EventCameraDriver
+from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.stream_settings import EventStream, Stream
 from sliplab.storage.streams import FrameChunk, Sink
 
 READY_S = 180.0
@@ -32,6 +37,10 @@ ANSWER_S = 20.0
 TURN_S = 0.004
 """Period at which the scene follows the clock, s."""
 END_S = 5.0
+
+
+Addresses = tuple[Any, Any, Any, Mapping[str, Any]]
+"""Of sync box, event camera, force sensor and further cameras."""
 
 
 class Loopback:
@@ -45,26 +54,40 @@ class Loopback:
     Attributes:
         sync_address: address of the sync box.
         event_address: where the event camera's driver finds its fake.
+        stream_addresses: the same of further event cameras, by the names of their streams.
         force_address: where that of the force sensor does; None without one.
 
     Raises:
         RigError: they do not start.
     """
 
-    def __init__(self, settings: MockSettings, timing: Timing, devices: DeviceSettings) -> None:
+    def __init__(
+        self,
+        settings: MockSettings,
+        timing: Timing,
+        devices: DeviceSettings,
+        streams: Mapping[str, Stream] | None = None,
+    ) -> None:
+        further = {
+            name: (stream.device.driver, stream.mock)
+            for name, stream in (streams or {}).items()
+            if isinstance(stream, EventStream) and stream.device and stream.mock
+        }
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._frames, their_frames = context.Pipe(duplex=False)
         self._asking = threading.Lock()
         self.on_frames: Callable[[FrameChunk], None] = _forget
         self._process = context.Process(
-            target=_serve, args=(theirs, their_frames, settings, timing, devices), name="stand-ins"
+            target=_serve,
+            args=(theirs, their_frames, settings, timing, devices, further),
+            name="stand-ins",
         )
         self._process.start()
         theirs.close()
         their_frames.close()
         try:
-            self.sync_address, self.event_address, self.force_address = self._answer(READY_S)
+            self._take(self._answer(READY_S))
         except BaseException:
             self.close()
             raise
@@ -93,6 +116,16 @@ class Loopback:
         if force is not None and force.reach is not None and devices.force_sensor is not None:
             update["force_sensor"] = force.reach(devices.force_sensor, self.force_address)
         return devices.model_copy(update=update)
+
+    def reached_stream(self, name: str, settings: DriverSettings) -> DriverSettings:
+        """Return the settings for the driver of a further event camera to reach its fake."""
+        reach = find_driver(settings.driver, EventCameraDriver).reach
+        assert reach is not None  # the rig file was checked against it
+        found: DriverSettings = reach(settings, self.stream_addresses[name])
+        return found
+
+    def _take(self, addresses: Addresses) -> None:
+        self.sync_address, self.event_address, self.force_address, self.stream_addresses = addresses
 
     # -- Simulation ------------------------------------------------------------------------
 
@@ -143,7 +176,7 @@ class Loopback:
 
     def restore(self, device: str) -> None:
         """Clear a device's faults; see `SimulationServer.restore`. Drivers must be rebuilt."""
-        self.sync_address, self.event_address, self.force_address = self._ask("restore", device)
+        self._take(self._ask("restore", device))
 
     def arm_place(self) -> tuple[float, float, float]:
         """Return the true position of the sensor: right and up on the plate, and depth, mm."""
@@ -201,6 +234,7 @@ def _serve(
     settings: MockSettings,
     timing: Timing,
     devices: DeviceSettings,
+    further: Mapping[str, tuple[str, FurtherEventCamera]],
 ) -> None:
     """Run the process; it ends with its parent, without waiting for libraries to shut down."""
     from sliplab.rigs.loopback.simulation_server import SimulationServer
@@ -208,7 +242,7 @@ def _serve(
     sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes
     status, server = 1, None
     try:
-        server = SimulationServer(settings, timing, devices, frames.send)
+        server = SimulationServer(settings, timing, devices, frames.send, further)
         pipe.send((True, server.addresses))
         while True:
             if pipe.poll(TURN_S):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -21,10 +21,17 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, Truth
-from sliplab.rigs.core.driver import ArmScene, FakeForceSensor, PulseTrain
+from sliplab.rigs.core.driver import (
+    ArmScene,
+    EventCameraDriver,
+    FakeEventCamera,
+    FakeForceSensor,
+    PulseTrain,
+)
 from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
+from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.loopback.tool_load import ToolLoad
@@ -33,9 +40,11 @@ from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.event_camera import MockEventCamera
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
+from sliplab.rigs.mock.further_settings import FurtherEventCamera
+from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
 from sliplab.rigs.mock.path import ContactPlane
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import EventCamera, MockSettings
 from sliplab.rigs.mock.sync import MockSyncBox
 from sliplab.rigs.mock.truth import truth_of
 from sliplab.rigs.mock.world import World, start_pose
@@ -67,6 +76,7 @@ class SimulationServer:
         timing: signals that reach each device; frames by hardware trigger.
         devices: the rig's drivers: fakes of their kinds listen where they will look.
         on_frames: called with the frames of each turn.
+        further: driver and simulated camera of each further event camera, by its stream's name.
     """
 
     def __init__(
@@ -75,6 +85,7 @@ class SimulationServer:
         timing: Timing,
         devices: DeviceSettings,
         on_frames: Callable[[FrameChunk], None],
+        further: Mapping[str, tuple[str, FurtherEventCamera]] | None = None,
     ) -> None:
         _warm_up(settings, timing)
         self._origin_ns = time.monotonic_ns() - LAG_NS
@@ -135,17 +146,28 @@ class SimulationServer:
             None if self._tool_load is None else self._tool_load.at,
         )
         self.arm = fake_arm(devices.arm, scene)
+        self._further: dict[str, MockEventCamera] = {}
+        self._make_further: dict[str, Callable[[], FakeEventCamera]] = {}
+        for name, (kind, made) in (further or {}).items():
+            own = Identity[EventCamera](name, made, made.clock_ppm, made.seed)
+            self._further[name] = MockEventCamera(self.world, self._box, own)
+            fake = find_driver(kind, EventCameraDriver).fake
+            assert fake is not None  # the rig file was checked against it
+            self._make_further[name] = partial(fake, (made.width, made.height))
+        self.further = {name: make() for name, make in self._make_further.items()}
         self.arm.start()
-        self._events.start()
+        self._start_events()
 
     @property
-    def addresses(self) -> tuple[Any, Any, Any]:
-        """The addresses of sync box, event camera and force sensor."""
-        return self.sync_box.address, self.camera.address, self.force and self.force.address
+    def addresses(self) -> tuple[Any, Any, Any, dict[str, Any]]:
+        """The addresses of sync box, event camera, force sensor and further cameras."""
+        further = {name: camera.address for name, camera in self.further.items()}
+        force = self.force and self.force.address
+        return self.sync_box.address, self.camera.address, force, further
 
     def close(self) -> None:
         """Close every fake."""
-        for part in (self.arm, self.camera, self.sync_box, self.force):
+        for part in (self.arm, self.camera, self.sync_box, self.force, *self.further.values()):
             if part is not None:
                 part.close()
 
@@ -182,12 +204,21 @@ class SimulationServer:
             self._sent["events"] += len(chunk)
             self._sent["event_pulses"] += len(pulses.t_ns)
             self._stamps_us.append(chunk.t_us)
+        for name, seen in self._further.items():
+            found, edges = seen.read(), seen.read_pulses()
+            if len(found) or len(edges):
+                self.further[name].send(found, edges)
+                self._sent[name] += len(found)
         if self._force is not None and self.force is not None:
             self._send_forces(self._force, self.force)
         if self._tool_load is not None and self._tool_load.follow():
             self.arm.inject(Kind.PROTECTIVE_STOP)
         if self._grabbing:
             self._send_frames()
+
+    def _start_events(self) -> None:
+        for camera in (self._events, *self._further.values()):
+            camera.start()
 
     def _send_forces(self, seen: MockForceSensor, wire: FakeForceSensor) -> None:
         try:
@@ -233,7 +264,7 @@ class SimulationServer:
                 break
         self.world.begin_trial(seed)
         self._path.begin(self.world.past_ns)
-        self._events.start()
+        self._start_events()
         if self._force is not None:
             self._force.start()
         self._sent.clear()
@@ -315,7 +346,8 @@ class SimulationServer:
         """Inject a fault of a device now.
 
         Args:
-            device: ``arm``, ``sync_box``, ``event_camera`` or ``force_sensor``.
+            device: ``arm``, ``sync_box``, ``event_camera``, ``force_sensor``, or the name of a
+                further event camera's stream.
             kind: for the arm a value of `rigs.core.fakes.Kind`; for the sync box ``reset``,
                 ``silence`` or ``unplug``; for the event camera ``stall`` or ``unplug``; for the
                 force sensor ``silence``, ``overload`` or ``unplug``.
@@ -332,6 +364,8 @@ class SimulationServer:
             },
             "event_camera": {"stall": self.camera.stall, "unplug": self.camera.close},
         }
+        for name, camera in self.further.items():
+            known[name] = {"stall": camera.stall, "unplug": camera.close}
         if self.force is not None:
             known["force_sensor"] = {
                 "silence": self.force.silence,
@@ -344,7 +378,7 @@ class SimulationServer:
             raise RigError(device, f"its fake cannot simulate '{kind}'") from None
         what()
 
-    def restore(self, device: str) -> tuple[Any, Any, Any]:
+    def restore(self, device: str) -> tuple[Any, Any, Any, dict[str, Any]]:
         """A person puts right whatever is wrong with a device.
 
         A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
@@ -371,6 +405,9 @@ class SimulationServer:
         elif device == "force_sensor" and self.force is not None and self._make_force is not None:
             self.force.close()
             self.force = self._make_force()
+        elif device in self.further:
+            self.further[device].close()
+            self.further[device] = self._make_further[device]()
         else:
             raise RigError(device, "has no fake")
         return self.addresses

@@ -69,6 +69,14 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
     return TrialClocks(arm, events, frames, round(drift[3] * settings.sync_box_ppm * 1000))
 
 
+def own_clock(settings: Clocks, ppm: float, name: str, rig_seed: int, trial_seed: int) -> ClockMap:
+    """Draw the clock of a further device by its name, as `trial_clocks` does those of the first."""
+    drift = float(generator(rig_seed, f"clock drift of {name}").uniform(-1.0, 1.0))
+    longest = int(settings.offset_h * HOUR_NS)
+    offset = generator(trial_seed, f"clock offset of {name}").integers(0, longest, endpoint=True)
+    return ClockMap.line(0, int(offset), round(drift * ppm * 1000))
+
+
 @dataclass(frozen=True)
 class FaultyClock(ClockMap):
     """Map from true to device time of a clock with additional drift, jumps or restarts.

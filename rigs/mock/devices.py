@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
-from sliplab.protocols.timing import Timing
+from sliplab.protocols.timing import FrameGrade, StreamTiming, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull
+from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
+from sliplab.rigs.mock.further_settings import Further, FurtherEventCamera, FurtherFrameCamera
+from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator, VirtualClock
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import EventCamera, FrameCamera, MockSettings
 from sliplab.rigs.mock.sync import ExposureLine, FreeRun, MockSyncBox
+from sliplab.rigs.mock.thermometer import MockThermometer
 from sliplab.rigs.mock.truth import clocks_of, readings_of, truth_of
 from sliplab.rigs.mock.world import World
+from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.streams import Sink
 
 T = TypeVar("T")
+FurtherDevice = MockEventCamera | MockFrameCamera | MockThermometer
+GONE = (
+    "does not answer (simulated fault); check its power and its cable, "
+    "then run the same command to resume"
+)
 
 
 class Guarded:
@@ -51,11 +60,22 @@ def on_cable(device: T, name: Device, world: World) -> T:
     def check() -> None:
         if world.faults.gone(name, world.now_ns):
             words = name.replace("_", " ")
-            text = (
-                "does not answer (simulated fault); check its power and its cable, "
-                "then run the same command to resume"
-            )
-            raise ArmFault(words, text) if name == "arm" else RigError(words, text)
+            raise ArmFault(words, GONE) if name == "arm" else RigError(words, GONE)
+
+    return cast(T, Guarded(device, check))
+
+
+def on_stream_cable(device: T, name: str, world: World) -> T:
+    """Wrap a further device as `on_cable` does, by the name of its stream."""
+    if not any(isinstance(f, StreamGone) and f.stream == name for f in world.settings.faults):
+        return device
+
+    def check() -> None:
+        if any(
+            gone.stream == name and begin <= world.now_ns < end
+            for gone, begin, end in world.faults.spans(StreamGone)
+        ):
+            raise RigError("further device", GONE)
 
     return cast(T, Guarded(device, check))
 
@@ -87,6 +107,8 @@ class MockDevices:
     world: World
     timing: Timing
     force: MockForceSensor | None = None
+    further: Mapping[str, FurtherDevice] = field(default_factory=dict)
+    """Further devices by the names of their streams."""
 
     def begin_trial(self, seed: int) -> None:
         """Make the trial depend only on `seed` and the program; see `World.begin_trial`."""
@@ -111,17 +133,25 @@ class MockDevices:
         clocks = clocks_of(self.world, self.sync.clock, recorded_ns, self.timing.frames)
         if self.force is not None:
             clocks["force"] = readings_of(self.force.clock, self.sync.clock, recorded_ns)
+        for name, device in self.further.items():
+            clock = IDENTITY if device.timed_by_host else device.clock
+            clocks[name] = readings_of(clock, self.sync.clock, recorded_ns)
         return {
             **truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px, hold_true_ns),
             "clocks": clocks,
         }
 
 
-def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevices:
+def build_mock(
+    settings: MockSettings,
+    timing: Timing | None = None,
+    further: Mapping[str, tuple[Further, StreamTiming, str]] | None = None,
+) -> MockDevices:
     """Build the devices of a simulated rig. The same settings give the same rig.
 
     Args:
         timing: signals that reach each device; all if left out.
+        further: settings, timing and unit of each further device, by the name of its stream.
     """
     timing = timing or Timing()
     world = World(settings)
@@ -146,4 +176,28 @@ def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevi
         world=world,
         timing=timing,
         force=force,
+        further={
+            name: on_stream_cable(_further(name, *one, world, sync), name, world)
+            for name, one in (further or {}).items()
+        },
     )
+
+
+def _further(
+    name: str,
+    settings: Further,
+    timing: StreamTiming,
+    unit: str,
+    world: World,
+    box: MockSyncBox,
+) -> FurtherDevice:
+    """Build a further device; its stream's unit is that of a scalar sensor."""
+    if isinstance(settings, FurtherEventCamera):
+        seen = Identity[EventCamera](name, settings, settings.clock_ppm, settings.seed)
+        return MockEventCamera(world, box, seen)
+    if isinstance(settings, FurtherFrameCamera):
+        own = Identity[FrameCamera](name, settings, settings.clock_ppm, settings.seed)
+        grade = cast(FrameGrade, timing.grade)  # checked against those of its kind
+        trigger = box if grade == "hardware trigger" else FreeRun(world, own)
+        return MockFrameCamera(world, trigger, grade, own)
+    return MockThermometer(world, settings, name, unit)

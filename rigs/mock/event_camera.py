@@ -9,6 +9,8 @@ from sliplab.rigs.mock.clocks import HighestStamp
 from sliplab.rigs.mock.fault_settings import EventBurst
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.identity import Identity
+from sliplab.rigs.mock.settings import EventCamera
 from sliplab.rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
@@ -91,17 +93,29 @@ class MockEventCamera:
 
     It sends complete blocks of the scene's steps (32 ms by default), which is its latency. After
     `stop`, the remaining events can still be read.
+
+    Args:
+        own: of a further camera, whose events no fault changes; the rig's first one by default.
+
+    Attributes:
+        clock: true time to the camera's, in the running trial.
     """
 
-    def __init__(self, world: World, box: MockSyncBox) -> None:
+    timed_by_host = False
+
+    def __init__(
+        self, world: World, box: MockSyncBox, own: Identity[EventCamera] | None = None
+    ) -> None:
         self._world = world
-        settings = world.settings.event_camera
+        self._own = own or Identity("event_camera", world.settings.event_camera)
+        settings = self._own.settings
         self.width, self.height = settings.width, settings.height
-        self._sensor = MarkerSensor(
-            EventOptics(**settings.model_dump()), world.skin.layout_mm, world.settings.seed
-        )
-        self._bursts = Bursts(world, self.width, self.height)
-        self._input = SyncInput(world, box, "event_camera")
+        optics = EventOptics(**settings.model_dump(include=set(EventCamera.model_fields)))
+        seed = self._own.fabrication_seed(world)
+        self._sensor = MarkerSensor(optics, world.skin.layout_mm, seed)
+        self._loads_of = "" if self._own.first else self._own.name
+        self._bursts = Bursts(world, self.width, self.height) if self._own.first else None
+        self._input = SyncInput(world, box, self._own.name)
         self._begin()
         world.on_begin.append(self._begin)
 
@@ -111,14 +125,15 @@ class MockEventCamera:
         self._next_ns = 0
         self._loads: History | None = None
         self._stamps = HighestStamp()
+        self.clock = self._own.clock(self._world)
 
     def start(self) -> None:
         """Start streaming: every pixel takes the current image as its reference."""
         world = self._world
-        loads = self._loads = world.keep_loads()
+        loads = self._loads = world.keep_loads(self._loads_of)
         self._next_ns = loads.end_ns
         row_ns, rows = loads.between(self._next_ns, self._next_ns)
-        self._sensor.reset(self._on_skin(row_ns, rows)[0], world.seed)
+        self._sensor.reset(self._on_skin(row_ns, rows)[0], self._own.trial_seed(world))
         self._begun_ns, self._until_ns, self._running = world.now_ns, NEVER, True
         self._input.skip()
 
@@ -135,23 +150,24 @@ class MockEventCamera:
             last_ns -= last_ns % self._sensor.optics.block_ns
         elif done_ns > self._until_ns:
             last_ns = int(loads.between(self._until_ns, self._until_ns)[0][0])
-        sent_ns = world.faults.sent_until_ns(world.now_ns)
+        sent_ns = self._sent_until_ns()
         if sent_ns < last_ns:
             last_ns = sent_ns - sent_ns % self._sensor.optics.block_ns
         if last_ns <= self._next_ns:
             return EventChunk.empty()
         row_ns, rows = loads.between(self._next_ns, last_ns)
         t_ns, x, y, p = self._sensor.sense(self._on_skin(row_ns, rows), row_ns)
-        t_ns, x, y, p = self._bursts.into(
-            (t_ns, x, y, p), self._next_ns, last_ns, self._sensor.scans
-        )
+        if self._bursts is not None:
+            t_ns, x, y, p = self._bursts.into(
+                (t_ns, x, y, p), self._next_ns, last_ns, self._sensor.scans
+            )
         self._next_ns = last_ns
         loads.forget(last_ns)
         gaps = [(t_ns[0], self._begun_ns)] if len(t_ns) and t_ns[0] < self._begun_ns else []
-        for begin, end in [*gaps, *world.faults.gaps_ns()]:
+        for begin, end in [*gaps, *self._gaps_ns()]:
             kept = (t_ns < begin) | (t_ns >= end)
             t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
-        stamps = world.clocks.event_camera.to_reference(t_ns) // 1000
+        stamps = self.clock.to_reference(t_ns) // 1000
         return EventChunk(x, y, p, self._stamps.of(stamps))
 
     def _on_skin(self, t_ns: I64, loads: F64) -> F64:
@@ -167,21 +183,30 @@ class MockEventCamera:
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses since the last call, camera clock in ns."""
-        t_ns = self._input.edges_ns(self._world.faults.sent_until_ns(self._world.now_ns))
+        t_ns = self._input.edges_ns(self._sent_until_ns())
         if not self._running and self._until_ns == 0:
             return PulseChunk(np.empty(0, np.int64))
         kept = (t_ns >= self._begun_ns - REPORT_NS) & (t_ns <= self._until_ns)
-        for begin, end in self._world.faults.gaps_ns():
+        for begin, end in self._gaps_ns():
             kept &= (t_ns < begin) | (t_ns >= end)
-        stamp = self._world.clocks.event_camera.to_reference(t_ns[kept])
+        stamp = self.clock.to_reference(t_ns[kept])
         return PulseChunk(stamp // 1000 * 1000)
 
     def stop(self) -> None:
         """Stop streaming; the rest, up to the last complete step, can still be read."""
         if self._running:
             self._world.advance()
-            self._world.drop_loads()
+            self._world.drop_loads(self._loads_of)
             self._running, self._until_ns = False, self._world.now_ns
+
+    def _sent_until_ns(self) -> int:
+        """Return the true time up to which the camera has sent its data."""
+        now_ns = self._world.now_ns
+        return self._world.faults.sent_until_ns(now_ns) if self._own.first else now_ns
+
+    def _gaps_ns(self) -> list[tuple[int, int]]:
+        """Return the true intervals of which the camera loses its data."""
+        return self._world.faults.gaps_ns() if self._own.first else []
 
     def close(self) -> None:
         """Close the device."""

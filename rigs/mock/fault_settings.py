@@ -195,6 +195,16 @@ class DeviceGone(_TimedFault):
     """Time until it answers again, permanent if left out. It returns switched on and idle."""
 
 
+class StreamGone(_TimedFault):
+    """A further device loses its power or its cable."""
+
+    kind: Literal["stream_gone"]
+    stream: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+    """Name of its stream."""
+    seconds: Seconds | None = None
+    """If left out, the device is gone for good."""
+
+
 AnyFault = (
     ArmProtectiveStop
     | ArmOffPath
@@ -214,6 +224,7 @@ AnyFault = (
     | PlateStuck
     | DiskFull
     | DeviceGone
+    | StreamGone
 )
 Fault = Annotated[AnyFault, Field(discriminator="kind")]
 """One fault, discriminated by its `kind`."""

@@ -19,7 +19,8 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.clocks import Jitter, Lateness
 from sliplab.rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
 from sliplab.rigs.mock.faults import NEVER
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.identity import Identity
+from sliplab.rigs.mock.settings import FrameCamera, MockSettings
 from sliplab.rigs.mock.sync import ClockReader, FreeRun, Ticks
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.frames import (
@@ -48,16 +49,26 @@ class MockFrameCamera:
     Args:
         trigger: source of its exposures, the sync box or the camera itself.
         grade: grade of its time stamps; only `host arrival` changes them.
+        own: of a further camera; the rig's first one by default.
+
+    Attributes:
+        clock: true time to the camera's, in the running trial.
+        timed_by_host: its frames carry no time but that of their arrival.
     """
 
     def __init__(
-        self, world: World, trigger: Ticks, grade: FrameGrade = "hardware trigger"
+        self,
+        world: World,
+        trigger: Ticks,
+        grade: FrameGrade = "hardware trigger",
+        own: Identity[FrameCamera] | None = None,
     ) -> None:
         self._world, self._trigger = world, trigger
-        self._faults = FrameFaults(world, trigger)
-        self._has_clock = grade != "host arrival"
-        self._clock_reader = ClockReader(world, "frame_camera")
-        settings = world.settings.frame_camera
+        self._own = own or Identity("frame_camera", world.settings.frame_camera)
+        self._faults = FrameFaults(world, trigger, first=self._own.first)
+        self.timed_by_host = grade == "host arrival"
+        self._clock_reader = ClockReader(world, self._own.name)
+        settings = self._settings = self._own.settings
         self.px_per_mm, self.rate_hz = settings.px_per_mm, settings.rate_hz
         self.mid_exposure_ns = settings.exposure_us * 500
         """Time from the start of an exposure, which is its tick, to its middle."""
@@ -70,11 +81,13 @@ class MockFrameCamera:
     def _begin(self) -> None:
         self._running, self._until_ns = False, 0
         self._run, self._next_tick, self._number = self._trigger.run, 0, 0
+        self.clock = self._own.clock(self._world)
+        self._seed = self._own.trial_seed(self._world)
         self._jitter = Jitter(
-            self._world.seed, "frame stamps", self._world.settings.clocks.frame_jitter_us
+            self._seed, "frame stamps", self._world.settings.clocks.frame_jitter_us
         )
-        late_us = 0.0 if self._has_clock else self._world.settings.frame_camera.arrival_jitter_us
-        self._late = Lateness(self._world.seed, "frame arrivals", late_us)
+        late_us = self._settings.arrival_jitter_us if self.timed_by_host else 0.0
+        self._late = Lateness(self._seed, "frame arrivals", late_us)
         self._arrived_ns = 0
         self._noise: tuple[int, F64] | None = None
 
@@ -84,7 +97,7 @@ class MockFrameCamera:
         Raises:
             RigError: the camera is grabbing, or the region exceeds the sensor.
         """
-        settings = self._world.settings.frame_camera
+        settings = self._settings
         if self._running:
             raise RigError("frame camera", "the region cannot change while grabbing; stop first")
         if not (1 <= width_px <= settings.width and 1 <= height_px <= settings.height):
@@ -106,7 +119,7 @@ class MockFrameCamera:
 
     def read(self) -> FrameChunk:
         """Return the frames since the last call whose read-out is complete."""
-        world, trigger, settings = self._world, self._trigger, self._world.settings.frame_camera
+        world, trigger, settings = self._world, self._trigger, self._settings
         world.advance()
         if trigger.run != self._run:
             self._run, self._next_tick = trigger.run, 0
@@ -130,11 +143,11 @@ class MockFrameCamera:
         mid = true[: len(ticks)][kept] + self.mid_exposure_ns
         ticks, number, host = ticks[kept], number[kept], host[kept]
         stamp = host
-        if self._has_clock:
-            stamp = world.clocks.frame_camera.to_reference(mid + self._jitter.ns(ticks))
+        if not self.timed_by_host:
+            stamp = self.clock.to_reference(mid + self._jitter.ns(ticks))
         sync = trigger.bits(ticks) if len(ticks) else np.empty(0, np.uint8)
         if self._view is None:
-            self._view = PlateView(_optics(world.settings), *self._size)
+            self._view = PlateView(_optics(world.settings, settings), *self._size)
         seen = expose(world.tips_at, mid, exposed_ns, self.px_per_mm)
         seen = self._faults.hide(mid, seen)
         if settings.level == "tracks":
@@ -148,12 +161,12 @@ class MockFrameCamera:
             images[:] = self._board(world.board)
             return FrameChunk(images, number, stamp, host, sync)
         marked = seen.plate_mm if world.plate_marked else None
-        self._view.draw(images, seen.tips_mm, marked, number, world.seed, seen.paths)
+        self._view.draw(images, seen.tips_mm, marked, number, self._seed, seen.paths)
         return FrameChunk(images, number, stamp, host, sync)
 
     def read_clock(self) -> ClockReads:
         """Read the camera's clock: one row."""
-        return self._clock_reader.read(self._world.clocks.frame_camera)
+        return self._clock_reader.read(self.clock)
 
     def stop(self) -> None:
         """Stop grabbing; frames exposed before can still be read."""
@@ -168,7 +181,7 @@ class MockFrameCamera:
 
     def _tracks(self, view: PlateView, seen: Exposures, number: I64) -> tuple[F32, F32 | None]:
         """Return the result of tracking the images of `seen`: markers and the plate."""
-        settings = self._world.settings.frame_camera
+        settings = self._settings
         noise = self._centroid_noise(number)
         markers = view.centre_px(seen.tips_mm)
         # like the tracker: a marker cut off by the image's edge is not measured
@@ -185,13 +198,13 @@ class MockFrameCamera:
     def _board(self, place: BoardPlace) -> U8:
         """Return the image of the board in front of the camera, which hides the scene."""
         if self._shown is None or self._shown[0] != (place, self._size):
-            optics = self._world.settings.frame_camera
+            optics = self._settings
             camera = BoardCamera(
                 optics.px_per_mm, *self._size, optics.tilt_deg, (optics.k1,), optics.distance_mm
             )
             levels = optics.ground_level, optics.tip_level
             picture = draw_board(camera, place, BoardPrint(), dark=levels[0], bright=levels[1])
-            draw = generator(self._world.settings.seed, "board noise")
+            draw = generator(self._own.fabrication_seed(self._world), "board noise")
             noisy = picture + optics.noise * draw.standard_normal(picture.shape)
             self._shown = (place, self._size), np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
         return self._shown[1]
@@ -206,7 +219,7 @@ class MockFrameCamera:
         for first, last in itertools.pairwise(edges if len(number) else ()):
             block = int(blocks[first])
             if self._noise is None or self._noise[0] != block:
-                draw = generator(self._world.seed, "centroid noise", block)
+                draw = generator(self._seed, "centroid noise", block)
                 self._noise = block, draw.standard_normal((_NOISE_FRAMES, things, 2))
             result[first:last] = self._noise[1][inside[first:last]]
         return result
@@ -223,8 +236,8 @@ def _blank_cut(place_px, reach_px, width, height):  # type: ignore[no-untyped-de
                 place_px[k, i] = np.nan
 
 
-def _optics(settings: MockSettings) -> FrameOptics:
-    camera, plate = settings.frame_camera, settings.scene.plate
+def _optics(settings: MockSettings, camera: FrameCamera) -> FrameOptics:
+    plate = settings.scene.plate
     return FrameOptics(
         px_per_mm=camera.px_per_mm,
         tip_radius_mm=camera.tip_radius_mm,
@@ -248,15 +261,15 @@ OUT_OF_SIGHT_MM = 500.0
 
 
 class FrameFaults:
-    """The current trial's faults of the frame camera."""
+    """The current trial's faults of the frame camera; a further one only loses sight of markers."""
 
-    def __init__(self, world: World, trigger: Ticks) -> None:
-        self._world, self._trigger = world, trigger
+    def __init__(self, world: World, trigger: Ticks, *, first: bool = True) -> None:
+        self._world, self._trigger, self._first = world, trigger, first
 
     def lost(self, ticks: I64) -> Mask:
         """Return a mask of the frames that never reach the host, (k,) for k ticks."""
         lost = np.zeros(len(ticks), np.bool_)
-        if not len(ticks):
+        if not self._first or not len(ticks):
             return lost
         for fault, begin_ns, _ in self._world.faults.spans(FramesLost):
             first = self._trigger.tick_at(begin_ns)
@@ -275,6 +288,8 @@ class FrameFaults:
             on_time_ns: (k,), arrival times without faults.
         """
         arrival = on_time_ns
+        if not self._first:
+            return arrival
         for fault, begin_ns, _ in self._world.faults.spans(FrameLate):
             first = self._trigger.tick_at(begin_ns)
             after = ticks >= first

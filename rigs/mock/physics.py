@@ -41,7 +41,8 @@ class Physics:
     Attributes:
         step_ns: largest lag of the last row behind the present.
         track: rows of `rigs.scene.contact.record` since the trial began.
-        loads: forces of every row since `keep_loads`, or None.
+        loads: forces of every row since `keep_loads`, or None; more_loads: the same for each
+            further event camera, by its name.
         wrench: sum of the contact's forces on the plate, and their torque about its centre, of
             every row since `keep_wrench`, (k, 6) in N and N m; or None, at no cost.
     """
@@ -67,6 +68,7 @@ class Physics:
         self.tips: Tips = new_tips(len(skin))
         self.track = History(track_width(len(skin)))
         self.loads: History | None = None
+        self.more_loads: dict[str, History] = {}
         self.wrench: History | None = None
         self.plate_free = False
         self._plate_ramp: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
@@ -116,7 +118,8 @@ class Physics:
         if self.loads is not None:
             load = self.loads.grow(t_ns[1:])
         else:
-            load = np.empty((count, 0 if self.wrench is None else 3 * len(self.tips.state)))
+            unseen = self.wrench is None and not self.more_loads
+            load = np.empty((count, 0 if unseen else 3 * len(self.tips.state)))
         springs, state = self.springs, self.tips.state
         if not self.plate_free:
             height = np.empty(count + 1)
@@ -138,12 +141,14 @@ class Physics:
         self._sum_up(t_ns[1:], track, load)
         if landed:
             self._hold_plate(-plate.stroke_mm)
-            for rows in (self.track, self.loads, self.wrench):
+            for rows in (self.track, self.loads, self.wrench, *self.more_loads.values()):
                 if rows is not None:
                     rows.shrink(count - done, int(t_ns[done]))
 
     def _sum_up(self, t_ns: I64, track: F64, load: F64) -> None:
-        """Keep the sum of the tips' forces if a force sensor reads it."""
+        """Keep the tips' forces for further cameras, and their sum for a force sensor."""
+        for rows in self.more_loads.values():
+            rows.grow(t_ns)[:] = load
         if self.wrench is not None:
             self.wrench.grow(t_ns)[:] = plate_wrench(track, load)
 
@@ -183,14 +188,22 @@ class Physics:
 
     # -- state for devices -----------------------------------------------------------------
 
-    def keep_loads(self, now_ns: int) -> History:
-        """Record the forces of every row from now on, until `loads` is reset."""
+    def keep_loads(self, now_ns: int, camera: str = "") -> History:
+        """Record the forces of every row from now on, until `loads` is reset.
+
+        Args:
+            camera: name of a further event camera: its record is among `more_loads`.
+        """
         self._catch_up(now_ns)
         tips = self.tips
-        self.loads = History(3 * len(tips.state))
-        row = self.loads.grow(np.array([self.track.end_ns], np.int64))[0]
+        loads = History(3 * len(tips.state))
+        row = loads.grow(np.array([self.track.end_ns], np.int64))[0]
         row[:] = np.column_stack([tips.force, tips.normal]).ravel()
-        return self.loads
+        if camera:
+            self.more_loads[camera] = loads
+        else:
+            self.loads = loads
+        return loads
 
     def keep_wrench(self, now_ns: int) -> History:
         """Keep the sum of the forces of every row from the present on."""

@@ -15,12 +15,13 @@ from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, CodeBits
 from sliplab.rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
 from sliplab.rigs.mock.fault_settings import (
     DeviceGone,
-    PulseDevice,
     PulsesDuplicated,
     PulsesLate,
     PulsesLost,
 )
 from sliplab.rigs.mock.faults import NEVER
+from sliplab.rigs.mock.identity import Identity
+from sliplab.rigs.mock.settings import FrameCamera
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.clockmap import ClockMap
@@ -106,7 +107,15 @@ class Ticks:
 
 
 class FreeRun(Ticks):
-    """Exposures of a free-running camera; the first comes within one period."""
+    """Exposures of a free-running camera; the first comes within one period.
+
+    Args:
+        own: the camera; the rig's first one by default.
+    """
+
+    def __init__(self, world: World, own: Identity[FrameCamera] | None = None) -> None:
+        self._own = own or Identity("frame_camera", world.settings.frame_camera)
+        super().__init__(world)
 
     def _clear(self) -> None:
         super()._clear()
@@ -115,11 +124,12 @@ class FreeRun(Ticks):
     def start(self) -> None:
         """Start exposures; running cycles are discarded."""
         world = self._world
-        period_ns = 1e9 / world.settings.frame_camera.rate_hz
-        clock, now_ns = world.clocks.frame_camera, world.now_ns
+        period_ns = 1e9 / self._own.settings.rate_hz
+        clock, now_ns = self._own.clock(world), world.now_ns
         if isinstance(clock, FaultyClock):  # cycles follow a clock's drifts, and not its jumps
             now_ns = int(clock.pace_ns(np.array([now_ns], np.int64))[0])
-        share = generator(world.seed, "first exposure", self._starts).uniform()
+        seed = self._own.trial_seed(world)
+        share = generator(seed, "first exposure", self._starts).uniform()
         origin_ns = undisturbed(clock).to_reference(now_ns) + round(share * period_ns)
         self._tick_on(clock, period_ns, origin_ns)
         self._starts += 1
@@ -287,7 +297,7 @@ class MockSyncBox(Ticks):
 class SyncInput:
     """A device's input on the sync line: its edges in true time with the device's jitter."""
 
-    def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
+    def __init__(self, world: World, box: MockSyncBox, device: str) -> None:
         self._world, self._box, self._device = world, box, device
         self._reset()
         world.on_begin.append(self._reset)
@@ -326,7 +336,7 @@ class SyncInput:
 class _PulseFaults:
     """Faults of the pulses of one train in one device."""
 
-    def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
+    def __init__(self, world: World, box: MockSyncBox, device: str) -> None:
         self._box, self._device, self._book = box, device, world.faults
         self._waiting = np.empty((2, 0), np.int64)
         doubled = [fault.device for fault in self._book.of(PulsesDuplicated)]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
+from sliplab.rigs.mock.clocks import TrialClocks, own_clock, shifted, trial_clocks, with_faults
 from sliplab.rigs.mock.fault_settings import PlateStuck
 from sliplab.rigs.mock.faults import FaultBook
 from sliplab.rigs.mock.history import History
@@ -26,6 +26,7 @@ from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.lens import BoardPlace
 from sliplab.rigs.scene.skin import Skin
 from sliplab.rigs.scene.vibration import Vibration
+from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -152,6 +153,19 @@ class World:
         """Largest lag of the last row behind the present."""
         return self.physics.step_ns
 
+    def further_clock(self, name: str, ppm: float) -> ClockMap:
+        """Return the map from true time to the clock of a further device in this trial.
+
+        Args:
+            name: of its stream.
+            ppm: its largest drift, either way.
+        """
+        settings = self.settings
+        clock = own_clock(
+            settings.clocks, ppm, name, settings.seed, settings.seed if self._run_on else self.seed
+        )
+        return shifted(clock, self.past_ns) if self._run_on else clock
+
     # -- the arm ---------------------------------------------------------------------------
 
     def start_arm(self, segments: Sequence[Segment]) -> list[Leg]:
@@ -190,9 +204,13 @@ class World:
 
     # -- state for devices -----------------------------------------------------------------
 
-    def keep_loads(self) -> History:
-        """Record the forces of every row from the last one on, until `drop_loads`."""
-        return self.physics.keep_loads(self.now_ns)
+    def keep_loads(self, camera: str = "") -> History:
+        """Record the forces of every row from the last one on, until `drop_loads`.
+
+        Args:
+            camera: name of a further event camera, which has a record of its own.
+        """
+        return self.physics.keep_loads(self.now_ns, camera)
 
     def keep_wrench(self) -> History:
         """Keep the sum of the forces of every row from the last one on, until the trial ends."""
@@ -202,9 +220,12 @@ class World:
         """Stop keeping the sum of the forces."""
         self.physics.wrench = None
 
-    def drop_loads(self) -> None:
-        """Stop recording forces."""
-        self.physics.loads = None
+    def drop_loads(self, camera: str = "") -> None:
+        """Stop recording forces for the first event camera, or for a further one."""
+        if camera:
+            self.physics.more_loads.pop(camera, None)
+        else:
+            self.physics.loads = None
 
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
         """Return positions of the tips and heights of the plate, mm: (k, n, 2) and (k,).

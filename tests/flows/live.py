@@ -72,7 +72,7 @@ def request_in(folder: Path, data: dict[str, Any], rig: Path) -> RunRequest:
 def stage_of(file: RigFile) -> Iterator[Loopback]:
     """Fakes for a rig file, which outlive the rigs that are built on them."""
     assert file.devices is not None
-    stage = Loopback(file.scene, file.timing, file.devices)
+    stage = Loopback(file.scene, file.timing, file.devices, file.streams)
     try:
         yield stage
     finally:

@@ -141,12 +141,12 @@ class _Camera:
 def test_a_camera_whose_times_are_worse_than_promised_is_refused(tmp_path: Path) -> None:
     file = load(loopback(), tmp_path / "rig.yaml")
     fine: Any = _Camera(Stamping("chunk", "hardware trigger"))
-    _check_grade(file, fine)
+    _check_grade(file.timing.frames, fine, "timing.frames")
     poor: Any = _Camera(Stamping("host arrival", "host arrival"))
     with pytest.raises(RigError, match=r"'host arrival'.*write timing.frames: host arrival"):
-        _check_grade(file, poor)
+        _check_grade(file.timing.frames, poor, "timing.frames")
     simulated: Any = object()
-    _check_grade(file, simulated)  # knows of no stamps
+    _check_grade(file.timing.frames, simulated, "timing.frames")  # knows of no stamps
 
 
 def _arm(**change: Any) -> Change:

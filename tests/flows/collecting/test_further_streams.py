@@ -1,0 +1,403 @@
+"""Trials of a rig with further cameras and a thermometer: stored, timed, gated, resumed."""
+
+from __future__ import annotations
+
+import json
+import re
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.clocks.refit import fit_again
+from sliplab.flows.api import open_store
+from sliplab.flows.collecting.session import TrialCollector
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.preflight import check
+from sliplab.flows.planning.run_request import describe_campaign, make_request
+from sliplab.flows.ui import view
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
+from tests.conftest import ROOT
+from tests.flows.collecting.test_session import checksums, short, take_all
+from tests.flows.collecting.test_session import session as plain_session
+from tests.flows.conftest import write
+from tests.flows.ui.test_view import Read
+
+TRACKS = {"level": "tracks"}
+SIDE = {
+    "kind": "events",
+    "timing": {"drift_ppm": 50},
+    "mock": {"width": 320, "height": 240, "px_per_mm": 7, "threshold": 0.3, "clock_ppm": 40},
+}
+BACK = {
+    "kind": "frames",
+    "scale_px_per_mm": 4,
+    "region_px": [160, 160],
+    "timing": {"resolution_us": 0},
+    "mock": {"px_per_mm": 4, "clock_ppm": 20},
+}
+FREE = {
+    **BACK,
+    "rate_hz": 60,
+    "timing": {"grade": "device time stamps", "resolution_us": 0},
+    "mock": {"px_per_mm": 4, "rate_hz": 60, "level": "tracks"},
+}
+HEARD = {
+    **BACK,
+    "rate_hz": 50,
+    "timing": {"grade": "host arrival", "delay": {"shortest_us": 3000, "longest_us": 9000}},
+    "mock": {
+        "px_per_mm": 4, "rate_hz": 50, "level": "tracks",
+        "latency_us": 4000, "arrival_jitter_us": 4000,
+    },
+}  # fmt: skip
+WARM = {
+    "kind": "scalar",
+    "unit": "degC",
+    "timing": {"delay": {"shortest_us": 0, "longest_us": 4000}},
+    "mock": {"ambient": 22, "above": 2, "rate_hz": 40},
+}
+TWIN = {"kind": "events", "mock": {}}
+"""As the rig's first event camera, with pixels and a clock of its own."""
+ALL = {"side": SIDE, "twin": TWIN, "back": BACK, "free": FREE, "heard": HEARD, "warm": WARM}
+
+
+def session(
+    folder: Path, streams: dict[str, Any], *, data: dict[str, Any] | None = None, **mock: Any
+) -> tuple[TrialCollector, Campaign]:
+    """A connected session on a mock rig with further devices."""
+    folder.mkdir(exist_ok=True)
+    rig_file = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
+    simulated = {**rig_file["mock"], "frame_camera": TRACKS, **mock}
+    text = json.dumps(
+        {**rig_file, "mock": simulated, "streams": streams},
+        default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
+    )
+    (folder / "rig.yaml").write_text(text)
+    run_request = make_request(
+        write(folder / "p.yaml", data or short()), folder / "rig.yaml", folder / "store"
+    )
+    campaign = describe_campaign(Store.create(folder / "store"), run_request)
+    rig = build_rig(run_request.rig)
+    rig.connect()
+    return TrialCollector(run_request.plan, run_request.rig, rig, campaign), campaign
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """One slide with five further devices; its store is whole."""
+    folder = tmp_path_factory.mktemp("streams") / "a"
+    work, campaign = session(folder, ALL)
+    work.take(pending_trials(work.plan, campaign)[:1])
+    assert verify(Store.open(folder / "store")) == []
+    (recording,) = campaign.recordings()
+    return recording
+
+
+def test_every_stream_is_stored_and_counted(taken: Recording) -> None:
+    record = taken.record
+    assert {name: stream.kind for name, stream in record.streams.items()} == {
+        "side": "events", "twin": "events", "back": "frames", "free": "frames", "heard": "frames",
+        "warm": "scalar",
+    }  # fmt: skip
+    seconds = record.recorded_s
+    side, back = record.streams["side"], record.streams["back"]
+    assert side.rows == len(taken.events(stream="side")) > 1000
+    assert side.rows != record.counts.events
+    assert (side.size_px, back.size_px, back.px_per_mm) == ((320, 240), (160, 160), 4)
+    assert side.pulses == pytest.approx(record.counts.pulses, abs=12)
+    assert back.rows == pytest.approx(100 * seconds, rel=0.15)
+    assert record.streams["free"].rows == pytest.approx(60 * seconds, rel=0.2)
+    assert record.streams["heard"].rows == pytest.approx(50 * seconds, rel=0.25)
+    images = list(taken.frames(stream="back"))
+    assert len(images) == back.rows
+    assert images[0].shape == (160, 160)
+    assert images[0].max() > 100  # white markers on a dark ground
+    assert taken.video("free") is None
+    events = taken.events(stream="side")
+    assert events.x.max() < 320
+    assert events.y.max() < 240
+
+
+def test_every_clock_holds_its_uncertainty_against_the_truth(taken: Recording) -> None:
+    clocks, truth = taken.record.clocks.streams, (taken.simulation_truth() or {})["clocks"]
+    grades = {name: (clock.grade, clock.kind) for name, clock in clocks.items()}
+    assert grades == {
+        "side": ("trigger input", "95 %"),
+        "twin": ("trigger input", "95 %"),
+        "back": ("hardware trigger", "95 %"),
+        "free": ("device time stamps", "hard bound"),
+        "heard": ("host arrival", "hard bound"),
+        "warm": ("host arrival", "hard bound"),
+    }
+    free = np.array(truth["free"])
+    error = np.abs(np.asarray(clocks["free"].map.to_reference(free[:, 0])) - free[:, 1])
+    assert error.max() <= (clocks["free"].uncertainty_ns or 0) < 1e6
+    for name in ("side", "twin", "back"):
+        # the true clock is a straight line; within the stretch of the pulses
+        pairs, clock = np.array(truth[name]), clocks[name]
+        ends = clock.map.to_reference(np.array(clock.map.device_ns))
+        shares = (ends - pairs[0, 1]) / (pairs[-1, 1] - pairs[0, 1])
+        true = pairs[0, 0] + shares * (pairs[-1, 0] - pairs[0, 0])
+        error = np.abs(np.array(clock.map.device_ns) - true)
+        assert len(error) >= 2
+        assert error.max() <= (clock.uncertainty_ns or 0)
+        assert (clocks[name].uncertainty_ns or 0) < 1e4
+    # what the host times by arrival is a delay older than its own clock says
+    for name, shortest, longest in (("heard", 4e6, 8e6), ("warm", 1e6, 3e6)):
+        pairs = np.array(truth[name])
+        mid = (taken.record.streams[name].mid_exposure_ns or 0) if name == "heard" else 0
+        mapped = np.asarray(clocks[name].map.to_reference(pairs[:, 0]))
+        age = pairs[:, 1] - mapped - mid
+        bound = clocks[name].uncertainty_ns or 0
+        assert np.all(age >= shortest - bound)
+        assert np.all(age <= longest + bound)
+    # each clock is its own
+    offsets = {name: truth[name][0][0] for name in ("side", "back", "free", "event_camera", "arm")}
+    assert len(set(offsets.values())) == 5
+
+
+def test_both_event_cameras_see_the_same_motion(taken: Recording) -> None:
+    # little moves in the hold, much in the slide after it
+    start, end = taken.step("hold")[0], taken.motion_ns[1]
+    edges = np.arange(start, end, 10_000_000)
+    rates = []
+    for name in ("events", "twin"):
+        found = taken.events(start, end, name)
+        times = np.asarray(taken.clock(name).to_reference(found.t_us * 1000))
+        rates.append(np.histogram(times, edges)[0])
+    assert np.corrcoef(rates)[0, 1] > 0.98
+    # one bin later they would not agree
+    assert np.corrcoef(rates[0][1:], rates[1][:-1])[0, 1] < np.corrcoef(rates)[0, 1] - 0.02
+    assert not np.array_equal(taken.events().x[:500], taken.events(stream="twin").x[:500])
+
+
+def test_the_thermometer_shows_a_cooling_body(taken: Recording) -> None:
+    warm = taken.scalars("warm")
+    assert warm.unit == "degC"
+    assert len(warm) == pytest.approx(40 * taken.record.recorded_s, rel=0.25)
+    assert np.all((warm.value > 21.8) & (warm.value < 24.2))
+    assert np.allclose(warm.value / 0.0625, np.round(warm.value / 0.0625))
+    half = len(warm) // 2
+    assert warm.value[:half].mean() > warm.value[half:].mean()
+    figures = taken.record.streams["warm"].figures
+    assert figures["min"] <= figures["mean"] <= figures["max"]
+    assert figures["max"] == warm.value.max()
+
+
+def test_gates_and_catalogue_know_them(taken: Recording) -> None:
+    gates = taken.record.quality.gates
+    assert {f"sync_uncertainty_{name}_s" for name in ALL} <= gates.keys()
+    assert {
+        "event_gap_side_s", "event_burst_side", "frames_lost_back", "frames_lost_free",
+        "frames_lost_heard",
+    } <= gates.keys()  # fmt: skip
+    assert all(gate.passed for gate in gates.values())
+    row = catalogue(Store.open(taken.folder.parents[3])).iloc[0]
+    assert row["side_events"] == taken.record.streams["side"].rows
+    assert row["back_frames"] == taken.record.streams["back"].rows
+    assert 22 < row["warm_mean"] < 24
+
+
+def test_clocks_are_fitted_again_to_the_same(taken: Recording) -> None:
+    found, residuals = fit_again(taken, None)
+    assert "clocks" not in found
+    assert {"side_us", "back_us"} <= residuals.keys()
+
+
+def test_the_public_interface_puts_them_on_one_time_line(taken: Recording) -> None:
+    trial = open_store(taken.folder.parents[3]).trial(taken.trial_id)
+    start, end = trial.step("slide")
+    assert len(trial.events(start, end, "side")) > 100
+    inside = (trial.frame_times("back") >= start) & (trial.frame_times("back") < end)
+    assert np.count_nonzero(inside) == pytest.approx((end - start) / 1e7, abs=1)
+    times = trial.scalars("warm").t_ns
+    assert np.all(np.diff(times) >= 0)
+    assert times[0] < start < end < times[-1] + 100_000_000
+
+
+def test_the_first_cameras_are_as_on_a_rig_without_them(tmp_path: Path) -> None:
+    alone, campaign = plain_session(tmp_path / "a", short(), frame_camera=TRACKS)
+    take_all(alone)
+    # an identical rig, its two further cameras on the wire
+    both, more = session(tmp_path / "b", {"side": SIDE, "back": BACK})
+    both.take(pending_trials(both.plan, more)[:1])
+    (with_them,) = more.recordings()
+    without = campaign.recording(with_them.trial_id)
+    one, other = ((r.folder / "data.h5").read_bytes() for r in (with_them, without))
+    assert one == other
+    assert not list(without.folder.glob("stream-*"))
+    assert "streams" not in without.record.to_json()
+    assert with_them.record.simulation_truth is not None
+
+
+def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
+    streams = {"side": SIDE, "warm": WARM}
+    whole, campaign = session(tmp_path / "a", streams)
+    take_all(whole)
+    expected = checksums(campaign)
+    part, pieces = session(tmp_path / "b", streams)
+    part.take(pending_trials(part.plan, pieces)[:1])
+    # killed in the second trial: its files stay behind, and go to quarantine
+    trial = pending_trials(part.plan, pieces)[0]
+    writer = pieces.begin(trial.id, None, 100)
+    writer.add_stream("side", whole.rig.further[0].device.read())
+    assert (writer.folder / "stream-side.h5").exists()
+    again, pieces = session(tmp_path / "b", streams)
+    take_all(again)
+    assert checksums(pieces) == expected
+    assert any(path.name.startswith(trial.id) for path in (pieces.folder / "quarantine").iterdir())
+    assert verify(Store.open(tmp_path / "b" / "store")) == []
+
+
+def record_calls(rig: Rig, called: list[str]) -> None:
+    """Note in what order a rig's devices are stopped and closed."""
+    devices = {"arm": rig.arm, "events": rig.event_camera, "sync": rig.sync}
+    devices |= {device.name: device.device for device in rig.further}
+    for name, device in devices.items():
+        for what in ("stop", "close"):
+            done = getattr(device, what)
+
+            def noted(name: str = name, what: str = what, done: Any = done) -> None:
+                called.append(f"{what} {name}")
+                done()
+
+            target = getattr(device, "_target", device)
+            setattr(target, what, noted)
+
+
+@pytest.mark.parametrize("name", ["side", "back", "warm"])
+def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path) -> None:
+    streams = {"side": SIDE, "back": BACK, "warm": WARM}
+    fault = {"kind": "stream_gone", "stream": name, "trial": 2, "at_s": 0.3}
+    work, campaign = session(tmp_path / "a", streams, faults=[fault])
+    called: list[str] = []
+    record_calls(work.rig, called)
+    text = rf"{name} \(further device\): does not answer \(simulated fault\)"
+    with pytest.raises(RigError, match=text):
+        take_all(work)
+    assert called[0] == "stop arm"
+    assert campaign.committed() == set()
+    (aside,) = campaign.quarantined()
+    assert "does not answer" in aside["cause"]
+    called.clear()
+    work.rig.close()
+    others = [call for call in called if call.startswith("close")]
+    assert others[0] == "close arm"
+    assert set(others[-2:]) <= {f"close {stream}" for stream in streams}
+    repaired, campaign = session(tmp_path / "a", streams)
+    take_all(repaired)
+    assert len(campaign.committed()) == 3
+
+
+def test_a_camera_that_falls_silent_fails_a_gate(tmp_path: Path) -> None:
+    class Silent:
+        """An event camera that sends nothing more after its first blocks."""
+
+        def __init__(self, camera: Any) -> None:
+            self._camera, self._reads = camera, 0
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._camera, name)
+
+        def read(self) -> Any:
+            self._reads += 1
+            chunk = self._camera.read()
+            return chunk if self._reads < 3 else type(chunk).empty()
+
+    data = short()
+    data["collection"]["gates"] = {"retakes": 0}
+    work, campaign = session(tmp_path / "a", {"side": SIDE}, data=data)
+    (side,) = work.rig.further
+    work.rig.further = (type(side)(side.name, Silent(side.device), side.about),)
+    work.take(pending_trials(work.plan, campaign)[:1])
+    assert campaign.committed() == set()
+    (aside,) = campaign.quarantined()
+    assert "event_gap_side_s" in aside["cause"]
+    assert "event_gap_s =" not in aside["cause"]
+
+
+def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
+    store = Store.open(taken.folder.parents[3])
+    counts = view.save(view.find(store, taken.trial_id), tmp_path / "t.rrd")
+    assert counts["side_events"] == taken.record.streams["side"].rows
+    assert counts["back_frames"] == taken.record.streams["back"].rows
+    assert counts["warm_scalar"] == taken.record.streams["warm"].rows
+    read = Read(tmp_path / "t.rrd")
+    times, values = read.curve("/streams/warm")
+    assert values == list(taken.scalars("warm").value)
+    assert times == list(taken.clock("warm").to_reference(taken.scalars("warm").t_ns))
+    pictures, _ = read["/streams/back", "EncodedImage:blob"]
+    assert pictures == list(taken.frame_times("back"))
+    assert len(read["/streams/side/on", "Points2D:positions"][0]) > 10
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "text"),
+    [
+        ({"events": SIDE}, "streams.events", "is the name of one of a rig's first devices"),
+        ({"Side": SIDE}, "streams.Side", "a stream's name must match"),
+        ({"side": {"kind": "pictures"}}, "streams.side.kind", "must be one of events, frames"),
+        ({"side": {"kind": "events"}}, "streams.side.mock", "is needed by driver: mock"),
+        (
+            {"side": {**SIDE, "device": {"driver": "dvxplorer"}}},
+            "streams.side.device", "has no meaning with driver: mock",
+        ),
+        (
+            {"side": {**SIDE, "mock": {"pixels": 5}}},
+            "streams.side.mock.pixels", "unknown key",
+        ),
+        (
+            {"side": {**SIDE, "timing": {"grade": "host arrival"}}},
+            "streams.side.timing.grade", "must be trigger input",
+        ),
+        (
+            {"back": {**BACK, "region_px": [160, 2000]}},
+            "streams.back.region_px", "exceeds mock.height = 1200",
+        ),
+        ({"back": {**BACK, "scale_px_per_mm": 5}}, "streams.back.scale_px_per_mm", "must be mock"),
+        ({"free": {**FREE, "rate_hz": None}}, "streams.free.rate_hz", "is needed with"),
+        ({"back": {**BACK, "rate_hz": 50}}, "streams.back.rate_hz", "has no meaning with"),
+        (
+            {"side": {**SIDE, "timing": {"drift_ppm": 20}}},
+            "streams.side.mock.clock_ppm", "must be at most timing.drift_ppm = 20",
+        ),
+        (
+            {"warm": {**WARM, "timing": {"delay": {"shortest_us": 0, "longest_us": 2000}}}},
+            "streams.warm.mock.arrival_jitter_us", "must be at most 1000",
+        ),
+    ],
+)  # fmt: skip
+def test_a_wrong_stream_is_named_by_its_key(
+    changes: dict[str, Any], key: str, text: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=re.escape(text)) as raised:
+        session(tmp_path / "a", changes)
+    assert raised.value.key == key
+
+
+def test_a_fault_of_an_unknown_stream_is_refused(tmp_path: Path) -> None:
+    fault = {"kind": "stream_gone", "stream": "other"}
+    with pytest.raises(InputError, match="is no further device of the rig; it has: side"):
+        session(tmp_path / "a", {"side": SIDE}, faults=[fault])
+
+
+def test_the_shipped_rig_passes_its_check(tmp_path: Path) -> None:
+    rig = ROOT / "rigs" / "mock_two_cameras.yaml"
+    file, _ = load_rig_file(rig)
+    assert set(file.streams) == {"side_events", "back_frames", "plate_temperature"}
+    found = check(write(tmp_path / "p.yaml", short()), rig, tmp_path / "s", ())
+    assert all(item.passed for item in found)
+    names = {item.name for item in found}
+    assert {f"clock: {name}" for name in file.streams} <= names
