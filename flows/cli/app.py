@@ -11,6 +11,7 @@ from sliplab.flows.cli import (
     control,
     detect,
     exchange,
+    new,
     publish,
     review,
     rigs,
@@ -63,5 +64,6 @@ for part in (
     review.app,
     detect.app,
     schema.app,
+    new.app,
 ):
     app.add_typer(part)

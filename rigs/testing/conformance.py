@@ -9,6 +9,7 @@ A package with a driver tries every rule that applies to its kind by two lines o
 from __future__ import annotations
 
 import gc
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -25,7 +26,7 @@ from sliplab.rigs.core.driver import (
 )
 from sliplab.rigs.testing import arm_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
-from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules
+from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, Rules
 from sliplab.rigs.testing.stream_bench import (
     ArmForceBench,
     EventBench,
@@ -129,14 +130,8 @@ def conformance(
     return test
 
 
-def broken_rules(cases: list[Case]) -> dict[str, str]:
-    """Return what was seen of each rule that is broken, by its name."""
-    broken = {}
-    for case in cases:
-        try:
-            case()
-        except RuleBroken as error:
-            broken[error.rule] = error.seen
-        except NotTried:
-            continue
-    return broken
+def free_port() -> int:
+    """Return a TCP port of this computer that nobody listens at now."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        found: int = probe.getsockname()[1]
+        return found

@@ -6,7 +6,7 @@ with `ERROR` and a reason:
     MOVE 400.0 5.0 300.0 180.0 0.0 0.0 1.6      (x y z in mm, rotation vector in deg, mm/s)
     STOP
 
-Unasked it sends 250 times a second its time, its pose, its state and the level of its sync input:
+Unasked it sends 500 times a second its time, its pose, its state and the level of its sync input:
 
     POSE 1000123456 400.000 0.000 300.000 180.000 0.000 0.000 MOVING 0
 """

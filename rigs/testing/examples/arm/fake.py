@@ -9,7 +9,7 @@ from sliplab.rigs.core.driver import ArmScene
 from sliplab.rigs.core.fakes import CLOCK_BACK_S, Kind, ServedController
 
 ACCELERATION_MM_S2 = 500.0
-PERIOD_S = 0.004
+PERIOD_S = 0.002
 STATES = {
     Kind.PROTECTIVE_STOP: "PROTECTIVE",
     Kind.EMERGENCY_STOP: "EMERGENCY",

@@ -1,4 +1,4 @@
-"""An example force sensor: settings and declaration.
+"""Example force sensor: settings and declaration.
 
 Imported whenever a rig file names the driver, by `sliplab plan` too: keep it cheap. The driver
 itself, and a maker's library, are imported when the device is made.

@@ -26,7 +26,8 @@ class FakeExampleForce(FakeStream):
         samples["t"], samples["force"], samples["torque"] = (
             chunk.t_ns, chunk.force_n, chunk.torque_nm,
         )  # fmt: skip
-        self._last = samples[-1:].copy()
+        if len(samples):
+            self._last = samples[-1:].copy()
         samples["force"] -= self._zero["force"]
         samples["torque"] -= self._zero["torque"]
         if self._streaming:

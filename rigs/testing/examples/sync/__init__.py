@@ -1,4 +1,4 @@
-"""An example sync box: settings and declaration.
+"""Example sync box: settings and declaration.
 
 Imported whenever a rig file names the driver, by `sliplab plan` too: keep it cheap. The driver
 itself, and a maker's library, are imported when the device is made.
