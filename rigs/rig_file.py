@@ -21,7 +21,7 @@ from sliplab.protocols.quantity import (
     PositiveSpeed,
 )
 from sliplab.protocols.shown import MASK, is_secret
-from sliplab.protocols.timing import Timing
+from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.protocols.yaml_file import (
     NAME_PATTERN,
     KeyedError,
@@ -38,7 +38,13 @@ from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.fault_settings import StreamGone
 from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.stream_settings import Streams, check_streams, named_drivers, stream_drivers
+from sliplab.rigs.stream_settings import (
+    FrameStream,
+    Streams,
+    check_streams,
+    named_drivers,
+    stream_drivers,
+)
 
 CAMERAS = {"events": "event camera", "frames": "frame camera"}
 """Streams by name in rig files and protocols, and the devices that give them."""
@@ -385,15 +391,23 @@ def same_rig(one: str, other: str) -> bool:
 def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
     """Check that exposures end before the next tick, where every tick triggers a frame."""
     rate = plan.protocol.collection.recording.sync_rate
-    if rig.timing.frames != "hardware trigger":
-        return
-    for name in ("devices", "mock"):
-        section = getattr(rig, name)
-        camera = None if section is None else section.frame_camera
+    triggered: dict[str, Any] = {}
+    if rig.timing.frames == "hardware trigger":
+        sections = {name: getattr(rig, name) for name in ("devices", "mock")}
+        triggered = {
+            f"{name}.frame_camera": None if section is None else section.frame_camera
+            for name, section in sections.items()
+        }
+    for name, stream in rig.streams.items():
+        if isinstance(stream, FrameStream) and stream.timing.grade == "hardware trigger":
+            triggered |= {
+                f"streams.{name}.{part}": getattr(stream, part) for part in ("device", "mock")
+            }
+    for name, camera in triggered.items():
         if camera is not None and camera.exposure_us * rate > 1e6:
             raise InputError(
                 file,
-                f"{name}.frame_camera.exposure_us",
+                f"{name}.exposure_us",
                 f"{camera.exposure_us:g}",
                 f"must be at most {1e6 / rate:g}, the period of {plan.file}'s sync_rate: "
                 "every tick triggers a frame",
@@ -445,12 +459,17 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
         InputError: the first move beyond a limit.
     """
     most_us = 1e6 / 4 / plan.protocol.collection.recording.sync_rate
-    for name in ("event_camera", "frame_camera", "arm_controller"):
-        jitter_us = getattr(rig.timing, name).jitter_us
+    clocks: dict[str, DeviceClock] = {
+        f"timing.{name}": getattr(rig.timing, name)
+        for name in ("event_camera", "frame_camera", "arm_controller")
+    }
+    clocks |= {f"streams.{name}.timing": stream.timing for name, stream in rig.streams.items()}
+    for name, clock in clocks.items():
+        jitter_us = clock.jitter_us
         if jitter_us > most_us:
             raise InputError(
                 file,
-                f"timing.{name}.jitter_us",
+                f"{name}.jitter_us",
                 f"{jitter_us:g}",
                 f"must be at most {most_us:g}, a quarter of a tick of {plan.file}'s sync_rate: "
                 "pulses could not be distinguished",

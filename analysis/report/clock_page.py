@@ -18,6 +18,7 @@ from sliplab.analysis.report.clock_trials import (
     DeviceClocks,
     TrialClocks,
     campaign_clocks,
+    device_names,
 )
 from sliplab.analysis.report.figures.clocks import (
     GateLine,
@@ -27,7 +28,7 @@ from sliplab.analysis.report.figures.clocks import (
     residuals,
 )
 from sliplab.analysis.report.page import Figure, Number, Table, number, render_page
-from sliplab.storage.schema.trial import DEVICES, Gate, TrialRecord
+from sliplab.storage.schema.trial import Gate, TrialRecord
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.store import QuarantineEntry
 
@@ -75,6 +76,11 @@ class _Shown:
         self.rows = list(enumerate(trials, start=1))
         self.simulated = simulated
 
+    @cached_property
+    def devices(self) -> tuple[str, ...]:
+        """Every device that is shown, first ones and further ones."""
+        return device_names(trial for _, trial in self.rows)
+
     def of_device(self, name: str) -> list[tuple[int, DeviceClocks]]:
         """Return one device in all trials that have it."""
         return [
@@ -90,7 +96,7 @@ class _Shown:
         """Every device that some trial has, with its grades."""
         grades = {
             device: sorted({known.grade for _, known in self.of_device(device)})
-            for device in DEVICES
+            for device in self.devices
         }
         return {name: f"{name}, {' or '.join(found)}" for name, found in grades.items() if found}
 
@@ -227,8 +233,8 @@ def _most_uncertain(shown: _Shown) -> Table:
         return "–" if known is None else f"{number(known.against_events_us)} ({known.grade})"
 
     worst = sorted((trial for _, trial in shown.rows), key=lambda trial: -trial.worst_us)[:WORST]
-    rows = [[*_named(trial), *(against(trial, name) for name in DEVICES)] for trial in worst]
-    columns = ("trial", "campaign", "taken as no.", *(f"{name} (µs)" for name in DEVICES))
+    rows = [[*_named(trial), *(against(trial, name) for name in shown.devices)] for trial in worst]
+    columns = ("trial", "campaign", "taken as no.", *(f"{name} (µs)" for name in shown.devices))
     return Table(columns, rows)
 
 
@@ -241,10 +247,10 @@ def _most_missed(shown: _Shown) -> Table:
 
     hit = sorted((trial for _, trial in shown.rows if trial.missed), key=lambda t: -t.missed)
     rows = [
-        [*_named(trial), *(counts(trial.devices.get(name)) for name in DEVICES)]
+        [*_named(trial), *(counts(trial.devices.get(name)) for name in shown.devices)]
         for trial in hit[:WORST]
     ]
-    return Table(("trial", "campaign", "taken as no.", *DEVICES), rows)
+    return Table(("trial", "campaign", "taken as no.", *shown.devices), rows)
 
 
 def _named(trial: TrialClocks) -> list[str]:

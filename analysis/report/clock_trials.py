@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypedDict
@@ -61,6 +61,8 @@ class TrialClocks:
     refused: Mapping[str, str]
     frames_lost: int | None
     results: Derived
+    further: tuple[str, ...] = ()
+    """Names of the further devices, each of which gives a stream."""
 
     @property
     def worst_us(self) -> float:
@@ -94,6 +96,12 @@ class TrialClocks:
         return self.results.arrays(self.name)
 
 
+def device_names(trials: Iterable[TrialClocks]) -> tuple[str, ...]:
+    """Return the devices whose clocks are shown: the first ones, then further ones by name."""
+    further = {name for trial in trials for name in trial.further}
+    return (*DEVICES, *sorted(further))
+
+
 def read_trials(store: Store, item: Collected) -> list[TrialClocks]:
     """Read the trials of a campaign, in the order in which they were taken."""
     results = Derived.of(store, SYNC, item.name)
@@ -119,6 +127,7 @@ def _read(item: Collected, recording: Recording, number: int, results: Derived) 
         {device: reason for device, reason in refused.items() if device in known},
         int(lost) if isinstance(lost, int) else None,
         results,
+        tuple(name for name, about in recording.record.streams.items() if about.timing is not None),
     )
 
 
@@ -175,7 +184,7 @@ class CampaignClocks(TypedDict):
 def campaign_clocks(trials: Sequence[TrialClocks], refitted: int = 0) -> CampaignClocks:
     """Summarise a campaign's clocks by device."""
     devices = {}
-    for name in DEVICES:
+    for name in device_names(trials):
         there = [trial.devices[name] for trial in trials if name in trial.devices]
         if there:
             devices[name] = _numbers(there)

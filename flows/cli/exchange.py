@@ -75,6 +75,9 @@ def export(
     ],
     form: Annotated[str, typer.Option("--format", help="File format: aedat4 or dsec.")] = "aedat4",
     labels: Annotated[bool, typer.Option("--labels", help="Export the labels as a table.")] = False,
+    stream: Annotated[
+        str, typer.Option("--stream", help="Name of a further event camera's stream to export.")
+    ] = "events",
     as_json: JsonOption = False,
 ) -> None:
     """Export trials in formats of other programs, or their labels as a table."""
@@ -102,13 +105,20 @@ def export(
         return
     if form not in SUFFIXES:
         raise InputError("--format", "", form, f"must be one of {', '.join(SUFFIXES)}")
+    recordings = [campaign.recording(name) for name in names]
+    for recording in recordings:
+        if stream not in recording.streams("events") and stream != "events":
+            there = ", ".join(recording.streams("events")) or "none"
+            text = f"trial {recording.trial_id} has the streams of events: {there}"
+            raise InputError("--stream", "", stream, text)
     with console.bar("export (trials)", len(names)) as bar:
         result = export_trials(
-            [campaign.recording(name) for name in names],
+            recordings,
             output,
             form,
             campaign.name,
             lambda trial: bar.advance(1, trial),
+            stream,
         )
     if not as_json:
         result = {key: value for key, value in result.items() if key != "files"}

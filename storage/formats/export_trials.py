@@ -15,7 +15,7 @@ from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, 
 from sliplab.storage.formats.dsec import write_dsec
 from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST, RISING, Triggers
 from sliplab.storage.schema.label import LABELS
-from sliplab.storage.streams import I64, EventChunk, Json
+from sliplab.storage.streams import EVENTS_KIND, I64, EventChunk, Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -31,8 +31,13 @@ def export_trials(
     kind: str,
     campaign: str,
     on_trial: Callable[[str], None] = lambda name: None,
+    stream: str = EVENTS_KIND,
 ) -> Json:
     """Export trials to `folder`, each file complete or not at all, and a manifest last.
+
+    Args:
+        stream: name of a further event camera's stream, whose events, pulses and clock are
+            exported in place of the first one's.
 
     Returns:
         ``trials``, ``events``, ``frames`` and ``triggers`` written, and ``files``.
@@ -48,7 +53,7 @@ def export_trials(
         path = folder / f"{recording.trial_id}{SUFFIXES[kind]}"
         temporary = path.with_name(f".{path.name[:200]}.{os.getpid()}.tmp")
         try:
-            counts = _WRITERS[kind](recording, temporary)
+            counts = _WRITERS[kind](recording, temporary, stream)
             sync_file(temporary)
             os.replace(temporary, path)
         except ValueError as error:
@@ -58,7 +63,9 @@ def export_trials(
         listed.append(_listed(recording, path.name, counts))
     sync_folder(folder)
     simulated = any(recording.simulated for recording in recordings)
-    about = {"campaign": campaign, "format": kind, "simulated": simulated, "trials": listed}
+    about: Json = {"campaign": campaign, "format": kind, "simulated": simulated, "trials": listed}
+    if stream != EVENTS_KIND:
+        about["stream"] = stream
     write_json(folder / EXPORT_MANIFEST, {"sliplab_export": EXPORT_FORMAT, **about})
     totals = {name: sum(item[name] for item in listed) for name in ("events", "frames", "triggers")}
     return {"trials": len(listed), **totals, "files": [item["file"] for item in listed]}
@@ -83,13 +90,13 @@ def _source(recording: Recording) -> str:
     return f"sliplab {SIMULATED}" if recording.simulated else "sliplab"
 
 
-def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
+def _aedat4(recording: Recording, path: Path, stream: str) -> dict[str, int]:
     """Write everything on the event camera's clock, us; frames at the middle of their exposure."""
-    triggers = _triggers(recording)
-    streams = {0: Stream(EVENTS, "events", _size(recording), _source(recording))}
+    triggers = _triggers(recording, stream)
+    streams = {0: Stream(EVENTS, "events", _size(recording, stream), _source(recording))}
     frame_us = np.empty(0, np.int64)
     if recording.has_video:
-        frame_us = recording.clock("events").to_device(recording.frame_times()) // 1000
+        frame_us = recording.clock(stream).to_device(recording.frame_times()) // 1000
         first = recording.frame(0) if len(frame_us) else np.empty((1, 1))
         height, width = first.shape
         streams[1] = Stream(FRAMES, "frames", (width, height), _source(recording))
@@ -98,7 +105,7 @@ def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
         raise ValueError("has frames before the event camera's clock started")
     with Aedat4Writer(path, streams) as file:
         count = 0
-        for chunk in _pieces(recording):
+        for chunk in _pieces(recording, stream):
             file.events(0, chunk)
             count += len(chunk)
         file.triggers(2, triggers)
@@ -108,32 +115,32 @@ def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
     return {"events": count, "frames": len(frame_us), "triggers": len(triggers.t_us)}
 
 
-def _dsec(recording: Recording, path: Path) -> dict[str, int]:
+def _dsec(recording: Recording, path: Path, stream: str) -> dict[str, int]:
     """Write events and triggers; DSEC's event file holds no frames."""
-    triggers = _triggers(recording)
-    with recording.open() as reader:
+    triggers = _triggers(recording, stream)
+    with recording.open(stream) as reader:
         events = reader.events()
     write_dsec(path, events, triggers, simulated=recording.simulated)
     return {"events": len(events), "frames": 0, "triggers": len(triggers.t_us)}
 
 
-_WRITERS: dict[str, Callable[[Recording, Path], dict[str, int]]] = {
+_WRITERS: dict[str, Callable[[Recording, Path, str], dict[str, int]]] = {
     "aedat4": _aedat4,
     "dsec": _dsec,
 }
 
 
-def _pieces(recording: Recording) -> Iterator[EventChunk]:
+def _pieces(recording: Recording, stream: str) -> Iterator[EventChunk]:
     """Yield all events, about `_PIECE` at a time."""
-    with recording.open() as reader:
+    with recording.open(stream) as reader:
         cuts = np.unique(reader.event_times()[::_PIECE]).tolist()
         for start, end in zip(cuts, [*cuts[1:], None], strict=True):
             yield reader.events(start, end)
 
 
-def _triggers(recording: Recording) -> Triggers:
+def _triggers(recording: Recording, stream: str) -> Triggers:
     """Return triggers as they were imported, or else the sync pulses as rising edges."""
-    with recording.open() as reader:
+    with recording.open(stream) as reader:
         if reader.has("triggers/t"):
             t_ns: I64 = reader.column("triggers/t")
             kinds = reader.column("triggers/kind").astype(np.uint8)
@@ -143,11 +150,13 @@ def _triggers(recording: Recording) -> Triggers:
     return Triggers(t_ns // 1000, kinds)
 
 
-def _size(recording: Recording) -> tuple[int, int]:
-    """Return columns and rows of the event camera, or the least that its events need."""
-    if (known := recording.record.geometry.event_px) is not None:
+def _size(recording: Recording, stream: str) -> tuple[int, int]:
+    """Return columns and rows of an event camera, or the least that its events need."""
+    about = recording.record.streams.get(stream)
+    known = recording.record.geometry.event_px if about is None else about.size_px
+    if known is not None:
         return known
-    with recording.open() as reader:
+    with recording.open(stream) as reader:
         events = reader.events()
     return (
         int(events.x.max(initial=0)) + 1,

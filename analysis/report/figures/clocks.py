@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from sliplab.analysis.report.figures.style import (
     GREEN,
     GREY,
     ORANGE,
+    PURPLE,
     STYLE,
     WIDTH,
     svg_text,
@@ -29,6 +31,14 @@ COLOURS = {"events": BLUE, "frames": ORANGE, "arm": GREEN}
 
 
 MARKS = {"events": "o", "frames": "s", "arm": "^"}
+
+FURTHER = (PURPLE, "#56B4E9", "#882255", GREY, "#8C564B")
+"""Colours of further devices, which are told apart by their labels as well."""
+
+
+def colour_of(device: str) -> str:
+    """Return a device's colour: its own, or one that depends on its name alone."""
+    return COLOURS.get(device) or FURTHER[zlib.crc32(device.encode()) % len(FURTHER)]
 
 
 BINS = 40
@@ -131,7 +141,7 @@ def residuals(devices: Sequence[Residuals], *, simulated: bool) -> str:
             len(devices), 1, figsize=(7.6, 2.1 * len(devices) + 0.6), sharex=True, squeeze=False
         )
         for axes, device in zip(panels[:, 0], devices, strict=True):
-            colour = COLOURS[device.device]
+            colour = colour_of(device.device)
             middle, low, median, high = pooled(device.time_s, device.residual_us)
             axes.fill_between(
                 middle, low, high, color=colour, alpha=0.25, lw=0, label="95 % of all trials"
@@ -203,15 +213,15 @@ def _panel(axes: Any, panel: OverTrials) -> None:
         panel.series.items(), offsets, strict=True
     ):
         axes.plot(
-            np.asarray(numbers) + offset, values, MARKS[device], ms=4, mew=0, alpha=0.75,
-            color=COLOURS[device], label=name, rasterized=len(numbers) > DENSE,
+            np.asarray(numbers) + offset, values, MARKS.get(device, "D"), ms=4, mew=0, alpha=0.75,
+            color=colour_of(device), label=name, rasterized=len(numbers) > DENSE,
         )  # fmt: skip
     for gate in panel.gates:
         # gates of the same height alternate, so that both colours are seen
         begin = 4 * list(panel.series).index(gate.device)
         axes.plot(
             [gate.first - 0.5, gate.last + 0.5], [gate.value] * 2, ls=(begin, (4, 4)), lw=1.4,
-            color=COLOURS[gate.device], label=f"gate of {gate.device}",
+            color=colour_of(gate.device), label=f"gate of {gate.device}",
         )  # fmt: skip
     axes.set_ylabel(panel.label)
     if panel.logarithmic:

@@ -146,7 +146,8 @@ def test_every_fault_once_in_a_campaign_and_the_table_in_the_docs(tmp_path: Path
         now = checksums(campaign)
         assert kept.items() <= now.items()  # what was committed stays as it was
         kept = now
-    assert {fault["kind"] for fault in FAULTS} | {"plate_stuck"} == set(KINDS)
+    # this rig has no further devices; tests/flows/collecting/test_further_streams.py loses some
+    assert {fault["kind"] for fault in FAULTS} | {"plate_stuck", "stream_gone"} == set(KINDS)
     sound, campaign = session(tmp_path, data, frame_camera={"level": "tracks"})
     sound.take(pending_trials(sound.plan, campaign))
     assert len(sound.plan) == len(campaign.committed()) == PLANNED

@@ -8,6 +8,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -23,11 +24,16 @@ from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.mock.further_settings import Thermometer
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.thermometer import MockThermometer
+from sliplab.rigs.mock.world import World
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
+from tests.command_line import answer, here
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import checksums, short, take_all
 from tests.flows.collecting.test_session import session as plain_session
@@ -401,3 +407,70 @@ def test_the_shipped_rig_passes_its_check(tmp_path: Path) -> None:
     assert all(item.passed for item in found)
     names = {item.name for item in found}
     assert {f"clock: {name}" for name in file.streams} <= names
+
+
+def test_sync_shows_the_clock_of_each(taken: Recording) -> None:
+    store = taken.folder.parents[3]
+    devices = answer("sync", store)["campaigns"]["tiny"]["devices"]
+    assert list(devices) == ["events", "frames", "arm", *sorted(ALL)]
+    assert devices["side"]["pulses"]["missed"] == 0
+    assert devices["side"]["grade"] == "trigger input"
+    assert devices["warm"]["pulses"] is None
+    page = (store / "report" / "sync.html").read_text()
+    assert "side, trigger input" in page
+    assert "heard, host arrival" in page
+
+
+def test_the_events_of_a_further_camera_are_exported_by_its_name(
+    taken: Recording, tmp_path: Path
+) -> None:
+    store = taken.folder.parents[3]
+    for form in ("aedat4", "dsec"):
+        folder = tmp_path / form
+        found = answer(
+            "export", store, taken.trial_id, "--output", folder, "--format", form,
+            "--stream", "side",
+        )  # fmt: skip
+        assert found["events"] == taken.record.streams["side"].rows
+        assert found["triggers"] == taken.record.streams["side"].pulses
+        (path,) = folder.glob(f"*.{'h5' if form == 'dsec' else form}")
+        assert path.stat().st_size > 1000
+    with h5py.File(next((tmp_path / "dsec").glob("*.h5"))) as file:
+        assert int(file["events/x"][:].max()) < 320
+    said = here("export", store, taken.trial_id, "--output", tmp_path / "x", "--stream", "back")
+    assert said.returncode == 2
+    assert "has the streams of events: events, side, twin" in said.stderr
+
+
+def test_readings_do_not_depend_on_how_often_they_are_read() -> None:
+    def run(step_s: float) -> tuple[Any, Any]:
+        file, _ = load_rig_file(ROOT / "rigs" / "mock_two_cameras.yaml")
+        rig = build_rig(file)
+        rig.connect()
+        assert rig.simulation is not None
+        rig.simulation.begin_trial(3)
+        side, _, warm = (further.device for further in rig.further)
+        for device in (side, warm):
+            device.start()
+        rig.sync.start(100.0, 5, "lfsr")
+        chunks = []
+        while rig.clock.now_ns() < 2_000_000_000:
+            rig.clock.wait(step_s)
+            chunks.append((side.read(), warm.read()))
+        events = np.concatenate([chunk.t_us for chunk, _ in chunks])
+        readings = np.concatenate([chunk.value for _, chunk in chunks])
+        return events, readings
+
+    for one, other in zip(run(0.05), run(0.4), strict=True):
+        assert len(one) > 20
+        assert np.array_equal(one[: len(other)], other[: len(one)])
+
+
+def test_a_cooling_body_follows_newtons_law() -> None:
+    world = World(MockSettings(seed=3))
+    world.begin_trial(4)
+    made = MockThermometer(world, Thermometer(ambient=20, above=5, time_constant_s=10), "w", "degC")
+    times = np.array([0, 10_000_000_000, 20_000_000_000], np.int64)
+    above = made.true_at(times) - 20
+    assert 0 < above[0] <= 5
+    assert above[1:] == pytest.approx(above[0] * np.exp([-1.0, -2.0]))
