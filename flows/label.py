@@ -49,11 +49,8 @@ def _required_labels(campaigns: list[Collected]) -> list[TrialWork]:
 def label(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> StepResult:
     """Label every trial of `campaigns` that needs it.
 
-    Raises:
-        StoreError: a campaign was recorded without frames.
+    Trials without frames are labelled by their events.
     """
-    for item in campaigns:
-        item.need("frames", "a label is the displacement of the markers in them")
     required = _required_labels(campaigns)
     stale = stale_trials(store, LABELS, required)
     run_trials(store, LABELS, "label", stale, labelling.label_results, cluster)

@@ -1,7 +1,8 @@
 """Ground truth of one recorded trial: its markers' places, and its onsets by both rules.
 
-The positions come from the trial's video, tracked once, or from a camera that provides tracks. The
-paper's rule and the change points are both kept; the protocol says which of them rules.
+The positions come from the trial's video, tracked once, or from a camera that provides tracks; of
+a trial without frames, from the events of its markers. The paper's rule and the change points are
+both kept; the protocol says which of them rules.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.labels.camera_shift import CameraShift
+from sliplab.analysis.labels.camera_shift import CameraShift, no_shift
 from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
+from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
 from sliplab.analysis.labels.force_onsets import ForceOnsets, onsets_by_force
 from sliplab.analysis.labels.onsets import (
     NO_ONSET,
@@ -29,6 +31,7 @@ from sliplab.protocols.settings import Labelling
 from sliplab.storage.schema.label import (
     ChangePoints,
     OnsetDoubts,
+    OnsetIntervals,
     Rule,
     RuleOnsets,
     TrialLabel,
@@ -40,6 +43,8 @@ VERSION = 5
 
 LOST_SHARE = 0.05
 """A marker that is lost in more of the frames than this is named in the flags."""
+EVENTS = "events"
+"""The source of labels of trials without frames."""
 HOLD_SLIP_PX = 1.0
 """One that moved further than this in the hold is counted there."""
 
@@ -73,6 +78,7 @@ class Label:
             last part; NaN where unknown.
         start_ns, stop_ns: of the slide or retraction.
         force: by the force along the plate; None where the trial has none.
+        intervals: central 95 % of the paper's onsets, of labels from events.
         rest_ns: where the plate came to rest after that began; None where none moved, or it was
             not seen to rest.
     """
@@ -91,6 +97,7 @@ class Label:
     rest_ns: int | None
     source: str
     force: ForceOnsets | None = None
+    intervals: OnsetIntervals | None = None
 
     @property
     def paper(self) -> Onsets:
@@ -199,9 +206,12 @@ class Label:
             quality=np.round(self.quality(), 3).tolist(),
             source=self.source,
         )
-        if self.force is None:
-            return label
-        return label.model_copy(update={"force": self.force.document()})
+        only_some: dict[str, Any] = {}
+        if self.force is not None:
+            only_some["force"] = self.force.document()
+        if self.intervals is not None:
+            only_some["intervals"] = self.intervals
+        return label.model_copy(update=only_some) if only_some else label
 
     def as_arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return the arrays that are kept; displacements to a thousandth of a pixel."""
@@ -230,11 +240,13 @@ def label_results(
 
 
 def label_recording(recording: Recording, settings: Labelling) -> Label:
-    """Find a trial's onsets in its video, or in its tracks where there is no video.
+    """Find a trial's onsets in its video, in its tracks where there is no video, or in its events.
 
     Raises:
-        ValueError: the trial has neither video nor tracks, or its markers cannot be distinguished.
+        ValueError: the trial has none of them, or its markers cannot be distinguished.
     """
+    if recording.frame_source == "none" and recording.record.counts.events:
+        return _label_events(recording, settings)
     frame_ns = recording.frame_times()
     motion_ns = recording.motion_ns
     timing = recording.record.timing
@@ -249,6 +261,41 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
         source=recording.frame_source,
         force=onsets_by_force(recording),
     )
+
+
+def _label_events(recording: Recording, settings: Labelling) -> Label:
+    """Label a trial by its events; see `event_labels`."""
+    found = onsets_by_events(recording, settings)
+    start_ns, stop_ns = recording.motion_ns
+    counted = Counted(found.paper, found.paper_doubts, found.displacement_px)
+    return Label(
+        settings.rule,
+        settings.reference,
+        # nothing is seen of markers that rest: what moves in the hold is in doubt from either end
+        {"hold_start": counted, "hold_end": counted},
+        found.slips,
+        found.slip_doubts,
+        found.t_ns,
+        found.hold_slip_px,
+        _inner_places(found),
+        no_shift(len(found.t_ns)),
+        start_ns,
+        stop_ns,
+        None,
+        EVENTS,
+        onsets_by_force(recording),
+        OnsetIntervals(incipient_ns=found.intervals[0], gross_ns=found.intervals[1]),
+    )
+
+
+def _inner_places(found: EventOnsets) -> Places:
+    """Places in the picture of the event camera."""
+    if found.tracks is None:
+        unknown = np.full_like(found.displacement_px, np.nan)
+        return Places(np.stack([unknown, unknown], axis=2), unknown, np.zeros_like(unknown))
+    known = np.isfinite(found.displacement_px)
+    xy = np.where(known[..., None], found.tracks.xy, np.nan)
+    return Places(xy, found.sigma_px, known.astype(np.float64))
 
 
 def label_places(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.labels import labelling
+from sliplab.analysis.labels import event_labels, labelling
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.schema.label import LABELS, OnsetDoubts, TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
@@ -30,6 +30,9 @@ _AFTER: dict[str, State] = {
 def label_key(recording: Recording, settings: Labelling) -> str:
     """Return the key of a trial's automatic label."""
     parameters = settings.model_dump(mode="json")
+    if recording.frame_source == "none":
+        made_of = [recording.checksum, event_labels.VERSION]
+        return make_key(LABELS, labelling.VERSION, made_of, parameters)
     return make_key(LABELS, labelling.VERSION, recording.checksum, parameters)
 
 

@@ -32,6 +32,7 @@ class SlipTimes:
     low_ns: Ints
     high_ns: Ints
     centre: int
+    widest_ns: int = WIDEST_NS
 
     @property
     def onsets(self) -> Onsets:
@@ -47,13 +48,13 @@ class SlipTimes:
 
     def doubts(self) -> Doubts:
         """Return the onsets that these intervals leave ambiguous."""
-        onsets, wide = self.onsets, self.high_ns - self.low_ns > WIDEST_NS
+        onsets, wide = self.onsets, self.high_ns - self.low_ns > self.widest_ns
         gross = incipient = None
         if onsets.gross_ns is not None and wide[self.centre]:
             gross = "the centre marker's slip is only known to " + self._width(self.centre)
         if onsets.incipient_ns is not None:
             for marker in np.flatnonzero(wide).tolist():
-                if self.low_ns[marker] < onsets.incipient_ns + WIDEST_NS // 2:
+                if self.low_ns[marker] < onsets.incipient_ns + self.widest_ns // 2:
                     incipient = f"marker {marker}'s slip is only known to {self._width(marker)}"
         return Doubts(incipient, gross)
 

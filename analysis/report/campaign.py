@@ -75,7 +75,11 @@ def collected_section(
         "campaign", "experiment", "planned", "committed", "planned (min)", "taken (min)",
         "planned (MB)", "taken (MB)",
     )  # fmt: skip
-    return CollectedSection(summary.quality, source_words(summary), grids, Table(columns, rows))
+    frames = summary.labels is not None and any(
+        count for name, count in summary.labels.source.items() if name != "events"
+    )
+    kept = source_words(summary) if frames else "nothing, for this rig has no frame camera"
+    return CollectedSection(summary.quality, kept, grids, Table(columns, rows))
 
 
 def tracks_words(simulated: bool) -> str:
@@ -88,8 +92,12 @@ def tracks_words(simulated: bool) -> str:
 def source_words(summary: Summary | OneCameraSummary) -> str:
     """Return what the labels were read from."""
     if summary.labels is None:
-        return "nothing, for this rig has no frame camera"
-    words = {"video": "the video", "tracks": tracks_words(summary.simulated)}
+        return "nothing yet"
+    words = {
+        "video": "the video",
+        "tracks": tracks_words(summary.simulated),
+        "events": "the events of the markers and the arm's motion",
+    }
     return " or ".join(words[name] for name, count in summary.labels.source.items() if count)
 
 
@@ -255,7 +263,7 @@ def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
             ReferenceTrial(
                 trial=trial.id,
                 place=trial.index + 1,
-                hold_events_per_s=hold_rate(recording),
+                hold_events_per_s=hold_rate(recording) if recording.record.counts.events else None,
                 first_slip_ms=None if onset is None else (onset - begin) / 1e6,
             )
         )
@@ -268,7 +276,7 @@ def wear(rows: Sequence[ReferenceTrial]) -> dict[str, Trend]:
     The slope of Theil and Sen: one odd trial does not move it. None with fewer than three trials.
     """
     found = {}
-    for name in WEAR:
+    for name in _measured(rows):
         there = [(row.place, v) for row in rows if (v := getattr(row, name)) is not None]
         middle = float(np.median([value for _, value in there])) if there else 0.0
         slope: list[float | None] = [None, None, None]
@@ -281,9 +289,16 @@ def wear(rows: Sequence[ReferenceTrial]) -> dict[str, Trend]:
     return found
 
 
+def _measured(rows: Sequence[ReferenceTrial]) -> list[str]:
+    """Return the figures that a rig measures: without events there is no rate of theirs."""
+    events = any(row.hold_events_per_s is not None for row in rows)
+    return [name for name in WEAR if events or name != "hold_events_per_s"]
+
+
 def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> Figure:
     places = [row.place for row in rows]
-    panels = {label: [getattr(row, key) for row in rows] for key, (_, label) in WEAR.items()}
+    measured = _measured(rows)
+    panels = {WEAR[key][1]: [getattr(row, key) for row in rows] for key in measured}
     data: dict[str, Sequence[object]] = {
         "trial": [row.trial for row in rows],
         "place in the plan": places,

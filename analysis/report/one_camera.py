@@ -13,7 +13,7 @@ from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.labels import label_errors
 from sliplab.analysis.labels.reviewed import Labels as KeptLabels
 from sliplab.analysis.report import clocks
-from sliplab.analysis.report.campaign import collected_section, quality_section
+from sliplab.analysis.report.campaign import collected_section, quality_section, references_of
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.marker_network import (
@@ -49,16 +49,12 @@ from sliplab.storage.trials.store import Store, StoreError
 F64 = npt.NDArray[np.float64]
 BEFORE_S, BIN_S = 1.0, 0.1
 """Drawn time before the motion, and the interval over which a rate is taken."""
-CAN_BE_DONE = {
-    "events": {"sync", "label", "train", "evaluate", "report"},
-    "frames": {"sync", "report"},
-}
-"""Steps after collection that need nothing of the missing stream."""
+CAN_BE_DONE = {"events": {"sync", "label", "train", "evaluate", "report"}}
+"""Steps after collection that need nothing of the missing stream; without frames, all do."""
 NO_EVENTS = "works with the spiking network on events, and there are none"
 NO_SLIDES = "the classifier is trained on slides, and without events nothing else is evaluated"
+NO_LABELS = "not done yet; run `sliplab label`"
 NO_CLASSIFIER = "not done yet; run `sliplab train`, then `sliplab evaluate`"
-NO_FRAMES = "needs labels, which are read from frames"
-NO_LABEL = "a label is the displacement of the markers in frames, and there are none"
 
 
 def reason_against(step: str, missing: str | None, *, slides: bool = True) -> str | None:
@@ -70,11 +66,15 @@ def reason_against(step: str, missing: str | None, *, slides: bool = True) -> st
     """
     if missing == "events" and step in {"train", "evaluate"} and not slides:
         return NO_SLIDES
-    if missing is None or step in CAN_BE_DONE[missing]:
+    if missing != "events" or step in CAN_BE_DONE[missing]:
         return None
-    if missing == "events":
-        return NO_EVENTS
-    return NO_LABEL if step == "label" else NO_FRAMES
+    return NO_EVENTS
+
+
+def has_labels(store: Store, campaigns: Sequence[Collected]) -> bool:
+    """Check that every trial has its label."""
+    labels = KeptLabels(store)
+    return all(labels.fresh(item, trial) for item in campaigns for _, trial in item.trials)
 
 
 def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
@@ -84,14 +84,15 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
         StoreError: there are frames, and a trial has no label yet.
     """
     labels, inputs = KeptLabels(store), []
-    labelled = missing_stream(campaigns) == "events"
+    frames = missing_stream(campaigns) == "events"
+    labelled = frames or has_labels(store, campaigns)
     for item in campaigns:
         for trial, recording in item.trials:
-            if labelled and not labels.fresh(item, recording):
+            if frames and not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
             label = labels.key(item, recording) if labelled else None
             inputs.append([item.name, trial.id, recording.checksum, label])
-    judged = read_judged(store, campaigns) if labelled else None
+    judged = read_judged(store, campaigns) if frames else None
     if judged is not None:
         inputs.append([judged.evaluation.key])
     plans = [[item.plan.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
@@ -113,14 +114,15 @@ def one_camera_summary(
     missing = missing_stream(campaigns)
     frames = missing == "events"
     labels, rates = None, None
-    if frames:
+    labelled = frames or has_labels(store, campaigns)
+    if labelled:
         labels = Labels(
             error_ms=label_errors.label_errors(store, campaigns),
             rules_ms=label_errors.rules_compared(store, campaigns),
             source=label_sources(campaigns),
             holds=label_errors.holds_compared(store, campaigns),
         )
-    else:
+    if not frames:
         rates = {item.name: _rate(item) for item in campaigns}
     summary = OneCameraSummary(
         simulated=store.simulated,
@@ -128,10 +130,12 @@ def one_camera_summary(
         left_out=tuple(
             StepLeftOut(name=name, reason=reason)
             for name in ("label", "train", "evaluate")
-            if (reason := reason_against(name, missing) or _not_done(name, judged)) is not None
+            if (reason := reason_against(name, missing) or _not_done(name, judged, labelled))
+            is not None
         ),
         labels=labels,
         event_rates=rates,
+        references=references_of(store, campaigns),
         clocks_us=_clocks(campaigns),
         sync=sync_part(campaigns),
         quality=quality_part(campaigns),
@@ -142,8 +146,10 @@ def one_camera_summary(
     return summary if judged is None else with_classifier(summary, store, campaigns, judged)
 
 
-def _not_done(step: str, judged: Judged | None) -> str | None:
+def _not_done(step: str, judged: Judged | None, labelled: bool) -> str | None:
     """Return the reason for a step that can be done and was not; None where it was."""
+    if step == "label":
+        return None if labelled else NO_LABELS
     return NO_CLASSIFIER if judged is None and step in {"train", "evaluate"} else None
 
 
@@ -245,7 +251,7 @@ def one_camera_sections(
     sections: list[Content | None] = [
         LeftOutSection(summary.one_camera, Table(("step", "why it is left out"), rows)),
         collected_section(campaigns, summary),
-        quality_section(campaigns, {}, simulated=simulated),
+        quality_section(campaigns, summary.references, simulated=simulated),
     ]
     if judged is not None:
         sections += marker_sections(store, campaigns, summary, judged)

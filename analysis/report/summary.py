@@ -201,9 +201,10 @@ def _in_words(value: Any) -> str:
 
 
 def label_sources(campaigns: Sequence[Collected]) -> dict[str, int]:
-    """Count trials with a video, and with tracks in its place."""
+    """Count trials with a video, with tracks in its place, and, if there are, with neither."""
     found = Counter(recording.frame_source for item in campaigns for _, recording in item.trials)
-    return {name: found[name] for name in ("video", "tracks")}
+    sources = {name: found[name] for name in ("video", "tracks")}
+    return sources | ({"events": found["none"]} if found["none"] else {})
 
 
 def sync_part(campaigns: Sequence[Collected]) -> Sync:

@@ -58,6 +58,13 @@ class ChangePoints(RuleOnsets):
     high_ns: tuple[Int, ...] = ()
 
 
+class OnsetIntervals(Part):
+    """Central 95 % of the onsets by the paper's rule; null where there is none."""
+
+    incipient_ns: tuple[Int, Int] | None
+    gross_ns: tuple[Int, Int] | None
+
+
 class TrialLabel(RuleOnsets, Document):
     """The label of one trial.
 
@@ -93,7 +100,9 @@ class TrialLabel(RuleOnsets, Document):
     quality: tuple[Number, ...] = ()
     """Each marker's lowest quality from the motion's start to its slip, 0 to 1."""
     source: str | None = None
-    """`video`, or `tracks` that the camera provided."""
+    """`video`, `tracks` that the camera provided, or `events` of a trial without frames."""
+    intervals: OnsetIntervals | None = None
+    """Of the paper's rule; written only for labels from events."""
 
     def by_rule(self, rule: Rule) -> RuleOnsets:
         """Return the onsets of one rule.

@@ -199,7 +199,8 @@ class ReferenceTrial(Part):
 
     trial: str
     place: Int
-    hold_events_per_s: Number
+    hold_events_per_s: Known
+    """Null without events."""
     first_slip_ms: Known
     """After the motion began."""
 
@@ -323,9 +324,11 @@ class OneCameraSummary(Document):
     left_out: tuple[StepLeftOut, ...]
     """Analyses that need the other stream."""
     labels: Labels | None = None
-    """Null without frames."""
+    """Null where trials have no labels yet."""
     event_rates: dict[str, MotionRate] | None = None
     """By campaign; null without events."""
+    references: dict[str, References] = Field(default_factory=dict)
+    """Of campaigns with reference trials."""
     classifier: MarkerClassifier | None = None
     """Trained on marker displacements; this key and the next six are written only where frames
     alone were recorded and the store is evaluated, with the meaning that they have in `Summary`."""

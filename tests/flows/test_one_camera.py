@@ -50,7 +50,7 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
     states = {row.name: (row.state, row.note) for row in outcome.rows}
     missing = {"events": "frames", "frames": "events"}[camera]
     for name, (state, note) in states.items():
-        possible = name.startswith("collect") or name in CAN_BE_DONE[missing]
+        possible = camera == "events" or name.startswith("collect") or name in CAN_BE_DONE[missing]
         assert (state == LEFT_OUT) != possible, name
         if not possible:
             assert missing in note
@@ -60,19 +60,25 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
     assert summary is not None
     assert (summary.simulated, summary.one_camera) == (True, camera)
     assert summary.quality.committed == 5
-    assert (summary.labels is None) == (camera == "events")
+    assert summary.labels is not None
     assert (summary.event_rates is None) == (camera == "frames")
     left_out = [each.name for each in summary.left_out]
     page = (store.folder / "report" / "index.html").read_text()
     assert "Every number and figure in this report is simulated." in page
     assert "What this report leaves out" in page
+    assert "Accuracy of the labels" in page
     if camera == "events":
-        assert left_out == ["label", "train", "evaluate"]
+        assert left_out == []
+        assert summary.labels.source == {"video": 0, "tracks": 0, "events": 5}
+        errors = summary.labels.error_ms
+        assert (errors.incipient.n, errors.gross.n) == (3, 3)
+        assert max(errors.incipient.max_abs or 0.0, errors.gross.max_abs or 0.0) < 100
+        assert "the plate moves by itself" in page
         for rate in (summary.event_rates or {}).values():
             assert rate.hold is not None
             assert rate.motion is not None
             assert rate.motion > rate.hold > 0
-        assert "Onsets of slip are read from the markers" in page
+        assert "Onsets of slip are read from the events of the" in page
         assert (store.folder / "report" / "figures" / "event-rates.svg").exists()
     else:
         assert left_out == []
@@ -86,7 +92,6 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
         assert "The classifier on marker displacements" in page
         assert "no clock lies between them" in page
         assert (store.folder / "report" / "figures" / "confusion.svg").exists()
-        assert summary.labels is not None
         assert summary.labels.error_ms.incipient.n == 5
         assert summary.labels.error_ms.incipient.max_abs is not None
         assert summary.labels.error_ms.incipient.max_abs < 25

@@ -11,7 +11,6 @@ import yaml
 
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.collect import collect
-from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
@@ -111,17 +110,14 @@ def test_cameras_are_events_or_frames_or_both(cameras: list[str], tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("camera", "step", "says"),
+    ("camera", "says"),
     [
-        ("events", "label", "recorded without frames; a label is the displacement"),
-        ("events", "train", "has no label yet"),
-        ("frames", "train", "recorded without events; the network is trained on windows of them"),
+        ("events", "has no label yet"),
+        ("frames", "recorded without events; the network is trained on windows of them"),
     ],
 )
-def test_a_step_says_which_stream_it_lacks(
-    camera: str, step: str, says: str, tmp_path: Path
-) -> None:
+def test_training_says_what_it_lacks(camera: str, says: str, tmp_path: Path) -> None:
     take(camera, tmp_path)
     store = Store.open(tmp_path / "store")
     with pytest.raises(StoreError, match=says):
-        {"label": label, "train": train}[step](store, collected(store))
+        train(store, collected(store))

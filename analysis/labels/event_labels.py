@@ -1,0 +1,277 @@
+"""Labels of trials without frames: onsets from the events of the markers and the arm's motion.
+
+Markers are tracked inside the sensor (`event_tracking`), and what they lack behind the sensor's own
+way is slip (`event_slips`). Displacements are in pixels of the frame camera's scale, so that a
+threshold means what it means in frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sliplab.analysis.labels.doubts import Doubts, slipped_in_hold, unseen
+from sliplab.analysis.labels.event_slips import Slips, slips
+from sliplab.analysis.labels.event_tracking import (
+    EventTracks,
+    find_discs,
+    track_discs,
+    without_hot_pixels,
+)
+from sliplab.analysis.labels.onsets import NO_ONSET, Onsets, last_off_axis, paper_onsets
+from sliplab.analysis.labels.slip_times import SlipTimes
+from sliplab.protocols.settings import Labelling
+from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.recording import Recording
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+VERSION = 1
+SLICE_NS = 5_000_000
+"""Displacements are given every 5 ms."""
+FIRST_MM = 0.3
+"""Way of the sensor in which discs are looked for: less than most need to slip."""
+WIDEST_NS = 300_000_000
+"""An onset whose 95 % interval is wider is in doubt."""
+NEAR_LOST_NS = 1_000_000_000
+"""So near to lost events a slip may be nothing but motion that was not seen."""
+TURNED_BACK_MM = 0.05
+POSE_NS = 20_000_000
+"""Poses are means over so long: an arm reports them with noise."""
+PHASES = ("slide", "twist")
+NO_PLATE = "the plate moves by itself, and the event camera does not see it"
+NO_DISCS = "the markers were not found in the events of the first motion"
+TURNED = "the sensor turned back on its way"
+
+
+class Interval(NamedTuple):
+    """The central 95 % of an onset, ns."""
+
+    low_ns: int
+    high_ns: int
+
+    @property
+    def width_ns(self) -> int:
+        """Its width."""
+        return self.high_ns - self.low_ns
+
+
+@dataclass(frozen=True)
+class EventOnsets:
+    """Onsets of one trial by its events.
+
+    Attributes:
+        t_ns: (n,) ends of the slices on the time line.
+        displacement_px: (n, m) from rest, NaN where unknown. sigma_px: likewise, its deviation.
+        hold_slip_px: (m,) displacement in the hold.
+        paper: by the paper's rule, with its doubts and the 95 % of either onset.
+        slips: beginning of each slip, with doubts.
+        tracks: of the markers in the inner picture; None where they were not found.
+    """
+
+    t_ns: I64
+    displacement_px: F64
+    sigma_px: F64
+    hold_slip_px: F64
+    paper: Onsets
+    paper_doubts: Doubts
+    intervals: tuple[Interval | None, Interval | None]
+    slips: SlipTimes
+    slip_doubts: Doubts
+    tracks: EventTracks | None
+
+
+def onsets_by_events(recording: Recording, settings: Labelling) -> EventOnsets:
+    """Find the onsets of a trial.
+
+    A trial that cannot be labelled so has onsets in doubt, and the reason.
+
+    Raises:
+        StoreError: it has no events, or the scale of the frame camera is unknown.
+    """
+    start_ns, stop_ns = recording.motion_ns
+    size_px = recording.event_px
+    events = without_hot_pixels(recording.events(), size_px)
+    clock = recording.clock("events")
+    begin_ns = int(clock.to_reference(int(events.t_us[0]) * 1000)) if len(events) else start_ns
+    # slices end where the motion begins and go on from there
+    before = max((start_ns - begin_ns) // SLICE_NS, 1)
+    edges_ns = start_ns + SLICE_NS * np.arange(-before, (stop_ns - start_ns) // SLICE_NS + 1)
+    centre = recording.record.geometry.centre
+    layout_px, scale = recording.layout_px, recording.record.geometry.px_per_mm or 1.0
+    layout_mm = layout_px / scale
+    if recording.motion_phase not in PHASES or recording.record.experiment != "kinematic":
+        return _refused(edges_ns[1:], len(layout_mm), centre, NO_PLATE)
+    base = bases(recording, layout_mm, edges_ns[1:], start_ns)
+    way = np.hypot(base[..., 0], base[..., 1])
+    if (np.maximum.accumulate(way) - way).max() > TURNED_BACK_MM:
+        return _refused(edges_ns[1:], len(layout_mm), centre, TURNED)
+    farthest = way.max(axis=1)
+    settle = slice(int(before), int(np.searchsorted(farthest, FIRST_MM)) + 1)
+    edges_us = np.asarray(clock.to_device(edges_ns)) // 1000
+    first = _between(events, int(edges_us[settle.start]), int(edges_us[settle.stop]))
+    discs = find_discs(first, layout_mm, size_px)
+    if discs is None:
+        return _refused(edges_ns[1:], len(layout_mm), centre, NO_DISCS)
+    tracks = track_discs(events, edges_us, discs, settle)
+    along = _directions(base, way)
+    moved = ((tracks.xy - tracks.rests.xy) * along).sum(axis=2)
+    moved[tracks.lost] = np.nan
+    found = slips(way, moved, tracks.sigma, int(before), tracks.backlash_px)
+    return _onsets(
+        found, tracks, edges_ns[1:], way, moved, settings, scale, centre, start_ns,
+        twists=recording.motion_phase == "twist",
+    )  # fmt: skip
+
+
+def bases(recording: Recording, layout_mm: F64, t_ns: I64, start_ns: int) -> F64:
+    """Motion of each papilla's stuck tip as the sensor sees it, mm, (n, m, 2).
+
+    Columns count to the right and rows downwards; 0 before the motion.
+
+    Args:
+        layout_mm: (m, 2), likewise. t_ns: (n,) on the time line. start_ns: of the motion.
+    """
+    with recording.open() as reader:
+        poses = reader.poses()
+    pose_ns = np.asarray(recording.clock("arm").to_reference(poses.t_ns))
+    turns = Rotation.from_rotvec(np.radians(poses.rotvec_deg))
+    first = max(int(np.searchsorted(pose_ns, start_ns)) - 1, 0)
+    rest = turns[first]
+    held = (pose_ns >= start_ns - 10 * POSE_NS) & (pose_ns <= start_ns)
+    origin = poses.xyz_mm[held].mean(axis=0) if held.any() else poses.xyz_mm[first]
+    # the tool's axes are the plate's: right, up, into the plate
+    shift = rest.inv().apply(poses.xyz_mm - origin)[:, :2] * [1.0, -1.0]
+    turned = (rest.inv() * turns).as_rotvec()[:, 2]
+    rows = np.column_stack([shift, turned])
+    period = float(np.median(np.diff(pose_ns))) if len(pose_ns) > 1 else POSE_NS
+    width = max(int(POSE_NS / max(period, 1.0)) // 2 * 2 + 1, 1)
+    if 1 < width < len(rows):
+        padded = np.pad(rows, ((width // 2, width // 2), (0, 0)), mode="edge")
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(padded, axis=0)])
+        rows = (total[width:] - total[:-width]) / width
+    x, y, angle = (np.interp(t_ns, pose_ns, column) for column in rows.T)
+    # seen from above with rows downwards, the plate turns the same way as the sensor's angle
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    u, v = layout_mm[None, :, 0] - x[:, None], layout_mm[None, :, 1] - y[:, None]
+    seen = np.stack([cosine * u - sine * v, sine * u + cosine * v], axis=2) - layout_mm[None]
+    seen[t_ns <= start_ns] = 0.0
+    return np.asarray(seen, np.float64)
+
+
+def _between(events: EventChunk, begin_us: int, end_us: int) -> EventChunk:
+    part = slice(*np.searchsorted(events.t_us, (begin_us, end_us)).tolist())
+    return EventChunk(events.x[part], events.y[part], events.p[part], events.t_us[part])
+
+
+def _directions(base: F64, way: F64) -> F64:
+    """(n, m, 2) directions of the bases' motion; before it is one, the first that is."""
+    along = base / np.maximum(way, 1e-9)[..., None]
+    for marker in range(way.shape[1]):
+        far = np.flatnonzero(way[:, marker] > TURNED_BACK_MM)
+        along[: far[0] if len(far) else None, marker] = along[far[0], marker] if len(far) else 0.0
+    return along
+
+
+def _onsets(
+    found: Slips, tracks: EventTracks, t_ns: I64, way: F64, moved: F64, settings: Labelling,
+    scale: float, centre: int, start_ns: int, *, twists: bool,
+) -> EventOnsets:  # fmt: skip
+    """Apply both rules to the slips."""
+    moved_px, sigma = np.abs(found.distance_mm) * scale, found.sigma_mm * scale
+    still = int(np.searchsorted(t_ns, start_ns))
+    hold = np.abs(moved[max(still, 1) - 1] - moved[0]) / found.gain * scale
+    if twists:
+        centre = last_off_axis(paper_onsets(t_ns, moved_px, centre, settings, start_ns), centre)
+    paper = paper_onsets(t_ns, moved_px, centre, settings, start_ns)
+    times = [
+        _times(t_ns, way[:, k], knees)
+        for k, knees in enumerate(zip(found.low_mm, found.knee_mm, found.high_mm, strict=True))
+    ]
+    low, at, high = np.array(times, np.int64).reshape(-1, 3).T
+    # like the paper's rule: what never gets far enough has not slipped
+    crept = paper.per_marker_ns == NO_ONSET
+    low, at, high = (np.where(crept, NO_ONSET, column) for column in (low, at, high))
+    slip_times = SlipTimes(at, low, high, centre, WIDEST_NS // 2)
+    held = slipped_in_hold(hold, settings.hold_slip_px)
+    lost_ns = t_ns[tracks.lost & (t_ns > start_ns)]
+    intervals = _intervals(t_ns, moved_px, sigma, paper, centre, settings.threshold_px, start_ns)
+
+    def doubts(onsets: Onsets) -> Doubts:
+        return (
+            held.or_else(unseen(t_ns, moved_px, onsets, centre, start_ns))
+            .or_else(_near_lost(onsets, lost_ns))
+        )  # fmt: skip
+
+    return EventOnsets(
+        t_ns, moved_px, sigma, hold, paper, doubts(paper).or_else(_wide(intervals)), intervals,
+        slip_times, doubts(slip_times.onsets).or_else(slip_times.doubts()), tracks,
+    )  # fmt: skip
+
+
+def _times(t_ns: I64, way: F64, places_mm: tuple[float, ...]) -> list[int]:
+    """Return the times at which a base passed some places, -1 for one that is unknown."""
+    forwards = np.maximum.accumulate(way)
+    return [
+        NO_ONSET if np.isnan(place) else round(float(np.interp(place, forwards, t_ns - t_ns[0])))
+        + int(t_ns[0])
+        for place in places_mm
+    ]  # fmt: skip
+
+
+def _intervals(
+    t_ns: I64, moved_px: F64, sigma_px: F64, paper: Onsets, centre: int, threshold_px: float,
+    start_ns: int,
+) -> tuple[Interval | None, Interval | None]:  # fmt: skip
+    """Return when the displacements, give or take two deviations, cross the threshold."""
+    moving = (t_ns > start_ns)[:, None]
+    end = len(t_ns) - 1
+    bounds = []
+    for limit in (moved_px + 2.0 * sigma_px, moved_px - 2.0 * sigma_px):
+        over = moving & (limit > threshold_px)
+        bounds.append(np.where(over.any(axis=0), over.argmax(axis=0), end))
+    may, must = bounds
+    # a marker that never crosses cannot be late
+    crosses = paper.per_marker_ns != NO_ONSET
+    incipient = gross = None
+    if paper.incipient_ns is not None:
+        incipient = Interval(int(t_ns[may[crosses].min()]), int(t_ns[must[crosses].min()]))
+    if paper.gross_ns is not None:
+        gross = Interval(int(t_ns[may[centre]]), int(t_ns[must[centre]]))
+    return incipient, gross
+
+
+def _wide(intervals: tuple[Interval | None, Interval | None]) -> Doubts:
+    reasons = [
+        f"the crossing is only known to {known.width_ns / 1e6:.0f} ms"
+        if known is not None and known.width_ns > WIDEST_NS
+        else None
+        for known in intervals
+    ]
+    return Doubts(*reasons)
+
+
+def _near_lost(onsets: Onsets, lost_ns: I64) -> Doubts:
+    """Doubts of onsets beside lost events."""
+
+    def of(onset: int | None) -> str | None:
+        near = onset is not None and bool((np.abs(lost_ns - onset) < NEAR_LOST_NS).any())
+        return "events were lost beside it" if near else None
+
+    return Doubts(of(onsets.incipient_ns), of(onsets.gross_ns))
+
+
+def _refused(t_ns: I64, markers: int, centre: int, reason: str) -> EventOnsets:
+    """Return a trial of which nothing is known, and why."""
+    none = np.full(markers, NO_ONSET, np.int64)
+    unknown = np.full((len(t_ns), markers), np.nan)
+    doubts = Doubts(reason, reason)
+    return EventOnsets(
+        t_ns, unknown, unknown, np.full(markers, np.nan), Onsets(None, None, None, none), doubts,
+        (None, None), SlipTimes(none, none, none, centre), doubts, None,
+    )  # fmt: skip
