@@ -248,7 +248,7 @@ def tracks(recordings: Sequence[Recording]) -> list[str]:
             [np.interp(found.t_ns, frames.frame_ns, row) for row in frames.displacement_px.T], 1
         )
         near = (found.t_ns > frames.start_ns)[:, None] & (seen < 4.0)
-        near &= np.isfinite(found.displacement_px)
+        near &= (seen > 0.5) & np.isfinite(found.displacement_px)
         off.append((found.displacement_px - seen)[near])
         z.append(np.abs(off[-1]) / found.sigma_px[near])
         for kind in KINDS:
@@ -266,7 +266,7 @@ def tracks(recordings: Sequence[Recording]) -> list[str]:
                 inside.append(low <= true <= high)
     errors, sigmas = np.abs(np.concatenate(off)), np.concatenate(z)
     return [
-        f"distance slid, up to 4 px (0.2 mm): median {np.median(errors):.2f} px, 95 % "
+        f"distance slid, from 0.5 to 4 px (0.2 mm): median {np.median(errors):.2f} px, 95 % "
         f"{np.quantile(errors, 0.95):.2f} px; within two deviations {(sigmas < 2).mean():.3f}",
         f"onsets less those from frames: median {np.median(apart):.0f} ms, "
         f"absolute {np.median(np.abs(apart)):.0f} / {np.quantile(np.abs(apart), 0.95):.0f} ms",

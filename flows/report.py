@@ -26,6 +26,7 @@ from sliplab.flows.steps import StepResult
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json, write_json, write_text
+from sliplab.storage.schema.document import DocumentError
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived
@@ -62,22 +63,38 @@ def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
         if (missing := missing_stream(campaigns)) is not None:
             judged = read_judged(store, campaigns) if missing == "events" else None
             shown = one_camera.one_camera_summary(store, campaigns, planned, judged)
-            parts = one_camera.one_camera_sections(store, campaigns, shown, judged)
-            write_figures(folder, parts, simulated=shown.simulated)
-            write_text(folder / "index.html", one_camera.render(campaigns, shown, parts))
-            numbers = shown.to_json()
+            if one_camera.is_evaluated(store, campaigns):
+                numbers = shown.to_json() | _evaluated(store, campaigns, planned, shown)
+            else:
+                parts = one_camera.one_camera_sections(store, campaigns, shown, judged)
+                write_figures(folder, parts, simulated=shown.simulated)
+                write_text(folder / "index.html", one_camera.render(campaigns, shown, parts))
+                numbers = shown.to_json()
         else:
-            numbers = _two_cameras(store, campaigns, planned)
+            numbers = _evaluated(store, campaigns, planned)
     write_json(folder / SUMMARY, {**numbers, "timing_s": step_seconds(store)})
     Derived.of(store, STEP).write(STEP, key, {})
 
 
-def _two_cameras(store: Store, campaigns: list[Collected], planned: Mapping[str, int]) -> Json:
-    """Write the page, and return the numbers, of campaigns with events and frames."""
+def _evaluated(
+    store: Store,
+    campaigns: list[Collected],
+    planned: Mapping[str, int],
+    without_frames: OneCameraSummary | None = None,
+) -> Json:
+    """Write the page, and return the numbers, of campaigns with a spiking network.
+
+    Args:
+        without_frames: what is said besides where there are no frames.
+    """
     folder = report_folder(store)
     sources = read_sources(store, campaigns, planned, step_seconds(store))
     summary = make_summary(sources)
     sections = content.make_sections(sources, summary, content.read_shown(sources))
+    if without_frames is not None:
+        rates = one_camera.rate_section(campaigns, without_frames)
+        sections = [one_camera.left_out_section(without_frames), *sections]
+        sections += [] if rates is None else [rates]
     write_figures(folder, sections, simulated=summary.simulated)
     write_text(folder / "index.html", content.render(sources, summary, sections))
     return summary.to_json()
@@ -99,9 +116,13 @@ def against(store: Store, other: Path) -> tuple[comparison.Comparison, Path]:
     Raises:
         InputError: there is no such report.
     """
-    if read_one_camera(store) is not None:
-        raise InputError("STORE", "", str(store.folder), comparison.ONE_CAMERA)
-    compared = comparison.compare(read_summary(store), comparison.load_other(other))
+    try:
+        here = read_summary(store)
+    except DocumentError:
+        if read_one_camera(store) is None:
+            raise
+        raise InputError("STORE", "", str(store.folder), comparison.ONE_CAMERA) from None
+    compared = comparison.compare(here, comparison.load_other(other))
     path = report_folder(store) / comparison.PAGE
     write_text(path, comparison.render(compared, store.folder, other))
     return compared, path

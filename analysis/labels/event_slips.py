@@ -161,7 +161,7 @@ def _fit(s: Any, y: Any, low: int, high: int, origin: float, curved: bool) -> An
         square += y[i] * y[i]
     for a in range(k):
         normal[a, a] += 1e-9
-    best = np.linalg.solve(normal, right)
+    best: Any = np.linalg.solve(normal, right)
     left = max(square - best @ right, 0.0)
     return best[0], best[1], (best[2] if curved else 0.0), np.sqrt(left / max(high - low - k, 1))
 

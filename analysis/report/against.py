@@ -128,7 +128,7 @@ class Comparison:
         }
 
 
-ONE_CAMERA = "is a report on a rig with one camera: there is no network to compare"
+ONE_CAMERA = "is a report on a rig with one camera, without a spiking network to compare"
 
 
 def load_other(place: Path) -> Summary:

@@ -32,6 +32,7 @@ class LabelSection(Content):
         source: what labels are read from; ruling: the rule that counts.
         papillae: change points of all papillae; None where no truth is known.
         truth: the figure has distances from the truth.
+        from_events: there are no frames.
     """
 
     template: ClassVar[str] = "labels.html"
@@ -44,6 +45,7 @@ class LabelSection(Content):
     rules: Table
     holds: Table
     doubted: Table
+    from_events: bool
 
 
 def label_section(
@@ -88,6 +90,7 @@ def label_section(
             ("campaign", "onset", "trials", "in doubt because"),
             [[*key[:2], str(count), key[2]] for key, count in causes.most_common()],
         ),
+        bool(labels.source.get("events")),
     )
 
 

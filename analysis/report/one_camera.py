@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, missing_stream
+from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
 from sliplab.analysis.labels.reviewed import Labels as KeptLabels
 from sliplab.analysis.report import clocks
@@ -31,7 +32,7 @@ from sliplab.analysis.report.page import (
     percent,
     render_page,
 )
-from sliplab.analysis.report.sources import VERSION
+from sliplab.analysis.report.sources import VERSION, report_key
 from sliplab.analysis.report.summary import (
     label_sources,
     package_versions,
@@ -71,6 +72,17 @@ def reason_against(step: str, missing: str | None, *, slides: bool = True) -> st
     return NO_EVENTS
 
 
+def is_evaluated(store: Store, campaigns: Sequence[Collected]) -> bool:
+    """Check that the spiking network was evaluated on trials without frames."""
+    if missing_stream(list(campaigns)) != "frames" or not has_labels(store, campaigns):
+        return False
+    try:
+        evaluation_of(store)
+    except StoreError:
+        return False
+    return True
+
+
 def has_labels(store: Store, campaigns: Sequence[Collected]) -> bool:
     """Check that every trial has its label."""
     labels = KeptLabels(store)
@@ -95,6 +107,8 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
     judged = read_judged(store, campaigns) if frames else None
     if judged is not None:
         inputs.append([judged.evaluation.key])
+    if is_evaluated(store, campaigns):
+        inputs.append([report_key(store, campaigns)])
     plans = [[item.plan.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
     return make_key("report, one camera", VERSION, [inputs, plans], None)
 
@@ -114,7 +128,7 @@ def one_camera_summary(
     missing = missing_stream(campaigns)
     frames = missing == "events"
     labels, rates = None, None
-    labelled = frames or has_labels(store, campaigns)
+    labelled, evaluated = frames or has_labels(store, campaigns), is_evaluated(store, campaigns)
     if labelled:
         labels = Labels(
             error_ms=label_errors.label_errors(store, campaigns),
@@ -130,7 +144,10 @@ def one_camera_summary(
         left_out=tuple(
             StepLeftOut(name=name, reason=reason)
             for name in ("label", "train", "evaluate")
-            if (reason := reason_against(name, missing) or _not_done(name, judged, labelled))
+            if (
+                reason := reason_against(name, missing)
+                or _not_done(name, judged is not None or evaluated, labelled)
+            )
             is not None
         ),
         labels=labels,
@@ -146,11 +163,11 @@ def one_camera_summary(
     return summary if judged is None else with_classifier(summary, store, campaigns, judged)
 
 
-def _not_done(step: str, judged: Judged | None, labelled: bool) -> str | None:
+def _not_done(step: str, evaluated: bool, labelled: bool) -> str | None:
     """Return the reason for a step that can be done and was not; None where it was."""
     if step == "label":
         return None if labelled else NO_LABELS
-    return NO_CLASSIFIER if judged is None and step in {"train", "evaluate"} else None
+    return NO_CLASSIFIER if not evaluated and step in {"train", "evaluate"} else None
 
 
 def _clocks(campaigns: Sequence[Collected]) -> dict[str, float]:
@@ -239,6 +256,19 @@ class RateSection(Content):
     rates: Table
 
 
+def left_out_section(summary: OneCameraSummary) -> LeftOutSection:
+    """Say which camera is missing, and what is left out for it."""
+    rows = [[each.name, each.reason] for each in summary.left_out]
+    return LeftOutSection(summary.one_camera, Table(("step", "why it is left out"), rows))
+
+
+def rate_section(campaigns: Sequence[Collected], summary: OneCameraSummary) -> RateSection | None:
+    """Show event rates; None without events."""
+    if summary.event_rates is None:
+        return None
+    return _rates(campaigns, summary.event_rates, summary.simulated)
+
+
 def one_camera_sections(
     store: Store,
     campaigns: list[Collected],
@@ -247,9 +277,8 @@ def one_camera_sections(
 ) -> list[Content]:
     """Make all sections, in order."""
     simulated = summary.simulated
-    rows = [[each.name, each.reason] for each in summary.left_out]
     sections: list[Content | None] = [
-        LeftOutSection(summary.one_camera, Table(("step", "why it is left out"), rows)),
+        left_out_section(summary),
         collected_section(campaigns, summary),
         quality_section(campaigns, summary.references, simulated=simulated),
     ]
@@ -258,8 +287,7 @@ def one_camera_sections(
     if summary.labels is not None:
         distances = label_errors.distances(store, campaigns)
         sections.append(label_section(store, campaigns, summary, distances))
-    if summary.event_rates is not None:
-        sections.append(_rates(campaigns, summary.event_rates, simulated))
+    sections.append(rate_section(campaigns, summary))
     if summary.one_camera == "events":
         page = (store.folder / "report" / clocks.PAGE).exists()
         sections.append(

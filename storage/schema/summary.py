@@ -330,8 +330,9 @@ class OneCameraSummary(Document):
     references: dict[str, References] = Field(default_factory=dict)
     """Of campaigns with reference trials."""
     classifier: MarkerClassifier | None = None
-    """Trained on marker displacements; this key and the next six are written only where frames
-    alone were recorded and the store is evaluated, with the meaning that they have in `Summary`."""
+    """Trained on marker displacements; only where frames alone were recorded. This key and the next
+    six are written only where the store is evaluated, with the meaning that they have in `Summary`;
+    where events alone were recorded, the other keys of `Summary` are, too."""
     kinematic: Kinematic | None = None
     gravity: Experiment | None = None
     disturbance: Experiment | None = None

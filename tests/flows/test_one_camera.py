@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,11 @@ import yaml
 
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.one_camera import CAN_BE_DONE
+from sliplab.flows.collect import collect
 from sliplab.flows.evaluate import evaluate
+from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.report import read_one_camera, report
+from sliplab.flows.report import against, read_one_camera, report
 from sliplab.flows.study import Outcome, study
 from sliplab.flows.study_ledger import LEFT_OUT
 from sliplab.flows.train import train
@@ -74,6 +77,14 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
         assert (errors.incipient.n, errors.gross.n) == (3, 3)
         assert max(errors.incipient.max_abs or 0.0, errors.gross.max_abs or 0.0) < 100
         assert "the plate moves by itself" in page
+        assert summary.kinematic is not None
+        assert summary.kinematic.accuracy.n > 50
+        assert summary.kinematic.latency_ms.incipient.n >= 0
+        assert summary.gravity is not None
+        assert summary.gravity.accounted.without_onsets == 2
+        assert summary.kinematic.work is not None
+        assert "Window accuracy" in page or "window accuracy" in page
+        assert (store.folder / "report" / "figures" / "confusion.svg").exists()
         for rate in (summary.event_rates or {}).values():
             assert rate.hold is not None
             assert rate.motion is not None
@@ -135,8 +146,50 @@ def test_training_and_evaluation_repeat_and_say_what_is_stale(tmp_path: Path) ->
     assert {rule.choose for rule in told.detection.values()} == {"protocol"}
 
 
+def test_a_report_on_events_says_which_steps_are_still_to_do(tmp_path: Path) -> None:
+    store, _ = take("events", tmp_path)
+    campaigns = collected(store)
+    for name, then in (("evaluation", ["train", "evaluate"]), ("labels", ["label"])):
+        shutil.rmtree(store.folder / "derived" / name)
+        assert report(store, campaigns)["done"] == 1
+        summary = read_one_camera(store)
+        assert summary is not None
+        assert [each.name for each in summary.left_out][: len(then)] == then
+        assert all("not done yet; run `sliplab" in each.reason for each in summary.left_out)
+        assert summary.kinematic is None
+        assert (summary.labels is None) == (name == "labels")
+
+
+def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
+    """Of frames, the time to the first slip; there is no rate of events."""
+    slides = tiny()
+    slides["collection"]["references"] = {
+        "every": 2, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
+    }  # fmt: skip
+    rig = yaml.safe_load((ROOT / "rigs" / "rehearsal.yaml").read_text())
+    rig["extends"] = str(ROOT / "rigs" / rig["extends"])
+    path = write(tmp_path / "rig.yaml", {**rig, "name": "frames", "cameras": ["frames"]})
+    request = make_request(write(tmp_path / "tiny.yaml", slides), path, tmp_path / "store")
+    collect(request)
+    store = Store.open(request.store)
+    campaigns = collected(store)
+    label(store, campaigns)
+    report(store, campaigns)
+    summary = read_one_camera(store)
+    assert summary is not None
+    found = summary.references["tiny"]
+    assert len(found.trials) >= 3
+    assert all(trial.hold_events_per_s is None for trial in found.trials)
+    assert all(trial.first_slip_ms is not None for trial in found.trials)
+    assert found.wear.keys() == {"first_slip_ms"}
+    page = (store.folder / "report" / "index.html").read_text()
+    assert "no campaign has reference trials" not in page
+    assert "time to the first slip" in page
+
+
 def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) -> None:
     store, _ = take("events", tmp_path)
+    assert {each.beyond for each in against(store, store.folder)[0].figures} <= {False, None}
     assert report(store, collected(store))["done"] == 0
     before = summary_json(store)
     (store.folder / "report" / "index.html").unlink()
@@ -146,9 +199,11 @@ def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) ->
     assert before == after
 
 
-def test_a_report_on_one_camera_is_not_compared(tmp_path: Path) -> None:
+def test_a_report_on_frames_is_not_compared(tmp_path: Path) -> None:
     from sliplab.analysis.report.against import load_other
 
-    store, _ = take("events", tmp_path)
+    store, _ = take("frames", tmp_path)
     with pytest.raises(InputError, match="one camera"):
         load_other(store.folder)
+    with pytest.raises(InputError, match="one camera"):
+        against(store, store.folder)

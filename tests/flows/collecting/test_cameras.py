@@ -109,15 +109,9 @@ def test_cameras_are_events_or_frames_or_both(cameras: list[str], tmp_path: Path
     assert caught.value.key.startswith("cameras")
 
 
-@pytest.mark.parametrize(
-    ("camera", "says"),
-    [
-        ("events", "has no label yet"),
-        ("frames", "recorded without events; the network is trained on windows of them"),
-    ],
-)
-def test_training_says_what_it_lacks(camera: str, says: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("camera", ["events", "frames"])
+def test_training_says_what_it_lacks(camera: str, tmp_path: Path) -> None:
     take(camera, tmp_path)
     store = Store.open(tmp_path / "store")
-    with pytest.raises(StoreError, match=says):
+    with pytest.raises(StoreError, match="has no label yet"):
         train(store, collected(store))
