@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sliplab.protocols import InputError, Move, Plan, Trial, Twist
 from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.stream_settings import EventStream, FrameStream
 
 RESERVE = 200_000_000
 """Bytes that must stay free: other programs use the disk, too."""
@@ -31,10 +32,29 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
     plate = plan.protocol.collection.plate is not None
     events = known.noise_events_per_s * seconds + known.signal_events_per_mm * moved
     events += known.events_per_fall if plate else 0.0
-    total = known.fixed_bytes + events * known.bytes_per_event
-    if rig.frame_px(plan) is not None:
-        total += rig.frame_bytes(plate) * seconds * plan.protocol.collection.recording.sync_rate
+    cameras = 1 + sum(isinstance(stream, EventStream) for stream in rig.streams.values())
+    total = known.fixed_bytes + cameras * events * known.bytes_per_event
+    rate_hz, frame_px = plan.protocol.collection.recording.sync_rate, rig.frame_px(plan)
+    if frame_px is not None:
+        total += rig.frame_bytes(plate) * seconds * rate_hz
+    for stream in rig.streams.values():
+        if isinstance(stream, FrameStream):
+            total += (
+                _frame_bytes(rig, stream, frame_px, plate) * seconds * (stream.rate_hz or rate_hz)
+            )
     return total
+
+
+def _frame_bytes(
+    rig: RigFile, stream: FrameStream, frame_px: tuple[int, int] | None, plate: bool
+) -> float:
+    """Estimate one frame of a further camera: the first one's, by its number of pixels."""
+    if stream.mock is not None and stream.mock.level == "tracks":
+        return rig.estimates.bytes_per_tracked_frame
+    first = rig.estimates.bytes_per_plate_frame if plate else rig.estimates.bytes_per_frame
+    if frame_px is None:
+        return first
+    return first * stream.region_px[0] * stream.region_px[1] / (frame_px[0] * frame_px[1])
 
 
 def plan_bytes(rig: RigFile, plan: Plan, skip: set[str] | None = None) -> float:

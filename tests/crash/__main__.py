@@ -98,7 +98,9 @@ def main() -> int:
     parser.add_argument(
         "--only", choices=PARTS, action="append", help="one part, may be repeated; all by default"
     )
-    parser.add_argument("--video", action="store_true", help="with a video of every trial")
+    parser.add_argument(
+        "--video", action="store_true", help="with a video of every trial, and further cameras"
+    )
     asked = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     results: dict[str, Any] = {}

@@ -19,6 +19,19 @@ NAME = "crash"
 BY_TIME = {"provenance.json"}
 """Time and place: the only file of a trial that differs between runs."""
 
+WITH_VIDEO = {
+    "extends": str(ROOT / "rigs" / "mock.yaml"),
+    "name": "crash",
+    "streams": {
+        "side": {"kind": "events", "mock": {"width": 160, "height": 120, "px_per_mm": 3.5}},
+        "back": {
+            "kind": "frames", "scale_px_per_mm": 4, "region_px": [64, 64],
+            "mock": {"px_per_mm": 4}, "timing": {"resolution_us": 0},
+        },
+    },
+}  # fmt: skip
+"""The rig of trials with a video, which has a further camera of either kind, too."""
+
 
 def protocol(trials: int, video: bool = False) -> dict[str, Any]:
     """Slides that are over in a second, each in a direction of its own."""
@@ -46,7 +59,10 @@ def run_request(folder: Path, trials: int, video: bool = False) -> RunRequest:
     """Protocol and rig file in `folder`, and a store beside them that may not exist yet."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "protocol.yaml").write_text(yaml.safe_dump(protocol(trials, video)))
-    rig = ROOT / "rigs" / ("mock.yaml" if video else "rehearsal.yaml")
+    rig = ROOT / "rigs" / "rehearsal.yaml"
+    if video:
+        rig = folder / "rig.yaml"
+        rig.write_text(yaml.safe_dump(WITH_VIDEO))
     return make_request(folder / "protocol.yaml", rig, folder / "store")
 
 

@@ -16,6 +16,7 @@ from sliplab.analysis.clocks.refit import fit_again
 from sliplab.flows.api import open_store
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.flows.ui import view
@@ -80,14 +81,19 @@ ALL = {"side": SIDE, "twin": TWIN, "back": BACK, "free": FREE, "heard": HEARD, "
 
 
 def session(
-    folder: Path, streams: dict[str, Any], *, data: dict[str, Any] | None = None, **mock: Any
+    folder: Path,
+    streams: dict[str, Any],
+    *,
+    data: dict[str, Any] | None = None,
+    cameras: tuple[str, ...] | list[str] = ("events", "frames"),
+    **mock: Any,
 ) -> tuple[TrialCollector, Campaign]:
     """A connected session on a mock rig with further devices."""
     folder.mkdir(exist_ok=True)
     rig_file = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
     simulated = {**rig_file["mock"], "frame_camera": TRACKS, **mock}
     text = json.dumps(
-        {**rig_file, "mock": simulated, "streams": streams},
+        {**rig_file, "mock": simulated, "streams": streams, "cameras": list(cameras)},
         default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
     )
     (folder / "rig.yaml").write_text(text)
@@ -474,3 +480,31 @@ def test_a_cooling_body_follows_newtons_law() -> None:
     above = made.true_at(times) - 20
     assert 0 < above[0] <= 5
     assert above[1:] == pytest.approx(above[0] * np.exp([-1.0, -2.0]))
+
+
+@pytest.mark.parametrize("cameras", [["events"], ["frames"]])
+def test_a_rig_with_one_first_camera_has_further_ones(cameras: list[str], tmp_path: Path) -> None:
+    work, campaign = session(tmp_path / "a", {"side": SIDE, "back": BACK}, cameras=cameras)
+    work.take(pending_trials(work.plan, campaign)[:1])
+    (recording,) = campaign.recordings()
+    assert verify(Store.open(tmp_path / "a" / "store")) == []
+    assert recording.streams("events") == [*(["events"] if cameras == ["events"] else []), "side"]
+    assert len(recording.events(stream="side")) > 100
+    assert len(recording.frame_times("back")) > 50
+    assert set(recording.record.clocks.streams) == {"side", "back"}
+    found, _ = fit_again(recording, None)
+    assert "clocks" not in found
+
+
+def test_the_estimate_counts_further_cameras(tmp_path: Path) -> None:
+    alone, _ = session(tmp_path / "a", {})
+    more, _ = session(tmp_path / "b", {"side": SIDE, "back": BACK, "free": FREE, "warm": WARM})
+    trial = next(iter(alone.plan))
+    one, all_of_them = (trial_bytes(work.rig_file, work.plan, trial) for work in (alone, more))
+    known, seconds = alone.rig_file.estimates, alone.plan.seconds(trial, recorded_only=True)
+    first_px = alone.rig_file.frame_px(alone.plan)
+    assert first_px is not None
+    events = one - known.fixed_bytes - known.bytes_per_tracked_frame * seconds * 100
+    back = known.bytes_per_frame * 160 * 160 / (first_px[0] * first_px[1]) * seconds * 100
+    free = known.bytes_per_tracked_frame * seconds * 60
+    assert all_of_them - one == pytest.approx(events + back + free)
