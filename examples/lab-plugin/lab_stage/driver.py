@@ -121,15 +121,11 @@ class LabStage(ThreadedArm):
         return last.pose
 
     def now_ns(self) -> int:
-        """Return the controller's clock now: its newest time, and what has passed since, ns.
-
-        Raises:
-            ArmFault: no connection.
-        """
+        """Return the controller's time in the newest pose, ns. Raises ArmFault: no connection."""
         last = self._stream.last
         if self._lost is not None or last is None:
             raise self._fault(self.state(), "tells no time")
-        return last.t_ns + time.monotonic_ns() - last.host_ns
+        return last.t_ns
 
     def health(self) -> DeviceHealth:
         """Return the controller's own description. Raises ArmFault: no connection, no answer."""

@@ -40,13 +40,14 @@ class FakeLabStage(ServedController):
         super().__init__(host, motion, clock)
         self.port, self._sync = port, sync
         self._stopped, self._silent = "", False
+        self._late, self._held = False, ""
         self._back_s = 0.0
         self._client: asyncio.StreamWriter | None = None
 
     def restore(self) -> None:
         """Put link and safety right, as a person would."""
         self._inside(self._connections.cut)
-        self._stopped, self._silent = "", False
+        self._stopped, self._silent, self._late = "", False, False
         self._inside(self._listen)
 
     def _listen(self) -> None:
@@ -59,6 +60,8 @@ class FakeLabStage(ServedController):
             self._silent = True
         elif kind is Kind.CLOCK_BACK:
             self._back_s += 5.0
+        elif kind is Kind.LATE_ANSWER:
+            self._late = True
         elif kind not in STATES:
             raise ValueError(f"{kind.value} is not simulated: this controller does not report it")
         else:
@@ -71,13 +74,16 @@ class FakeLabStage(ServedController):
     async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self._client is not None:
             return  # one client: another one finds the door closed again
-        self._client = writer
+        self._client, self._held = writer, ""
         poses = asyncio.get_running_loop().create_task(self._tell(writer))
         try:
             while line := await reader.readline():
                 answer = self._answer(line.decode("ascii").split())
-                if not self._silent:
-                    writer.write(answer.encode())
+                if self._late:
+                    self._late, self._held = False, answer
+                elif not self._silent:
+                    writer.write((self._held + answer).encode())
+                    self._held = ""
         finally:
             self._client = None
             self._halt()
