@@ -11,16 +11,6 @@ from tests.examples.conftest import Lab, checkout
 pytestmark = pytest.mark.programs
 
 
-def test_its_drivers_keep_the_rules_by_its_own_test() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "tests"],
-        cwd=PLUGIN, env={**os.environ, "PYTHONPATH": str(PLUGIN)}, capture_output=True, text=True,
-        timeout=LIMIT_S,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout
-    assert "25 passed" in done.stdout  # none is skipped
-
-
 def test_a_package_outside_the_checkout_runs_a_campaign(tmp_path: Path) -> None:
     before = checkout()
     sliplab = Lab(tmp_path, "lab-plugin")
