@@ -57,7 +57,7 @@ class StreamBench(Bench):
         self.fed: list[Any] = []
         self.came: list[Any] = []
         self._next_ns = FIRST_NS
-        self._mark = 0
+        self._mark: int | None = None
 
     # -- the fake, by kind -----------------------------------------------------------------
 
@@ -152,8 +152,11 @@ class StreamBench(Bench):
             raise Seen(f"not all that was sent had been read after {self.bounds.call_s:g} s")
         return got
 
-    def mark(self) -> int:
-        """Return the time from which batches will be compared, in the unit of the chunk."""
+    def mark(self) -> int | None:
+        """Return a time that all data from now on have reached, in the unit of the chunk.
+
+        None where the device begins each run with a clock of its own.
+        """
         return self._next_ns
 
     def complete(self, times: Sequence[int]) -> bool:
@@ -167,7 +170,7 @@ class StreamBench(Bench):
             sent = np.concatenate([getattr(chunk, name) for chunk in self.fed])
             found = np.concatenate(
                 [
-                    getattr(chunk, name)[getattr(chunk, self.clock_field) >= self._mark]
+                    getattr(chunk, name)[getattr(chunk, self.clock_field) >= (self._mark or 0)]
                     for chunk in self.came
                 ]
             )
@@ -232,8 +235,8 @@ class EventBench(StreamBench):
         self.pulses.extend(self.call("read_pulses", self.device.read_pulses).t_ns.tolist())
         return super().read()
 
-    def mark(self) -> int:
-        """Return the time from which batches will be compared, us."""
+    def mark(self) -> int | None:
+        """Return the time of the next batch, us."""
         self.fed_pulses.clear()
         return self._next_ns // 1000
 
@@ -245,7 +248,7 @@ class EventBench(StreamBench):
     def check_content(self) -> None:
         """Raise Seen if events or pulses came otherwise than they were sent."""
         super().check_content()
-        found = [pulse for pulse in self.pulses if pulse >= self._mark * 1000]
+        found = [pulse for pulse in self.pulses if pulse >= (self._mark or 0) * 1000]
         if found != self.fed_pulses:
             raise Seen(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
 
@@ -390,6 +393,10 @@ class ArmForceBench(StreamBench):
         """Close the arm's fake."""
         self._arm.close_fake()
 
+    def mark(self) -> int | None:
+        """Return the controller's time."""
+        return self._arm.now_ns()
+
     def feed(self) -> None:
         """The controller measures by itself."""
 
@@ -452,6 +459,10 @@ class SyncBench(StreamBench):
         """Return the box's next pulses. Raises RigError."""
         found: PulseChunk = self.device.read_pulses()
         return found
+
+    def mark(self) -> int | None:
+        """Return None: each train begins at 0."""
+        return None
 
     def feed(self) -> None:
         """The box ticks by itself."""
