@@ -41,6 +41,7 @@ from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
+    check_distinct,
     check_streams,
     named_drivers,
     stream_drivers,
@@ -180,7 +181,9 @@ class RigFile(StrictModel):
 
     @model_validator(mode="after")
     def _streams_are_complete(self) -> RigFile:
-        check_streams(self.streams, self.driver)
+        check_streams(self.streams, self.driver, None if self.mock is None else self.mock.clocks)
+        if self.driver == "devices":
+            check_distinct(self.devices, self.streams)
         for index, fault in enumerate(() if self.mock is None else self.mock.faults):
             if isinstance(fault, StreamGone) and fault.stream not in self.streams:
                 known = ", ".join(self.streams) or "none"

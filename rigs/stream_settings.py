@@ -10,6 +10,7 @@ The first event camera and the first frame camera stay in `devices:` and `mock:`
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, Union
@@ -42,6 +43,7 @@ from sliplab.rigs.mock.further_settings import (
     FurtherFrameCamera,
     Thermometer,
 )
+from sliplab.rigs.mock.settings import Clocks
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 RESERVED = frozenset({
@@ -49,6 +51,8 @@ RESERVED = frozenset({
     "force_sensor",
 })  # fmt: skip
 """Names of the first devices, in files, records and columns."""
+_PLACES = frozenset({"serial", "host", "port", "events_port", "triggers_port", "index", "path"})
+"""Keys by which drivers tell their devices apart."""
 MOST = 16
 """Further devices of a rig: a limit for people's typing errors, not of the store."""
 
@@ -234,8 +238,13 @@ Streams = Annotated[dict[str, Annotated[Stream, _ByKind()]], Field(max_length=MO
 """The `streams:` section of a rig file."""
 
 
-def check_streams(streams: Mapping[str, Stream], rig_driver: str) -> None:
+def check_streams(
+    streams: Mapping[str, Stream], rig_driver: str, clocks: Clocks | None = None
+) -> None:
     """Check names, and that each device has what the rig's driver needs.
+
+    Args:
+        clocks: of a simulated rig.
 
     Raises:
         KeyedError: the first that is wrong.
@@ -253,6 +262,47 @@ def check_streams(streams: Mapping[str, Stream], rig_driver: str) -> None:
             if not needed and found is not None:
                 text = f"has no meaning with driver: {rig_driver}"
                 raise KeyedError(f"{key}.{part}", "...", text)
+        jitter = {"events": "pulse_jitter_us", "frames": "frame_jitter_us"}.get(stream.kind)
+        if clocks is None or jitter is None or stream.timing.grade == "host arrival":
+            continue
+        promised = stream.timing.jitter_us
+        if getattr(clocks, jitter) > promised:
+            text = f"must be at most {key}.timing.jitter_us = {promised:g}"
+            raise KeyedError(f"mock.clocks.{jitter}", getattr(clocks, jitter), text)
+
+
+def check_distinct(devices: DeviceSettings | None, streams: Mapping[str, Stream]) -> None:
+    """Check that no two devices of one driver are the same one.
+
+    Raises:
+        KeyedError: two have the same serial number, address or port, or both leave it out.
+    """
+    known: dict[tuple[str, str], str] = {}
+    first = [] if devices is None else list(devices.drivers())
+    named = [(f"devices.{driver.kind.replace(' ', '_')}", driver, used) for driver, used in first]
+    named += [
+        (f"streams.{name}.device", driver, used) for name, driver, used in stream_drivers(streams)
+    ]
+    for key, driver, settings in named:
+        place = _place(settings.model_dump(mode="json"))
+        if not place:
+            continue
+        found = driver.name, json.dumps(place, sort_keys=True)
+        if found in known and key.startswith("streams."):
+            text = f"is the same device as {known[found]}: say which by {', '.join(place)}"
+            raise KeyedError(key, driver.name, text)
+        known[found] = key
+
+
+def _place(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Return what tells one device from another of its driver, by its key."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            found |= _place(value, f"{before}{key}.")
+        elif key in _PLACES:
+            found[f"{before}{key}"] = value
+    return found
 
 
 def stream_drivers(streams: Mapping[str, Stream]) -> Iterator[tuple[str, Driver[Any], Any]]:

@@ -382,6 +382,10 @@ def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
         ({"free": {**FREE, "rate_hz": None}}, "streams.free.rate_hz", "is needed with"),
         ({"back": {**BACK, "rate_hz": 50}}, "streams.back.rate_hz", "has no meaning with"),
         (
+            {"side": {**SIDE, "timing": {"drift_ppm": 50, "jitter_us": 1}}},
+            "mock.clocks.pulse_jitter_us", "must be at most streams.side.timing.jitter_us = 1",
+        ),
+        (
             {"side": {**SIDE, "timing": {"drift_ppm": 20}}},
             "streams.side.mock.clock_ppm", "must be at most timing.drift_ppm = 20",
         ),
