@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -94,21 +95,32 @@ def _trials(publication: Publication) -> pa.Table:
     rows.insert(2, "folder", [trial_folder(*key) for key in keys])
     rows.insert(3, "split", [publication.split(*key) for key in keys])
     factors: dict[str, str] = {}
+    units: dict[str, str] = {}
     for _, recording in publication.recordings:
+        units |= {name: about.unit or "" for name, about in recording.record.streams.items()}
         for factor, level in recording.record.condition.items():
             (column,) = condition_columns({factor: level})
             unit = level.partition(" ")[2]
             factors[column] = f"level of the factor {factor}{f', {unit}' if unit else ''}"
     told = {name: _TRIAL_COLUMNS.get(name) or factors.get(name) for name in rows.columns}
-    return _table(rows, {name: text or _figure(name) for name, text in told.items()})
+    return _table(rows, {name: text or _figure(name, units) for name, text in told.items()})
 
 
-def _figure(name: str) -> str:
-    """Describe a column of a named stream: `NAME_events`, `force_normal_peak_n`."""
-    stream, _, figure = name.partition("_")
+def _figure(name: str, units: Mapping[str, str]) -> str:
+    """Describe a column of a named stream: `NAME_events`, `force_normal_peak_n`.
+
+    Args:
+        units: of the streams that have one, by name; empty for the others.
+    """
+    # names may have underscores: the longest one that fits is meant
+    stream = max((known for known in units if name.startswith(f"{known}_")), key=len, default="")
+    stream = stream or name.partition("_")[0]
+    figure = name.removeprefix(f"{stream}_")
     if name.endswith(("_events", "_frames")):
         return f"number of {name.rpartition('_')[2]} of the camera {name.rpartition('_')[0]}"
     unit = ", N" if figure.endswith("_n") else ""
+    if units.get(stream):
+        unit = f", {units[stream]}"
     return f"{figure.removesuffix('_n').replace('_', ' ')} of the stream {stream}{unit}"
 
 

@@ -45,7 +45,7 @@ MOST_STREAMS = 64
 """Named streams that are read of one trial; a file with more is none of ours."""
 _BLOCK = 1 << 15
 _FEW = 16
-_MOST_KIND = 64
+_MOST_TEXT = 128
 _CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
 """Cache of unpacked chunks, a column. A chunk of events fits; with more than the processor's own
 cache holds, every chunk would go through main memory."""
@@ -171,7 +171,7 @@ def _text(group: Any, name: str) -> str:
     if not h5py.h5a.exists(group, name.encode()):
         return ""
     found = h5py.h5a.open(group, name.encode())
-    if found.dtype.kind != "S" or found.shape != () or found.dtype.itemsize > _MOST_KIND:
+    if found.dtype.kind != "S" or found.shape != () or found.dtype.itemsize > _MOST_TEXT:
         return ""
     value = np.empty((), found.dtype)
     found.read(value)

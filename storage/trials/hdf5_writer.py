@@ -301,7 +301,7 @@ class StreamFile:
             for part, (_, column) in columns.items():
                 self._create(f"{group}/{part}", column)
             self._file[group].attrs[KIND_ATTRIBUTE] = np.bytes_(kind)
-            if isinstance(chunk, ScalarChunk):
+            if isinstance(chunk, ScalarChunk) and chunk.unit:
                 self._file[group].attrs[UNIT_ATTRIBUTE] = np.bytes_(chunk.unit.encode())
         for part, (field, _) in columns.items():
             self._columns[f"{group}/{part}"].append(getattr(chunk, field))

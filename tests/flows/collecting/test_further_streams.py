@@ -512,3 +512,19 @@ def test_the_estimate_counts_further_cameras(tmp_path: Path) -> None:
     back = known.bytes_per_frame * 160 * 160 / (first_px[0] * first_px[1]) * seconds * 100
     free = known.bytes_per_tracked_frame * seconds * 60
     assert all_of_them - one == pytest.approx(events + back + free)
+
+
+def test_a_publication_has_their_files_and_describes_their_columns(
+    taken: Recording, tmp_path: Path
+) -> None:
+    folder = tmp_path / "published"
+    answer(
+        "publish", taken.folder.parents[3], "--as", "croissant", "--output", folder,
+        "--licence", "CC-BY-4.0", "--creator", "Somebody",
+    )  # fmt: skip
+    (trial,) = (folder / "campaigns" / "tiny" / "trials").iterdir()
+    assert (trial / "stream-back.mkv").read_bytes() == taken.video("back").read_bytes()  # type: ignore[union-attr]
+    assert (trial / "stream-side.h5").is_file()
+    card = (folder / "README.md").read_text()
+    assert "mean of the stream warm, degC" in card
+    assert "number of events of the camera side" in card

@@ -256,6 +256,15 @@ def test_scalars_are_no_wrenches(tmp_path: Path) -> None:
         assert len(reader.scalars("none")) == 0
         with pytest.raises(ValueError, match="is of kind 'scalar', no wrench"):
             reader.wrenches("warm")
+    writer = campaign(tmp_path / "u").begin("t", FRAME, 100)
+    units = {"plain": "", "long": "\N{OHM SIGN}" * 20}
+    for name, unit in units.items():
+        writer.add_stream(name, ScalarChunk(WARM.t_ns, WARM.host_ns, WARM.value, unit))
+    with StreamReader(writer.seal() / "data.h5") as reader:
+        assert [reader.scalars(name).unit for name in ("plain", "long")] == [
+            "",
+            "\N{OHM SIGN}" * 20,
+        ]
     writer = campaign(tmp_path / "f").begin("t", FRAME, 100)
     writer.add_stream("warm", WARM)
     with pytest.raises(ValueError, match="is of kind 'scalar', not 'wrench'"):
