@@ -46,6 +46,9 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     "serve": (("--store", "ROOM/file", "--rig", "mock"), "ROOM/file", None, None),
     "import": (("ROOM/nowhere", "--store", "ROOM/i", "--name", "n"), "ROOM/nowhere", None, None),
     "export": (("ROOM/nowhere", "x", "--output", "ROOM/o"), "ROOM/nowhere", None, None),
+    "publish": (
+        ("ROOM/nowhere", "--as", "croissant", "--output", "ROOM/o"), "ROOM/nowhere", None, None,
+    ),
     "view": (("ROOM/nowhere", "x"), "ROOM/nowhere", None, None),
     "detect": (("--rig", "mock", "--model", "ROOM/nowhere"), "ROOM/nowhere", None, None),
     "export-model": (("ROOM/nowhere", "--out", "ROOM/e"), "ROOM/nowhere", None, None),
