@@ -22,6 +22,8 @@ from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion, runni
 T = TypeVar("T")
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 LOOPBACK = "127.0.0.1"
+MOST_WAITING = 64 << 20
+"""Bytes of a fake stream that may wait for a client; then the connection breaks, as a device's."""
 START_S = 5.0
 """Time limit for a fake to open its ports, or to close them, s."""
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
@@ -191,8 +193,11 @@ class FakeStream(ABC):
 
     def _write(self, data: bytes) -> None:
         """Send data to the client, in the loop."""
-        if self._client is not None and not self._silent:
-            self._client.write(data)
+        if self._client is None or self._silent:
+            return
+        self._client.write(data)
+        if self._client.transport.get_write_buffer_size() > MOST_WAITING:
+            self._client.transport.abort()
 
     def silence(self) -> None:
         """Send and answer nothing from now on; the connection stays."""

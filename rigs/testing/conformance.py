@@ -26,7 +26,7 @@ from sliplab.rigs.core.driver import (
 )
 from sliplab.rigs.testing import arm_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
-from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, Rules
+from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules
 from sliplab.rigs.testing.stream_bench import (
     ArmForceBench,
     EventBench,
@@ -126,6 +126,8 @@ def conformance(
             case()
         except NotTried as reason:
             pytest.skip(str(reason))
+        except RuleBroken as error:
+            pytest.fail(str(error), pytrace=False)  # its text says it all
 
     return test
 

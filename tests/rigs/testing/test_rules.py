@@ -10,7 +10,7 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import FrameCameraDriver
 from sliplab.rigs.testing import arm_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
-from sliplab.rigs.testing.conformance import cases
+from sliplab.rigs.testing.conformance import cases, conformance
 from sliplab.rigs.testing.examples import arm, events, frames
 from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Seen
 from tests.conftest import ROOT
@@ -43,14 +43,11 @@ def test_each_kind_has_the_rules_that_apply_to_it() -> None:
 
 
 def test_a_failure_names_the_rule_what_was_seen_and_what_would_be_right() -> None:
-    def check(bench: ArmBench) -> None:
-        raise Seen("the arm danced")
-
     with (
         ArmBench(arm.DRIVER, arm_settings(), Bounds()) as bench,
         pytest.raises(RuleBroken) as error,
     ):
-        Rule("poise", "the arm keeps its poise", check).hold("my_arm", bench)
+        Rule("poise", "the arm keeps its poise", _dances).hold("my_arm", bench)
     assert str(error.value).splitlines() == [
         "my_arm breaks the rule 'poise'",
         "  seen:  the arm danced",
@@ -96,3 +93,17 @@ def test_limits_in_the_plates_frame_are_refused_with_what_to_write() -> None:
     )
     with pytest.raises(ValueError, match=r"limits\.frame: must be base"):
         cases(arm.DRIVER, settings)[0]()
+
+
+def test_a_failure_in_pytest_is_the_message_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    silly = Rule("poise", "the arm keeps its poise", _dances)
+    monkeypatch.setattr(arm_rules.RULES, "all", [silly])
+    test = conformance(arm.DRIVER, arm_settings())
+    (case,) = cases(arm.DRIVER, arm_settings())
+    with pytest.raises(pytest.fail.Exception, match="breaks the rule 'poise'") as error:
+        test(case)
+    assert error.value.pytrace is False
+
+
+def _dances(bench: ArmBench) -> None:
+    raise Seen("the arm danced")
