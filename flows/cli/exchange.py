@@ -33,7 +33,7 @@ def import_(
 ) -> None:
     """Import recordings of other programs into a new campaign; unknown values are marked.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; by default the files' content decides.
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw or es; by default the content decides.
     """
     from dataclasses import replace
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sliplab.storage.trials.store import Campaign, Store
 
 app = typer.Typer()
-FORMATS = ("croissant",)
+FORMATS = ("croissant", "mcap")
 
 
 @app.command()
@@ -38,8 +38,8 @@ def publish(
     as_json: JsonOption = False,
 ) -> None:
     """Publish committed trials as a data set in one folder, with a data card and checksums."""
-    from sliplab.storage.formats.croissant import publish_croissant
     from sliplab.storage.formats.publication import About, Publication
+    from sliplab.storage.formats.publish import publish as write
     from sliplab.storage.process import now
     from sliplab.storage.remote.mirror import open_store
 
@@ -58,7 +58,7 @@ def publish(
     if licence is None:
         console.say("warning: no --licence: nobody may use the data until there is one")
     with console.bar("publish (trials)", publication.count) as bar:
-        result = publish_croissant(publication, output, lambda name: bar.advance(1, name))
+        result = write(publication, output, form, lambda name: bar.advance(1, name))
     finish(result, f"published in {output}{_mark(publication)}", as_json)
 
 

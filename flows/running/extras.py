@@ -16,6 +16,7 @@ EXTRAS = {
     "cluster": ("distributed", "prefect_dask"),
     "view": ("rerun",),
     "onnx": ("onnx", "onnxruntime"),
+    "publish": ("mcap", "zstandard", "lz4"),
 }  # fmt: skip
 """Modules that each extra installs."""
 

@@ -8,23 +8,58 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pyarrow as pa
 
+from sliplab.storage.formats import ros2_messages as ros2
+from sliplab.storage.formats.mcap_trials import COLUMNS_TOPIC
 from sliplab.storage.formats.publication import Publication
 from sliplab.storage.trials.hdf5_writer import COLUMNS, STREAMS, TIMING, TRACKS
 from sliplab.storage.trials.store import IMPORTED
 
-_LOAD = """\
+_TABLES = """\
 ```python
 import mlcroissant
 
 data = mlcroissant.Dataset("croissant.json")
 for record in data.records("trials"):
-    print(record["trials/trial"], record["trials/folder"])
+    print(record["trials/trial"], record["trials/path"])
 ```
-
+"""
+_LOADS = {
+    "croissant": """
 Events, poses and clocks are in `data.h5` of each trial's folder (HDF5 with the filters of the
 package `hdf5plugin`), the maps of its clocks in `record.json`. The folder is also a store of
 SlipLab: `sliplab.open_store(".")`.
-"""
+""",
+    "mcap": """
+Each trial is an MCAP file of ROS 2 messages, which Foxglove opens; in Python with the packages
+`mcap` and `mcap-ros2-support`:
+
+```python
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+with open(path, "rb") as file:
+    reader = make_reader(file, decoder_factories=[DecoderFactory()])
+    for _, channel, message, decoded in reader.iter_decoded_messages(topics=["/arm/pose"]):
+        print(message.log_time, decoded.pose.position.x)
+```
+
+`sliplab import campaigns/NAME --store STORE --name NAME` makes a store of them again.
+""",
+}
+_TOPICS = (
+    ("/events", ros2.EVENTS, "packets of at most 10 ms; encoding `mono`: 64 bits an event, "
+     "bits 0 to 31 ns after `time_base` on the camera's clock, 32 to 47 column, 48 to 62 row, "
+     "63 brighter"),
+    ("/frames", ros2.IMAGE, "grey levels, `mono8`, stamped with the middle of the exposure"),
+    ("/arm/pose", ros2.POSE, "tool centre point in the arm's base frame, m and quaternion"),
+    ("/event_pulses, /arm_pulses, /sync_pulses", ros2.PULSE,
+     "sync pulses that a device saw or sent"),
+    ("/phases", ros2.PHASE, "phases of the motion"),
+    ("/onsets", ros2.ONSET, "onsets of the label, by each rule"),
+    ("/NAME", f"{ros2.WRENCH}, {ros2.SCALAR}, {ros2.EVENTS} or {ros2.IMAGE}",
+     "further sensors and cameras: N and N m along the sensor's axes, readings in their unit"),
+    (COLUMNS_TOPIC, ros2.COLUMN, "all columns but events as the devices gave them, see below"),
+)  # fmt: skip
 _LIMITS = (
     "Labels follow from the rule that they name; they are measurements with doubts, not a truth.",
     "An onset that is missing is unknown or in doubt, or the slip did not happen; the label's "
@@ -44,8 +79,12 @@ _IMPORTED_LIMITS = (
 )
 
 
-def data_card(publication: Publication, tables: Mapping[str, pa.Table]) -> str:
-    """Return the card as Markdown; of simulated data, its first line says so."""
+def data_card(publication: Publication, tables: Mapping[str, pa.Table], form: str) -> str:
+    """Return the card as Markdown; of simulated data, its first line says so.
+
+    Args:
+        form: ``croissant`` or ``mcap``.
+    """
     about = publication.about
     simulated = sum(recording.simulated for _, recording in publication.recordings)
     part = (
@@ -63,7 +102,7 @@ def data_card(publication: Publication, tables: Mapping[str, pa.Table]) -> str:
         [f"# {about.title}", "", publication.description, ""],
         ["## Licence", "", licence, ""],
         ["## Citation", "", publication.citation, ""],
-        ["## Load", "", _LOAD],
+        ["## Load", "", _TABLES + _LOADS[form]],
         ["## How it was made", "", *_made(publication), ""],
         ["## Splits", "", *_splits(publication), ""],
         ["## Clocks", "", *_clocks(publication), ""],
@@ -71,10 +110,10 @@ def data_card(publication: Publication, tables: Mapping[str, pa.Table]) -> str:
             [f"## `{name}.parquet`", "", *_columns_of(table), ""]
             for name, table in sorted(tables.items(), reverse=True)
         ),
-        ["## `data.h5`", "", *_hdf5(), ""],
+        *([["## Topics", "", *_topics(), ""]] if form == "mcap" else []),
+        ["## Columns of `data.h5`", "", *_hdf5(), ""],
         ["## Known limits", "", *(f"- {text}" for text in _limits(publication)), ""],
-        ["## Checksums", "", "`sha256sum -c checksums.sha256` checks every file; each trial's "
-         "`checksums.json` is the one that it was committed with.", ""],
+        ["## Checksums", "", "`sha256sum -c checksums.sha256` checks every file.", ""],
     ]  # fmt: skip
     return "\n".join([*first, *(line for section in sections for line in section)])
 
@@ -143,6 +182,15 @@ def _columns_of(table: pa.Table) -> list[str]:
         for field in table.schema
     ]
     return _rows(("column", "type", "meaning and unit"), rows)
+
+
+def _topics() -> list[str]:
+    text = (
+        "Log times are on the trial's time line, plus `log_time_minus_time_line_ns` of the file's "
+        "metadata `sliplab` (0, unless the time line begins below 0); stamps are on the time line. "
+        "Attachments: record, provenance, label with its arrays, campaign, protocol, rig."
+    )
+    return [text, "", *_rows(("topic", "message", "contents"), _TOPICS)]
 
 
 def _hdf5() -> list[str]:

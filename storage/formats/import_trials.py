@@ -34,6 +34,8 @@ from sliplab.storage.formats.foreign import (
     read_head,
 )
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
+from sliplab.storage.formats.mcap_import import MAGIC, read_mcap
+from sliplab.storage.formats.original import Original, StoredTrial
 from sliplab.storage.formats.prophesee import faery_type, read_by_faery
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
@@ -57,6 +59,7 @@ READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
     "lab-hdf5": ((".h5", ".hdf5"), read_lab_hdf5),
     "raw": ((".raw", ".dat"), read_by_faery),
     "es": ((".es",), read_by_faery),
+    "mcap": ((".mcap",), read_mcap),
 }
 LAB_PICKLES = "lab-pickles"
 KINDS = (*READERS, LAB_PICKLES)
@@ -92,8 +95,6 @@ def import_trials(
     """
     campaign = store.campaign(name)
     fresh = not campaign.begun
-    if not fresh and IMPORTED not in campaign.info:
-        raise InputError("--name", "", name, "is a collected campaign; choose another name")
     existing = campaign.committed()
     imported: list[str] = []
     skipped: list[str] = []
@@ -102,6 +103,8 @@ def import_trials(
     try:
         for trial in trials:
             on_trial(trial.name)
+            if not fresh:
+                _check_campaign(campaign, trial)
             if trial.name in existing:
                 skipped.append(trial.name)
                 continue
@@ -110,10 +113,12 @@ def import_trials(
                     origin, "", None,
                     f"holds two files for the trial {trial.name}; import them one by one",
                 )  # fmt: skip
+            if imported:
+                _check_campaign(campaign, trial)
             if not campaign.begun:
                 _describe(campaign, trial, origin, kind)
             try:
-                taken, warned = _take(campaign, trial, kind)
+                taken, warned = _take(store, campaign, trial, kind)
             except FormatError as error:
                 file = error.file or (origin if origin.is_file() else origin / trial.source)
                 raise InputError(file, "", None, str(error)) from None
@@ -127,7 +132,25 @@ def import_trials(
     return {**result, "warnings": warnings} if warnings else result
 
 
+def _check_campaign(campaign: Campaign, trial: ForeignTrial) -> None:
+    """Check that a trial belongs to a campaign that has begun."""
+    if isinstance(trial, StoredTrial) and trial.original is not None:
+        if not trial.original.campaign.is_of(campaign):
+            raise InputError(
+                "--name", "", campaign.name,
+                f"has another protocol or rig than {trial.source}; choose another name, and "
+                "import one campaign at a time",
+            )  # fmt: skip
+    elif IMPORTED not in campaign.info:
+        raise InputError(
+            "--name", "", campaign.name, "is a collected campaign; choose another name"
+        )
+
+
 def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) -> None:
+    if isinstance(trial, StoredTrial) and trial.original is not None:
+        trial.original.campaign.begin(campaign)
+        return
     about = {"from": origin.name, "format": kind, "when": now()}
     info: CampaignInfo = {
         "name": campaign.name, "simulated": trial.simulated, IMPORTED: about
@@ -136,8 +159,12 @@ def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) 
     campaign.update(info, text, text.replace("protocol", "rig file"))
 
 
-def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str, int], list[str]]:
+def _take(
+    store: Store, campaign: Campaign, trial: ForeignTrial, kind: str
+) -> tuple[dict[str, int], list[str]]:
     """Commit one trial; return its counts and warnings."""
+    if isinstance(trial, StoredTrial) and trial.original is not None:
+        return _restore(store, campaign, trial, trial.original), []
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
         (first_us, last_us), warnings = _fill(writer, trial)
@@ -149,6 +176,26 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str,
         writer.discard()
         raise
     return {"events": rows.events, "frames": rows.frames}, warnings
+
+
+def _restore(
+    store: Store, campaign: Campaign, trial: StoredTrial, original: Original
+) -> dict[str, int]:
+    """Commit a trial of a store as it was, with its label and clocks; return its counts."""
+    writer = campaign.begin(safe_name(trial.name), original.frame_px(), original.rate_hz)
+    try:
+        original.keep_label(store, campaign.name, trial.name)
+        kept = {"imported": now(), "from": trial.source}
+        original.commit(
+            writer, Provenance.model_validate({**original.provenance.to_json(), **kept})
+        )
+    except BaseException:
+        writer.discard()
+        original.drop_label(store, campaign.name, trial.name)
+        raise
+    original.keep_sync(campaign, campaign.recording(trial.name))
+    counts = original.record.counts
+    return {"events": counts.events, "frames": counts.frames}
 
 
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
@@ -343,6 +390,8 @@ def _possible(file: Path) -> tuple[str, ...]:
     head = read_head(file)
     if head.startswith(LINE):
         return ("aedat4",)
+    if head.startswith(MAGIC):
+        return ("mcap",)
     if head.startswith(_HDF5):
         return ("dsec", "lab-hdf5")
     if form := faery_type(head):

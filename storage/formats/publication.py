@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -28,6 +28,8 @@ LICENCES = (
 )  # fmt: skip
 """Licences of data by their SPDX ids; any other one is ``LicenseRef-NAME``, as SPDX has it."""
 _OWN_LICENCE = re.compile(r"LicenseRef-[A-Za-z0-9.-]+")
+PERSONAL = ("operator", "host")
+"""Keys of a trial's provenance that are not published."""
 NO_SPLIT = "none"
 SPLITS = {
     "train": "cr:TrainingSplit",
@@ -163,6 +165,20 @@ class Publication:
             return recording.files()
         except StoreError as error:
             raise _damaged(campaign, recording.folder.name, str(error)) from None
+
+
+def campaign_folder(campaign: str) -> str:
+    """Return the path of a campaign's folder in a publication."""
+    return f"campaigns/{campaign}"
+
+
+def trial_folder(campaign: str, trial: str) -> str:
+    """Return the path of a trial's folder in a publication that keeps a store's files."""
+    return f"{campaign_folder(campaign)}/trials/{trial}"
+
+
+TrialPath = Callable[[str, str], str]
+"""Gives a trial's path in a publication from the names of its campaign and itself."""
 
 
 def _damaged(campaign: Campaign, trial: str, cause: str) -> InputError:

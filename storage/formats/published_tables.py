@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from sliplab.protocols.plan import condition_columns
 from sliplab.storage.formats.export_trials import label_table
-from sliplab.storage.formats.publication import Publication
+from sliplab.storage.formats.publication import Publication, TrialPath
 from sliplab.storage.trials.catalogue import catalogue
 
 TRIALS, LABELLED = "trials", "labels"
@@ -19,7 +19,7 @@ TRIALS, LABELLED = "trials", "labels"
 _TRIAL_COLUMNS = {
     "campaign": "one protocol run on one rig",
     "trial": "id, unique within its campaign",
-    "folder": "folder of the trial's files in this data set",
+    "path": "folder of the trial's files, or its file, in this data set",
     "split": "part of the split: train, validation or test; none where no protocol splits",
     "experiment": "kind of the protocol",
     "role": "measured, or what else the trial is for",
@@ -59,8 +59,11 @@ _BY_RULE = {
 }
 
 
-def write_tables(publication: Publication, folder: Path) -> dict[str, pa.Table]:
+def write_tables(publication: Publication, folder: Path, path: TrialPath) -> dict[str, pa.Table]:
     """Write ``trials.parquet`` and, where there are labels, ``labels.parquet``.
+
+    Args:
+        path: gives the path of a trial in the publication.
 
     Returns:
         The tables by name; each field's metadata has its ``description``.
@@ -68,7 +71,7 @@ def write_tables(publication: Publication, folder: Path) -> dict[str, pa.Table]:
     Raises:
         StoreError: a trial is damaged.
     """
-    tables = {TRIALS: _trials(publication)}
+    tables = {TRIALS: _trials(publication, path)}
     parts = [
         label_table(publication.store, campaign.name, sorted(campaign.committed()))
         for campaign in publication.campaigns
@@ -82,17 +85,12 @@ def write_tables(publication: Publication, folder: Path) -> dict[str, pa.Table]:
     return tables
 
 
-def trial_folder(campaign: str, trial: str) -> str:
-    """Return the path of a trial's folder in a publication."""
-    return f"campaigns/{campaign}/trials/{trial}"
-
-
-def _trials(publication: Publication) -> pa.Table:
+def _trials(publication: Publication, path: TrialPath) -> pa.Table:
     names = [campaign.name for campaign in publication.campaigns]
     rows = catalogue(publication.store)
     rows = rows[rows["campaign"].isin(names)].dropna(axis=1, how="all").reset_index(drop=True)
     keys = list(zip(rows["campaign"], rows["trial"], strict=True))
-    rows.insert(2, "folder", [trial_folder(*key) for key in keys])
+    rows.insert(2, "path", [path(*key) for key in keys])
     rows.insert(3, "split", [publication.split(*key) for key in keys])
     factors: dict[str, str] = {}
     units: dict[str, str] = {}

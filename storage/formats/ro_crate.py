@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import PurePosixPath
 
-from sliplab.storage.formats.publication import Publication
+from sliplab.storage.formats.publication import Publication, TrialPath, campaign_folder
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import PROTOCOL, RIG
+from sliplab.storage.trials.store import PROTOCOL, RIG, Campaign
 
 _CONTEXT = "https://w3id.org/ro/crate/1.1/context"
 _KINDS = {
@@ -15,18 +15,25 @@ _KINDS = {
     ".mkv": "video/x-matroska",
     ".json": "application/json",
     ".yaml": "application/yaml",
+    ".mcap": "application/x-mcap",
     ".parquet": "application/x-parquet",
     ".npz": "application/zip",
     ".md": "text/markdown",
 }
 
 
-def ro_crate(publication: Publication, sums: Mapping[str, str], sizes: Mapping[str, int]) -> Json:
+def ro_crate(
+    publication: Publication,
+    sums: Mapping[str, str],
+    sizes: Mapping[str, int],
+    data: TrialPath,
+) -> Json:
     """Return the content of ``ro-crate-metadata.json``.
 
     Args:
         sums: SHA-256 of every file, by its path in the publication.
         sizes: bytes of each.
+        data: gives the path of a trial's data.
     """
     about = publication.about
     people = [{"@id": f"#creator-{n}", "@type": "Person", "name": name}
@@ -36,8 +43,8 @@ def ro_crate(publication: Publication, sums: Mapping[str, str], sizes: Mapping[s
          "version": version}
         for version in publication.versions.get("sliplab", ())
     ]  # fmt: skip
-    runs = [_run(publication, campaign.name, [item["@id"] for item in programs])
-            for campaign in publication.campaigns]  # fmt: skip
+    used = [item["@id"] for item in programs]
+    runs = [_run(campaign, used, data) for campaign in publication.campaigns]
     files = [
         {
             "@id": name,
@@ -77,17 +84,15 @@ def ro_crate(publication: Publication, sums: Mapping[str, str], sizes: Mapping[s
     return {"@context": context, "@graph": graph}
 
 
-def _run(publication: Publication, campaign: str, programs: list[str]) -> Json:
+def _run(campaign: Campaign, programs: list[str], data: TrialPath) -> Json:
     """Describe how a campaign's trials were made: by which program, protocol and rig."""
-    kept = {item.name: item for item in publication.campaigns}[campaign]
-    folder = f"campaigns/{campaign}"
+    folder = campaign_folder(campaign.name)
+    simulated = " (simulated)" if campaign.info["simulated"] else ""
     return {
-        "@id": f"#collection-{campaign}",
+        "@id": f"#collection-{campaign.name}",
         "@type": "CreateAction",
-        "name": f"collection of {campaign}{' (simulated)' if kept.info['simulated'] else ''}",
+        "name": f"collection of {campaign.name}{simulated}",
         "instrument": [{"@id": name} for name in programs],
         "object": [{"@id": f"{folder}/{name}"} for name in (PROTOCOL, RIG)],
-        "result": [
-            {"@id": f"{folder}/trials/{trial}/data.h5"} for trial in sorted(kept.committed())
-        ],
+        "result": [{"@id": data(campaign.name, trial)} for trial in sorted(campaign.committed())],
     }

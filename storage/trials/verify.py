@@ -198,13 +198,18 @@ def _temporary(folder: Path, campaign: str) -> list[Problem]:
 
 
 def _contents(folder: Path) -> Found:
-    problems: Found = []
     try:
         record = TrialRecord.load(folder / RECORD)
     except NewerFormat as error:
         return [(folder / RECORD, f"was written by a newer version (format {error.format})")]
     if record.trial != folder.name:
-        problems.append((folder / RECORD, f"is of trial {record.trial}"))
+        return [(folder / RECORD, f"is of trial {record.trial}")]
+    return content_problems(folder, record)
+
+
+def content_problems(folder: Path, record: TrialRecord) -> Found:
+    """Return what does not fit a trial's record in its files, or runs backwards, by file."""
+    problems: Found = []
     with StreamReader(folder / DATA) as reader:
         counts = reader.counts()
         made = [name for name in TIMING if reader.has(name)]

@@ -194,3 +194,10 @@ def count_frames(path: Path) -> int:
     """Number of frames, counted by packets without decoding."""
     with av.open(str(path)) as container:
         return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
+
+
+def frame_rate(path: Path) -> int:
+    """Frames a second of a video's time base; the frames have times of their own."""
+    with av.open(str(path)) as container:
+        rate: int = round(container.streams.video[0].average_rate)
+    return rate

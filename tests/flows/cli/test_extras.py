@@ -113,6 +113,7 @@ def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
         ("hardware", "rtde_control", "check pilot --rig loopback --store OUT/new"),
         ("cluster", "distributed", "label STORE --dask 127.0.0.1:1"),
         ("view", "rerun", "view STORE TRIAL --save OUT/trial.rrd"),
+        ("publish", "mcap", "publish STORE --as mcap --output OUT/published"),
     ],
 )
 def test_a_command_says_which_extra_it_lacks(

@@ -40,10 +40,25 @@ def test_one_campaign_is_published_and_a_missing_licence_is_said(tmp_path: Path)
     assert [path.name for path in (tmp_path / "out" / "campaigns").iterdir()] == ["small"]
 
 
+def test_mcap_files_are_published_and_imported_again(tmp_path: Path) -> None:
+    store, output = older_store(tmp_path / "store"), tmp_path / "out"
+    found = answer("publish", store, "--as", "mcap", "--output", output, "--licence", "CC0-1.0")
+    assert (found["trials"], found["labels"]) == (4, 4)
+    folder, again = output / "campaigns" / "small", tmp_path / "again"
+    taken = answer("import", folder, "--store", again, "--name", "small")
+    assert len(taken["imported"]) == 4
+    assert answer("verify", again)["whole"] == 4
+    mine, theirs = answer("trials", store)["trials"], answer("trials", again)["trials"]
+    assert mine == theirs
+    # a campaign as any other: steps run on it, with what they need of protocol and rig
+    labelled = answer("label", again)
+    assert labelled["done"] + labelled["fresh"] == 4
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--as", "word"), "--as = word: must be one of croissant"),
+        (("--as", "word"), "--as = word: must be one of croissant, mcap"),
         (("--as", "croissant", "--campaign", "x"), "--campaign = x: must be a campaign of"),
         (("--as", "croissant", "--licence", "free"), "--licence = free: must be one of CC0-1.0"),
         (("--as", "croissant", "--creator", " "), "--creator"),

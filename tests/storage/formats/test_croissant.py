@@ -14,9 +14,9 @@ import pytest
 from rocrate.rocrate import ROCrate
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.croissant import publish_croissant
 from sliplab.storage.formats.export_trials import label_table
 from sliplab.storage.formats.publication import About, Publication
+from sliplab.storage.formats.publish import publish
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
@@ -50,7 +50,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def published(labelled: Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, published."""
     output = tmp_path_factory.mktemp("out") / "published"
-    result = publish_croissant(publication(labelled), output)
+    result = publish(publication(labelled), output, "croissant")
     assert (result["trials"], result["labels"], result["simulated"]) == (4, 4, True)
     return output
 
@@ -74,7 +74,7 @@ def test_croissants_own_reader_finds_no_fault_and_loads_the_tables(
     for one, row in zip(trials, expected.to_dict("records"), strict=True):
         assert {key: one[f"trials/{key}"] for key in row} == row
         assert one["trials/split"] == "train"
-        assert (published / str(one["trials/folder"]) / "data.h5").is_file()
+        assert (published / str(one["trials/path"]) / "data.h5").is_file()
     where = labelled.campaigns()[0]
     labels = label_table(labelled, where.name, sorted(where.committed()))
     for found, row in zip(data.records("labels"), labels.to_dict("records"), strict=True):
@@ -148,7 +148,9 @@ def test_a_real_campaign_with_a_video_without_labels(tmp_path: Path) -> None:
     writer.commit(record("t", simulated=False), Provenance(host="test", operator="somebody"))
     about = About("One | trial", (), None, "2026-11-24")
     output = tmp_path / "deep" / "out"
-    publish_croissant(publication(Store.open(tmp_path / "store"), about=about, splits={}), output)
+    publish(
+        publication(Store.open(tmp_path / "store"), about=about, splits={}), output, "croissant"
+    )
     data = mlcroissant.Dataset(output / "croissant.json")
     assert {item.uuid for item in data.metadata.record_sets} == {"splits", "trials"}
     assert {item.uuid for item in data.metadata.file_sets} == {"recordings", "records", "videos"}
@@ -166,7 +168,7 @@ def test_a_real_campaign_with_a_video_without_labels(tmp_path: Path) -> None:
         assert (mine == theirs).all()
     commit(where, "simulated")
     mixed = publication(Store.open(tmp_path / "store"))
-    publish_croissant(mixed, tmp_path / "mixed")
+    publish(mixed, tmp_path / "mixed", "croissant")
     card = (tmp_path / "mixed" / "README.md").read_text()
     assert card.splitlines()[0] == "Simulated data in part: 1 of 2 trials."
 
@@ -180,7 +182,7 @@ def test_nothing_is_left_of_an_interrupted_publication(labelled: Store, tmp_path
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        publish_croissant(publication(labelled), tmp_path / "out", stop)
+        publish(publication(labelled), tmp_path / "out", "croissant", stop)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -193,12 +195,12 @@ def test_what_cannot_be_published_is_said_and_changes_nothing(tmp_path: Path) ->
     output = tmp_path / "out"
     output.mkdir()
     with pytest.raises(InputError, match=r"--output = .*out: exists; it is not overwritten"):
-        publish_croissant(publication(store), output)
+        publish(publication(store), output, "croissant")
     output.rmdir()
     data = (folder / "data.h5").read_bytes()
     (folder / "data.h5").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     with pytest.raises(InputError, match=r"campaigns\.c\.trials\.t = .*checksum.*must be whole"):
-        publish_croissant(publication(store), output)
+        publish(publication(store), output, "croissant")
     (folder / "data.h5").write_bytes(data[:-1])
     with pytest.raises(InputError, match=r"campaigns\.c\.trials\.t = .* bytes.*must be whole"):
         publication(store)
@@ -223,6 +225,6 @@ def test_a_licence_of_ones_own_has_a_name_and_no_address(tmp_path: Path) -> None
     commit(campaign(tmp_path / "store"), "t")
     about = About("T", (), "LicenseRef-Lab", "2026-11-24")
     output = tmp_path / "out"
-    publish_croissant(publication(Store.open(tmp_path / "store"), about=about), output)
+    publish(publication(Store.open(tmp_path / "store"), about=about), output, "croissant")
     assert json.loads((output / "croissant.json").read_text())["license"] == "LicenseRef-Lab"
     assert ROCrate(output).root_dataset["license"].id == "#LicenseRef-Lab"

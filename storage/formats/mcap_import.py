@@ -1,0 +1,348 @@
+"""Reader of MCAP files with ROS 2 messages: those that SlipLab published, and other recordings.
+
+A file of ours has a trial with all that belongs to it. Of any other file the first topic of
+`event_camera_msgs/msg/EventPacket` and the first one of `sensor_msgs/msg/Image` are read, with
+their ROS times. Records and chunks are read by the `mcap` library, within limits: a foreign file
+says how large its parts are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import json_text, safe_name
+from sliplab.storage.formats import ros2_messages as ros2
+from sliplab.storage.formats.foreign import (
+    MOST_PX,
+    ForeignTrial,
+    FormatError,
+    event_chunk,
+)
+from sliplab.storage.formats.mcap_trials import (
+    FORMAT,
+    LABEL_ARRAYS,
+    LABEL_JSON,
+    METADATA,
+    SYNC_JSON,
+)
+from sliplab.storage.formats.original import CampaignTexts, Original, StoredTrial
+from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
+from sliplab.storage.schema.label import TrialLabel
+from sliplab.storage.schema.trial import Provenance, SyncResult, TrialRecord
+from sliplab.storage.streams import U8, EventChunk, FrameChunk, Json
+from sliplab.storage.trials.checksums import PROVENANCE, RECORD
+from sliplab.storage.trials.store import INFO, PROTOCOL, RIG
+
+MAGIC = b"\x89MCAP0\r\n"
+_MOST_RECORD, _MOST_CHUNK, _MOST_KEPT = 1 << 28, 1 << 28, 1 << 30
+_FRAMES_AT_ONCE = 32
+_LATEST_NS = 1 << 62
+DocumentT = TypeVar("DocumentT", bound=Document)
+
+
+@dataclass
+class _Found:
+    """What a file holds, but its events and frames."""
+
+    topics: dict[str, str] = field(default_factory=dict)
+    """Message type by topic, in the order of the file."""
+    cameras: dict[str, str] = field(default_factory=dict)
+    """Topic by the name of a camera, of a file of ours."""
+    attached: dict[str, bytes] = field(default_factory=dict)
+    about: dict[str, str] | None = None
+    columns: dict[tuple[str, str], list[ros2.Rows]] = field(default_factory=dict)
+    size: tuple[int, int] | None = None
+    """Columns and rows of the events of other files, once they were read."""
+
+
+def read_mcap(path: Path, name: str) -> ForeignTrial:
+    """Read a file.
+
+    Raises:
+        FormatError: it is damaged, or has no events and no trial of a store.
+        ModuleNotFoundError: the extra `publish` is missing.
+    """
+    found = _scan(path)
+    if found.about is not None:
+        return _ours(path, found)
+    return _other(path, name, found)
+
+
+def _scan(path: Path) -> _Found:
+    """Read all of a file once, and check it."""
+    found = _Found()
+    kept = 0
+    for kind, topic, data in _messages(path, found, {ros2.COLUMN}):
+        if kind != ros2.COLUMN:
+            continue
+        kept += len(data)
+        if kept > _MOST_KEPT:
+            raise FormatError(f"holds more than {_MOST_KEPT >> 30} GiB in {topic}")
+        rows = ros2.Rows.parse(data)
+        found.columns.setdefault((rows.file, rows.column), []).append(rows)
+    return found
+
+
+def _messages(
+    path: Path, found: _Found | None, kinds: Collection[str], topic: str | None = None
+) -> Iterator[tuple[str, str, bytes]]:
+    """Yield messages of some types, and of one topic: type, topic and bytes, as the file has them.
+
+    Raises:
+        FormatError: the file is damaged.
+    """
+    from mcap.exceptions import McapError
+    from mcap.records import Attachment, Channel, Chunk, DataEnd, Message, Metadata, Schema
+    from mcap.stream_reader import StreamReader
+
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+
+    def one(record: Any) -> Iterator[tuple[str, str, bytes]]:
+        if isinstance(record, Schema):
+            schemas[record.id] = record.name if record.encoding == "ros2msg" else ""
+        elif isinstance(record, Channel):
+            kind = schemas.get(record.schema_id, "") if record.message_encoding == "cdr" else ""
+            channels[record.id] = kind, record.topic
+            if found is not None:
+                found.topics.setdefault(record.topic, kind)
+                if (camera := record.metadata.get("camera")) is not None:
+                    found.cameras[camera] = record.topic
+        elif isinstance(record, Message):
+            if record.channel_id not in channels:
+                raise FormatError("holds a message of no channel")
+            kind, of = channels[record.channel_id]
+            if kind in kinds and topic in (None, of):
+                yield kind, of, record.data
+        elif isinstance(record, Attachment) and found is not None:
+            found.attached[record.name] = record.data
+        elif isinstance(record, Metadata) and found is not None and record.name == METADATA:
+            found.about = dict(record.metadata)
+
+    try:
+        with path.open("rb") as handle:
+            reader = StreamReader(handle, emit_chunks=True, record_size_limit=_MOST_RECORD)
+            for record in reader.records:
+                if isinstance(record, DataEnd):
+                    continue
+                for part in _opened(record) if isinstance(record, Chunk) else (record,):
+                    yield from one(part)
+    except FormatError:
+        raise
+    except McapError as error:
+        raise FormatError(f"is damaged: {str(error) or type(error).__name__}") from None
+    except (
+        struct.error,
+        ValueError,
+        KeyError,
+        RuntimeError,
+        MemoryError,
+        OSError,
+        EOFError,
+    ) as error:
+        raise FormatError(f"is damaged or cut short: {error}") from None
+
+
+def _opened(chunk: Any) -> list[Any]:
+    """Unpack a chunk, within limits, and check its checksum."""
+    import zstandard
+    from mcap.stream_reader import breakup_chunk
+
+    if chunk.uncompressed_size > _MOST_CHUNK:
+        raise FormatError(f"holds a chunk of {chunk.uncompressed_size} bytes")
+    if chunk.compression == "zstd":
+        # the library allocates what the frame says
+        if zstandard.frame_content_size(chunk.data) not in (-1, chunk.uncompressed_size):
+            raise FormatError("holds a chunk of another size than it says")
+    elif chunk.compression == "lz4":
+        chunk = _unpacked_lz4(chunk)
+    elif chunk.compression:
+        raise FormatError(f"is compressed by {chunk.compression!r:.40}, which is unknown")
+    try:
+        return breakup_chunk(chunk, validate_crc=True)
+    except zstandard.ZstdError as error:
+        raise FormatError(f"holds a damaged chunk: {error}") from None
+
+
+def _unpacked_lz4(chunk: Any) -> Any:
+    from dataclasses import replace
+
+    from lz4.frame import LZ4FrameDecompressor
+
+    data = LZ4FrameDecompressor().decompress(chunk.data, chunk.uncompressed_size + 1)
+    if len(data) != chunk.uncompressed_size:
+        raise FormatError("holds a chunk of another size than it says")
+    return replace(chunk, data=data, compression="")
+
+
+def _ours(path: Path, found: _Found) -> ForeignTrial:
+    """Return the trial of a store that a file holds."""
+    about = found.about or {}
+    if about.get("format") != FORMAT:
+        raise FormatError(
+            f"has the format {about.get('format')!r:.20} of a published trial; this version of "
+            f"SlipLab reads {FORMAT}"
+        )
+    for name in (RECORD, PROVENANCE, INFO, PROTOCOL, RIG):
+        if name not in found.attached:
+            raise FormatError(f"lacks {name} of its trial")
+    for name, data in found.attached.items():
+        if about.get(f"sha256 {name}") != hashlib.sha256(data).hexdigest():
+            raise FormatError(f"has a {name!r:.60} that does not match its checksum")
+    record = _document(found, RECORD, TrialRecord)
+    label = _document(found, LABEL_JSON, TrialLabel) if LABEL_JSON in found.attached else None
+    sync = _document(found, SYNC_JSON, SyncResult) if SYNC_JSON in found.attached else None
+    try:
+        safe_name(record.trial)
+        rate_hz = int(about.get("frame_rate_hz", "100"))
+    except (StoreError, ValueError) as error:
+        raise FormatError(f"holds no trial: {error}") from None
+    if not 0 < rate_hz < 1_000_000:
+        raise FormatError(f"has {rate_hz} frames a second")
+    events = {
+        camera: _our_events(path, topic)
+        for camera, topic in found.cameras.items()
+        if found.topics[topic] == ros2.EVENTS
+    }
+    frames = {
+        camera: _our_frames(path, topic)
+        for camera, topic in found.cameras.items()
+        if found.topics[topic] == ros2.IMAGE
+    }
+    original = Original(
+        record, _document(found, PROVENANCE, Provenance), _campaign(path, found),
+        {key: _column(parts) for key, parts in found.columns.items()}, events, frames,
+        {key[1].split("/")[1]: parts[0].unit for key, parts in found.columns.items()
+         if key[1].startswith("streams/") and key[1].endswith("/value")},
+        rate_hz, label, found.attached.get(LABEL_ARRAYS), sync,
+    )  # fmt: skip
+    return StoredTrial(
+        record.trial, path.name, events.get("events", lambda: iter(())), "the trial's time line",
+        simulated=record.simulated, original=original,
+    )  # fmt: skip
+
+
+def _json(found: _Found, name: str) -> Json:
+    try:
+        data = json.loads(found.attached[name].decode())
+        json_text(data)  # no NaN, no infinity
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"has a damaged {name}: {error}") from None
+    if not isinstance(data, dict):
+        raise FormatError(f"has a damaged {name}: it is not an object")
+    return data
+
+
+def _document(found: _Found, name: str, kind: type[DocumentT]) -> DocumentT:
+    try:
+        return kind.parse(_json(found, name), Path(name))
+    except (DocumentError, NewerFormat) as error:
+        raise FormatError(f"has a damaged {error}") from None
+
+
+def _campaign(path: Path, found: _Found) -> CampaignTexts:
+    info = _json(found, INFO)
+    if not isinstance(info.get("name"), str) or not isinstance(info.get("simulated"), bool):
+        raise FormatError(f"has a damaged {INFO}: it lacks name or simulated")
+    texts = []
+    for name in (PROTOCOL, RIG):
+        try:
+            texts.append(found.attached[name].decode())
+            parse_yaml(texts[-1], path)
+        except (ValueError, InputError) as error:
+            raise FormatError(f"has a damaged {name}: {error}") from None
+    return CampaignTexts(info, *texts)  # type: ignore[arg-type]  # checked as far as it is used
+
+
+def _column(parts: list[ros2.Rows]) -> npt.NDArray[np.generic]:
+    first = parts[0].values
+    for part in parts:
+        if part.values.dtype != first.dtype or part.values.shape[1:] != first.shape[1:]:
+            raise FormatError(f"holds {part.column!r:.60} as rows of several kinds")
+    return np.concatenate([part.values for part in parts])
+
+
+def _our_events(path: Path, topic: str) -> Callable[[], Iterator[EventChunk]]:
+    def read() -> Iterator[EventChunk]:
+        for _, _, data in _messages(path, None, {ros2.EVENTS}, topic):
+            packet = ros2.EventPacket.parse(data)
+            t_ns, chunk = ros2.unpack_mono(packet)
+            if np.any(t_ns % 1000):
+                raise FormatError("holds events between two microseconds of their camera")
+            yield _checked(chunk, packet)
+
+    return read
+
+
+def _our_frames(path: Path, topic: str) -> Callable[[], Iterator[U8]]:
+    def read() -> Iterator[U8]:
+        for _, _, data in _messages(path, None, {ros2.IMAGE}, topic):
+            yield ros2.Image.parse(data).image
+
+    return read
+
+
+def _checked(chunk: EventChunk, packet: ros2.EventPacket) -> EventChunk:
+    """Check events against the size that their packet gives."""
+    size = packet.width, packet.height
+    if 0 not in size and len(chunk) and (chunk.x.max() >= size[0] or chunk.y.max() >= size[1]):
+        raise FormatError(f"holds events outside of the {size[0]} x {size[1]} pixels of its camera")
+    return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
+
+
+def _other(path: Path, name: str, found: _Found) -> ForeignTrial:
+    """Return the trial of a recording by other programs."""
+    topics = {
+        kind: next((t for t, of in found.topics.items() if of == kind), None)
+        for kind in (ros2.EVENTS, ros2.IMAGE)
+    }
+    events, images = topics[ros2.EVENTS], topics[ros2.IMAGE]
+    if events is None:
+        there = ", ".join(sorted({kind for kind in found.topics.values() if kind})) or "none"
+        raise FormatError(
+            f"has no messages of {ros2.EVENTS}; its ROS 2 messages are: {there}"[:400]
+        )
+    left = sorted(topic for topic in found.topics if topic not in (events, images))
+
+    def all_events() -> Iterator[EventChunk]:
+        for _, _, data in _messages(path, None, {ros2.EVENTS}, events):
+            packet = ros2.EventPacket.parse(data)
+            if 0 < packet.width <= MOST_PX and 0 < packet.height <= MOST_PX:
+                found.size = packet.width, packet.height
+            yield _checked(ros2.unpack_mono(packet)[1], packet)
+
+    def all_frames() -> Iterator[FrameChunk]:
+        last = 0
+        messages = _messages(path, None, {ros2.IMAGE}, images)
+        for number, (_, _, data) in enumerate(messages):
+            one = ros2.Image.parse(data)
+            if not last <= one.t_ns < _LATEST_NS:
+                raise FormatError(f"holds a frame at {one.t_ns} ns after one at {last} ns")
+            last = one.t_ns
+            times = np.array([one.t_ns], np.int64)
+            yield FrameChunk(
+                one.image[None], np.array([number], np.int64), times, times, np.zeros(1, np.uint8)
+            )
+
+    frame_px = None
+    if images is not None:
+        first = next(all_frames(), None)
+        frame_px = None if first is None else (first.images.shape[2], first.images.shape[1])
+    return ForeignTrial(
+        name, path.name, all_events, "ROS time, rounded to us", lambda: found.size,
+        frames=None if frame_px is None else all_frames, frame_px=frame_px,
+        about={"left_out": left} if left else {},
+        unknown=("sync grade", "poses", "motion", "condition"),
+    )  # fmt: skip

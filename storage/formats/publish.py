@@ -1,0 +1,158 @@
+"""Publication of trials in one folder: as the store's own files, or as MCAP files.
+
+Beside the trials there are tables, a data card, checksums, and descriptions as Croissant and as
+RO-Crate. The folder of the store's own files reads as a store as well.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import inside, sha256, write_json_aside
+from sliplab.storage.formats.croissant import croissant
+from sliplab.storage.formats.data_card import data_card
+from sliplab.storage.formats.foreign import FormatError
+from sliplab.storage.formats.mcap_trials import write_mcap
+from sliplab.storage.formats.publication import (
+    PERSONAL,
+    Publication,
+    TrialPath,
+    campaign_folder,
+    staged,
+    trial_folder,
+)
+from sliplab.storage.formats.published_tables import LABELLED, write_tables
+from sliplab.storage.formats.ro_crate import ro_crate
+from sliplab.storage.schema.label import LABELS
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.checksums import CHECKSUMS, DATA, PROVENANCE
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, STORE, SYNC, Campaign
+
+CROISSANT, RO_CRATE, CARD, SUMS = (
+    "croissant.json", "ro-crate-metadata.json", "README.md", "checksums.sha256"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form that trials are published in.
+
+    Attributes:
+        path: gives a trial's folder or file in the publication.
+        data: what follows in the path of the trial's data.
+        write: writes one trial into the publication's folder.
+    """
+
+    path: TrialPath
+    data: str
+    write: Callable[[Publication, Campaign, Recording, Path], None]
+
+
+def publish(
+    publication: Publication,
+    output: Path,
+    form: str,
+    on_trial: Callable[[str], None] = lambda name: None,
+) -> Json:
+    """Write a publication into the new folder `output`.
+
+    Args:
+        form: one of `FORMS`.
+
+    Returns:
+        ``trials``, ``labels``, ``files`` and ``bytes`` written, and ``simulated``.
+
+    Raises:
+        InputError: `output` exists, or a trial is damaged or does not fit the format.
+    """
+    how = FORMS[form]
+    with staged(output) as folder:
+        for campaign in publication.campaigns:
+            _copy_campaign(campaign, folder)
+        for campaign, recording in publication.recordings:
+            on_trial(recording.folder.name)
+            how.write(publication, campaign, recording, folder)
+        tables = write_tables(publication, folder, how.path)
+        (folder / CARD).write_text(data_card(publication, tables, form), "utf-8")
+        write_json_aside(folder / CROISSANT, croissant(publication, tables, folder))
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        sums = {path.relative_to(folder).as_posix(): sha256(path) for path in files}
+        sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+        crate = ro_crate(publication, sums, sizes, lambda *trial: how.path(*trial) + how.data)
+        write_json_aside(folder / RO_CRATE, crate)
+        sums[RO_CRATE] = sha256(folder / RO_CRATE)
+        lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
+        (folder / SUMS).write_text(lines, "utf-8")
+    return {
+        "trials": publication.count,
+        "labels": len(tables[LABELLED]) if LABELLED in tables else 0,
+        "files": len(sums) + 1,
+        "bytes": sum(sizes.values()),
+        "simulated": publication.simulated,
+    }
+
+
+def _copy_campaign(campaign: Campaign, folder: Path) -> None:
+    target = folder / campaign_folder(campaign.name)
+    target.mkdir(parents=True)
+    for name in (INFO, PROTOCOL, RIG, CHECKSUMS):
+        if (campaign.folder / name).is_file():
+            shutil.copyfile(campaign.folder / name, target / name)
+
+
+def _copy_trial(
+    publication: Publication, campaign: Campaign, recording: Recording, folder: Path
+) -> None:
+    """Copy a trial's files, its label and its refitted clocks, into a store."""
+    store, trial = publication.store, recording.folder.name
+    if not (folder / STORE).exists():
+        shutil.copyfile(store.folder / STORE, folder / STORE)
+    target = folder / trial_folder(campaign.name, trial)
+    target.mkdir(parents=True)
+    for name, path in publication.files(campaign, recording).items():
+        shutil.copyfile(path, target / name)
+    shutil.copyfile(recording.folder / CHECKSUMS, target / CHECKSUMS)
+    made = campaign.provenance(recording).to_json()
+    kept = {key: value for key, value in made.items() if key not in PERSONAL}
+    write_json_aside(target / PROVENANCE, kept)
+    labels = Derived.of(store, LABELS, campaign.name)
+    results = {LABELS: [labels.folder / f"{trial}.json", labels.arrays_path(trial)]}
+    if recording.refitted:
+        results[SYNC] = [campaign.sync_file(trial)]
+    for step, paths in results.items():
+        copied = folder / "derived" / step / campaign.name
+        for path in paths:
+            if path.is_file():
+                copied.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(inside(path, store.folder), copied / path.name)
+
+
+def mcap_file(campaign: str, trial: str) -> str:
+    """Return the path of a trial's MCAP file in a publication."""
+    return f"{campaign_folder(campaign)}/{trial}.mcap"
+
+
+def _write_mcap(
+    publication: Publication, campaign: Campaign, recording: Recording, folder: Path
+) -> None:
+    publication.files(campaign, recording)  # each is checked
+    path = folder / mcap_file(campaign.name, recording.folder.name)
+    try:
+        write_mcap(path, publication.store, campaign, recording, PERSONAL)
+    except FormatError as error:
+        raise InputError(
+            "--as", "", "mcap", f"trial {recording.folder.name} {error}; it fits croissant"
+        ) from None
+
+
+FORMS = {
+    "croissant": Form(trial_folder, f"/{DATA}", _copy_trial),
+    "mcap": Form(mcap_file, "", _write_mcap),
+}
+"""Forms of a publication, by name."""
