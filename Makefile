@@ -25,9 +25,9 @@ test: $(DONE)
 test-programs: $(DONE)
 	$(PYTEST) -n 3 --dist worksteal -m 'programs and not realtime and not long'
 
-# stand-ins in real time
+# fakes in real time; they wait more than they compute
 test-realtime: $(DONE)
-	$(PYTEST) -n 2 --dist worksteal -m 'realtime and not long'
+	$(PYTEST) -n 4 --dist worksteal -m 'realtime and not long'
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)
