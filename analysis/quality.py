@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from sliplab.analysis.clocks.synchronise import (
+    SyncStreams,
     TrialSync,
     further_clocks,
     streams_of,
@@ -54,6 +55,9 @@ WINDOW_S = 0.5
 """The shortest interval over which a speed is measured, s."""
 ARRIVAL_WINDOW_S = 1.0
 """The same where poses are timed by their arrival: a busy host reads some of them late."""
+_SURE_EVENTS = 15.0
+_PULSE_NS = 2_000_000
+"""A device reports a pulse if it has one so near; ticks are 10 ms apart at 100 Hz."""
 _WINDOW_POSES = 5
 _NOISE = 0.01
 """Intervals are long enough that the poses' noise changes a speed by this share of it at most."""
@@ -156,7 +160,7 @@ def assess(
         lost = _frames_lost(streams.frame_number, motion.recorded_ns, rate_hz)
         results["frames_lost"] = _gate(lost, gates.frames_lost)
     if with_events:
-        gap_s = _event_gap(event_us, sync, "events", motion.moving_ns)
+        gap_s = _event_gap(event_us, streams.event_pulses, "events", streams, sync, motion, gates)
         results["event_gap_s"] = _gate(gap_s, float(gates.event_gap))
         results["event_burst"] = _gate(_event_burst(event_us), gates.event_burst)
     if gates.hold_slip is not None and tracks:
@@ -178,7 +182,7 @@ def assess(
         if about.of_camera:
             with StreamReader(folder / stream_file(name)) as reader:
                 named[name], gated = _further_camera(
-                    name, about, reader, sync, motion, gates, rate_hz
+                    name, about, reader, streams, sync, motion, gates, rate_hz
                 )
             results |= gated
         else:
@@ -196,6 +200,7 @@ def _further_camera(
     name: str,
     about: StreamRecord,
     reader: StreamReader,
+    streams: SyncStreams,
     sync: TrialSync,
     motion: Motion,
     gates: Gates,
@@ -204,13 +209,13 @@ def _further_camera(
     """Count what a further camera sent, and apply the gates of losses as to a first one."""
     if about.kind == EVENTS_KIND:
         event_us = reader.event_times()
-        pulses = len(reader.pulses("event_pulses"))
-        gap_s = _event_gap(event_us, sync, name, motion.moving_ns)
+        pulse_ns = reader.pulses("event_pulses")
+        gap_s = _event_gap(event_us, pulse_ns, name, streams, sync, motion, gates)
         found = {
             f"event_gap_{name}_s": _gate(gap_s, float(gates.event_gap)),
             f"event_burst_{name}": _gate(_event_burst(event_us), gates.event_burst),
         }
-        return about.model_copy(update={"rows": len(event_us), "pulses": pulses}), found
+        return about.model_copy(update={"rows": len(event_us), "pulses": len(pulse_ns)}), found
     numbers = reader.column(f"{FRAMES_KIND}/number")
     lost = _frames_lost(numbers, motion.recorded_ns, about.rate_hz or rate_hz)
     gate = _gate(lost, gates.frames_lost)
@@ -318,18 +323,69 @@ def _frames_lost(numbers: I64, recorded_ns: tuple[int, int], rate_hz: float) -> 
     return max(gaps, expected - 1 - len(numbers), 0)
 
 
-def _event_gap(event_us: I64, sync: TrialSync, camera: str, moving_ns: tuple[int, int]) -> float:
+def _event_gap(
+    event_us: I64,
+    pulse_ns: I64,
+    camera: str,
+    streams: SyncStreams,
+    sync: TrialSync,
+    motion: Motion,
+    gates: Gates,
+) -> float:
     """Return the longest silence of an event camera while the arm moved in contact, seconds.
 
     -1 when it is unknown, because a clock has no map or there are no events.
+
+    Args:
+        pulse_ns: sync pulses that the camera reported, on its clock.
     """
     if camera not in sync.devices or "arm" not in sync.devices or not len(event_us):
         return -1.0
     arm, events = (sync.devices[name].map for name in ("arm", camera))
-    start, end = (int(events.to_device(int(arm.to_reference(t)))) // 1000 for t in moving_ns)
-    inside = event_us[np.searchsorted(event_us, start) : np.searchsorted(event_us, end, "right")]
-    edges = np.concatenate([[start], inside, [end]])
-    return float(np.max(np.diff(edges))) / 1e6
+    hold, start, end = (
+        int(events.to_device(int(arm.to_reference(t)))) // 1000
+        for t in (motion.recorded_ns[0], *motion.moving_ns)
+    )
+    sent_ns = np.asarray(events.to_device(streams.sync_pulses))
+    return longest_silence_s(
+        event_us, (hold, start, end), missing_pulses(sent_ns, pulse_ns), float(gates.event_gap)
+    )
+
+
+def missing_pulses(sent_ns: I64, reported_ns: I64) -> I64:
+    """Return the pulses that a device does not report, of those sent to it, on its clock, ns."""
+    if not len(reported_ns):
+        return sent_ns
+    reported = np.sort(reported_ns)
+    after = np.clip(np.searchsorted(reported, sent_ns), 1, len(reported) - 1)
+    nearest = np.minimum(abs(sent_ns - reported[after - 1]), abs(reported[after] - sent_ns))
+    return sent_ns[nearest > _PULSE_NS]
+
+
+def longest_silence_s(
+    event_us: I64, hold_start_end_us: tuple[int, int, int], missing_ns: I64, limit_s: float
+) -> float:
+    """Return the longest silence of an event camera from a motion's start to its end, seconds.
+
+    A quiet camera is silent for longer than the limit by itself. So a silence above the limit
+    counts only if the camera should have sent something in it: a sync pulse that is missing, or
+    at least 15 events at its rate in the hold, of which none comes with a probability of 3e-7.
+
+    Args:
+        event_us: (n,) times of events, ascending.
+        hold_start_end_us: begin of the recorded hold, and start and end of the motion.
+        missing_ns: (k,) sync pulses that the camera did not report.
+        limit_s: longest silence that passes.
+    """
+    hold, start, end = hold_start_end_us
+    held, first, last = np.searchsorted(event_us, (hold, start, end))
+    rate_hz = (first - held) / max((start - hold) * 1e-6, 1e-6)
+    edges = np.concatenate([[start], event_us[first:last], [end]])
+    silence_s = np.diff(edges) / 1e6
+    known = np.searchsorted(np.sort(missing_ns) // 1000, edges)
+    lost = (silence_s * rate_hz >= _SURE_EVENTS) | (np.diff(known) > 0)
+    counted = silence_s[(silence_s <= limit_s) | lost]
+    return float(counted.max()) if len(counted) else 0.0
 
 
 def _hold_slip_px(frame_ns: I64, tracks: list[Any], sync: TrialSync, moving_ns: int) -> float:

@@ -96,7 +96,8 @@ class Gates(StrictModel):
     """95 % uncertainty of events against frames and poses, by grade."""
     frames_lost: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     event_gap: PositiveSeconds = Decimal("0.05")
-    """Longest silence of the event camera while the arm moves in contact."""
+    """Longest silence of the event camera while the arm moves in contact, if it should have sent
+    something: a sync pulse is missing, or 15 events were to be expected at its rate in the hold."""
     event_burst: Annotated[int, Field(ge=1, le=1_000_000_000)] = 50_000
     """Most events in any 10 ms: more is flicker, not skin."""
     path_deviation: PositiveMillimetres = Decimal("0.1")

@@ -142,7 +142,7 @@ def test_what_cannot_be_extended_is_said(text: str, says: str, base: Path) -> No
 def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mock").mkdir()
-    for name in ("loopback", "mock", "mock_noisy", "mock-noisy", "mock-weak", "rehearsal"):
+    for name in ("loopback", "mock", "mock_noisy", "mock-noisy", "mock-quiet", "rehearsal"):
         assert rig_path(Path(name)) == shipped_rigs()[name.replace("-", "_")]
     assert rig_path(Path("mock.yaml")) == Path("mock.yaml")
     assert rig_path(Path("some/mock")) == Path("some/mock")
