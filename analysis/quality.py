@@ -151,6 +151,11 @@ def assess(
             for name, about in further.items()
             if about.kind == ScalarChunk.KIND
         }
+        loads = {
+            name: reader.wrenches(name)
+            for name, about in further.items()
+            if about.kind == WrenchChunk.KIND
+        }
         wrenches = reader.wrenches(FORCE) if FORCE in named and to_plate is not None else None
     sync = synchronise(streams, timing, rate_hz, with_events=with_events)
     there = {"events": with_events, "arm": True, "frames": mid_exposure_ns is not None}
@@ -185,6 +190,12 @@ def assess(
                     name, about, reader, streams, sync, motion, gates, rate_hz
                 )
             results |= gated
+        elif about.kind == WrenchChunk.KIND:
+            rows: dict[str, Any] = {"rows": len(loads[name])}
+            if about.to_plate is not None:
+                figures = _force_figures(loads[name], about.to_plate, sync, motion, name)
+                rows["figures"] = figures
+            named[name] = about.model_copy(update=rows)
         else:
             named[name] = _scalar_record(about, readings[name])
     counts = Counts(
@@ -237,12 +248,12 @@ def _scalar_record(about: StreamRecord, readings: ScalarChunk) -> StreamRecord:
 
 
 def _force_figures(
-    wrenches: WrenchChunk, to_plate: Rows, sync: TrialSync, motion: Motion
+    wrenches: WrenchChunk, to_plate: Rows, sync: TrialSync, motion: Motion, name: str = FORCE
 ) -> dict[str, float]:
     """Return the figures of a trial's forces on the plate; none where a clock is not known."""
-    if FORCE not in sync.devices or "arm" not in sync.devices:
+    if name not in sync.devices or "arm" not in sync.devices:
         return {}
-    on_box = np.asarray(sync.devices[FORCE].map.to_reference(wrenches.t_ns))
+    on_box = np.asarray(sync.devices[name].map.to_reference(wrenches.t_ns))
     start, moving, end = (
         int(sync.devices["arm"].map.to_reference(t))
         for t in (motion.recorded_ns[0], motion.moving_ns[0], motion.moving_ns[1])

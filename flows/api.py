@@ -157,15 +157,18 @@ class Trial:
         times = self.recording.clock("arm").to_reference(found.t_ns)
         return Poses(np.asarray(times), found.xyz_mm, found.rotvec_deg)
 
-    def forces(self) -> PlateForces:
+    def forces(self, stream: str = "force") -> PlateForces:
         """Forces on the plate in its axes, and on the time line (see docs/force.md).
+
+        Args:
+            stream: name of a further force sensor's stream; the first sensor's by default.
 
         Raises:
             StoreError: the trial is damaged, or has no forces.
         """
         from sliplab.analysis.force import plate_forces
 
-        return plate_forces(self.recording)
+        return plate_forces(self.recording, stream)
 
     def scalars(self, stream: str) -> Scalars:
         """Readings of a sensor of one quantity, such as a thermometer.

@@ -66,7 +66,14 @@ class ForceTiming(DeviceClock):
     where the grade is `host time`."""
 
 
-StreamGrade = Literal["trigger input", "hardware trigger", "device time stamps", "host arrival"]
+StreamGrade = Literal[
+    "trigger input",
+    "hardware trigger",
+    "device time stamps",
+    "host arrival",
+    "host time",
+    "arm clock",
+]
 
 
 class StreamTiming(DeviceClock):
@@ -74,15 +81,16 @@ class StreamTiming(DeviceClock):
 
     grade: StreamGrade = "host arrival"
     """As that of the first cameras: `trigger input` of an event camera, `hardware trigger`,
-    `device time stamps` or `host arrival` of a frame camera, `host arrival` of a scalar sensor."""
+    `device time stamps` or `host arrival` of a frame camera, `host arrival` of a scalar sensor,
+    `host time` or `arm clock` of a force sensor."""
     delay: Delay = Delay(shortest_us=0, longest_us=50_000)
     """From the end of an exposure, or from the reading, to the host; where the grade is
-    `host arrival`."""
+    `host arrival` or `host time`."""
 
     @property
     def through_host(self) -> bool:
         """True if the device has no wire, so that the host has to read clocks."""
-        return self.grade not in WIRED
+        return self.grade not in {*WIRED, "arm clock"}
 
 
 class Timing(StrictModel):

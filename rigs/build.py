@@ -17,9 +17,15 @@ from sliplab.rigs.core.capabilities import (
     RigError,
     Truth,
 )
-from sliplab.rigs.core.driver import EventCameraDriver, FrameCameraDriver, ScalarSensorDriver
+from sliplab.rigs.core.driver import (
+    EventCameraDriver,
+    ForceSensorDriver,
+    FrameCameraDriver,
+    ScalarSensorDriver,
+)
 from sliplab.rigs.core.further import (
     FurtherEvents,
+    FurtherForces,
     FurtherFrames,
     FurtherScalars,
     FurtherStream,
@@ -32,7 +38,13 @@ from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.discovery import need_libraries
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.rig_file import RigFile
-from sliplab.rigs.stream_settings import EventStream, FrameStream, Stream, simulated_streams
+from sliplab.rigs.stream_settings import (
+    EventStream,
+    ForceStream,
+    FrameStream,
+    Stream,
+    simulated_streams,
+)
 from sliplab.storage.schema.trial import StreamRecord
 from sliplab.storage.streams import Sink
 
@@ -101,7 +113,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         force=devices.force,
         force_limit_n=force_limit(file),
         further=tuple(
-            further_stream(name, file.streams[name], device)
+            further_stream(name, file.streams[name], device, taught_frame(file))
             for name, device in devices.further.items()
         ),
         simulation=_MockSimulation(devices),
@@ -192,7 +204,7 @@ def _driven_rig(
         arm = devices.arm_driver.build(calibrated_arm(file, devices))
         further = []
         for name, stream in file.streams.items():
-            further.append(_driven_stream(name, stream, shown))
+            further.append(_driven_stream(name, stream, shown, arm, taught_frame(file)))
             undo.callback(further[-1].close)
         rig = Rig(
             name=file.name,
@@ -226,8 +238,10 @@ def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None
     return driver.fake(settings, px_per_mm, shown, file.scene.frame_camera.exposure_us * 500)
 
 
-def _driven_stream(name: str, stream: Stream, shown: Loopback | None) -> FurtherStream:
-    """Build a further device by its driver.
+def _driven_stream(
+    name: str, stream: Stream, shown: Loopback | None, arm: Arm, plate: PlateFrame
+) -> FurtherStream:
+    """Build a further device by its driver; beside the arm, whose controller may measure forces.
 
     Raises:
         RigError: it is missing, or delivers other time stamps than the rig file says.
@@ -240,6 +254,8 @@ def _driven_stream(name: str, stream: Stream, shown: Loopback | None) -> Further
         device = driver.build(settings)
     elif isinstance(driver, FrameCameraDriver) and isinstance(stream, FrameStream):
         device = driver.build(settings, stream.scale_px_per_mm)
+    elif isinstance(driver, ForceSensorDriver):
+        device = driver.build(settings, arm)
     elif isinstance(driver, ScalarSensorDriver):
         device = driver.build(settings)
     assert device is not None  # the rig file was checked against its driver
@@ -247,16 +263,20 @@ def _driven_stream(name: str, stream: Stream, shown: Loopback | None) -> Further
         undo.callback(device.close)
         if isinstance(stream, FrameStream):
             _check_grade(stream.timing.grade, device, f"streams.{name}.timing.grade")
-        made = further_stream(name, stream, device)
+        made = further_stream(name, stream, device, plate)
         undo.pop_all()
     return made
 
 
-def further_stream(name: str, stream: Stream, device: Any) -> FurtherStream:
+def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) -> FurtherStream:
     """Return a further device of a rig with what a trial's record says of its stream.
 
+    Args:
+        plate: the plate's frame as taught, in whose axes forces are.
+
     Raises:
-        RigError: a frame camera cannot record the region that the rig file says.
+        RigError: a frame camera cannot record the region that the rig file says, or another device
+            differs from what the file says of it.
     """
     said: dict[str, Any] = {"kind": stream.kind, "rows": 0, "timing": stream.timing}
     if isinstance(stream, EventStream):
@@ -269,6 +289,15 @@ def further_stream(name: str, stream: Stream, device: Any) -> FurtherStream:
         if stream.rate_hz is not None:
             said["rate_hz"] = stream.rate_hz
         return FurtherFrames(name, device, StreamRecord(**said))
+    if isinstance(stream, ForceStream):
+        if device.grade != stream.timing.grade:
+            text = (
+                f"its times are of the grade '{device.grade}'; "
+                f"write streams.{name}.timing.grade: {device.grade}"
+            )
+            raise RigError(f"{name} (force sensor)", text)
+        matrix = plate.force_matrix(device.mounting)
+        return FurtherForces(name, device, StreamRecord(**said, to_plate=matrix))
     if device.unit != stream.unit:
         text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
         raise RigError(f"{name} (scalar sensor)", text)

@@ -32,6 +32,7 @@ from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSetting
 from sliplab.rigs.core.driver import (
     Driver,
     EventCameraDriver,
+    ForceSensorDriver,
     FrameCameraDriver,
     ScalarSensorDriver,
 )
@@ -43,7 +44,7 @@ from sliplab.rigs.mock.further_settings import (
     FurtherFrameCamera,
     Thermometer,
 )
-from sliplab.rigs.mock.settings import Clocks
+from sliplab.rigs.mock.settings import Clocks, ForceSensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 RESERVED = frozenset({
@@ -63,6 +64,8 @@ class _Stream(StrictModel):
     GRADES: ClassVar[tuple[StreamGrade, ...]]
     """Grades of its kind, the default first."""
     DRIVERS: ClassVar[type[Driver[Any]]]
+    TIMING: ClassVar[dict[str, Any]] = {}
+    """Other defaults of its timing than those of every stream."""
 
     timing: StreamTiming
     """How its times come onto the time line, and how good its clock is."""
@@ -73,8 +76,8 @@ class _Stream(StrictModel):
         if not isinstance(data, dict):
             return data
         timing = data.get("timing", {})
-        if isinstance(timing, dict) and "grade" not in timing:
-            return {**data, "timing": {"grade": cls.GRADES[0], **timing}}
+        if isinstance(timing, dict):
+            return {**data, "timing": {"grade": cls.GRADES[0], **cls.TIMING, **timing}}
         return data
 
     @model_validator(mode="after")
@@ -94,7 +97,11 @@ class _Stream(StrictModel):
         if ppm > timing.drift_ppm:
             text = f"must be at most timing.drift_ppm = {timing.drift_ppm:g}"
             raise KeyedError(".mock.clock_ppm", ppm, text)
-        if timing.grade == "host arrival" and not isinstance(mock, FurtherEventCamera):
+        if timing.grade == "arm clock":
+            text = "must be host time: the simulated sensor has a clock of its own"
+            raise KeyedError(".timing.grade", timing.grade, text)
+        by_delay = timing.grade in {"host arrival", "host time"}
+        if by_delay and not isinstance(mock, FurtherEventCamera):
             shortest, longest = timing.delay.shortest_us, timing.delay.longest_us
             if mock.latency_us < shortest:
                 text = f"must be at least timing.delay.shortest_us = {shortest:g}"
@@ -191,10 +198,24 @@ class ScalarStream(_Stream):
         return unit
 
 
-Stream = EventStream | FrameStream | ScalarStream
+class ForceStream(_Stream):
+    """A further force/torque sensor. It neither limits the arm nor ends a press."""
+
+    GRADES = ("host time", "arm clock")
+    DRIVERS = ForceSensorDriver
+    TIMING = {"delay": {"shortest_us": 0, "longest_us": 5_000}}  # noqa: RUF012
+
+    kind: Literal["wrench"]
+    device: Annotated[DriverSettings, OfKind(ForceSensorDriver)] | None = None
+    mock: ForceSensor | None = None
+    """The simulated sensor, which feels the same load as the first one."""
+
+
+Stream = EventStream | FrameStream | ForceStream | ScalarStream
 KINDS: dict[str, type[Stream]] = {
     "events": EventStream,
     "frames": FrameStream,
+    "wrench": ForceStream,
     "scalar": ScalarStream,
 }
 

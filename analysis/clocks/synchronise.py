@@ -8,7 +8,6 @@ was timed is its grade, and it goes wherever the result goes (docs/clocks.md).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -35,8 +34,8 @@ from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTimi
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.trial import Clocks, DeviceRecord, StreamRecord
-from sliplab.storage.streams import EVENTS_KIND, WrenchChunk
-from sliplab.storage.trials.checksums import stream_file
+from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, WrenchChunk
+from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 from sliplab.storage.trials.recording import Recording
@@ -67,6 +66,7 @@ class FurtherClock:
         pulses: sync pulses on the device's clock; of a frame camera the starts of the exposures
             during which the sync line was high.
         reads: the device's clock as the host read it.
+        samples: of a force sensor: its own and the host's time of each sample.
     """
 
     kind: str
@@ -74,6 +74,7 @@ class FurtherClock:
     pulses: I64
     reads: ClockReadings
     mid_exposure_ns: int = 0
+    samples: tuple[I64, I64] | None = None
 
 
 @dataclass(frozen=True)
@@ -184,36 +185,38 @@ class TrialSync:
         return self.devices["events"].uncertainty_ns + self.devices[device].uncertainty_ns
 
 
-def further_clock(about: StreamRecord, reader: StreamReader | None) -> FurtherClock | None:
+def further_clock(name: str, about: StreamRecord, reader: StreamReader) -> FurtherClock | None:
     """Read the clock data of a further device; None of one that `timing.rig` times.
 
     Args:
         about: what the record says of its stream.
-        reader: of a camera, its own file.
+        reader: the file that holds the stream: a camera's own, or the trial's.
     """
     if about.timing is None:
         return None
     none = np.empty(0, np.int64)
-    pulses, reads = none, ClockReadings(none, none, none)
-    if reader is not None and about.kind == EVENTS_KIND:
+    pulses, reads, samples = none, ClockReadings(none, none, none), None
+    if about.kind == EVENTS_KIND:
         pulses = reader.column("event_pulses/t")
-    elif reader is not None:
+    elif about.kind == WrenchChunk.KIND:
+        wrenches = reader.wrenches(name)
+        samples = wrenches.t_ns, wrenches.host_ns
+    elif about.kind == FRAMES_KIND:
         lit = reader.column("frames/sync") > 0
         pulses = reader.column("frames/t")[lit] - (about.mid_exposure_ns or 0)
         found = reader.clock_reads("frame_camera_reads")
         reads = ClockReadings(found.device_ns, found.before_ns, found.after_ns)
-    return FurtherClock(about.kind, about.timing, pulses, reads, about.mid_exposure_ns or 0)
+    mid_ns = about.mid_exposure_ns or 0
+    return FurtherClock(about.kind, about.timing, pulses, reads, mid_ns, samples)
 
 
 def further_clocks(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, FurtherClock]:
     """Read the clock data of the further devices of a sealed trial."""
     found: dict[str, FurtherClock] = {}
     for name, stream in about.items():
-        if stream.of_camera:
-            with StreamReader(folder / stream_file(name)) as reader:
-                clock = further_clock(stream, reader)
-        else:
-            clock = further_clock(stream, None)
+        file = stream_file(name) if stream.of_camera else DATA
+        with StreamReader(folder / file) as reader:
+            clock = further_clock(name, stream, reader)
         if clock is not None:
             found[name] = clock
     return found
@@ -252,7 +255,7 @@ def streams_of(
         wrenches={
             name: (column(f"{STREAM_GROUP}/{name}/t"), column(f"{STREAM_GROUP}/{name}/host"))
             for name, kind in reader.streams().items()
-            if kind == WrenchChunk.KIND
+            if kind == WrenchChunk.KIND and name not in (further or {})
         },
         further=dict(further or {}),
     )
@@ -269,9 +272,8 @@ def synchronise_recording(recording: Recording) -> TrialSync:
         raise StoreError(f"{recording.folder}: timing: is missing; its clocks cannot be fitted")
     further: dict[str, FurtherClock] = {}
     for name, about in recording.record.streams.items():
-        with ExitStack() as opened:
-            own = opened.enter_context(recording.open(name)) if about.of_camera else None
-            clock = further_clock(about, own)
+        with recording.open(name if about.of_camera else None) as reader:
+            clock = further_clock(name, about, reader)
         if clock is not None:
             further[name] = clock
     with recording.open() as reader:
@@ -302,8 +304,9 @@ def synchronise(
         _try(found, "arm", lambda: _arm_by_host(streams, timing))
     if streams.mid_exposure_ns is not None:
         _synchronise_frames(found, pulses, streams, streams.mid_exposure_ns)
-    for name in streams.wrenches:
-        _try(found, name, partial(_force, found, name, streams, timing))
+    how = timing.force or ForceTiming()
+    for name, samples in streams.wrenches.items():
+        _try(found, name, partial(_force, found, name, samples, how, streams, timing))
     for name, device in streams.further.items():
         _try(found, name, partial(_further, pulses, name, device, streams))
     return found
@@ -314,6 +317,8 @@ def _further(pulses: _Pulses, name: str, device: FurtherClock, streams: SyncStre
     how, timing = device.timing, pulses.timing
     if how.grade in {"trigger input", "hardware trigger"}:
         return pulses.fit(name, device.pulses, how, how.grade)
+    if device.samples is not None:
+        return _force(pulses.found, name, device.samples, how, streams, timing)
     if how.grade == "device time stamps":
         what = f"readings of the clock of {name}"
         bounded = _bounded(device.reads, how.drift_ppm + HOST_PPM, what)
@@ -417,16 +422,26 @@ def _arm_by_host(streams: SyncStreams, timing: Timing) -> DeviceSync:
     return _through_host(bounded, streams, timing, timing.arm)
 
 
-def _force(found: TrialSync, name: str, streams: SyncStreams, timing: Timing) -> DeviceSync:
-    """The clock of a force sensor: the arm's, or bounded by the arrivals of its samples."""
-    how = timing.force or ForceTiming()
+def _force(
+    found: TrialSync,
+    name: str,
+    samples: tuple[I64, I64],
+    how: ForceTiming | StreamTiming,
+    streams: SyncStreams,
+    timing: Timing,
+) -> DeviceSync:
+    """The clock of a force sensor: the arm's, or bounded by the arrivals of its samples.
+
+    Args:
+        samples: the sensor's and the host's time of each, ns.
+    """
     if how.grade == "arm clock":
         if "arm" not in found.devices:
             raise BoundsContradictError("the arm's clock stamps it, and that one was refused")
         arm = found.devices["arm"]
         kind = "hard bound" if arm.fit is None else "95 %"
         return DeviceSync(how.grade, arm.map, arm.uncertainty_ns, kind=kind)
-    device, host = streams.wrenches[name]
+    device, host = samples
     if np.any(np.diff(device) < 0):
         raise ClockRefused("residuals", f"its clock fell back during the trial; {UNDISTURBED}")
     some = slice(None, None, max(1, device.size // 4000))

@@ -44,7 +44,14 @@ from sliplab.flows.ui.review import event_rate
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, EventChunk, ScalarChunk
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    FRAMES_KIND,
+    I64,
+    EventChunk,
+    ScalarChunk,
+    WrenchChunk,
+)
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
@@ -107,7 +114,8 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
         )
         try:
             forces = has_forces(subject.recording)
-            further = {name: about.kind for name, about in subject.recording.record.streams.items()}
+            streams = subject.recording.record.streams.items()
+            further = {name: about.kind for name, about in streams if about.timing is not None}
             shown = blueprint(library, forces=forces, further=further)
             stream.save(unfinished, default_blueprint=shown)
             counts = send(library, stream, subject)
@@ -305,7 +313,7 @@ def _event_camera(to: _Columns, recording: Recording, stream: str, path: str) ->
 
 
 def _further(to: _Columns, recording: Recording) -> None:
-    """Send the streams of further devices; rows of wrenches are sent as forces, if at all."""
+    """Send the streams of further devices, each below its name."""
     for name, about in sorted(recording.record.streams.items()):
         path, count = f"streams/{name}", f"{name}_{about.kind}"
         if about.kind == EVENTS_KIND:
@@ -313,6 +321,10 @@ def _further(to: _Columns, recording: Recording) -> None:
         elif about.kind == FRAMES_KIND:
             _pictures(to, recording, name, path)
             to.sent[count] = about.rows
+        elif about.kind == WrenchChunk.KIND and about.timing is not None:
+            forces = plate_forces(recording, name)
+            to.scalars(f"{path}/normal", forces.t_ns, forces.normal_n, count)
+            to.scalars(f"{path}/tangential", forces.t_ns, forces.tangential_n)
         elif about.kind == ScalarChunk.KIND:
             found = recording.scalars(name)
             time_ns = np.asarray(recording.clock(name).to_reference(found.t_ns))
@@ -494,13 +506,14 @@ def blueprint(
     """
     views = library.blueprint
     force = [("force", "force on the plate (N)")] if forces else []
+    curves_of = _named(further, ScalarChunk.KIND, WrenchChunk.KIND)
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (
             ("displacement", "displacement (px)"), ("events/rate", "events (1/s)"),
             ("onsets", "onsets: 1 incipient, 2 gross"), ("network", "network, spikes a window"),
             *force, ("pulses", "sync pulses"),
-            *((f"streams/{name}", name) for name in _named(further, ScalarChunk.KIND)),
+            *((f"streams/{name}", name) for name in curves_of),
         )
     ]  # fmt: skip
     pictures = [

@@ -14,6 +14,7 @@ from typing import Any
 from sliplab.rigs.core.capabilities import (
     DeviceHealth,
     EventCamera,
+    ForceSensor,
     FrameCamera,
     RigError,
     ScalarSensor,
@@ -50,6 +51,9 @@ class _Further:
 
     def connect(self) -> None:
         """Open the connection, unless that was done on construction."""
+
+    def prepare(self) -> None:
+        """Make ready for a trial: the arm is clear of the plate."""
 
     def start(self) -> None:
         """Start streaming; earlier data are discarded."""
@@ -151,4 +155,35 @@ class FurtherScalars(_Further):
         sink.add_stream(self.name, readings)
 
 
-FurtherStream = FurtherEvents | FurtherFrames | FurtherScalars
+@dataclass(frozen=True)
+class FurtherForces(_Further):
+    """A further force sensor, which is recorded only."""
+
+    device: ForceSensor
+
+    def connect(self) -> None:
+        """Open the connection."""
+        with self._named():
+            self.device.connect()
+
+    def prepare(self) -> None:
+        """Take the present load for zero, where that is done before each trial."""
+        if self.device.zeroing == "trial":
+            with self._named():
+                self.device.zero()
+
+    def drain(self, sink: Sink) -> None:
+        """Read what has come."""
+        with self._named():
+            forces = self.device.read()
+        sink.add_stream(self.name, forces)
+
+    def finish(self, sink: Sink) -> None:
+        """Stop, and read what was sent before."""
+        with self._named():
+            self.device.stop()
+            forces = self.device.read()
+        sink.add_stream(self.name, forces)
+
+
+FurtherStream = FurtherEvents | FurtherFrames | FurtherForces | FurtherScalars

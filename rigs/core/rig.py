@@ -150,6 +150,13 @@ class Rig:
             raise RigError("frame camera", f"the rig {self.name} has none")
         return self.frame_camera
 
+    @property
+    def _through_host(self) -> bool:
+        """True if some device has no wire, so that the host has to read the sync box's clock."""
+        by_host = self.force is not None and self.force.grade == "host time"
+        further = any(device.through_host for device in self._reading)
+        return self.timing.reads_clocks or by_host or further
+
     def _devices(self) -> list[Any]:
         """Return arm, cameras, sync box and sensors, as far as the rig has them, the arm first."""
         found = (self.arm, self.event_camera, self.frame_camera, self.sync, self.force)
@@ -559,7 +566,7 @@ class Rig:
             sink.add_frames(self.frame_camera.read())
         if self.timing.frames == "exposure line":
             sink.add_exposures(self.sync.read_exposures())
-        if self.timing.reads_clocks or any(device.through_host for device in self._reading):
+        if self._through_host:
             sink.add_box_reads(self.sync.read_clock())
         if self.timing.frames == "device time stamps" and self.frame_camera is not None:
             sink.add_frame_camera_reads(self.frame_camera.read_clock())
@@ -583,6 +590,8 @@ class Rig:
             self.simulation.begin_trial(seed)
         if self.force is not None and self.force.zeroing == "trial":
             self.force.zero()
+        for device in self.further:
+            device.prepare()
 
     def _segment(
         self, times: StepTimes, begin: Position, end: Position, speed: float

@@ -18,7 +18,7 @@ from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.further_settings import Further, FurtherEventCamera, FurtherFrameCamera
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator, VirtualClock
-from sliplab.rigs.mock.settings import EventCamera, FrameCamera, MockSettings
+from sliplab.rigs.mock.settings import EventCamera, ForceSensor, FrameCamera, MockSettings
 from sliplab.rigs.mock.sync import ExposureLine, FreeRun, MockSyncBox
 from sliplab.rigs.mock.thermometer import MockThermometer
 from sliplab.rigs.mock.truth import clocks_of, readings_of, truth_of
@@ -27,7 +27,7 @@ from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.streams import Sink
 
 T = TypeVar("T")
-FurtherDevice = MockEventCamera | MockFrameCamera | MockThermometer
+FurtherDevice = MockEventCamera | MockFrameCamera | MockForceSensor | MockThermometer
 GONE = (
     "does not answer (simulated fault); check its power and its cable, "
     "then run the same command to resume"
@@ -200,4 +200,6 @@ def _further(
         grade = cast(FrameGrade, timing.grade)  # checked against those of its kind
         trigger = box if grade == "hardware trigger" else FreeRun(world, own)
         return MockFrameCamera(world, trigger, grade, own)
+    if isinstance(settings, ForceSensor):
+        return MockForceSensor(world, settings, name)
     return MockThermometer(world, settings, name, unit)

@@ -17,7 +17,7 @@ from sliplab.rigs.mock.clocks import FaultyClock, Lateness, Noise, faulty, undis
 from sliplab.rigs.mock.history import History
 from sliplab.rigs.mock.settings import ForceSensor
 from sliplab.rigs.mock.world import World
-from sliplab.rigs.scene.randomness import generator
+from sliplab.rigs.scene.randomness import generator, key
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import WrenchChunk
 
@@ -27,10 +27,14 @@ DEVICE = "force sensor"
 BEHIND_NS = 64_000_000
 """Loads kept behind the last sample that was read."""
 _HOUR_NS = 3_600_000_000_000
+_SEEDS = 2**63
 
 
 class MockForceSensor:
     """A force/torque sensor behind the plate, its axes those of the plate.
+
+    Args:
+        name: of a further sensor's stream, which no fault disturbs; the first one has none.
 
     Attributes:
         clock: true time to the sensor's, with its faults.
@@ -38,11 +42,12 @@ class MockForceSensor:
 
     mounting = Mounting()
     grade: ForceGrade = "host time"
+    timed_by_host = False
 
-    def __init__(self, world: World, settings: ForceSensor) -> None:
-        self._world, self._settings = world, settings
+    def __init__(self, world: World, settings: ForceSensor, name: str = "") -> None:
+        self._world, self._settings, self._name = world, settings, name
         self.zeroing: Literal["trial", "session", "never"] = settings.bias
-        seed = world.settings.seed if settings.seed is None else settings.seed
+        seed = self._own(world.settings.seed if settings.seed is None else settings.seed)
         self._mix: F64 = np.eye(6) + _cross_talk(settings, seed)
         self._ppb = round(
             float(generator(seed, "force sensor drift").uniform(-1.0, 1.0))
@@ -55,15 +60,18 @@ class MockForceSensor:
 
     def _begin(self) -> None:
         world, settings = self._world, self._settings
-        rng = generator(world.seed, "force sensor")
+        seed = self._own(world.seed)
+        rng = generator(seed, "force sensor")
         longest = int(world.settings.clocks.offset_h * _HOUR_NS)
         clock = ClockMap.line(0, int(rng.integers(0, longest, endpoint=True)), self._ppb)
-        self.clock: ClockMap = faulty(clock, "force_sensor", world.faults)
+        self.clock: ClockMap = clock
+        if not self._name:
+            self.clock = faulty(clock, "force_sensor", world.faults)
         self._cycles = undisturbed(self.clock)
         most = np.repeat([settings.drift_n_per_min, settings.drift_nm_per_min], 3) / 60.0
         self._drift_per_s: F64 = rng.uniform(-1.0, 1.0, 6) * most
-        self._noise = Noise(world.seed, "force noise", 6)
-        self._late = Lateness(world.seed, "force reception", settings.arrival_jitter_us)
+        self._noise = Noise(seed, "force noise", 6)
+        self._late = Lateness(seed, "force reception", settings.arrival_jitter_us)
         self._first = -(-self._cycles.to_reference(world.now_ns) // self._period_ns)
         self._read, self._arrived_ns = self._first, 0
         self._loads: History | None = None
@@ -76,7 +84,7 @@ class MockForceSensor:
 
     def start(self) -> None:
         """Start streaming; earlier samples are dropped."""
-        self._loads, self._until_ns = self._world.keep_wrench(), None
+        self._loads, self._until_ns = self._world.keep_wrench(self._name), None
         now = self._cycles.to_reference(self._loads.end_ns)
         self._read = -(-now // self._period_ns)
 
@@ -125,25 +133,29 @@ class MockForceSensor:
         """Take one sample, with its noise, for zero from now on."""
         streaming = self._loads is not None and self._until_ns is None
         self._world.advance()
-        loads = self._loads if streaming else self._world.keep_wrench()
+        loads = self._loads if streaming else self._world.keep_wrench(self._name)
         assert loads is not None
         at_ns = np.array([loads.end_ns], np.int64)
         # no instant of a sample: its noise is drawn apart
-        noise = generator(self._world.seed, "force bias").standard_normal((1, 6))
+        noise = generator(self._own(self._world.seed), "force bias").standard_normal((1, 6))
         self._bias = (self._mixed(loads.at(at_ns), at_ns) + noise * self._scatter())[0]
         if not streaming:
-            self._world.drop_wrench()
+            self._world.drop_wrench(self._name)
 
     def stop(self) -> None:
         """Stop streaming; what was sampled up to the last whole step can still be read."""
         if self._loads is not None and self._until_ns is None:
             self._world.advance()
-            self._world.drop_wrench()
+            self._world.drop_wrench(self._name)
             self._until_ns = self._world.now_ns
 
     def close(self) -> None:
         """Close the device."""
         self.stop()
+
+    def _own(self, seed: int) -> int:
+        """Return a seed of this sensor's own: a further one has other draws than the first."""
+        return key(seed, f"stream {self._name}") % _SEEDS if self._name else seed
 
     def _mixed(self, load: F64, true_ns: I64) -> F64:
         """Return what the axes show of loads (k, 6) at true times, without noise."""

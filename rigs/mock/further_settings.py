@@ -10,6 +10,7 @@ from sliplab.protocols.yaml_file import StrictModel
 from sliplab.rigs.mock.settings import (
     EventCamera,
     Finite,
+    ForceSensor,
     FrameCamera,
     NonNegative,
     Positive,
@@ -58,4 +59,4 @@ class Thermometer(StrictModel):
     """Delay besides; half-normal, up to this limit of four sigma."""
 
 
-Further = FurtherEventCamera | FurtherFrameCamera | Thermometer
+Further = FurtherEventCamera | FurtherFrameCamera | ForceSensor | Thermometer

@@ -44,7 +44,8 @@ class Physics:
         loads: forces of every row since `keep_loads`, or None; more_loads: the same for each
             further event camera, by its name.
         wrench: sum of the contact's forces on the plate, and their torque about its centre, of
-            every row since `keep_wrench`, (k, 6) in N and N m; or None, at no cost.
+            every row since `keep_wrench`, (k, 6) in N and N m; or None, at no cost. more_wrenches:
+            the same for each further force sensor, by its name.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Physics:
         self.loads: History | None = None
         self.more_loads: dict[str, History] = {}
         self.wrench: History | None = None
+        self.more_wrenches: dict[str, History] = {}
         self.plate_free = False
         self._plate_ramp: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
         self._plate_motion = np.zeros(2)
@@ -118,7 +120,7 @@ class Physics:
         if self.loads is not None:
             load = self.loads.grow(t_ns[1:])
         else:
-            unseen = self.wrench is None and not self.more_loads
+            unseen = self.wrench is None and not self.more_loads and not self.more_wrenches
             load = np.empty((count, 0 if unseen else 3 * len(self.tips.state)))
         springs, state = self.springs, self.tips.state
         if not self.plate_free:
@@ -141,7 +143,8 @@ class Physics:
         self._sum_up(t_ns[1:], track, load)
         if landed:
             self._hold_plate(-plate.stroke_mm)
-            for rows in (self.track, self.loads, self.wrench, *self.more_loads.values()):
+            more = *self.more_loads.values(), *self.more_wrenches.values()
+            for rows in (self.track, self.loads, self.wrench, *more):
                 if rows is not None:
                     rows.shrink(count - done, int(t_ns[done]))
 
@@ -149,8 +152,11 @@ class Physics:
         """Keep the tips' forces for further cameras, and their sum for a force sensor."""
         for rows in self.more_loads.values():
             rows.grow(t_ns)[:] = load
-        if self.wrench is not None:
-            self.wrench.grow(t_ns)[:] = plate_wrench(track, load)
+        if self.wrench is not None or self.more_wrenches:
+            found = plate_wrench(track, load)
+            for sums in (self.wrench, *self.more_wrenches.values()):
+                if sums is not None:
+                    sums.grow(t_ns)[:] = found
 
     # -- the plate -------------------------------------------------------------------------
 
@@ -205,14 +211,22 @@ class Physics:
             self.loads = loads
         return loads
 
-    def keep_wrench(self, now_ns: int) -> History:
-        """Keep the sum of the forces of every row from the present on."""
+    def keep_wrench(self, now_ns: int, sensor: str = "") -> History:
+        """Keep the sum of the forces of every row from the present on.
+
+        Args:
+            sensor: name of a further force sensor: its record is among `more_wrenches`.
+        """
         self._catch_up(now_ns)
-        self.wrench = History(6)
+        wrench = History(6)
         last_ns = np.array([self.track.end_ns], np.int64)
         load = np.column_stack([self.tips.force, self.tips.normal]).reshape(1, -1)
-        self.wrench.grow(last_ns)[:] = plate_wrench(self.track.at(last_ns), load)
-        return self.wrench
+        wrench.grow(last_ns)[:] = plate_wrench(self.track.at(last_ns), load)
+        if sensor:
+            self.more_wrenches[sensor] = wrench
+        else:
+            self.wrench = wrench
+        return wrench
 
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
         """Return positions of the tips and heights of the plate, mm: (k, n, 2) and (k,).

@@ -212,13 +212,20 @@ class World:
         """
         return self.physics.keep_loads(self.now_ns, camera)
 
-    def keep_wrench(self) -> History:
-        """Keep the sum of the forces of every row from the last one on, until the trial ends."""
-        return self.physics.keep_wrench(self.now_ns)
+    def keep_wrench(self, sensor: str = "") -> History:
+        """Keep the sum of the forces of every row from the last one on, until the trial ends.
 
-    def drop_wrench(self) -> None:
-        """Stop keeping the sum of the forces."""
-        self.physics.wrench = None
+        Args:
+            sensor: name of a further force sensor, which has a record of its own.
+        """
+        return self.physics.keep_wrench(self.now_ns, sensor)
+
+    def drop_wrench(self, sensor: str = "") -> None:
+        """Stop keeping the sum of the forces for the first force sensor, or for a further one."""
+        if sensor:
+            self.physics.more_wrenches.pop(sensor, None)
+        else:
+            self.physics.wrench = None
 
     def drop_loads(self, camera: str = "") -> None:
         """Stop recording forces for the first event camera, or for a further one."""

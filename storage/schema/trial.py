@@ -238,8 +238,8 @@ class StreamRecord(Part):
         Annotated[StreamTiming, PlainSerializer(lambda timing: timing.model_dump(mode="json"))]
         | None
     ) = None
-    """How the device is timed, from which its clock is fitted again; null for a wrench, which
-    `timing.rig` has."""
+    """How a further device is timed, from which its clock is fitted again; null for the first force
+    sensor, which `timing.rig` times."""
     to_plate: tuple[tuple[Number, Number, Number], ...] | None = None
     """Of a wrench: rows of the matrix from its axes to those of the plate (x right, y up, z into
     the plate), such that the product is the force on the plate; null where it is unknown."""

@@ -11,10 +11,12 @@ import pytest
 from sliplab.protocols import InputError
 from sliplab.rigs.build import _driven_stream
 from sliplab.rigs.core.capabilities import RigError, ScalarSensor
-from sliplab.rigs.core.further import FurtherScalars
+from sliplab.rigs.core.further import FurtherForces, FurtherScalars, FurtherStream
+from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.discovery import ping_devices
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_lock import lock_names
+from sliplab.rigs.stream_settings import Stream
 from sliplab.storage.streams import NullSink, ScalarChunk
 from tests.conftest import ROOT
 from tests.flows.conftest import write
@@ -82,6 +84,17 @@ WARM = {"kind": "scalar", "unit": "degC", "device": {"driver": "lab_thermometer"
 SIDE = {"kind": "events", "device": {"driver": "dvxplorer"}}
 
 
+class Arm:
+    """An arm that no device here asks anything of."""
+
+
+def built(name: str, stream: Stream) -> FurtherStream:
+    """A further device by its driver, on a plate as an arm's base."""
+    frame = PlateFrame.taught(((0.0, 0.0, 0.0), (60.0, 0.0, 0.0), (0.0, 60.0, 0.0)))
+    arm: Any = Arm()
+    return _driven_stream(name, stream, None, arm, frame)
+
+
 def real_rig(folder: Path, streams: dict[str, Any], **devices: Any) -> RigFile:
     """The shipped rig with a UR arm and further devices."""
     box = {"sync_box": {"port": "/dev/serial/by-id/box"}}
@@ -97,7 +110,7 @@ def real_rig(folder: Path, streams: dict[str, Any], **devices: Any) -> RigFile:
 def test_a_scalar_sensor_of_a_package_is_read(install: Install, tmp_path: Path) -> None:
     install("lab_thermometer", THERMOMETER, "lab_thermometer = lab_thermometer:DRIVER")
     file = real_rig(tmp_path, {"warm": WARM})
-    device = _driven_stream("warm", file.streams["warm"], None)
+    device = built("warm", file.streams["warm"])
     assert isinstance(device, FurtherScalars)
     assert isinstance(device.device, ScalarSensor)
     assert device.about.unit == "degC"
@@ -126,14 +139,14 @@ def test_it_is_pinged_and_locked_by_its_name(install: Install, tmp_path: Path) -
     assert found["warm (scalar sensor)"] == "is not there"
     assert "thermometer-dev-absent.lock" in lock_names(file)
     with pytest.raises(RigError, match=r"warm \(scalar sensor\): there is no /dev/absent"):
-        _driven_stream("warm", file.streams["warm"], None).connect()
+        built("warm", file.streams["warm"]).connect()
 
 
 def test_a_sensor_in_another_unit_is_refused_and_closed(install: Install, tmp_path: Path) -> None:
     install("lab_thermometer", THERMOMETER, "lab_thermometer = lab_thermometer:DRIVER")
     file = real_rig(tmp_path, {"warm": {**WARM, "unit": "K"}})
     with pytest.raises(RigError, match=r"reads in degC, and the rig file says streams.warm.unit"):
-        _driven_stream("warm", file.streams["warm"], None)
+        built("warm", file.streams["warm"])
     import lab_thermometer  # type: ignore[import-not-found]
 
     assert lab_thermometer.Thermometer.closed
@@ -147,12 +160,12 @@ def test_a_camera_that_delivers_another_grade_is_refused(install: Install, tmp_p
     }  # fmt: skip
     triggered = real_rig(tmp_path, {"back": back}).streams["back"]
     with pytest.raises(RigError, match=r"write streams.back.timing.grade: host arrival"):
-        _driven_stream("back", triggered, None)
+        built("back", triggered)
     import lab_camera  # type: ignore[import-not-found]
 
     assert lab_camera.Camera.closed
     arrives = {**back, "rate_hz": 30, "timing": {"grade": "host arrival"}}
-    made = _driven_stream("back", real_rig(tmp_path, {"back": arrives}).streams["back"], None)
+    made = built("back", real_rig(tmp_path, {"back": arrives}).streams["back"])
     assert made.device.region == (64, 48)
     assert (made.about.size_px, made.about.px_per_mm) == ((64, 48), 4)
     assert (made.about.rate_hz, made.about.mid_exposure_ns) == (30, 1_000_000)
@@ -203,3 +216,16 @@ def test_a_wrong_device_is_named_by_its_key(
     with pytest.raises(InputError, match=text) as raised:
         real_rig(tmp_path, {"side": stream}, event_camera=usb("A"))
     assert raised.value.key == key
+
+
+def test_a_second_force_sensor_is_one_of_the_drivers_of_the_first(tmp_path: Path) -> None:
+    wrist = {"kind": "wrench", "device": {"driver": "ati_net_ft", "host": "192.0.2.7"}}
+    stream = real_rig(tmp_path, {"wrist": wrist}).streams["wrist"]
+    assert (stream.timing.grade, stream.timing.delay.longest_us) == ("host time", 5000)
+    made = built("wrist", stream)
+    assert isinstance(made, FurtherForces)
+    assert made.about.to_plate is not None
+    assert np.allclose(np.abs(np.linalg.det(np.array(made.about.to_plate))), 1.0)
+    said = {**wrist, "timing": {"grade": "arm clock"}}
+    with pytest.raises(RigError, match=r"write streams.wrist.timing.grade: host time"):
+        built("wrist", real_rig(tmp_path, {"wrist": said}).streams["wrist"])

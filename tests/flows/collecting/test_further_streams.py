@@ -75,9 +75,17 @@ WARM = {
     "timing": {"delay": {"shortest_us": 0, "longest_us": 4000}},
     "mock": {"ambient": 22, "above": 2, "rate_hz": 40},
 }
+WRIST = {
+    "kind": "wrench",
+    "timing": {"delay": {"shortest_us": 0, "longest_us": 4000}},
+    "mock": {"noise_n": 0.01, "rate_hz": 500},
+}
 TWIN = {"kind": "events", "mock": {}}
 """As the rig's first event camera, with pixels and a clock of its own."""
-ALL = {"side": SIDE, "twin": TWIN, "back": BACK, "free": FREE, "heard": HEARD, "warm": WARM}
+ALL = {
+    "side": SIDE, "twin": TWIN, "back": BACK, "free": FREE, "heard": HEARD, "wrist": WRIST,
+    "warm": WARM,
+}  # fmt: skip
 
 
 def session(
@@ -121,7 +129,7 @@ def test_every_stream_is_stored_and_counted(taken: Recording) -> None:
     record = taken.record
     assert {name: stream.kind for name, stream in record.streams.items()} == {
         "side": "events", "twin": "events", "back": "frames", "free": "frames", "heard": "frames",
-        "warm": "scalar",
+        "wrist": "wrench", "warm": "scalar",
     }  # fmt: skip
     seconds = record.recorded_s
     side, back = record.streams["side"], record.streams["back"]
@@ -151,11 +159,13 @@ def test_every_clock_holds_its_uncertainty_against_the_truth(taken: Recording) -
         "back": ("hardware trigger", "95 %"),
         "free": ("device time stamps", "hard bound"),
         "heard": ("host arrival", "hard bound"),
+        "wrist": ("host time", "hard bound"),
         "warm": ("host arrival", "hard bound"),
     }
-    free = np.array(truth["free"])
-    error = np.abs(np.asarray(clocks["free"].map.to_reference(free[:, 0])) - free[:, 1])
-    assert error.max() <= (clocks["free"].uncertainty_ns or 0) < 1e6
+    for name, most_ns in (("free", 1e6), ("wrist", 3e6)):
+        pairs = np.array(truth[name])
+        error = np.abs(np.asarray(clocks[name].map.to_reference(pairs[:, 0])) - pairs[:, 1])
+        assert error.max() <= (clocks[name].uncertainty_ns or 0) < most_ns
     for name in ("side", "twin", "back"):
         # the true clock is a straight line; within the stretch of the pulses
         pairs, clock = np.array(truth[name]), clocks[name]
@@ -208,6 +218,29 @@ def test_the_thermometer_shows_a_cooling_body(taken: Recording) -> None:
     assert figures["max"] == warm.value.max()
 
 
+def test_a_further_force_sensor_feels_what_the_first_one_feels(tmp_path: Path) -> None:
+    work, campaign = session(tmp_path / "a", {"wrist": WRIST}, force={})
+    work.take(pending_trials(work.plan, campaign)[:1])
+    (recording,) = campaign.recordings()
+    trial = open_store(tmp_path / "a" / "store").trial(recording.trial_id)
+    first, wrist = trial.forces(), trial.forces("wrist")
+    start, end = trial.step("slide")
+    shown = [found.between(start, end).normal_n.mean() for found in (first, wrist)]
+    assert shown[0] > 1.0
+    assert shown[0] == pytest.approx(shown[1], rel=0.05)
+    assert not np.array_equal(first.normal_n[:50], wrist.normal_n[:50])
+    figures = {name: recording.record.streams[name].figures for name in ("force", "wrist")}
+    assert figures["wrist"].keys() == figures["force"].keys() - {"pressed_mm"}
+    gate = recording.record.quality.gates["sync_uncertainty_wrist_s"]
+    assert (gate.grade, gate.passed) == ("host time", True)
+    # the first sensor's own rows are those of a rig without the second one
+    alone, other = session(tmp_path / "b", {}, force={})
+    alone.take(pending_trials(alone.plan, other)[:1])
+    (without,) = other.recordings()
+    for name, values in vars(without.wrenches()).items():
+        assert np.array_equal(getattr(recording.wrenches(), name), values)
+
+
 def test_gates_and_catalogue_know_them(taken: Recording) -> None:
     gates = taken.record.quality.gates
     assert {f"sync_uncertainty_{name}_s" for name in ALL} <= gates.keys()
@@ -220,6 +253,7 @@ def test_gates_and_catalogue_know_them(taken: Recording) -> None:
     assert row["side_events"] == taken.record.streams["side"].rows
     assert row["back_frames"] == taken.record.streams["back"].rows
     assert 22 < row["warm_mean"] < 24
+    assert row["wrist_normal_peak_n"] == taken.record.streams["wrist"].figures["normal_peak_n"]
 
 
 def test_clocks_are_fitted_again_to_the_same(taken: Recording) -> None:
@@ -289,9 +323,9 @@ def record_calls(rig: Rig, called: list[str]) -> None:
             setattr(target, what, noted)
 
 
-@pytest.mark.parametrize("name", ["side", "back", "warm"])
+@pytest.mark.parametrize("name", ["side", "back", "wrist", "warm"])
 def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path) -> None:
-    streams = {"side": SIDE, "back": BACK, "warm": WARM}
+    streams = {"side": SIDE, "back": BACK, "wrist": WRIST, "warm": WARM}
     fault = {"kind": "stream_gone", "stream": name, "trial": 2, "at_s": 0.3}
     work, campaign = session(tmp_path / "a", streams, faults=[fault])
     called: list[str] = []
@@ -345,6 +379,7 @@ def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
     counts = view.save(view.find(store, taken.trial_id), tmp_path / "t.rrd")
     assert counts["side_events"] == taken.record.streams["side"].rows
     assert counts["back_frames"] == taken.record.streams["back"].rows
+    assert counts["wrist_wrench"] == taken.record.streams["wrist"].rows
     assert counts["warm_scalar"] == taken.record.streams["warm"].rows
     read = Read(tmp_path / "t.rrd")
     times, values = read.curve("/streams/warm")
@@ -426,6 +461,7 @@ def test_sync_shows_the_clock_of_each(taken: Recording) -> None:
     assert devices["side"]["pulses"]["missed"] == 0
     assert devices["side"]["grade"] == "trigger input"
     assert devices["warm"]["pulses"] is None
+    assert devices["wrist"]["grade"] == "host time"
     page = (store / "report" / "sync.html").read_text()
     assert "side, trigger input" in page
     assert "heard, host arrival" in page
