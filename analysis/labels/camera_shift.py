@@ -24,6 +24,10 @@ ANCHORS, MANY = 5, 10
 """Markers at rest that show where the camera points, and so many that they cannot all have slipped
 together by chance."""
 _APART_PX = 0.3
+_CALM_SHARE = 0.1
+"""Share of the markers that may go on as they did by chance in a frame with a knock."""
+_RESTLESS = 5
+"""Steps of more than `LEAST_PX` after which a camera trembles: then any further step is its own."""
 _GONE_FRAMES = 3
 _KEEP = 0.8
 _UNANCHORED_PX = 0.15
@@ -59,10 +63,10 @@ def camera_shift(away: Floats) -> CameraShift:
     shift, unsure, sigma = np.zeros((n, 2)), np.zeros(n, np.bool_), np.full(n, _UNANCHORED_PX)
     stuck, gone = np.ones(m, np.bool_), np.zeros(m, np.int64)
     velocity, before = np.zeros((m, 2)), np.full((m, 2), np.nan)
-    now, drifted = np.zeros(2), False
+    now, drifted, fastest, restless = np.zeros(2), False, 0.0, 0
     for f in range(n):
         seen = np.isfinite(away[f, :, 0])
-        hold = stuck & seen
+        hold, last, trembles = stuck & seen, now, restless >= _RESTLESS
         anchored = False
         if hold.sum() >= ANCHORS:
             middle = np.median(away[f, hold], axis=0)
@@ -70,6 +74,10 @@ def camera_shift(away: Floats) -> CameraShift:
             anchored = near.sum() >= max(ANCHORS, 0.5 * hold.sum())
             if anchored:
                 now = np.median(away[f, hold][near], axis=0)
+                still = np.hypot(*away[f, hold].T) < LEAST_PX
+                if np.hypot(*now) > LEAST_PX and still.sum() >= ANCHORS and not trembles:
+                    # papillae that do not touch move together, and are more than those that do
+                    near, now = still, np.median(away[f, hold][still], axis=0)
                 sigma[f] = np.sqrt(np.mean((away[f, hold][near] - now) ** 2))
                 drifted |= bool(near.sum() >= MANY and np.hypot(*now) > LEAST_PX)
         if not anchored and seen.any():
@@ -77,20 +85,56 @@ def camera_shift(away: Floats) -> CameraShift:
             new = np.where(stuck[:, None], away[f] - now, away[f] - before - velocity - now)
             known = seen & np.isfinite(new[:, 0])
             step = np.median(new[known], axis=0) if known.sum() >= ANCHORS else np.zeros(2)
-            if np.hypot(*step) > KNOCK_PX:
+            knock = bool(np.hypot(*step) > KNOCK_PX)
+            if knock and fastest > KNOCK_PX and not trembles:
+                knock = _all_took(step, new, known, stuck, velocity)
+            if knock:
                 now = now + step
                 unsure[f] = True
         shift[f] = now
+        restless += bool(np.hypot(*(now - last)) > LEAST_PX)
         place = away[f] - now
         gone = np.where(seen & (np.hypot(*place.T) > 2 * _APART_PX), gone + 1, 0)
         stuck &= gone < _GONE_FRAMES
         moved = np.where(np.isfinite(before), place - before, 0.0)
+        fastest = max(fastest, float(np.hypot(*moved.T).max()))
         velocity = np.where(seen[:, None], _KEEP * velocity + (1 - _KEEP) * moved, velocity)
         before = np.where(seen[:, None], place, before)
     knocked = np.hypot(*np.diff(shift, axis=0, prepend=0.0).T).max(initial=0.0) > KNOCK_PX
     if not (drifted or knocked):
         return no_shift(n)
     return CameraShift(shift, unsure, sigma)
+
+
+def _all_took(
+    step: Floats,
+    new: Floats,
+    known: NDArray[np.bool_],
+    stuck: NDArray[np.bool_],
+    velocity: Floats,
+) -> bool:
+    """Return whether a median step is the camera's: then no marker goes on as it did.
+
+    It is asked once a marker has moved by more than a knock in a frame, as in slides above some
+    2 mm/s. There many may let go in a few frames, and each steps so far; but others still stand, or
+    slide on. Where all slide, they may slow down together, as the arm does.
+
+    Args:
+        new, velocity: (m, 2) innovations, and motion per frame so far, px.
+        known, stuck: (m,) markers with an innovation; those that stood still.
+    """
+    witnesses = known & stuck if (known & stuck).any() else known
+    if np.mean(np.hypot(*new[witnesses].T) < _APART_PX) >= _CALM_SHARE:
+        return False
+    if (known & stuck).any():
+        return True
+    common = np.median(velocity[known], axis=0)
+    speed = float(np.hypot(*common))
+    if speed <= _APART_PX:
+        return True
+    slower = -float(step @ common) / speed
+    across = np.hypot(*(step + slower * common / speed))
+    return not (across < _APART_PX and 0 < slower < speed + _APART_PX)
 
 
 def no_shift(n: int) -> CameraShift:
