@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sliplab.analysis.labels.doubts import Doubts, slipped_in_hold, unseen
-from sliplab.analysis.labels.event_slips import Slips, slips
+from sliplab.analysis.labels.event_slips import AT_REST_MM, Slips, slips
 from sliplab.analysis.labels.event_tracking import (
     EventTracks,
     find_discs,
@@ -121,6 +121,8 @@ def onsets_by_events(recording: Recording, settings: Labelling) -> EventOnsets:
     tracks = track_discs(events, edges_us, discs, settle)
     along = _directions(base, way)
     moved = ((tracks.xy - tracks.rests.xy) * along).sum(axis=2)
+    # what does not move makes no events, and needs none
+    moved[:, way.max(axis=0) < AT_REST_MM] = 0.0
     moved[tracks.lost] = np.nan
     found = slips(way, moved, tracks.sigma, int(before), tracks.backlash_px)
     return _onsets(

@@ -23,6 +23,8 @@ I64 = NDArray[np.int64]
 BEFORE_MM = 0.5
 """Way before a knee over which the gain is fitted, by a parabola where it is long enough."""
 _CURVED_MM = 0.35
+AT_REST_MM = 0.2
+"""A papilla whose base never gets so far, as on the axis of a twist, cannot slip further."""
 AHEAD_MM = np.array([0.06, 0.12, 0.25])
 """Ways ahead of the fit at which what is missing is looked at."""
 LACKS = np.array([0.6, 0.45, 0.35])
@@ -77,6 +79,9 @@ def slips(way_mm: F64, moved_px: F64, sigma_px: F64, first: int, backlash_px: fl
         if len(known) < 8:
             continue
         s, y = way_mm[known, marker], moved_px[known, marker]
+        if s.max() < AT_REST_MM:
+            distance[known, marker], sigma[known, marker] = 0.0, s
+            continue
         at, begin = _first_knee(s, y, BEFORE_MM, AHEAD_MM, LACKS)
         end = len(s)
         if at >= 0:

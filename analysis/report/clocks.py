@@ -37,6 +37,8 @@ def latency_note(sync: Sync) -> str:
     """Return what is under every table of latencies: the grade, and how far off it may be."""
     if "events" not in sync.grades:
         return "Onsets and detections are both read from the frames: no clock lies between them."
+    if "frames" not in sync.grades:
+        return "Onsets and detections are both read from the events: no clock lies between them."
     note = (
         f"Frames: {frames_grade(sync)}; events against them within {frames_uncertainty(sync)}, "
         "worst trial."
@@ -50,11 +52,14 @@ def latency_note(sync: Sync) -> str:
 
 def figure_note(sync: Sync) -> str:
     """Return the same for a figure of latencies, where it can be seen in it; else nothing."""
-    return f" {latency_note(sync)}" if unwired(sync) and "events" in sync.grades else ""
+    both = {"events", "frames"} <= sync.grades.keys()
+    return f" {latency_note(sync)}" if unwired(sync) and both else ""
 
 
 def short_note(sync: Sync) -> str:
     """Return the same for a headline latency."""
+    if "frames" not in sync.grades:
+        return "onsets by events"
     within = f", within {frames_uncertainty(sync)}" if unwired(sync) else ""
     return f"frames: {frames_grade(sync)}{within}"
 

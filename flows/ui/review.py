@@ -353,7 +353,11 @@ def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
     arrays: Arrays = {}
     if row.label != "missing":
         label, arrays = derived.load(row.trial, TrialLabel), derived.arrays(row.trial)
-    frame_ns = np.asarray(arrays.get("frame_ns", recording.frame_times()), np.int64)
+    frame_ns = np.empty(0, np.int64)
+    if "frame_ns" in arrays:
+        frame_ns = np.asarray(arrays["frame_ns"], np.int64)
+    elif recording.frame_source != "none":
+        frame_ns = recording.frame_times()
     moved = np.asarray(arrays.get("displacement_px", np.empty((len(frame_ns), 0))), np.float64)
     places, plate = arrays.get("xy_px"), arrays.get("plate_px")
     if places is None and recording.has_tracks:

@@ -315,7 +315,8 @@ class FramePlot:
 
     def frame_to(self, shown: ShownTrial) -> None:
         """Fit the plot to another trial's frames."""
-        width, height = shown.recording.frame_px
+        # without frames, markers are shown where the event camera sees them
+        width, height = shown.recording.record.geometry.frame_px or shown.recording.event_px
         self._size = (int(width), int(height))
         for axis, size in ((self.plot.x_range, width), (self.plot.y_range, height)):
             axis.update(start=0, end=int(size), reset_start=0, reset_end=int(size))
@@ -380,7 +381,11 @@ def _colour(shown: ShownTrial, index: int, marker: int) -> str:
 
 def _caption(shown: ShownTrial, index: int, lost: np.ndarray) -> str:
     text = f"frame {index} at {shown.frame_s[index]:.3f} s"
-    if not shown.recording.has_video:
+    if shown.recording.frame_source == "none":
+        text = (
+            f"slice {index} at {shown.frame_s[index]:.3f} s, as the event camera sees the markers"
+        )
+    elif not shown.recording.has_video:
         text += ", drawn from the camera's tracks: no video was stored"
     elif shown.xy_px is None:
         text += "; this label has no tracks: `sliplab label` computes a new one"

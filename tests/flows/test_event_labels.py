@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collect import collect
+from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
+from sliplab.flows.ui.review import TrialList, load_trial
+from sliplab.flows.ui.review_plots import FramePlot
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.schema.label import KINDS, TrialLabel
 from sliplab.storage.streams import EventChunk
@@ -168,6 +172,22 @@ def test_a_camera_that_loses_a_third_of_all_events_is_still_right_or_in_doubt(
     assert known >= 4
 
 
+def test_twists_are_labelled_too(tmp_path: Path) -> None:
+    """The centre turns on the spot, makes no event, and is in nobody's way."""
+    store = take("rehearsal", tmp_path, "press_twist", depth=[2.8], speed=[12.0], angle=[40.0])
+    for recording in store.campaign("press_twist").recordings():
+        found = by_events(recording)
+        errors = errors_ms(recording, found)
+        assert "incipient" in errors
+        assert all(abs(error) < 150.0 for error in errors.values())
+        began = (recording.simulation_truth() or {})["slip_per_papilla_ns"]
+        slipped = np.flatnonzero(found.slips.at_ns >= 0)
+        off = [abs(found.slips.at_ns[k] - began[k]) / 1e6 for k in slipped if began[k] is not None]
+        assert len(off) >= 15
+        assert np.median(off) < 20.0
+        assert found.displacement_px[-1, 0] == 0.0
+
+
 def test_without_events_everything_is_in_doubt(slides: list[Recording]) -> None:
     def none(events: EventChunk, gross_us: int) -> EventChunk:
         return EventChunk.empty()
@@ -181,19 +201,36 @@ def test_without_events_everything_is_in_doubt(slides: list[Recording]) -> None:
 def test_the_document_says_that_it_is_from_events(tmp_path: Path) -> None:
     store = take("mock_events", tmp_path, depth=[2.8], speed=[1.6], direction=[0.0])
     recording = next(iter(store.campaign("pilot").recordings()))
-    label = label_recording(recording, Labelling())
-    document = TrialLabel.model_validate(label.document().to_json())
+    found = label_recording(recording, Labelling())
+    document = TrialLabel.model_validate(found.document().to_json())
     assert document.source == "events"
     assert document.intervals is not None
     low, high = document.intervals.incipient_ns or (0, 0)
     assert document.incipient_ns is not None
     assert low <= document.incipient_ns <= high
     assert document.change_point is not None
-    arrays = label.as_arrays()
+    arrays = found.as_arrays()
     assert arrays["displacement_px"].shape == (len(arrays["frame_ns"]), 19)
     assert np.diff(arrays["frame_ns"]).tolist() == [5_000_000] * (len(arrays["frame_ns"]) - 1)
     # the centre slips last and then slides with the sensor, 20 px/mm
     assert 20.0 < arrays["displacement_px"][-1, 0] < 180.0
+
+
+def test_a_reviewer_sees_the_markers_where_the_event_camera_does(tmp_path: Path) -> None:
+    store = take("mock_events", tmp_path, depth=[2.8], speed=[1.6], direction=[0.0])
+    plot = FramePlot()
+    bare = TrialList(store)
+    shown = load_trial(store, bare.items["pilot"], bare.rows[0])
+    assert shown.displacement_px.shape == (0, 0)
+    plot.frame_to(shown)
+    label(store, collected(store))
+    trials = TrialList(store)
+    shown = load_trial(store, trials.items["pilot"], trials.rows[0])
+    plot.frame_to(shown)
+    assert (plot.plot.x_range.end, plot.plot.y_range.end) == (640, 480)
+    said = plot.draw(shown, 1000, shown.picture(1000))
+    assert "as the event camera sees the markers" in said
+    assert shown.places(1000)[0] == pytest.approx([319.5, 239.5], abs=60.0)
 
 
 def test_a_plate_that_moves_is_not_seen(tmp_path: Path) -> None:

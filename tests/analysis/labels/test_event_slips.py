@@ -81,6 +81,15 @@ def test_once_it_slips_the_play_of_the_track_is_part_of_its_deviation() -> None:
     assert found.sigma_mm[-1, 0] > PLAY_PX / np.sqrt(12) / 3.0
 
 
+def test_a_base_that_hardly_moves_does_not_slip() -> None:
+    """The centre of a twist."""
+    way = np.linspace(0.0, 0.1, 1000)[:, None]
+    found = slips(way, np.zeros((1000, 1)), np.full((1000, 1), 0.02), 0, PLAY_PX)
+    assert np.isnan(found.knee_mm[0])
+    assert (found.distance_mm == 0.0).all()
+    assert (found.sigma_mm <= 0.1).all()
+
+
 def test_a_marker_that_is_unknown_has_no_slip() -> None:
     way = np.linspace(0.0, 6.0, 1000)[:, None]
     unknown = np.full((1000, 1), np.nan)
