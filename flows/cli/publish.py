@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sliplab.storage.trials.store import Campaign, Store
 
 app = typer.Typer()
-FORMATS = ("croissant", "mcap")
+FORMATS = ("croissant", "mcap", "lerobot")
 
 
 @app.command()

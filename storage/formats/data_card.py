@@ -46,6 +46,29 @@ with open(path, "rb") as file:
 `sliplab import campaigns/NAME --store STORE --name NAME` makes a store of them again.
 """,
 }
+_LOADS["lerobot"] = (
+    _LOADS["croissant"]
+    + """
+Each trial is also an episode of a LeRobot v3 data set (`data`, `meta`), a row for each 1/100 s:
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+episodes = LeRobotDataset("name", root=".")
+```
+"""
+)
+_FEATURES = (
+    ("timestamp", "s after the start of the episode, which is `start_ns` of `meta/episodes` on the "
+     "time line"),
+    ("observation.state", "tool centre point, mm and rotation vector in degrees, interpolated at "
+     "the end of the row; no action is given, since none was recorded"),
+    ("observation.NAME", "force, N, and torque, N m, of a sensor, interpolated likewise"),
+    ("observation.images.events", "events of the row: red counts brighter, green darker ones, at "
+     "most 255; times within the row are in `data.h5` alone"),
+    ("observation.images.frames", "the last frame before the end of the row"),
+    ("slip", "0 before slip, 1 from its first onset, 2 from its second, -1 without a label"),
+)  # fmt: skip
 _TOPICS = (
     ("/events", ros2.EVENTS, "packets of at most 10 ms; encoding `mono`: 64 bits an event, "
      "bits 0 to 31 ns after `time_base` on the camera's clock, 32 to 47 column, 48 to 62 row, "
@@ -83,7 +106,7 @@ def data_card(publication: Publication, tables: Mapping[str, pa.Table], form: st
     """Return the card as Markdown; of simulated data, its first line says so.
 
     Args:
-        form: ``croissant`` or ``mcap``.
+        form: one of `storage.formats.publish.FORMS`.
     """
     about = publication.about
     simulated = sum(recording.simulated for _, recording in publication.recordings)
@@ -111,6 +134,8 @@ def data_card(publication: Publication, tables: Mapping[str, pa.Table], form: st
             for name, table in sorted(tables.items(), reverse=True)
         ),
         *([["## Topics", "", *_topics(), ""]] if form == "mcap" else []),
+        *([["## Features", "", *_rows(("feature", "meaning"), _FEATURES), ""]]
+          if form == "lerobot" else []),
         ["## Columns of `data.h5`", "", *_hdf5(), ""],
         ["## Known limits", "", *(f"- {text}" for text in _limits(publication)), ""],
         ["## Checksums", "", "`sha256sum -c checksums.sha256` checks every file.", ""],

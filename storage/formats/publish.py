@@ -1,4 +1,4 @@
-"""Publication of trials in one folder: as the store's own files, or as MCAP files.
+"""Publication of trials in one folder: the store's own files, MCAP, or a LeRobot data set.
 
 Beside the trials there are tables, a data card, checksums, and descriptions as Croissant and as
 RO-Crate. The folder of the store's own files reads as a store as well.
@@ -16,6 +16,7 @@ from sliplab.storage.files import inside, sha256, write_json_aside
 from sliplab.storage.formats.croissant import croissant
 from sliplab.storage.formats.data_card import data_card
 from sliplab.storage.formats.foreign import FormatError
+from sliplab.storage.formats.lerobot import write_lerobot
 from sliplab.storage.formats.mcap_trials import write_mcap
 from sliplab.storage.formats.publication import (
     PERSONAL,
@@ -47,11 +48,13 @@ class Form:
         path: gives a trial's folder or file in the publication.
         data: what follows in the path of the trial's data.
         write: writes one trial into the publication's folder.
+        finish: writes what is of all trials, and reports each of them.
     """
 
     path: TrialPath
     data: str
     write: Callable[[Publication, Campaign, Recording, Path], None]
+    finish: Callable[[Publication, Path, Callable[[str], None]], None] | None = None
 
 
 def publish(
@@ -76,8 +79,11 @@ def publish(
         for campaign in publication.campaigns:
             _copy_campaign(campaign, folder)
         for campaign, recording in publication.recordings:
-            on_trial(recording.folder.name)
+            if how.finish is None:
+                on_trial(recording.folder.name)
             how.write(publication, campaign, recording, folder)
+        if how.finish is not None:
+            how.finish(publication, folder, on_trial)
         tables = write_tables(publication, folder, how.path)
         (folder / CARD).write_text(data_card(publication, tables, form), "utf-8")
         write_json_aside(folder / CROISSANT, croissant(publication, tables, folder))
@@ -154,5 +160,6 @@ def _write_mcap(
 FORMS = {
     "croissant": Form(trial_folder, f"/{DATA}", _copy_trial),
     "mcap": Form(mcap_file, "", _write_mcap),
+    "lerobot": Form(trial_folder, f"/{DATA}", _copy_trial, write_lerobot),
 }
 """Forms of a publication, by name."""

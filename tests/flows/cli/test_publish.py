@@ -58,7 +58,7 @@ def test_mcap_files_are_published_and_imported_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--as", "word"), "--as = word: must be one of croissant, mcap"),
+        (("--as", "word"), "--as = word: must be one of croissant, mcap, lerobot"),
         (("--as", "croissant", "--campaign", "x"), "--campaign = x: must be a campaign of"),
         (("--as", "croissant", "--licence", "free"), "--licence = free: must be one of CC0-1.0"),
         (("--as", "croissant", "--creator", " "), "--creator"),
