@@ -124,6 +124,7 @@ def assess(
     with_events: bool = True,
     to_plate: Rows | None = None,
     further: Mapping[str, StreamRecord] | None = None,
+    frame_rate_hz: int | None = None,
 ) -> Assessment:
     """Fit the clocks of a sealed trial and apply the protocol's gates.
 
@@ -133,6 +134,7 @@ def assess(
         with_events: events were recorded.
         to_plate: rows of the matrix from the force sensor's axes to the plate's, if there is one.
         further: what is known of the streams of further devices, by name.
+        frame_rate_hz: of a frame camera that runs by itself; None for `rate_hz`, the box's ticks.
     """
     further = further or {}
     clocks = further_clocks(folder, further)
@@ -162,7 +164,7 @@ def assess(
     devices = [*(name for name, recorded in there.items() if recorded), *sorted(sync.streams)]
     results = _sync_gates(sync, gates, timing, motion.recorded_ns, devices)
     if mid_exposure_ns is not None:
-        lost = _frames_lost(streams.frame_number, motion.recorded_ns, rate_hz)
+        lost = _frames_lost(streams.frame_number, motion.recorded_ns, frame_rate_hz or rate_hz)
         results["frames_lost"] = _gate(lost, gates.frames_lost)
     if with_events:
         gap_s = _event_gap(event_us, streams.event_pulses, "events", streams, sync, motion, gates)

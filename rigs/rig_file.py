@@ -114,6 +114,8 @@ class FrameCameraSpec(StrictModel):
     width_px: int = Field(default=1920, ge=16, le=100_000)
     height_px: int = Field(default=1200, ge=16, le=100_000)
     """Pixels of the whole sensor."""
+    rate_hz: int | None = Field(default=None, ge=1, le=1000)
+    """Frames a second of a camera that runs by itself; left out, the sync box's ticks a second."""
     spool: bool = False
     """Write raw frames and encode them after the trial, where live encoding is too slow."""
 
@@ -206,7 +208,7 @@ class RigFile(StrictModel):
                 self.devices.frame_camera.exposure_us,
                 exposure_us,
             ),
-            ("timing.frames", self.timing.frames, "hardware trigger"),
+            ("timing.frames", self.timing.frames, self.devices.frame_camera_driver.grade),
             ("mock.frame_camera.level", self.mock.frame_camera.level, "video"),
         ):
             if value != right:
@@ -257,6 +259,21 @@ class RigFile(StrictModel):
                 stated,
                 f"must be mock.frame_camera.px_per_mm = {rendered:g}",
             )
+        return self
+
+    @model_validator(mode="after")
+    def _rates_agree(self) -> RigFile:
+        """Check the stated rate of a camera that runs by itself."""
+        stated = self.frame_camera.rate_hz
+        if stated is None:
+            return self
+        key = "frame_camera.rate_hz"
+        if self.timing.frames == "hardware trigger":
+            text = "must be left out with timing.frames: hardware trigger, the sync box's ticks"
+            raise KeyedError(key, stated, text)
+        if self.mock is not None and self.mock.frame_camera.rate_hz != stated:
+            text = f"must be mock.frame_camera.rate_hz = {self.mock.frame_camera.rate_hz:g}"
+            raise KeyedError(key, stated, text)
         return self
 
     @model_validator(mode="after")
@@ -315,6 +332,10 @@ class RigFile(StrictModel):
         if self.frame_source == "tracks":
             return known.bytes_per_tracked_frame
         return known.bytes_per_plate_frame if with_plate else known.bytes_per_frame
+
+    def frame_rate_hz(self, plan: Plan) -> int:
+        """Return the frames a second of the frame camera."""
+        return self.frame_camera.rate_hz or plan.protocol.collection.recording.sync_rate
 
     def frame_px(self, plan: Plan) -> tuple[int, int] | None:
         """Return width and height of the recorded region in px, multiples of 16; None: no video."""

@@ -269,11 +269,13 @@ class TrialCollector:
         """Record one attempt at a trial; commit it, or quarantine it if it fails a gate."""
         collection = self.plan.protocol.collection
         rate_hz = collection.recording.sync_rate
-        frame_px = self.rig_file.frame_px(self.plan)
+        frame_px, frame_rate_hz = (
+            self.rig_file.frame_px(self.plan), self.rig_file.frame_rate_hz(self.plan),
+        )  # fmt: skip
         with_events = self.rig_file.with_events(self.plan)
         mid_exposure_ns = None if frame_px is None else self.rig.frames.mid_exposure_ns
         spool = self.rig_file.frame_camera.spool
-        writer = self.campaign.begin(trial.id, frame_px, rate_hz, spool=spool)
+        writer = self.campaign.begin(trial.id, frame_px, frame_rate_hz, spool=spool)
         started = datetime.now(UTC)
         try:
             seed = hash_integer(trial.seed, number)
@@ -288,6 +290,7 @@ class TrialCollector:
                 rate_hz,
                 mid_exposure_ns,
                 with_events=with_events,
+                frame_rate_hz=frame_rate_hz,
                 to_plate=self._to_plate(),
                 further={device.name: device.about for device in self.rig.further},
             )

@@ -54,7 +54,7 @@ class DiskWatch:
         frame = rig.frame_px(plan)
         if not rig.frame_camera.spool or frame is None:
             return kept
-        rate = plan.protocol.collection.recording.sync_rate
+        rate = rig.frame_rate_hz(plan)
         return kept + frame[0] * frame[1] * rate * plan.seconds(trial, recorded_only=True)
 
     def check(self, trial: Trial) -> None:

@@ -36,7 +36,7 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
     total = known.fixed_bytes + cameras * events * known.bytes_per_event
     rate_hz, frame_px = plan.protocol.collection.recording.sync_rate, rig.frame_px(plan)
     if frame_px is not None:
-        total += rig.frame_bytes(plate) * seconds * rate_hz
+        total += rig.frame_bytes(plate) * seconds * rig.frame_rate_hz(plan)
     for stream in rig.streams.values():
         if isinstance(stream, FrameStream):
             total += (

@@ -16,7 +16,7 @@ from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings
 
 if TYPE_CHECKING:
-    from sliplab.protocols.timing import Code
+    from sliplab.protocols.timing import Code, FrameGrade
     from sliplab.rigs.core.capabilities import (
         Arm,
         EventCamera,
@@ -150,6 +150,8 @@ class FrameCameraDriver(Driver[SettingsT]):
     """Open the driver on frames of a scene: settings, px per mm, frames, half the exposure (ns)."""
     unplug: Callable[[FrameCamera], None] | None = None
     """Unplug a camera that `fake` has opened, for tests."""
+    grade: FrameGrade = "hardware trigger"
+    """How frames are timed on a loopback rig: `host arrival` where the camera runs by itself."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ BUILT_IN = {
     "abb_socket": "sliplab.rigs.devices.abb:SOCKET_DRIVER",
     "dvxplorer": "sliplab.rigs.devices.dvxplorer:DRIVER",
     "basler": "sliplab.rigs.devices.basler:DRIVER",
+    "uvc": "sliplab.rigs.devices.uvc:DRIVER",
     "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
     "ati_net_ft": "sliplab.rigs.devices.ati_net_ft:DRIVER",
     "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",

@@ -45,7 +45,7 @@ from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
 from sliplab.rigs.mock.path import ContactPlane
 from sliplab.rigs.mock.settings import EventCamera, MockSettings
-from sliplab.rigs.mock.sync import MockSyncBox
+from sliplab.rigs.mock.sync import FreeRun, MockSyncBox
 from sliplab.rigs.mock.truth import truth_of
 from sliplab.rigs.mock.world import World, start_pose
 from sliplab.storage.clockmap import ClockMap
@@ -73,7 +73,7 @@ class SimulationServer:
 
     Args:
         settings: the simulated scene and devices, with their faults.
-        timing: signals that reach each device; frames by hardware trigger.
+        timing: signals that reach each device; frames by hardware trigger or host arrival.
         devices: the rig's drivers: fakes of their kinds listen where they will look.
         on_frames: called with the frames of each turn.
         further: driver and simulated camera of each further event camera, by its stream's name.
@@ -98,7 +98,9 @@ class SimulationServer:
         self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
         self._box = MockSyncBox(self.world)
         self._events = MockEventCamera(self.world, self._box)
-        self._frames = MockFrameCamera(self.world, self._box, timing.frames)
+        wired = timing.frames == "hardware trigger"
+        trigger = self._box if wired else FreeRun(self.world)
+        self._frames = MockFrameCamera(self.world, trigger, timing.frames)
         self._plate = MockPlate(self.world)
         self._operator = SimulatedOperator(self.world)
         self._on_frames, self._grabbing = on_frames, False

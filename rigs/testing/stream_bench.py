@@ -47,7 +47,7 @@ class StreamBench(Bench):
 
     capability: ClassVar[type]
     clock_field: ClassVar[str] = "t_ns"
-    fields: ClassVar[tuple[str, ...]] = ()
+    fields: tuple[str, ...] = ()
     """Fields of a chunk that must come as they were sent."""
     device: Any = None
 
@@ -265,7 +265,7 @@ class FrameBench(StreamBench):
     """A frame camera on frames of a scene that the bench shows; also the `SceneFrames`."""
 
     capability = FrameCamera
-    fields = ("number", "t_ns", "images")
+    fields: tuple[str, ...] = ("number", "t_ns", "images")
 
     def __init__(self, driver: FrameCameraDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
@@ -274,7 +274,41 @@ class FrameBench(StreamBench):
         self._fake, self._unplug = driver.fake, driver.unplug
         self.on_frames: Callable[[FrameChunk], None] = lambda frames: None
         self.shape = SIZE
-        self._grabbing, self._number = False, 0
+        self._grabbing, self._number, self._begun_ns = False, 0, 0
+        self._by_arrival = driver.grade == "host arrival"
+        if self._by_arrival:
+            self.fields = ("number", "images")
+
+    def turn_back(self) -> None:
+        """Let the camera's clock fall back. Raises NotTried: it has none."""
+        if self._by_arrival:
+            raise NotTried("its frames are timed by their arrival")
+        super().turn_back()
+
+    def mark(self) -> int | None:
+        """Return the time from which batches will be compared, ns."""
+        return time.monotonic_ns() if self._by_arrival else super().mark()
+
+    def complete(self, times: Sequence[int]) -> bool:
+        """Return whether all that was fed has come."""
+        if not self._by_arrival:
+            return super().complete(times)
+        return any(chunk.number[-1] >= self.fed[-1].number[-1] for chunk in self._of_run())
+
+    def check_content(self) -> None:
+        """Raise Seen if what came differs from what `gather` fed last."""
+        if self._by_arrival:  # frames are told by their numbers: their times are the host's
+            first = self.fed[0].number[0]
+            self._mark = min(
+                int(chunk.t_ns[chunk.number >= first][0])
+                for chunk in self._of_run()
+                if chunk.number[-1] >= first
+            )
+        super().check_content()
+
+    def _of_run(self) -> list[FrameChunk]:
+        """Return what came since the last start; numbers begin anew with each."""
+        return [chunk for chunk in self.came if chunk.t_ns[0] >= self._begun_ns]
 
     def open(self) -> None:
         """Open the camera on the scene's frames. Raises RigError."""
@@ -288,6 +322,7 @@ class FrameBench(StreamBench):
     def grab(self, width_px: int, height_px: int) -> None:
         """Begin to expose a region."""
         self.shape, self._number, self._grabbing = (width_px, height_px), 0, True
+        self._begun_ns = time.monotonic_ns()
 
     def stop_grabbing(self) -> None:
         """Stop; an empty chunk ends the frames."""

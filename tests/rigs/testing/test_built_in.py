@@ -6,13 +6,14 @@ import pytest
 
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.registry import BUILT_IN, Listed, load_driver
-from sliplab.rigs.devices import abb, ati_net_ft, basler, dvxplorer, sync_box, ur
+from sliplab.rigs.devices import abb, ati_net_ft, basler, dvxplorer, sync_box, ur, uvc
 from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
+from sliplab.rigs.devices.uvc.settings import UvcSettings
 from sliplab.rigs.testing.conformance import Case, cases
 from sliplab.rigs.testing.rule import Bounds
 from tests.rigs.testing.trying import LIMITS, each_apart, free_udp_port, try_all
@@ -71,6 +72,11 @@ def basler_cases() -> list[Case]:
     return cases(basler.DRIVER, settings)
 
 
+def uvc_cases() -> list[Case]:
+    settings = UvcSettings(device="/dev/null", width_px=128, height_px=96, stall_s=0.4)
+    return cases(uvc.DRIVER, settings)
+
+
 LATE = "late answer"
 DEVICES = {
     # not simulated: requests of their own connection, registers, and HTTP
@@ -82,6 +88,7 @@ DEVICES = {
     "dvxplorer": (dvxplorer_cases, set()),
     "sync_box": (sync_cases, set()),
     "basler": (basler_cases, set()),
+    "uvc": (uvc_cases, {"times fall back"}),  # it has no clock
 }
 ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
 
