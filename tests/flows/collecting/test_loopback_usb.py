@@ -1,0 +1,71 @@
+"""A trial whose frames come through the driver of USB cameras, in real time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.conftest import ROOT
+from tests.flows.conftest import write
+from tests.flows.live import at_work, quick, request_in, stage_of, take_all
+from tests.rigs.waiting import own_address
+
+pytestmark = pytest.mark.realtime
+
+RATE_HZ = 30
+
+
+def usb_rig(folder: Path) -> Path:
+    """The shipped loopback rig with a USB camera in place of a Basler."""
+    exposure = {"exposure_us": 2000}
+    data = {
+        "extends": str(ROOT / "rigs" / "loopback.yaml"),
+        "name": "loopback",
+        "frame_camera": {
+            "scale_px_per_mm": 10, "width_px": 640, "height_px": 480, "rate_hz": RATE_HZ
+        },
+        "timing": {"frames": "host arrival"},
+        "devices": {
+            "arm": {"host": own_address()},
+            "frame_camera": {
+                "driver": "uvc", "width_px": 640, "height_px": 480, "rate_hz": RATE_HZ, **exposure
+            },
+        },
+        "mock": {
+            "arm": {"start_xyz_mm": [397, 0, 300]},
+            "frame_camera": {"rate_hz": RATE_HZ},
+        },
+    }  # fmt: skip
+    return write(folder / "rig.yaml", data)
+
+
+def test_frames_of_a_usb_camera_show_the_slide(tmp_path: Path) -> None:
+    run_request = request_in(tmp_path / "live", quick(), usb_rig(tmp_path))
+    with (
+        stage_of(run_request.rig) as stage,
+        at_work(run_request, stage) as (work, campaign),
+    ):
+        take_all(work)
+        (recording,) = campaign.recordings()
+    assert verify(Store.open(run_request.store)) == []
+    record = recording.record
+    assert record.simulated
+    assert record.clocks.frames is not None
+    assert record.clocks.frames.grade == "host arrival"
+    assert record.quality.gates["frames_lost"].passed
+    start, end = recording.motion_ns
+    times = recording.frame_times()
+    assert np.diff(times).min() > 0
+    inside = (times >= start) & (times < end)
+    assert abs(inside.sum() - RATE_HZ * (end - start) / 1e9) < 4
+    # the picture changes while the sensor slides, and hardly in the hold
+    hold, _ = recording.step("hold")
+    still = np.flatnonzero((times > hold + 1e8) & (times < start - 1e8))
+    images = [np.asarray(image, np.float64) for image in recording.frames()]
+    moved = [abs(images[k] - images[k - 1]).mean() for k in np.flatnonzero(inside)[2:-2]]
+    rest = [abs(images[k] - images[k - 1]).mean() for k in still[1:]]
+    assert np.median(moved) > np.median(rest)
