@@ -145,6 +145,7 @@ def _messages(
         raise FormatError(f"is damaged: {str(error) or type(error).__name__}") from None
     except (
         struct.error,
+        OverflowError,
         ValueError,
         KeyError,
         RuntimeError,

@@ -181,7 +181,8 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     """A file of another program, found by its name and read to its end."""
     from sliplab.protocols.errors import InputError
     from sliplab.storage.formats.foreign import FormatError
-    from sliplab.storage.formats.import_trials import kind_of, trials_in
+    from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
+    from sliplab.storage.trials.store import Store
 
     _read_pickles_here()
     folder = box / "foreign"
@@ -192,6 +193,11 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     path = _written(folder, name, data)
     where = folder if name.endswith(".json") else path
     try:
+        if name.endswith(".mcap"):  # may hold a whole trial of a store
+            shutil.rmtree(box / "again", ignore_errors=True)
+            made = Store.create(box / "again")
+            import_trials(made, "again", trials_in(where, "mcap"), where, "mcap")
+            return
         for trial in trials_in(where, kind_of(where)):
             sum(len(chunk) for chunk in trial.events())
             sum(len(chunk) for chunk in (trial.frames or (lambda: iter(())))())
@@ -225,7 +231,41 @@ def make_foreign(folder: Path) -> dict[str, bytes]:
             data = path.read_bytes()
             found[plain] = data.replace(b"a,r=1.aedat4", b"t.aedat4")
     (folder / "t.aedat4").write_bytes(found["t.aedat4"])
-    return found
+    return found | _made_mcap(folder)
+
+
+def _made_mcap(folder: Path) -> dict[str, bytes]:
+    """A published trial as it is, and without compression and checksums, which hide damage."""
+    from mcap.reader import make_reader
+    from mcap.writer import CompressionType, Writer
+
+    from sliplab.storage.formats.mcap_trials import write_mcap
+    from sliplab.storage.trials.store import Store
+
+    store = Store.open(folder / "small-store")
+    campaign = store.campaign("c")
+    whole, bare = folder / "whole.mcap", folder / "bare.mcap"
+    whole.unlink(missing_ok=True)
+    write_mcap(whole, store, campaign, campaign.recording("a,r=1"))
+    with whole.open("rb") as file, bare.open("wb") as out:
+        reader = make_reader(file)
+        writer = Writer(out, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, known, channel.metadata
+                )
+            number = channels[channel.id]
+            writer.add_message(number, message.log_time, message.data, message.publish_time)
+        for one in reader.iter_attachments():
+            writer.add_attachment(0, 0, one.name, one.media_type, one.data)
+        for about in reader.iter_metadata():
+            writer.add_metadata(about.name, about.metadata)
+        writer.finish()
+    return {"a.mcap": whole.read_bytes(), "b.mcap": bare.read_bytes()}
 
 
 def pickle_seeds() -> dict[str, bytes]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from scipy.spatial.transform import Rotation
@@ -445,6 +445,24 @@ def test_damage_ends_in_a_message_and_leaves_nothing(rich: Store, tmp_path: Path
         assert not list(made.folder.glob("derived/labels/**/*"))
         refused += 1
     assert refused > 100
+
+
+def test_a_length_beyond_any_file_is_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: the library asks for as many bytes as the record says."""
+    path = tmp_path / "t.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start("ros2")
+        kind = writer.register_schema(ros2.POSE, "ros2msg", ros2.definition(ros2.POSE))
+        writer.add_message(writer.register_channel("/a", "cdr", kind), 0, b"marked", 0)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    at = data.index(b"marked") - 22 - 9  # the message's record: a byte, its length, its head
+    assert data[at] == 5
+    data[at : at + 9] = struct.pack("<BQ", 0x7F, 2**63)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"t\.mcap: is damaged or cut short"):
+        take(Store.create(tmp_path / "store"), path, "c")
 
 
 def _with(where: Store, path: Path, change: Any) -> None:
