@@ -100,6 +100,10 @@ class MarkerNetworkSection(Content):
         return share_words(self.interval)
 
 
+def _frames(smoothing: int) -> str:
+    return "a frame" if smoothing == 1 else f"the mean of {smoothing} frames"
+
+
 def _network_section(
     kinematic: Kinematic, summary: OneCameraSummary, net: MarkerNet
 ) -> MarkerNetworkSection:
@@ -115,7 +119,7 @@ def _network_section(
     return MarkerNetworkSection(
         summary.classifier, accuracy, kinematic.interval, kinematic.seeds,
         sorted({
-            f"the mean of {rule.smoothing} frames leads by {rule.margin:g} points"
+            f"{_frames(rule.smoothing)} leads by {rule.margin:g} points"
             for rule in summary.detection.values()
         }),
         Figure(
