@@ -27,14 +27,9 @@ from sliplab.rigs.core.driver import (
 )
 from sliplab.rigs.testing import arm_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
+from sliplab.rigs.testing.camera_benches import EventBench, FrameBench
 from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules, Seen
-from sliplab.rigs.testing.stream_bench import (
-    ArmForceBench,
-    EventBench,
-    ForceBench,
-    FrameBench,
-    SyncBench,
-)
+from sliplab.rigs.testing.sensor_benches import ArmForceBench, ForceBench, SyncBench
 
 Make = Callable[[], Any]
 

@@ -8,15 +8,10 @@ import numpy as np
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.testing.bench import QUIET_S, check_close, check_methods
+from sliplab.rigs.testing.camera_benches import SIZE, FrameBench
 from sliplab.rigs.testing.rule import Rules, Seen
-from sliplab.rigs.testing.stream_bench import (
-    SIZE,
-    ArmForceBench,
-    ForceBench,
-    FrameBench,
-    StreamBench,
-    SyncBench,
-)
+from sliplab.rigs.testing.sensor_benches import ArmForceBench, ForceBench, SyncBench
+from sliplab.rigs.testing.stream_bench import StreamBench
 
 RULES = Rules[StreamBench]()
 """Rules of every kind of stream."""

@@ -29,7 +29,8 @@ from sliplab.rigs.testing import arm_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
 from sliplab.rigs.testing.bench import POLL_S, Bench, check_methods
 from sliplab.rigs.testing.rule import Bounds, NotTried
-from sliplab.rigs.testing.stream_bench import BATCHES, StreamBench, SyncBench
+from sliplab.rigs.testing.sensor_benches import SyncBench
+from sliplab.rigs.testing.stream_bench import BATCHES, StreamBench
 
 SETTINGS = MockSettings(
     frame_camera=FrameSettings(level="tracks"),
