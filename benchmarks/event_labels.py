@@ -128,7 +128,6 @@ CAMERAS = {
     "pixels of 30 Hz": "cutoff_hz: 30",
     "read-out of 1000 scans a second": "readout_hz: 1000, scan_us: 0",
     "contrast 1.2": "contrast: 1.2",
-    "9 px/mm": "px_per_mm: 9",
 }
 """Other event cameras, by settings of the simulated one."""
 CASES: dict[str, tuple[str, Change]] = {

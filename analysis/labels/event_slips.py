@@ -39,6 +39,9 @@ _KNOTS = 81
 _CORRELATED = 6.0
 """Neighbouring samples that err together: the arm's tremor, and thresholds of single pixels."""
 
+_WIDER = 1.4
+"""Stretch of the intervals: a knee is not quite one, and simulated slips ask for it."""
+
 
 @dataclass(frozen=True)
 class Slips:
@@ -137,6 +140,7 @@ def _locate(s: F64, y: F64, at: int, begin: int) -> tuple[F64, float, float]:
     weight = np.exp(-(squares - squares.min()) / (2 * noise * _CORRELATED))
     share = np.concatenate(([0.0], np.cumsum((weight[1:] + weight[:-1]) / 2)))
     knee = np.interp(np.array([0.025, 0.5, 0.975]) * share[-1], share, places)
+    knee = knee[1] + _WIDER * (knee - knee[1])
     return (
         knee,
         float(np.interp(knee[1], places, gains)),
