@@ -46,6 +46,8 @@ class LabelSection(Content):
     holds: Table
     doubted: Table
     from_events: bool
+    frame_ms: float
+    """Interval of two frames."""
 
 
 def label_section(
@@ -91,7 +93,17 @@ def label_section(
             [[*key[:2], str(count), key[2]] for key, count in causes.most_common()],
         ),
         bool(labels.source.get("events")),
+        _frame_ms(campaigns),
     )
+
+
+def _frame_ms(campaigns: Sequence[Collected]) -> float:
+    """Return the interval of two frames in the first trial that has any; 10 without one."""
+    records = (recording.record for item in campaigns for _, recording in item.trials)
+    found = next((record for record in records if record.counts.frames), None)
+    if found is None or not found.recorded_s:
+        return 10.0
+    return 1000 * found.recorded_s / found.counts.frames
 
 
 def _rules(rules: RuleErrors, known: bool) -> Table:
