@@ -122,7 +122,8 @@ def _headline(shown: _Shown) -> list[Number]:
     found = [Number("trials", str(len(shown.rows)), f"{changed} with refitted clocks in use")]
     for device, name in shown.titles.items():
         worst = max(known.against_events_us for _, known in shown.of_device(device))
-        against = "own clock" if device == "events" else "events against it"
+        own = device == "events" or "events" not in shown.titles
+        against = "own clock" if own else "events against it"
         found.append(Number(name, number(worst, 1, "µs"), f"worst trial, {against}"))
     return found
 

@@ -28,7 +28,8 @@ class DeviceClocks:
 
     Attributes:
         kind: ``95 %`` or ``hard bound``: what the uncertainty means.
-        against_events_us: of events against this device, both maps together; of events, their own.
+        against_events_us: of events against this device, both maps together; of events, and in a
+            trial without them, the device's own.
         gate_us: what the protocol allows; None where the record has no such gate.
         drift_ppm: what the box gains on the device.
         pulses: ``seen``, ``missed``, ``late``, ``spurious``; None without a wire.
@@ -134,6 +135,7 @@ def _read(item: Collected, recording: Recording, number: int, results: Derived) 
 def _device(clocks: Clocks, gates: Mapping[str, Gate], name: str) -> DeviceClocks:
     known = clocks.devices()[name]
     both = clocks.against_events_ns(name)
+    uncertainty_ns = known.uncertainty_ns if both is None else both
     gate = gates.get(f"sync_uncertainty_{name}_s")
     limit = None if gate is None else gate.limit
     # through the host, the recorded drift is of one step of the way
@@ -142,7 +144,7 @@ def _device(clocks: Clocks, gates: Mapping[str, Gate], name: str) -> DeviceClock
     return DeviceClocks(
         known.grade,
         known.kind or "",
-        math.nan if both is None else both / 1e3,
+        math.nan if uncertainty_ns is None else uncertainty_ns / 1e3,
         None if limit is None else 1e6 * limit,
         known.map.drift_ppm() if drift_ppm is None else drift_ppm,
         pulses if known.wired else None,

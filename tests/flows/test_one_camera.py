@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import against, read_one_camera, report
+from sliplab.flows.running.console import plain
 from sliplab.flows.study import Outcome, study
 from sliplab.flows.study_ledger import LEFT_OUT
 from sliplab.flows.train import train
@@ -51,6 +53,7 @@ def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
 def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path) -> None:
     store, outcome = take(camera, tmp_path)
     states = {row.name: (row.state, row.note) for row in outcome.rows}
+    json.dumps([outcome.steps, outcome.collected], default=plain, allow_nan=False)  # as --json
     missing = {"events": "frames", "frames": "events"}[camera]
     for name, (state, note) in states.items():
         possible = camera == "events" or name.startswith("collect") or name in CAN_BE_DONE[missing]
