@@ -32,6 +32,8 @@ def test_cheap_commands_run_as_printed(checkout: Path) -> None:
     (checkout / "lab.yaml").write_text(load_rig_file(Path("rehearsal"))[1])
     # what exchange.md takes in
     assert run("sliplab export data pilot --format aedat4 --output recordings", checkout).code == 0
+    # what publish.md takes in
+    assert run("sliplab publish data --as mcap --output bags", checkout).code == 0
 
     trials = [trial.id for trial in load_plan(ROOT / "protocols" / "pilot.yaml")]
     wanted = sorted(
