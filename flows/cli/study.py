@@ -95,7 +95,7 @@ def demo(
     """Run the pilot study on the simulated rig and print the report's path."""
     if rig == Path("rehearsal"):
         console.say(
-            "The demo's outside camera hands over simulated marker tracks, no video; "
+            "The demo's outside camera delivers simulated marker tracks, no video; "
             "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
         )
     _chain(folder, study_protocols(pilot=True, extra=False), rig, as_json)
