@@ -12,7 +12,8 @@ import difflib
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
 from datetime import date
 from decimal import Decimal
 from functools import cache
@@ -21,6 +22,7 @@ from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import CoreSchema, core_schema
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.quantity import number_meant
@@ -28,6 +30,7 @@ from sliplab.protocols.shown import MASK, foreign_character, holds_secret, is_se
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
+Chosen = TypeVar("Chosen", bound=BaseModel)
 
 
 class StrictModel(BaseModel):
@@ -357,6 +360,33 @@ def load(model: type[ModelT], path: Path, what: str) -> ModelT:
 def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -> InputError:
     fault = first_fault(model, error)
     return InputError(path, fault.key, fault.value, str(fault))
+
+
+class ChosenModel(ABC):
+    """Annotation of a field with one of several models, chosen by what is in the value."""
+
+    @abstractmethod
+    def read(self, value: Any) -> BaseModel:
+        """Return the model in `value`, checked by `checked`."""
+
+    @staticmethod
+    def checked(model: type[Chosen], value: Any) -> Chosen:
+        """Validate a value by the chosen model. Raises KeyedError, its key below the field's."""
+        try:
+            return model.model_validate(value)
+        except ValidationError as error:
+            fault = first_fault(model, error)
+        raise KeyedError(f".{fault.key}" if fault.key else "", fault.value, str(fault))
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: Callable[[Any], CoreSchema]
+    ) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self.read,
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda model: model.model_dump(mode="json")
+            ),
+        )
 
 
 def first_fault(model: type[BaseModel], error: ValidationError) -> KeyedError:

@@ -12,22 +12,21 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, Union
 
 from pydantic import (
     Field,
     GetJsonSchemaHandler,
     TypeAdapter,
-    ValidationError,
     field_validator,
     model_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema
 
 from sliplab.protocols.timing import StreamGrade, StreamTiming
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, first_fault
+from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
 from sliplab.rigs.core.driver import (
     Driver,
@@ -220,7 +219,7 @@ KINDS: dict[str, type[Stream]] = {
 }
 
 
-class _ByKind:
+class _ByKind(ChosenModel):
     """A further device; `kind` selects the model of the other keys."""
 
     def read(self, value: Any) -> Stream:
@@ -232,21 +231,7 @@ class _ByKind:
         kind = value.get("kind")
         if not isinstance(kind, str) or kind not in KINDS:
             raise KeyedError(".kind", kind, f"must be one of {', '.join(KINDS)}")
-        try:
-            return KINDS[kind].model_validate(value)
-        except ValidationError as error:
-            fault = first_fault(KINDS[kind], error)
-        raise KeyedError(f".{fault.key}" if fault.key else "", fault.value, str(fault))
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: Callable[[Any], CoreSchema]
-    ) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            self.read,
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda stream: stream.model_dump(mode="json")
-            ),
-        )
+        return self.checked(KINDS[kind], value)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler

@@ -6,23 +6,26 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.evaluation import NAME, STEP, evaluation_of
 from sliplab.analysis.evaluation.markers import make_marker_job
 from sliplab.analysis.evaluation.windows import window_intervals
 from sliplab.analysis.labels.reviewed import Labels
-from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import marker_net
 from sliplab.analysis.networks.marker_net import MarkerNet
-from sliplab.analysis.report.figures import windows as figures
-from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.latency import latency_section
 from sliplab.analysis.report.outcomes import failure_section
 from sliplab.analysis.report.page import Content, Figure, Table, percent
 from sliplab.analysis.report.summary import judged_part, plain_rules
-from sliplab.analysis.report.windows import METHODS, points_words, share_words, where_section
+from sliplab.analysis.report.windows import (
+    METHODS,
+    class_table,
+    confusion_figure,
+    points_words,
+    share_words,
+    training_figure,
+    where_section,
+)
 from sliplab.storage.schema.evaluation import (
     Accuracy,
     Evaluation,
@@ -109,11 +112,6 @@ def _network_section(
 ) -> MarkerNetworkSection:
     assert summary.classifier is not None
     simulated, accuracy = summary.simulated, kinematic.accuracy
-    confusion = np.asarray(kinematic.confusion)
-    called = {
-        f"called {word} (windows)": confusion[:, k].tolist()
-        for k, word in enumerate((*CLASS_WORDS, "undecided"))
-    }
     history = [asdict(epoch) for epoch in net.history]
     own = [percent(value) for value in (accuracy.argmax, accuracy.strict, accuracy.margin)]
     return MarkerNetworkSection(
@@ -122,14 +120,8 @@ def _network_section(
             f"{_frames(rule.smoothing)} leads by {rule.margin:g} points"
             for rule in summary.detection.values()
         }),
-        Figure(
-            figures.confusion(confusion, simulated=simulated), name="confusion",
-            data={"true class": list(CLASS_WORDS), **called},
-        ),
-        Figure(
-            figures.training_curves(history, net.chosen_epoch, simulated=simulated),
-            name="training", data={key: [row[key] for row in history] for key in history[0]},
-        ),
+        confusion_figure(kinematic, simulated=simulated),
+        training_figure(history, net.chosen_epoch, simulated=simulated),
         Table(
             ["method", "argmax", "strict", "margin", "classifier ahead by (points)"],
             [["marker classifier", *own, ""]]
@@ -138,11 +130,7 @@ def _network_section(
                 for name, found in kinematic.beside.items()
             ],
         ),
-        Table(
-            ["class", "precision", "recall"],
-            [[word, percent(kinematic.precision[name]), percent(kinematic.recall[name])]
-             for name, word in zip(CLASSES, CLASS_WORDS, strict=True)],
-        ),
+        class_table(kinematic),
     )  # fmt: skip
 
 

@@ -44,6 +44,14 @@ METHODS = {
 """Other methods as text, by name."""
 WORST = 10
 """Trials that are listed with their errors."""
+_HEADINGS = {
+    "epoch": "epoch",
+    "loss": "training loss (nats)",
+    "val_loss": "validation loss (nats)",
+    "train_argmax": "training accuracy, argmax (share)",
+    "val_argmax": "validation accuracy, argmax (share)",
+    "val_strict": "validation accuracy, strict (share)",
+}
 
 
 @dataclass(frozen=True)
@@ -78,44 +86,57 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
         [METHODS[name], percent(found.argmax), "", "", points_words(found.network_ahead)]
         for name, found in {**kinematic.beside, **baselines}.items()
     ]
+    history = [vars(record) for record in fitted.history]
+    return NetworkSection(
+        fitted.windows.length_ms, accuracy, kinematic.interval, kinematic.seeds, bool(baselines),
+        fitted.warnings, PAPER, confusion_figure(kinematic, simulated=simulated),
+        training_figure(history, fitted.chosen_epoch, simulated=simulated),
+        Table(
+            ["method", "argmax", "strict", "margin", "network ahead by (points)"],
+            [["spiking network", *own, ""], *methods],
+        ),
+        class_table(kinematic),
+    )  # fmt: skip
+
+
+def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> Figure:
+    """Draw the confusion matrix."""
     confusion = np.asarray(kinematic.confusion)
     called = {
         f"called {word} (windows)": confusion[:, k].tolist()
         for k, word in enumerate((*CLASS_WORDS, "undecided"))
     }
-    history = [vars(record) for record in fitted.history]
-    headings = {
-        "epoch": "epoch",
-        "loss": "training loss (nats)",
-        "val_loss": "validation loss (nats)",
-        "train_argmax": "training accuracy, argmax (share)",
-        "val_argmax": "validation accuracy, argmax (share)",
-        "val_strict": "validation accuracy, strict (share)",
-    }
-    return NetworkSection(
-        fitted.windows.length_ms, accuracy, kinematic.interval, kinematic.seeds, bool(baselines),
-        fitted.warnings, PAPER,
-        Figure(
-            figures.confusion(confusion, simulated=simulated),
-            name="confusion",
-            data={"true class": list(CLASS_WORDS), **called},
-        ),
-        Figure(
-            figures.training_curves(history, fitted.chosen_epoch, simulated=simulated),
-            name="training",
-            data={heading: [row[name] for row in history] for name, heading in headings.items()},
-        ),
-        Table(
-            ["method", "argmax", "strict", "margin", "network ahead by (points)"],
-            [["spiking network", *own, ""], *methods],
-        ),
-        Table(
-            ["class", "precision", "recall"],
-            [[word, percent(kinematic.precision[name]),
-              percent(kinematic.recall[name])]
-             for name, word in zip(CLASSES, CLASS_WORDS, strict=True)],
-        ),
-    )  # fmt: skip
+    return Figure(
+        figures.confusion(confusion, simulated=simulated),
+        name="confusion",
+        data={"true class": list(CLASS_WORDS), **called},
+    )
+
+
+def training_figure(
+    history: Sequence[dict[str, Any]], chosen_epoch: int, *, simulated: bool
+) -> Figure:
+    """Draw loss and accuracy over the epochs.
+
+    Args:
+        history: a row for each epoch, by the names in `_HEADINGS`.
+    """
+    return Figure(
+        figures.training_curves(history, chosen_epoch, simulated=simulated),
+        name="training",
+        data={heading: [row[name] for row in history] for name, heading in _HEADINGS.items()},
+    )
+
+
+def class_table(kinematic: Kinematic) -> Table:
+    """List precision and recall of each class."""
+    return Table(
+        ["class", "precision", "recall"],
+        [
+            [word, percent(kinematic.precision[name]), percent(kinematic.recall[name])]
+            for name, word in zip(CLASSES, CLASS_WORDS, strict=True)
+        ],
+    )
 
 
 @dataclass(frozen=True)

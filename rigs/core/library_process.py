@@ -14,11 +14,14 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, TypeVar
 
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 
+T = TypeVar("T")
 KILL_S = 2.0
 """Timeout for a child to end after a request or a kill, s."""
 _OUTPUT_BYTES = 2000
@@ -27,6 +30,20 @@ _OUTPUT_CHARACTERS = 160
 
 class LibraryError(RuntimeError):
     """The library refused, failed or timed out; the text says which."""
+
+
+def of_device(device: str, work: Callable[[], T]) -> T:
+    """Return the result of `work`, a call of a camera's library.
+
+    Raises:
+        RigError: of `device`, in place of a LibraryError; without the call's name, which means
+            nothing to a user.
+    """
+    try:
+        return work()
+    except LibraryError as error:
+        reason = str(error).partition(": ")[2]
+        raise RigError(device, reason.removeprefix(f"{device}: ")) from None
 
 
 class LibraryProcess:

@@ -6,14 +6,14 @@ A device's driver defines its other keys (`rigs.core.registry`). Cheap to import
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError
+from pydantic import Field, GetJsonSchemaHandler, TypeAdapter
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, first_fault, register_tags_of
+from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel, register_tags_of
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
 from sliplab.rigs.core.driver import (
@@ -39,7 +39,7 @@ _KINDS: dict[str, type[Driver[Any]]] = {
 """Kinds of drivers, by the key of the device in a rig file."""
 
 
-class OfKind:
+class OfKind(ChosenModel):
     """Settings of any installed driver of a kind; `driver` selects the model of the other keys."""
 
     def __init__(self, kind: type[Driver[Any]], default: str | None = None) -> None:
@@ -56,21 +56,7 @@ class OfKind:
             driver = find_driver(str(name), self._kind)
         except DriverError as error:
             raise KeyedError(".driver", name, str(error)) from None
-        try:
-            return driver.settings.model_validate(value)
-        except ValidationError as error:
-            fault = first_fault(driver.settings, error)
-        raise KeyedError(f".{fault.key}" if fault.key else "", fault.value, str(fault))
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: Callable[[Any], CoreSchema]
-    ) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            self.read,
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda settings: settings.model_dump(mode="json")
-            ),
-        )
+        return self.checked(driver.settings, value)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler

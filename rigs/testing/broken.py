@@ -57,7 +57,7 @@ class ClockNotWatched(ExampleArm):
 
 
 class StopWaits(ExampleArm):
-    """Stop waits for the arm to come to rest, and has not told it to."""
+    """Stop waits for the arm to come to rest, and sends it no command."""
 
     def stop(self) -> None:
         """Wait for rest, then stop."""

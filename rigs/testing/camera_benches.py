@@ -124,7 +124,7 @@ class FrameBench(StreamBench):
 
     def check_content(self) -> None:
         """Raise Seen if what came differs from what `gather` fed last."""
-        if self._by_arrival:  # frames are told by their numbers: their times are the host's
+        if self._by_arrival:  # frames are matched by their numbers: their times are the host's
             first = self.fed[0].number[0]
             self._mark = min(
                 int(chunk.t_ns[chunk.number >= first][0])

@@ -78,8 +78,8 @@ def write_tables(publication: Publication, folder: Path, path: TrialPath) -> dic
     ]
     labels = pd.concat([part for part in parts if len(part)] or [pd.DataFrame()])
     if len(labels):
-        told = {name: _label_text(name) for name in labels.columns}
-        tables[LABELLED] = _table(labels, told)
+        meanings = {name: _label_text(name) for name in labels.columns}
+        tables[LABELLED] = _table(labels, meanings)
     for name, table in tables.items():
         pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
     return tables
@@ -100,8 +100,8 @@ def _trials(publication: Publication, path: TrialPath) -> pa.Table:
             (column,) = condition_columns({factor: level})
             unit = level.partition(" ")[2]
             factors[column] = f"level of the factor {factor}{f', {unit}' if unit else ''}"
-    told = {name: _TRIAL_COLUMNS.get(name) or factors.get(name) for name in rows.columns}
-    return _table(rows, {name: text or _figure(name, units) for name, text in told.items()})
+    meanings = {name: _TRIAL_COLUMNS.get(name) or factors.get(name) for name in rows.columns}
+    return _table(rows, {name: text or _figure(name, units) for name, text in meanings.items()})
 
 
 def _figure(name: str, units: Mapping[str, str]) -> str:
@@ -134,12 +134,12 @@ def _label_text(name: str) -> str:
     return f"{_LABEL_COLUMNS.get(rest, rest)}; {rule_text}"
 
 
-def _table(rows: pd.DataFrame, told: dict[str, str]) -> pa.Table:
+def _table(rows: pd.DataFrame, meanings: dict[str, str]) -> pa.Table:
     table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata()
     for at, name in enumerate(table.column_names):
         column = table.column(at)
         kind = pa.string() if pa.types.is_null(column.type) else column.type
         kind = pa.string() if pa.types.is_large_string(kind) else kind
-        field = pa.field(name, kind, metadata={"description": told[name]})
+        field = pa.field(name, kind, metadata={"description": meanings[name]})
         table = table.set_column(at, field, column.cast(kind))
     return table

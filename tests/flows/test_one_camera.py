@@ -143,10 +143,10 @@ def test_training_and_evaluation_repeat_and_say_what_is_stale(tmp_path: Path) ->
 
     assert evaluate(store, campaigns, margin=90.0)["done"] == 1
     report(store, campaigns)
-    told = read_one_camera(store)
-    assert told is not None
-    assert {rule.margin for rule in told.detection.values()} == {90.0}
-    assert {rule.choose for rule in told.detection.values()} == {"protocol"}
+    summary = read_one_camera(store)
+    assert summary is not None
+    assert {rule.margin for rule in summary.detection.values()} == {90.0}
+    assert {rule.choose for rule in summary.detection.values()} == {"protocol"}
 
 
 def test_a_report_on_events_says_which_steps_are_still_to_do(tmp_path: Path) -> None:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-from sliplab.rigs.core.capabilities import DeviceHealth, RigError
-from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
+from sliplab.rigs.core.capabilities import DeviceHealth
+from sliplab.rigs.core.library_process import LibraryProcess, of_device
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
 from sliplab.rigs.devices.dvxplorer.source import DEVICE, Batch, open_source
 from sliplab.storage.streams import Json
@@ -48,14 +47,15 @@ class EventProcess:
     """
 
     def __init__(self, settings: DvxplorerSettings) -> None:
-        self._process = _raised(
+        self._process = of_device(
+            DEVICE,
             lambda: LibraryProcess(
                 "dv-processing",
                 "sliplab.rigs.devices.dvxplorer.process:serve",
                 (settings.model_dump_json(), OPEN_S),
                 OPEN_S,
                 ignore_suspend=True,
-            )
+            ),
         )
         self.name: str
         self.resolution: tuple[int, int]
@@ -81,16 +81,7 @@ class EventProcess:
         self._process.end()
 
     def _call(self, name: str, *arguments: Any) -> Any:
-        return _raised(lambda: self._process.call(name, *arguments, within_s=ANSWER_S))
-
-
-def _raised(work: Callable[[], Any]) -> Any:
-    try:
-        return work()
-    except LibraryError as error:
-        # drop the call's name, which means nothing to a user
-        reason = str(error).partition(": ")[2]
-        raise RigError(DEVICE, reason.removeprefix(f"{DEVICE}: ")) from None
+        return of_device(DEVICE, lambda: self._process.call(name, *arguments, within_s=ANSWER_S))
 
 
 def serve(fd: int, settings_json: str, start_s: float) -> None:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
-from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
+from sliplab.rigs.core.library_process import LibraryProcess, of_device
 from sliplab.rigs.devices.uvc.capture import Taken
 from sliplab.rigs.devices.uvc.settings import UvcSettings
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
@@ -65,14 +64,15 @@ class UvcCamera:
         self._running = False
         self._last: Taken | None = None
         self._fault: RigError | None = None
-        self._process = _raised(
+        self._process = of_device(
+            DEVICE,
             lambda: LibraryProcess(
                 "OpenCV",
                 "sliplab.rigs.devices.uvc.capture:serve",
                 (settings.model_dump_json(),),
                 OPEN_S,
                 ignore_suspend=True,
-            )
+            ),
         )
         self.in_force: Json = self._process.begun
         if self.in_force.get("exposure_us") is not None:  # the camera rounds it
@@ -193,15 +193,7 @@ class UvcCamera:
             raise RigError(DEVICE, fault)
 
     def _call(self, name: str, *arguments: Any) -> Any:
-        return _raised(lambda: self._process.call(name, *arguments, within_s=ANSWER_S))
-
-
-def _raised(work: Callable[[], Any]) -> Any:
-    try:
-        return work()
-    except LibraryError as error:
-        # the call's name means nothing to a user
-        raise RigError(DEVICE, str(error).partition(": ")[2]) from None
+        return of_device(DEVICE, lambda: self._process.call(name, *arguments, within_s=ANSWER_S))
 
 
 def _model(device: str) -> str:
