@@ -88,7 +88,7 @@ def over_campaign(
         unit, of = (1000, "(thousand/s)") if stream == "events" else (1, "(1/s)")
         top.plot(numbers, [rate / unit for rate in rates], "o", color=BLUE, **dots)
         top.set_ylabel(f"{stream}\n{of}")
-        top.set_ylim(bottom=0)
+        top.set_ylim(0, 1.1 * max(rates, default=0.0) / unit or 1.0)  # frames all come at one rate
         middle.plot(numbers, [100 * share for share in used], "o", color=GREEN, **dots)
         middle.axhline(100, color=RED, lw=0.9, ls="--", label="limit")
         middle.set_ylabel("tightest gate\n(% of its limit)")
