@@ -24,10 +24,12 @@ class StreamBuffer:
     Args:
         device: the device's part in the rig, for `RigError`.
         stall_s: silence of a running device that is a fault, s.
+        most_mb: data that may wait to be read, MB; a device that sends more is a fault. Left out,
+            only the number of parts is limited.
     """
 
-    def __init__(self, device: str, stall_s: float) -> None:
-        self._device, self._stall_s = device, stall_s
+    def __init__(self, device: str, stall_s: float, most_mb: float | None = None) -> None:
+        self._device, self._stall_s, self._most_mb = device, stall_s, most_mb
         self._lock = threading.Lock()
         self._fault: str | None = None
         self._running = False
@@ -36,6 +38,7 @@ class StreamBuffer:
     def _forget(self) -> None:
         self._parts: dict[str, list[Any]] = {}
         self._last: dict[str, int] = {}
+        self._bytes: dict[str, int] = {}
         self._count = 0
         self._stall = StallTimer()
 
@@ -50,8 +53,8 @@ class StreamBuffer:
         with self._lock:
             self._running = False
 
-    def add(self, stream: str, part: Any, times: I64) -> None:
-        """Add a part with its times, shape (n,); in the receiving thread.
+    def add(self, stream: str, part: Any, times: I64, nbytes: int = 0) -> None:
+        """Add a part with its times, shape (n,), and its size; in the receiving thread.
 
         Raises:
             ValueError: times fall back, or nobody reads.
@@ -65,7 +68,11 @@ class StreamBuffer:
             waiting = self._parts.setdefault(stream, [])
             if len(waiting) == MOST_PARTS:
                 raise ValueError(f"nobody read it: {MOST_PARTS} packets are waiting")
+            held = self._bytes.get(stream, 0) + nbytes
+            if self._most_mb is not None and held > 1e6 * self._most_mb:
+                raise ValueError(f"nobody read it: {self._most_mb:g} MB are full")
             waiting.append(part)
+            self._bytes[stream] = held
             self._last[stream] = int(times[-1])
             self._count += 1
 
@@ -82,6 +89,7 @@ class StreamBuffer:
         """
         with self._lock:
             taken = self._parts.pop(stream, [])
+            self._bytes.pop(stream, None)
             if not taken and not self._parts:
                 self._check()
         return taken
@@ -91,9 +99,17 @@ class StreamBuffer:
         with self._lock:
             self._check()
 
-    def _check(self) -> None:
+    def check_fault(self) -> None:
+        """Raise RigError if the device has failed; a silent one may still take a command."""
+        with self._lock:
+            self._check_fault()
+
+    def _check_fault(self) -> None:
         if self._fault is not None:
             raise RigError(self._device, f"{self._fault}; look at its cable, then open it again")
+
+    def _check(self) -> None:
+        self._check_fault()
         silent_s = self._stall.waited_s(self._count) if self._running else 0.0
         if silent_s > self._stall_s:
             raise RigError(self._device, f"silent for {silent_s:.1f} s; look at its cable")
