@@ -149,6 +149,25 @@ def _locate(s: F64, y: F64, at: int, begin: int) -> tuple[F64, float, float]:
 
 
 @njit(cache=True, nogil=True)
+def _add_row(normal: Any, right: Any, row: Any, value: float) -> float:
+    """Add an equation to normal equations; return the square of its right side."""
+    for a in range(row.size):
+        right[a] += row[a] * value
+        for b in range(row.size):
+            normal[a, b] += row[a] * row[b]
+    return value * value
+
+
+@njit(cache=True, nogil=True)
+def _solved(normal: Any, right: Any, square: float) -> Any:
+    """Solve normal equations; return the solution and the sum of squares that it leaves."""
+    for a in range(right.size):
+        normal[a, a] += 1e-9  # of few rows, they may be singular
+    best: Any = np.linalg.solve(normal, right)
+    return best, max(square - best @ right, 0.0)
+
+
+@njit(cache=True, nogil=True)
 def _fit(s: Any, y: Any, low: int, high: int, origin: float, curved: bool) -> Any:
     """Least-squares parabola (or line) over samples, and its residual's standard deviation.
 
@@ -163,15 +182,8 @@ def _fit(s: Any, y: Any, low: int, high: int, origin: float, curved: bool) -> An
         for a in range(k):
             powers[a] = row
             row *= u
-        for a in range(k):
-            right[a] += powers[a] * y[i]
-            for b in range(k):
-                normal[a, b] += powers[a] * powers[b]
-        square += y[i] * y[i]
-    for a in range(k):
-        normal[a, a] += 1e-9
-    best: Any = np.linalg.solve(normal, right)
-    left = max(square - best @ right, 0.0)
+        square += _add_row(normal, right, powers, y[i])
+    best, left = _solved(normal, right, square)
     return best[0], best[1], (best[2] if curved else 0.0), np.sqrt(left / max(high - low - k, 1))
 
 
@@ -227,14 +239,7 @@ def _hinges(s: Any, y: Any, places: Any, curved: bool) -> Any:
             row[0], row[1], row[2] = 1.0, min(u, 0.0), max(u, 0.0)
             if curved:
                 row[3] = row[1] * row[1]
-            for a in range(size):
-                right[a] += row[a] * y[i]
-                for b in range(size):
-                    normal[a, b] += row[a] * row[b]
-            square += y[i] * y[i]
-        for a in range(size):
-            normal[a, a] += 1e-9
-        best = np.linalg.solve(normal, right)
-        squares[p] = max(square - best @ right, 0.0)
+            square += _add_row(normal, right, row, y[i])
+        best, squares[p] = _solved(normal, right, square)
         levels[p], slopes[p] = best[0], best[1]
     return squares, slopes, levels
