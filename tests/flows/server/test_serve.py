@@ -32,7 +32,7 @@ from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
-from tests.flows.server.serving import Page
+from tests.flows.server.serving import Page, until
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
@@ -289,6 +289,8 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
 
     asyncio.run(serve._refuse_another("collect", "here", store.folder))  # it is ours
     page.call("/deployments/get_scheduled_flow_runs", {"deployment_ids": [there["id"]]})
+    # the server notes a runner's query some time after its answer
+    until("being served", lambda: page.deployment("collect")["status"] == "READY")
     with pytest.raises(InputError, match=r"--name = here: is served for .*store; give another"):
         asyncio.run(serve._refuse_another("collect", "here", tmp_path / "other"))
 
