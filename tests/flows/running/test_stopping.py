@@ -16,6 +16,15 @@ import pytest
 from sliplab.flows.running import console, stopping
 
 
+@pytest.fixture
+def terminal() -> Iterator[None]:
+    """A terminal whose end is noticed: the tests may run under nohup, which ignores it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("terminal")
 def test_a_signal_interrupts_and_is_remembered() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         with stopping.signals():
