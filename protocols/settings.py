@@ -24,9 +24,10 @@ Spikes = Annotated[float, Field(ge=0, le=1e6)]
 class Labelling(StrictModel):
     """Ground truth from the outside video."""
 
-    rule: Literal["paper", "change_point", "force"] = "paper"
+    rule: Literal["paper", "change_point", "force", "given"] = "paper"
     """Onset rule that later steps use; all are kept (docs/labels.md). `force` needs a rig with a
-    force sensor (docs/force.md)."""
+    force sensor (docs/force.md); `given` takes the labels that came with an imported recording
+    (docs/adapters.md)."""
     threshold_px: float = Field(default=2.0, gt=0, le=100)
     """A marker slips when its displacement exceeds this, pixels."""
     reference: Literal["hold_start", "hold_end"] = "hold_start"

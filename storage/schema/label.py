@@ -14,7 +14,8 @@ LABELS = "labels"
 """The step's name in stores."""
 Kind = Literal["incipient", "gross"]
 KINDS: tuple[Kind, ...] = ("incipient", "gross")
-Rule = Literal["paper", "change_point", "force"]
+Rule = Literal["paper", "change_point", "force", "given"]
+"""`given`: the onsets came with the recording."""
 RULES: tuple[Rule, ...] = ("paper", "change_point", "force")
 
 
@@ -65,6 +66,14 @@ class OnsetIntervals(Part):
     gross_ns: tuple[Int, Int] | None
 
 
+class ClassSpan(Part):
+    """Part of a recording that shows one class."""
+
+    start_ns: Int
+    end_ns: Int
+    name: str
+
+
 class TrialLabel(RuleOnsets, Document):
     """The label of one trial.
 
@@ -100,9 +109,13 @@ class TrialLabel(RuleOnsets, Document):
     quality: tuple[Number, ...] = ()
     """Each marker's lowest quality from the motion's start to its slip, 0 to 1."""
     source: str | None = None
-    """`video`, `tracks` that the camera provided, or `events` of a trial without frames."""
+    """`video`, `tracks` that the camera provided, `events` of a trial without frames, or `given`
+    with the recording."""
     intervals: OnsetIntervals | None = None
-    """Of the paper's rule; written only for labels from events."""
+    """Of the paper's rule, or of given onsets; written only for labels from events and given
+    ones."""
+    spans: tuple[ClassSpan, ...] = ()
+    """Classes other than those of slip; written only where the recording came with them."""
 
     def by_rule(self, rule: Rule) -> RuleOnsets:
         """Return the onsets of one rule.
@@ -111,7 +124,7 @@ class TrialLabel(RuleOnsets, Document):
             ValueError: the label is older than the rule, or the trial has no forces.
         """
         rules = {"paper": self.paper, "change_point": self.change_point, "force": self.force}
-        found = rules[rule]
+        found = self if rule == self.rule == "given" else rules.get(rule)
         if found is None and rule == "force":
             raise ValueError("force: is missing; the trial has no forces, or run `sliplab label`")
         if found is None:

@@ -203,6 +203,29 @@ class Geometry(Part):
     """Column and row where the event camera sees the skin's centre, if that was calibrated."""
 
 
+class GivenSpan(Part):
+    """Part of a recording that shows one class."""
+
+    start_ns: Int
+    end_ns: Int
+    name: str
+    """The class."""
+
+
+class Given(Part):
+    """Labels that came with a recording, on the trial's time line."""
+
+    source: str
+    """Where they stood: a file's name, or `file name`."""
+    incipient_ns: Int | None = None
+    """Onset of slip; null where the data set has none."""
+    gross_ns: Int | None = None
+    uncertainty_ns: Number | None = None
+    """Bound of the onsets' error; null where unknown."""
+    spans: tuple[GivenSpan, ...] = ()
+    """Classes other than those of slip."""
+
+
 class Imported(Part):
     """Origin of a trial that was not collected here."""
 
@@ -214,6 +237,12 @@ class Imported(Part):
     unknown: tuple[str, ...] = ()
     """Facts about the trial that are no longer known."""
     warnings: tuple[str, ...] = ()
+    fields: dict[str, str] = Field(default_factory=dict)
+    """What file names and tables said of the trial, by name; written for adapters only."""
+    span_ns: tuple[Int, Int] | None = None
+    """Start and end of the recording on the time line, where its steps do not say."""
+    given: Given | None = None
+    """Labels that came with it."""
 
 
 class StreamRecord(Part):

@@ -40,7 +40,7 @@ def test_keys_that_older_versions_did_not_write_have_defaults() -> None:
     ("change", "said"),
     [
         ({"incipient_ns": 1.5}, r"incipient_ns = 1.5: must be a whole number"),
-        ({"rule": "mine"}, r"rule = mine: must be 'paper', 'change_point' or 'force'"),
+        ({"rule": "mine"}, r"rule = mine: must be 'paper', 'change_point', 'force' or 'given'"),
         ({"paper": {"gross_ns": 1}}, r"paper.incipient_ns: is missing"),
     ],
 )
