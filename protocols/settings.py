@@ -44,17 +44,30 @@ class Labelling(StrictModel):
 class Windows(StrictModel):
     """From events to samples of shape (steps, channels, cells, cells)."""
 
-    length_ms: int = Field(default=30, ge=1, le=1000)
-    step_ms: int = Field(default=1, ge=1, le=100)
-    crop_px: int = Field(default=400, ge=20, le=480)
-    pool_px: int = Field(default=20, ge=1, le=240)
+    length_ms: int = Field(default=30, ge=1, le=60_000)
+    step_ms: int = Field(default=1, ge=1, le=1000)
+    crop_px: int = Field(default=400, ge=1, le=8192)
+    pool_px: int = Field(default=20, ge=1, le=8192)
     polarity: Literal["positive", "negative", "both"] = "positive"
+    taxels: int | None = Field(
+        default=None, ge=1, le=65_536, exclude_if=lambda value: value is None
+    )
+    """Taxels of a sensor that has no image: each is a channel, of each polarity one, and a sample
+    has a single cell. `crop_px` and `pool_px` are then left out. null: the square crop."""
 
     @model_validator(mode="after")
     def _fits(self) -> Windows:
         if self.length_ms % self.step_ms:
             raise KeyedError("analysis.windows.step_ms", self.step_ms, "must divide length_ms")
-        if self.crop_px % self.pool_px:
+        if self.taxels is not None:
+            for name in ("crop_px", "pool_px"):
+                value = getattr(self, name)
+                if value != type(self).model_fields[name].default:
+                    raise KeyedError(
+                        f"analysis.windows.{name}", value,
+                        f"must be left out beside taxels = {self.taxels}: taxels have no crop",
+                    )  # fmt: skip
+        elif self.crop_px % self.pool_px:
             raise KeyedError("analysis.windows.pool_px", self.pool_px, "must divide crop_px")
         return self
 
@@ -65,13 +78,18 @@ class Windows(StrictModel):
 
     @property
     def cells(self) -> int:
-        """Cells along one side of a sample (20)."""
-        return self.crop_px // self.pool_px
+        """Cells along one side of a sample (20); 1 of taxels."""
+        return 1 if self.taxels is not None else self.crop_px // self.pool_px
+
+    @property
+    def polarities(self) -> int:
+        """1, or 2 when both polarities are kept apart."""
+        return 2 if self.polarity == "both" else 1
 
     @property
     def channels(self) -> int:
-        """1, or 2 when both polarities are kept apart."""
-        return 2 if self.polarity == "both" else 1
+        """The polarities, of each taxel where there are taxels."""
+        return self.polarities * (self.taxels or 1)
 
 
 class Samples(StrictModel):

@@ -32,7 +32,8 @@ def bin_events(
     """Event counts of windows, by step, polarity and pooled cell.
 
     An event counts in the window [start, start + length), in step ``(t - start) // step``, in the
-    cell of ``pool`` x ``pool`` pixels of the square crop that holds its pixel.
+    cell of ``pool`` x ``pool`` pixels of the square crop that holds its pixel. With taxels all of
+    the sensor counts: taxel ``row * width + column`` is a channel, and there is one cell.
 
     Args:
         events: k of them, sorted by time; pixels may be integers of any kind, polarity also bool or
@@ -41,27 +42,27 @@ def bin_events(
         settings: window length, step, crop, pooling and polarity.
         width, height: the sensor's pixels.
         centre_px: column and row of the crop's middle, as near as it can be without leaving the
-            sensor; the sensor's own middle by default.
+            sensor; the sensor's own middle by default. Taxels have no crop.
 
     Returns:
         (n, steps, channels, cells, cells) uint8, rows before columns; a count over 255 stays 255.
-        With both polarities channel 0 is negative and channel 1 positive.
+        With both polarities the negative channels are before the positive ones.
 
     Raises:
         ValueError: columns of unequal length or not 1-D, times not sorted, a pixel outside the
-            sensor, or a crop larger than the sensor.
+            sensor, a crop larger than the sensor, or another number of taxels than it has.
         TypeError: a column holds no integers.
     """
     columns = _columns(events)
     starts = _times(starts_us, "starts_us")
     of_x, of_y = _cells(settings, width, height, centre_px)
     shape = (starts.size, settings.steps, settings.channels, settings.cells, settings.cells)
-    out = np.zeros(shape, np.uint8)
+    out = np.zeros((*shape[:2], settings.polarities, *_plane(settings, width, height)), np.uint8)
     state = _bin(
         *columns, starts, settings.step_ms * 1000, _CODES[settings.polarity], of_x, of_y, out
     )
     _raise_for_status(state, columns, width, height)
-    return out
+    return out.reshape(shape)
 
 
 def list_events(
@@ -85,10 +86,11 @@ def list_events(
     most = int((ends - np.searchsorted(times, starts)).clip(min=0).sum())
     offsets = np.zeros(starts.size * settings.steps + 1, np.int64)
     cell, count = np.empty(most, np.uint32), np.empty(most, np.uint8)
-    plane = np.zeros(settings.channels * settings.cells**2 + 1, np.uint8)
+    rows, across = _plane(settings, width, height)
+    plane = np.zeros(settings.polarities * rows * across + 1, np.uint8)
     state = _list(
         *columns, starts, settings.step_ms * 1000, settings.steps, _CODES[settings.polarity],
-        of_x, of_y, settings.cells, plane, np.empty(plane.size, np.uint32), offsets, cell, count,
+        of_x, of_y, rows, across, plane, np.empty(plane.size, np.uint32), offsets, cell, count,
     )  # fmt: skip
     _raise_for_status(state, columns, width, height)
     return SparseWindows(shape, offsets, cell[: offsets[-1]].copy(), count[: offsets[-1]].copy())
@@ -171,6 +173,12 @@ def _cells(
     settings: Windows, width: int, height: int, centre_px: tuple[float, float] | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """The cell column of each x and the cell row of each y; -1 outside the crop."""
+    if settings.taxels is not None:
+        if settings.taxels != width * height:
+            raise ValueError(
+                f"taxels = {settings.taxels}: the sensor has {width} x {height} = {width * height}"
+            )
+        return np.arange(width, dtype=np.int32), np.arange(height, dtype=np.int32)
     crop, pool = settings.crop_px, settings.pool_px
     if crop > width or crop > height:
         raise ValueError(f"crop_px = {crop}: larger than the sensor's {width} x {height} pixels")
@@ -182,6 +190,11 @@ def _cells(
 
     column, row = centre_px or (None, None)
     return along(width, column), along(height, row)
+
+
+def _plane(settings: Windows, width: int, height: int) -> tuple[int, int]:
+    """Rows and columns of the places that `_cells` gives."""
+    return (settings.cells,) * 2 if settings.taxels is None else (height, width)
 
 
 def _raise_for_status(state: int, columns: _Columns, width: int, height: int) -> None:
@@ -250,8 +263,8 @@ def _bin(
 @numba.njit(cache=True, nogil=True)
 def _list(
     x: Any, y: Any, p: Any, t: Any, starts: Any, step_us: int, steps: int, polarity: int,
-    of_x: Any, of_y: Any, cells: int, plane: Any, touched: Any, offsets: Any, cell: Any,
-    count: Any,
+    of_x: Any, of_y: Any, rows: int, across: int, plane: Any, touched: Any, offsets: Any,
+    cell: Any, count: Any,
 ) -> int:  # fmt: skip
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
@@ -270,7 +283,7 @@ def _list(
                 # half of the events have the other polarity, unpredictable for the processor:
                 # they are written to a dummy last cell, without a branch
                 selected = (column >= 0) & (row >= 0) & (both | (positive == wanted))
-                place = ((both & positive) * cells + row) * cells + column if selected else dummy
+                place = ((both & positive) * rows + row) * across + column if selected else dummy
                 found = plane[place]
                 touched[m] = place
                 m += (found == 0) & selected

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols import load_plan
+from sliplab.protocols.hashing import hash_data
+from sliplab.protocols.settings import AnalysisSettings, Windows
+from sliplab.protocols.yaml_file import KeyedError
+from tests.conftest import ROOT
 
 
 @pytest.mark.parametrize("outputs", [1, 4, 10])
@@ -21,3 +27,42 @@ def test_what_is_in_spikes_goes_with_the_number_of_output_neurons(outputs: int) 
     found = AnalysisSettings.model_validate(said)
     assert (found.training.gain, found.detection.margin) == (0.1, 3.0)
     assert found.detection.margin_grid == (1.0, 3.0)
+
+
+def test_settings_without_taxels_are_stored_as_before_there_were_any() -> None:
+    square = {"length_ms": 30, "step_ms": 1, "crop_px": 400, "pool_px": 20, "polarity": "positive"}
+    assert Windows().model_dump() == square
+    assert Windows(taxels=None).model_dump(mode="json") == square
+    # of SlipLab 1.0: keys of models and of evaluations are made from them
+    assert hash_data(AnalysisSettings().model_dump(mode="json")) == (
+        "ba3f1eaee0a4518bbe74c3f30c34533e8dcbba3fc60ff1ec2808ad03f67edb7c"
+    )
+    assert load_plan(ROOT / "protocols" / "kinematic.yaml").analysis_hash == (
+        "fea09f2994b5c46b7ea14175ca0080c60de8d3efc4f186fb5165a7fc61a4b77c"
+    )
+
+
+def test_taxels_are_channels_of_one_cell() -> None:
+    found = Windows(length_ms=250, taxels=39, polarity="both")
+    assert (found.steps, found.channels, found.cells) == (250, 78, 1)
+    assert Windows(taxels=39).channels == 39
+    assert found.model_dump()["taxels"] == 39
+    assert Windows.model_validate(found.model_dump()) == found
+    assert found != Windows(length_ms=250, polarity="both")
+
+
+@pytest.mark.parametrize(
+    ("data", "key", "right"),
+    [
+        ({"taxels": 39, "crop_px": 200}, "crop_px", "must be left out beside taxels = 39"),
+        ({"taxels": 39, "pool_px": 1}, "pool_px", "must be left out beside taxels = 39"),
+        ({"taxels": 39, "length_ms": 5, "step_ms": 2}, "step_ms", "must divide length_ms"),
+        ({"crop_px": 30}, "pool_px", "must divide crop_px"),
+    ],
+)
+def test_what_does_not_fit_a_window_is_named(data: dict[str, Any], key: str, right: str) -> None:
+    with pytest.raises(ValueError, match=right) as caught:
+        Windows.model_validate(data)
+    (error,) = caught.value.errors()  # type: ignore[attr-defined]
+    assert isinstance(error["ctx"]["error"], KeyedError)
+    assert error["ctx"]["error"].key == f"analysis.windows.{key}"

@@ -10,7 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sliplab.analysis.windows.windows import bin_events, first_pixel, window_totals
+from sliplab.analysis.windows.windows import (
+    bin_events,
+    first_pixel,
+    list_events,
+    window_totals,
+)
 from sliplab.protocols.settings import Windows
 from sliplab.storage.streams import EventChunk
 
@@ -202,3 +207,57 @@ def test_events_are_counted_about_the_centre_that_is_told() -> None:
     )  # 20 px right and down
     assert np.argwhere(middle[0, 0, 0]).tolist() == [[(250 - 40) // 20, (450 - 120) // 20]]
     assert np.argwhere(moved[0, 0, 0]).tolist() == [[(250 - 60) // 20, (450 - 140) // 20]]
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(0, 2_000),
+    steps=st.integers(1, 6),
+    step_ms=st.integers(1, 3),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 5)),
+    polarity=st.sampled_from(["positive", "negative", "both"]),
+)
+def test_taxels_are_counted_one_by_one(
+    seed: int, count: int, steps: int, step_ms: int, size: tuple[int, int], polarity: Any
+) -> None:
+    width, height = size
+    taxels = width * height
+    how = Windows(length_ms=steps * step_ms, step_ms=step_ms, taxels=taxels, polarity=polarity)
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(0, width, count), rng.integers(0, height, count)
+    p = rng.integers(0, 2, count)
+    t = np.sort(rng.integers(0, 40, count)) * 500
+    starts = rng.integers(-4, 44, 5) * 500
+
+    expected = np.zeros((5, steps, how.channels), np.int64)
+    kept = np.ones(count, bool) if polarity == "both" else p == (polarity == "positive")
+    sign = p if polarity == "both" else np.zeros(count, np.int64)
+    channel = sign * taxels + y * width + x
+    step = (t - starts[:, None]) // (step_ms * 1000)
+    window, event = np.nonzero(kept & (step >= 0) & (step < steps))
+    np.add.at(expected, (window, step[window, event], channel[event]), 1)
+
+    events = EventChunk(x, y, p, t)
+    got = bin_events(events, starts, how, width, height)
+    assert got.shape == (5, steps, how.channels, 1, 1)
+    assert got.dtype == np.uint8
+    np.testing.assert_array_equal(got[..., 0, 0], np.minimum(expected, 255))
+    listed = list_events(events, starts, how, width, height)
+    assert listed.shape == got.shape[1:]
+    np.testing.assert_array_equal(listed.dense(), got)
+    for a, b in zip(listed.offsets[:-1], listed.offsets[1:], strict=True):
+        assert (np.diff(listed.cell[a:b].astype(int)) > 0).all()
+    totals = window_totals(events, starts, how, width, height)
+    np.testing.assert_array_equal(totals, expected.sum(axis=(1, 2)))
+    # a sample of taxels has no sides to be mirrored along
+    mirrored = listed.mirrored(np.arange(5) % 4)
+    np.testing.assert_array_equal(mirrored.dense(), got)
+
+
+@pytest.mark.parametrize("counted", [bin_events, list_events, window_totals])
+@pytest.mark.parametrize("size", [(38, 1), (40, 1), (39, 2)])
+def test_a_sensor_has_as_many_taxels_as_its_windows(counted: Any, size: tuple[int, int]) -> None:
+    one = np.array([0])
+    with pytest.raises(ValueError, match=rf"taxels = 39: the sensor has {size[0]} x {size[1]} = "):
+        counted(EventChunk(one, one, one, one), one, Windows(taxels=39), *size)
