@@ -7,9 +7,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.adapter import CLASSES, load_adapter
+from sliplab.protocols.recorded import RecordedPlan, RecordedTrial, natural
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
+
+ADAPTER = "adapter"
+"""Key of a campaign's `imported` part: it came by an adapter, which it keeps."""
+_NO_PLAN = "was imported without an adapter: it has neither labels nor a split (docs/adapters.md)"
+
+
+def has_plan(info: CampaignInfo) -> bool:
+    """Return True for a campaign that was collected, or imported by an adapter."""
+    return IMPORTED not in info or ADAPTER in info[IMPORTED]
 
 
 @dataclass(frozen=True)
@@ -30,31 +41,63 @@ class Collected:
 
     @cached_property
     def plan(self) -> Plan:
-        """The plan of the campaign.
+        """The plan of a collected campaign.
 
         Raises:
             InputError: it was imported, or its protocol is damaged.
         """
-        if IMPORTED in self.campaign.info:
+        if IMPORTED in self.info:
             raise InputError("CAMPAIGN", "", self.name, "was imported: it has no protocol")
-        enabled = self.campaign.info.get("enabled", ())
+        enabled = self.info.get("enabled", ())
         return load_plan(self.campaign.protocol_file, enabled, stored=True)
+
+    @cached_property
+    def recorded(self) -> RecordedPlan | None:
+        """The plan of a campaign that was imported by an adapter; None of a collected one.
+
+        Raises:
+            InputError: it was imported without an adapter, or its adapter is damaged.
+        """
+        if IMPORTED not in self.info:
+            return None
+        if not has_plan(self.info):
+            raise InputError("CAMPAIGN", "", self.name, _NO_PLAN)
+        file = self.campaign.protocol_file
+        trials = tuple(map(_recorded_trial, self.campaign.recordings()))
+        return RecordedPlan(load_adapter(file), str(file), trials)
+
+    @property
+    def planned(self) -> Plan | RecordedPlan:
+        """The plan of the campaign, whichever it has."""
+        return self.recorded or self.plan
 
     @property
     def experiment(self) -> str:
-        """``kinematic``, ``gravity`` or ``disturbance``."""
+        """``kinematic``, ``gravity``, ``disturbance``, or ``classes`` of other classes than slip's.
+
+        Raises:
+            InputError: see `planned`.
+        """
+        if self.recorded is not None:
+            return self.recorded.adapter.experiment
         return self.plan.protocol.collection.experiment
 
     @property
     def settings(self) -> AnalysisSettings:
         """The `analysis:` section."""
+        if self.recorded is not None:
+            return self.recorded.adapter.analysis
         return self.plan.protocol.analysis
+
+    def describe(self, trial: Trial) -> dict[str, str]:
+        """Return a trial's condition as text with units, by factor."""
+        return self.planned.describe(trial)
 
     @cached_property
     def trials(self) -> list[tuple[Trial, Recording]]:
         """Committed trials of the plan, in the plan's order."""
         there = self.campaign.committed()
-        return [(t, self.campaign.recording(t.id)) for t in self.plan if t.id in there]
+        return [(t, self.campaign.recording(t.id)) for t in self.planned if t.id in there]
 
     def need(self, stream: str, use: str) -> None:
         """See that trials were recorded with a stream.
@@ -84,6 +127,22 @@ class Collected:
         return ((trial, recording) for trial, recording in self.trials if trial.split == split)
 
 
+def _recorded_trial(recording: Recording) -> RecordedTrial:
+    record = recording.record
+    origin = record.imported
+    given = None if origin is None else origin.given
+    names = [] if given is None else [span.name for span in given.spans]
+    return RecordedTrial(
+        record.trial,
+        record.condition,
+        {} if origin is None else origin.fields,
+        # a recording of several classes is spread over the split by the one that it begins with
+        names[0] if names else None,
+        record.recorded_s,
+        tuple(dict.fromkeys(names)),
+    )
+
+
 def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
     """The campaigns of a store, or those named.
 
@@ -94,12 +153,15 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
     campaigns = {campaign.name: campaign for campaign in store.campaigns()}
     if not campaigns:
         raise StoreError(f"{store.folder}: holds no campaign yet; run `sliplab collect` first")
-    imported = {name for name, campaign in campaigns.items() if IMPORTED in campaign.info}
+    imported = {name for name, campaign in campaigns.items() if not has_plan(campaign.info)}
     if imported >= campaigns.keys():
-        raise StoreError(f"{store.folder}: holds imported campaigns only, which have no protocol")
+        raise StoreError(
+            f"{store.folder}: holds only campaigns that were imported without an adapter: they "
+            "have neither labels nor a split (docs/adapters.md)"
+        )
     for name in names or ():
         if name in imported:
-            raise InputError("--campaign", "", name, "was imported: it has no protocol")
+            raise InputError("--campaign", "", name, _NO_PLAN)
         if name not in campaigns:
             raise InputError(
                 "--campaign",
@@ -114,6 +176,38 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
 def missing_stream(campaigns: list[Collected]) -> str | None:
     """Return ``events`` or ``frames``, whichever some campaign was recorded without; else None."""
     return next((item.missing_stream for item in campaigns if item.missing_stream), None)
+
+
+def of_classes(campaigns: list[Collected]) -> bool:
+    """Return True where the recordings show classes of their own instead of a slip.
+
+    Raises:
+        InputError: some do and some do not.
+    """
+    found = {item.experiment == CLASSES: item.name for item in campaigns}
+    if len(found) > 1:
+        raise InputError(
+            "--campaign", "", None,
+            f"'{found[True]}' is of classes and '{found[False]}' of slip: they are analysed apart, "
+            "so name one of them with --campaign",
+        )  # fmt: skip
+    return True in found
+
+
+def class_names(campaigns: list[Collected]) -> tuple[str, ...]:
+    """Return the names of all classes that recordings show, by the numbers that samples carry.
+
+    Raises:
+        InputError: the adapters list other classes.
+        StoreError: there are not two.
+    """
+    listed = {item.name: item.recorded.classes for item in campaigns if item.recorded is not None}
+    names = tuple(dict.fromkeys(name for found in listed.values() for name in found))
+    if not any(item.recorded and item.recorded.adapter.classes for item in campaigns):
+        names = tuple(sorted(names, key=natural))
+    if len(names) < 2:
+        raise StoreError(f"recordings of {len(names)} classes; at least two are needed to train")
+    return names
 
 
 def kinematic_campaigns(campaigns: list[Collected]) -> list[Collected]:
@@ -138,6 +232,15 @@ def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
     found = kinematic_campaigns(campaigns)
     for item in found:
         item.need("events", "the network is trained on windows of them")
+    return agreeing(found)
+
+
+def agreeing(found: list[Collected]) -> list[Collected]:
+    """Return campaigns whose windows are made alike.
+
+    Raises:
+        InputError: they are not.
+    """
     for other in found[1:]:
         if other.settings.windows != found[0].settings.windows:
             raise InputError(

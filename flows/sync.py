@@ -28,7 +28,7 @@ from sliplab.flows.running.parallel_map import run_trials
 from sliplab.flows.steps import StepResult
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import SYNC, Store
+from sliplab.storage.trials.store import SYNC, Store, StoreError
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -56,7 +56,14 @@ class SyncDone(StepResult):
 
 
 def sync(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> SyncDone:
-    """Fit what is stale, and write the page if anything on it has changed."""
+    """Fit what is stale, and write the page if anything on it has changed.
+
+    Raises:
+        StoreError: nothing but imported recordings, which have no sync pulses.
+    """
+    campaigns = [item for item in campaigns if item.recorded is None]
+    if not campaigns:
+        raise StoreError("imported recordings have no sync pulses: there are no clocks to fit")
     required = [
         TrialWork(recording, item.name, sync_key(recording))
         for item in campaigns

@@ -28,8 +28,9 @@ class RecordedTrial:
     Attributes:
         condition: levels by factor as text with unit: ``{"speed": "0.6 mm/s"}``.
         fields: everything that file names and tables said of it, by name.
-        label: its class; None for a trial of slip.
+        label: the class by which it is spread over the split; None for a trial of slip.
         seconds: length of its recording.
+        classes: all classes that it shows.
     """
 
     id: str
@@ -37,6 +38,7 @@ class RecordedTrial:
     fields: Mapping[str, str]
     label: str | None
     seconds: float
+    classes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class RecordedPlan:
         Raises:
             InputError: a trial is of a class that the adapter does not list.
         """
-        there = {trial.label for trial in self.recorded if trial.label is not None}
+        there = {name for trial in self.recorded for name in trial.classes}
         listed = self.adapter.classes
         if listed and (other := sorted(there - set(listed), key=natural)):
             raise InputError(

@@ -263,7 +263,7 @@ def _score_windows(job: MarkerJob, net: MarkerNet, margin: float) -> WindowScore
             points, test.y, net.points(validation.x), validation.y
         ),
         by_factor=window_groups.by_factor(
-            hits, trial, {k: item.plan.describe(of) for k, (item, of, _) in enumerate(known)}
+            hits, trial, {k: item.describe(of) for k, (item, of, _) in enumerate(known)}
         ),
         by_tenth=by_tenth, no_slip=no_slip,
         by_trial=tuple(

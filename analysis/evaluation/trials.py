@@ -61,7 +61,7 @@ def score_row(
         campaign=item.name,
         experiment=item.experiment,
         trial=trial.id,
-        condition=item.plan.describe(trial),
+        condition=item.describe(trial),
         incipient_ns=label.incipient_ns,
         gross_ns=label.gross_ns,
         end_ns=None if slip is None else slip.end_ns,

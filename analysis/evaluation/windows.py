@@ -93,7 +93,7 @@ def score_windows(
             validation.y,
         ),
         by_factor=window_groups.by_factor(
-            hits, trial, {k: item.plan.describe(of) for k, (item, of, _) in enumerate(known)}
+            hits, trial, {k: item.describe(of) for k, (item, of, _) in enumerate(known)}
         ),
         by_tenth=by_tenth,
         no_slip=no_slip,
@@ -117,7 +117,7 @@ def score_windows(
 def named(of: TrialRef) -> tuple[str, str, dict[str, str]]:
     """Return campaign, id and condition of a trial."""
     item, trial, _ = of
-    return item.name, trial.id, item.plan.describe(trial)
+    return item.name, trial.id, item.describe(trial)
 
 
 def phases(

@@ -17,6 +17,7 @@ from sliplab.analysis.labels.camera_shift import CameraShift, no_shift
 from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
 from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
 from sliplab.analysis.labels.force_onsets import ForceOnsets, onsets_by_force
+from sliplab.analysis.labels.given_labels import given_label
 from sliplab.analysis.labels.onsets import (
     NO_ONSET,
     Onsets,
@@ -235,6 +236,8 @@ def label_results(
     recording: Recording, settings: Labelling
 ) -> tuple[TrialLabel, dict[str, npt.NDArray[Any]]]:
     """Label a trial; return the document and the arrays that are kept."""
+    if settings.rule == "given":
+        return given_label(recording), {}
     label = label_recording(recording, settings)
     return label.document(), label.as_arrays()
 

@@ -178,7 +178,7 @@ class Generalisation:
             how = self.settings.training.model_copy(update=change)
             self.settings = self.settings.model_copy(update={"training": how})
         samples, known = all_samples(store, self.campaigns)
-        conditions = [item.plan.describe(trial) for item, trial, _ in known]
+        conditions = [item.describe(trial) for item, trial, _ in known]
         self.trials = TrialSamples(samples, [trial.id for _, trial, _ in known], conditions)
         ids = [[item.name, trial.id, recording.checksum] for item, trial, recording in known]
         settings = self.settings.model_dump(mode="json")

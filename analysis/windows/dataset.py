@@ -33,7 +33,7 @@ class SampleSet:
 
     Attributes:
         windows: event counts (n, steps, channels, cells, cells), sparse.
-        y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross.
+        y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross; or those of `span_samples`.
         trial: int64 (n,), each sample's trial by its index in `trials`.
         start_ns: int64 (n,), start of each window on its trial's time line.
         trials: the trials, each once; one may have no samples.
@@ -124,6 +124,9 @@ def crop_centre_px(recording: Recording) -> tuple[float, float] | None:
 
 def recorded_span(recording: Recording) -> tuple[int, int]:
     """Start and end of the recording on its time line, ns."""
+    origin = recording.record.imported
+    if origin is not None and origin.span_ns is not None:
+        return origin.span_ns
     recorded = [step for step in recording.record.steps if step.recorded]
     clock = recording.clock("arm")
     return clock.to_reference(recorded[0].start_ns), clock.to_reference(recorded[-1].end_ns)
@@ -161,6 +164,51 @@ def trial_samples(
         classes,
         np.zeros(len(starts), np.int64),
         starts,
+        (trial,),
+    )
+
+
+def span_samples(
+    recording: Recording,
+    label: TrialLabel,
+    trial: TrialId,
+    windows: Windows,
+    most: int,
+    classes: tuple[str, ...],
+    seed: int,
+) -> SampleSet:
+    """The samples of one trial whose label gives classes of its parts.
+
+    Windows lie one after the other in each part. Of a class that has more than `most` of them so
+    many are drawn.
+
+    Args:
+        classes: names of the classes, whose places are the samples' classes.
+        seed: of the draw (PCG64).
+
+    Returns:
+        the samples; ``y`` runs from 0 to ``len(classes) - 1``.
+    """
+    length_ns = windows.length_ms * 1_000_000
+    starts: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
+    of_class: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
+    rng = np.random.Generator(np.random.PCG64(seed))
+    for number, name in enumerate(classes):
+        there = [
+            consecutive_windows(span.start_ns, span.end_ns, length_ns)
+            for span in label.spans if span.name == name
+        ]  # fmt: skip
+        found = np.concatenate([starts[0], *there])
+        if len(found) > most:
+            found = np.sort(rng.choice(found, most, replace=False))
+        starts.append(found)
+        of_class.append(np.full(len(found), number, np.int64))
+    begins = np.concatenate(starts)
+    return SampleSet(
+        cut_windows(recording, begins, windows),
+        np.concatenate(of_class),
+        np.zeros(len(begins), np.int64),
+        begins,
         (trial,),
     )
 

@@ -7,8 +7,9 @@ recording or a setting changes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, agreeing, class_names, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.trial_work import EachTrial, TrialWork, in_order
 from sliplab.analysis.windows import dataset
@@ -37,6 +38,8 @@ class _SampleInputs:
     windows: Windows
     samples: Samples
     seed: int
+    classes: tuple[str, ...] = ()
+    """Of recordings that show classes of their own."""
 
 
 def split_trials(campaigns: list[Collected], split: str) -> list[TrialRef]:
@@ -69,9 +72,21 @@ def load_samples(
     Args:
         each: makes what is missing; in this process a trial takes 10 ms.
     """
-    used = training_campaigns(campaigns)
+    return _load(labels, training_campaigns(campaigns), split, each, ())
+
+
+def load_class_samples(
+    labels: Labels, campaigns: list[Collected], split: str, each: EachTrial = in_order
+) -> SampleSet:
+    """Load the samples of all trials of one split of campaigns of classes; see `load_samples`."""
+    return _load(labels, agreeing(campaigns), split, each, class_names(campaigns))
+
+
+def _load(
+    labels: Labels, used: list[Collected], split: str, each: EachTrial, classes: tuple[str, ...]
+) -> SampleSet:
     windows = used[0].settings.windows
-    trials = split_trials(used, split)
+    trials = [(item, trial, found) for item in used for trial, found in item.of_split(split)]
     inputs = [
         [_FORMAT],
         *(
@@ -80,24 +95,32 @@ def load_samples(
         ),
     ]
     settings = [item.settings.samples.model_dump(mode="json") for item in used]
-    key = make_key(STEP, dataset.VERSION, inputs, [windows.model_dump(mode="json"), settings])
+    parameters: list[Any] = [windows.model_dump(mode="json"), settings]
+    key = make_key(STEP, dataset.VERSION, inputs, [*parameters, classes] if classes else parameters)
     kept = Derived.of(labels.store, STEP)
-    path = kept.folder / f"{split}.arrays"
-    if not (kept.fresh(split, key) and path.exists()):
-        made = _make(labels, trials, windows, each)
+    name = f"classes-{split}" if classes else split
+    path = kept.folder / f"{name}.arrays"
+    if not (kept.fresh(name, key) and path.exists()):
+        made = _make(labels, trials, windows, each, classes)
         kept.folder.mkdir(parents=True, exist_ok=True)
         made.save(path)
-        kept.write(split, key, {"samples": len(made), "cells": len(made.windows.cell)})
+        kept.write(name, key, {"samples": len(made), "cells": len(made.windows.cell)})
     return SampleSet.load(path)
 
 
-def _make(labels: Labels, trials: list[TrialRef], windows: Windows, each: EachTrial) -> SampleSet:
+def _make(
+    labels: Labels,
+    trials: list[TrialRef],
+    windows: Windows,
+    each: EachTrial,
+    classes: tuple[str, ...],
+) -> SampleSet:
     work = [
         TrialWork(
             recording, item.name, "",
             _SampleInputs(
                 labels.read(item, recording), TrialId(item.name, trial.id), windows,
-                item.settings.samples, hash_integer("samples", trial.id),
+                item.settings.samples, hash_integer("samples", trial.id), classes,
             ),
         )
         for item, trial, recording in trials
@@ -108,6 +131,11 @@ def _make(labels: Labels, trials: list[TrialRef], windows: Windows, each: EachTr
 
 
 def _samples(recording: Recording, inputs: _SampleInputs) -> SampleSet:
+    if inputs.classes:
+        return dataset.span_samples(
+            recording, inputs.label, inputs.trial, inputs.windows, inputs.samples.per_class,
+            inputs.classes, inputs.seed,
+        )  # fmt: skip
     return dataset.trial_samples(
         recording, inputs.label, inputs.trial, inputs.windows, inputs.samples, inputs.seed
     )

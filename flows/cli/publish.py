@@ -77,14 +77,13 @@ def _campaigns(store: Store, names: Sequence[str] | None) -> tuple[Campaign, ...
 
 
 def _splits(campaigns: Sequence[Campaign]) -> dict[tuple[str, str], str]:
-    """Return the part of the split of every trial that was collected by a protocol."""
-    from sliplab.analysis.campaigns import Collected
-    from sliplab.storage.trials.store import IMPORTED
+    """Return the part of the split of every trial that has one."""
+    from sliplab.analysis.campaigns import Collected, has_plan
 
     splits = {}
     for campaign in campaigns:
-        if IMPORTED in campaign.info:
+        if not has_plan(campaign.info):
             continue
-        for trial in Collected(campaign).plan:
+        for trial in Collected(campaign).planned:
             splits[campaign.name, trial.id] = trial.split
     return splits

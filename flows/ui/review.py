@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, has_plan
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.errors import InputError
@@ -25,7 +25,7 @@ from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import Decision, Onsets, Verdict
-from sliplab.storage.trials.store import IMPORTED, Store
+from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.video import FrameReader
 
 LabelState = Literal["fresh", "stale", "missing"]
@@ -165,14 +165,14 @@ class TrialList:
                 raise InputError(
                     "--campaign", "", name, f"is not in {self.store.folder}; there are {there}"
                 )
-        ours = sorted(name for name, item in found.items() if IMPORTED not in item.info)
+        ours = sorted(name for name, item in found.items() if has_plan(item.info))
         # a store with nothing else is refused by the first imported campaign's own message
         names = self._names or ours or sorted(found)
         items = {name: Collected(found[name]) for name in names}
         rows: list[Row] = []
         for item in items.values():
             whole = item.campaign.committed()
-            planned = [trial.id for trial in item.plan if trial.id in whole]
+            planned = [trial.id for trial in item.planned if trial.id in whole]
             for trial in [*planned, *sorted(whole.difference(planned))]:
                 try:
                     rows.append(row_of(self.store, item, trial, len(rows)))

@@ -428,9 +428,14 @@ class Recording:
     def motion_ns(self) -> tuple[int, int]:
         """Start of the first and end of the last phase in which slip is looked for, ns.
 
+        Of an imported trial whose motion is not known it is the whole recording.
+
         Raises:
             KeyError: the motion has none.
         """
+        origin = self.record.imported
+        if origin is not None and origin.span_ns is not None and not self.record.steps:
+            return origin.span_ns
         clock = self.clock("arm")
         there = [step for step in self.record.steps if step.phase in ACTING]
         several = [step for step in there if step.recorded] if len(there) > 1 else []

@@ -71,7 +71,8 @@ def test_a_command_that_needs_a_protocol_says_that_there_is_none(
     options = ("slide", "--save", tmp_path / "t.rrd") if command == "view" else ()
     code, _, said = sliplab(command, store, *options)
     assert code == 2
-    assert "CAMPAIGN = a: was imported: it has no protocol" in " ".join(said.split())
+    expected = "CAMPAIGN = a: was imported without an adapter: it has neither labels nor a split"
+    assert expected in " ".join(said.split())
 
 
 def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
@@ -128,11 +129,11 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path, sliplab: Any) -> N
     assert sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "tiny")[0] == 0
     with pytest.raises(StoreError, match="is an imported campaign"):
         make_request(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
-    with pytest.raises(StoreError, match="imported campaigns only"):
+    with pytest.raises(StoreError, match="imported without an adapter"):
         collected(Store.open(store))
     where = Store.open(store).campaign("c")
     where.update({"name": "c", "simulated": True}, "protocol: 1\n", "rig: 1\n")
     commit(where, "t")
     assert [item.name for item in collected(Store.open(store))] == ["c"]
-    with pytest.raises(InputError, match="has no protocol"):
+    with pytest.raises(InputError, match="without an adapter"):
         collected(Store.open(store), ["tiny"])
