@@ -35,6 +35,10 @@ class StoreError(RuntimeError):
     """A store cannot be used as asked; the message begins with the path and says what to do."""
 
 
+class DamagedFile(InputError):
+    """A recording is truncated or damaged; it was named rightly, so that the command has failed."""
+
+
 class NoStore(InputError, StoreError):
     """The path or URL of a store was given, and no store can be there: wrong input.
 

@@ -22,7 +22,7 @@ from typer.exceptions import TyperException
 from sliplab.flows.running import console, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
-from sliplab.storage.errors import StoreError, disk_error, disk_fault
+from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _EXPECTED = {
@@ -121,7 +121,8 @@ def _wrong_input(error: InputError) -> Failure:
     file, key = error.file, error.key
     if _OPTION.fullmatch(file):
         file, key = "", f"{file} {key}".strip()
-    return Failure(error.message, console.WRONG_INPUT, file or None, key or None, error.value)
+    code = console.FAILED if isinstance(error, DamagedFile) else console.WRONG_INPUT
+    return Failure(error.message, code, file or None, key or None, error.value)
 
 
 def _wrong_usage(error: TyperException) -> Failure:

@@ -29,37 +29,58 @@ def import_(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Mark the trials as simulated.")
     ] = False,
+    salvage: Annotated[
+        bool,
+        typer.Option(
+            "--salvage", help="Import what stands whole before the damage in a damaged file."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Import recordings of other programs into a new campaign; unknown values are marked.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw or es; by default the content decides.
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw or es; by default the content decides,
+    for each file of a folder.
     """
     from dataclasses import replace
 
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
-    from sliplab.storage.formats.import_trials import KINDS, import_trials, kind_of, trials_in
+    from sliplab.storage.formats.import_trials import (
+        KINDS,
+        import_trials,
+        kind_of,
+        skipped_in,
+        trials_in,
+    )
     from sliplab.storage.trials.store import Store, StoreError
 
     where = Path(kind_or_path) if path is None else path
     kind = kind_of(where) if path is None else kind_or_path
-    if kind not in KINDS:
+    if path is not None and kind not in KINDS:
         raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
     try:
         safe_name(name)
     except StoreError as error:
         raise InputError("--name", "", name, str(error)) from None
+    skipped = skipped_in(where, kind)
     opened = Store.create(store)
-    found = trials_in(where, kind)
+    found = trials_in(where, kind, salvage=salvage)
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
     with store_lock(opened):
-        result = import_trials(opened, name, found, where, kind, lambda trial: console.say(trial))
+        result = import_trials(
+            opened, name, found, where, kind, lambda trial: console.say(trial), salvage=salvage
+        )
     for text in result.get("warnings", ()):
         console.say(f"warning: {text}")
+    for item in skipped:
+        console.say(f"skipped: {item.file}: {item.reason}")
+    if skipped:
+        result["skipped"] = [vars(item) for item in skipped]
     if not as_json:
-        result.pop("warnings", None)
+        for key in ("warnings", "salvaged", "skipped"):
+            result.pop(key, None)
     finish(result, f"imported into {store}", as_json)
 
 

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 SHOWN = (
-    "campaign", "trial", "recorded_s", "events", "frames", "frame_source", "attempt", "simulated"
+    "campaign", "trial", "recorded_s", "events", "frames", "frame_source", "attempt", "simulated",
+    "unread_bytes",
 )  # fmt: skip
 """Columns of the catalogue that fit a terminal."""
 
@@ -97,7 +98,7 @@ def verify(
     """Check every checksum, count and clock of a store; read-only unless --quarantine."""
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
-    from sliplab.storage.trials.verify import quarantine_damaged, trial_folders
+    from sliplab.storage.trials.verify import quarantine_damaged, salvaged, trial_folders
     from sliplab.storage.trials.verify import verify as look
 
     if is_url(store):
@@ -114,19 +115,21 @@ def verify(
         with store_lock(opened):
             moved = quarantine_damaged(opened, problems)
         console.say(f"{len(moved)} damaged trials were quarantined; `sliplab collect` retakes them")
+    torn = salvaged(opened)
+    for trial in torn:
+        console.say(f"{trial}: was salvaged from a damaged file: intact, but not all of it")
     if as_json:
         damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
-        console.print_json(
-            {
-                "trials": total,
-                "whole": total - damaged,
-                "damaged": damaged,
-                "format": opened.format,
-                "ok": not problems,
-                "problems": [vars(item) for item in problems],
-                "quarantined": moved,
-            }
-        )
+        result = {
+            "trials": total,
+            "whole": total - damaged,
+            "damaged": damaged,
+            "format": opened.format,
+            "ok": not problems,
+            "problems": [vars(item) for item in problems],
+            "quarantined": moved,
+        }
+        console.print_json(result | ({"salvaged": torn} if torn else {}))
     elif problems:
         rows = [[item.path, item.what] for item in problems]
         console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)

@@ -17,6 +17,7 @@ EXTRAS = {
     "view": ("rerun",),
     "onnx": ("onnx", "onnxruntime"),
     "publish": ("mcap", "zstandard", "lz4"),
+    "formats": ("faery",),
 }  # fmt: skip
 """Modules that each extra installs."""
 

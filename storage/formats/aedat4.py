@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -31,11 +31,15 @@ from sliplab.storage.formats.flatbuffers import (
 from sliplab.storage.formats.foreign import (
     LATEST_US,
     MOST_PX,
+    Damage,
     ForeignTrial,
     FormatError,
     Triggers,
+    as_damage,
+    check_pixels,
     event_chunk,
 )
+from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import U8, EventChunk, FrameChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
@@ -44,6 +48,7 @@ SIMULATED = "simulated"
 """Part of the source's name in a file that was written from simulated data."""
 _CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
 _MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
+_MOST_LOST = 1 << 53
 _PACKET_EVENTS = 1 << 16
 _PIECE = 1 << 20
 _ZSTD = 3
@@ -76,18 +81,27 @@ class Picture:
 class Aedat4File:
     """A file that is open for reading; a context manager.
 
+    Args:
+        end: byte before which packets are read, of a file that may be cut short; its own by
+            default.
+
+    Attributes:
+        at: byte of the packet that was read last.
+
     Raises:
         FormatError: it is none, or damaged.
         OSError: it cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, end: int | None = None) -> None:
         self.path = path
         self._handle = path.open("rb")
         self._buffer = bytearray(_PIECE)
         try:
             self._bytes = path.stat().st_size
             if (line := self._handle.read(len(LINE))) != LINE:
+                if LINE.startswith(line):
+                    raise Damage("is cut short in its first line")
                 raise FormatError(
                     f"is not an AEDAT4 file: it starts with {line!r}, not with {LINE!r}"
                 )
@@ -96,11 +110,20 @@ class Aedat4File:
             self._codec = _CODECS.get(table.number(0, "<i"), "")
             if self._codec == "":
                 raise FormatError("has an unknown compression")
-            end = table.number(1, "<q", -1)
-            self._begin = self._handle.tell()
-            self._end = self._bytes if end <= 0 else end
+            said = table.number(1, "<q", -1)
+            self.at = self._begin = self._handle.tell()
+            self._end = self._bytes if said <= 0 else said
+            self._short = (
+                f"is cut short: its header puts the end of its packets at byte {said}, and it has "
+                f"{self._bytes} bytes"
+                if said > self._bytes
+                else None
+            )
+            if end is not None:
+                self._end = min(self._end, end)
             if not self._begin <= self._end <= self._bytes:
-                raise FormatError("is cut short")
+                raise Damage(self._short or f"puts the end of its packets at byte {self._end}")
+            self._table = said if 0 < said < self._bytes else None
             self.streams = _streams(bytes(table.vector(2, 1)[1]))
         except BaseException:
             self._handle.close()
@@ -116,12 +139,72 @@ class Aedat4File:
         """Return the number of the first stream of a kind."""
         return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
 
-    def events(self, number: int) -> Iterator[EventChunk]:
-        """Yield the events of a stream, packets together up to `_PACKET_EVENTS` events.
+    def whole(self) -> Lost | None:
+        """Find the first packet that cannot be read; nothing from there on is read any more.
+
+        Returns:
+            What is lost by that; None where all is whole.
+        """
+        reason = self._short
+        for kind, read in (
+            (TRIGGERS, self._trigger_packets),
+            (FRAMES, self._equal_pictures),
+            (EVENTS, self._inside),
+        ):
+            number = self.first(kind)
+            try:
+                for _ in read(number) if number is not None else ():
+                    pass
+            except FormatError as error:
+                self._end, reason = self.at, str(error)
+        if reason is None:
+            return None
+        lost = {"events": self._lost(EVENTS), "frames": self._lost(FRAMES)}
+        known = {key: count for key, count in lost.items() if count is not None}
+        unread = self._bytes - self._end
+        return Lost(at_byte=self._end, unread_bytes=unread, reason=reason, **known)
+
+    def packets(self) -> int:
+        """Return the number of packets of the first streams of events, triggers and frames."""
+        numbers = [self.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES)]
+        return sum(stream in numbers for stream, _ in self._headers())
+
+    def _equal_pictures(self, number: int) -> Iterator[Picture]:
+        size = None
+        for picture in self.pictures(number):
+            if picture.image.shape != (size := size or picture.image.shape):
+                raise FormatError("holds a frame of another size than the first")
+            yield picture
+
+    def _inside(self, number: int) -> Iterator[EventChunk]:
+        for chunk in self.events(number, 0):
+            check_pixels(chunk, self.streams[number].size)
+            yield chunk
+
+    def _lost(self, kind: str) -> int | None:
+        """Return the items of a stream behind the end, by the table that closes a whole file."""
+        number = self.first(kind)
+        if number is None or self._table is None:
+            return None
+        try:
+            self._handle.seek(self._table)
+            data = self._unpacked(self._exactly(min(self._bytes - self._table, _MOST_PACKET)))
+            count = sum(
+                row.number(2, "<q")
+                for row in Table.root(data, b"FTAB").tables(0)
+                # a place in the table is behind the 8 bytes of its packet's header
+                if row.number(1, "<i") == number and row.number(0, "<q") >= self._end + 8
+            )
+            return count if 0 <= count < _MOST_LOST else None
+        except (FormatError, pa.ArrowException, OSError):
+            return None
+
+    def events(self, number: int, together: int = _PACKET_EVENTS) -> Iterator[EventChunk]:
+        """Yield the events of a stream, packets together up to `together` events.
 
         A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
         """
-        room = _empty(_PACKET_EVENTS)
+        room = _empty(together)
         filled = last = 0
         for data in self._packets(number):
             rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], "<u8")
@@ -129,7 +212,7 @@ class Aedat4File:
             if filled and filled + count > len(room):
                 yield _part(room, 0, filled)
                 filled = 0
-                room = _empty(_PACKET_EVENTS)
+                room = _empty(together)
             if count > len(room):
                 room = _empty(count)
             if not rows.flags.aligned:
@@ -146,15 +229,21 @@ class Aedat4File:
 
     def triggers(self, number: int) -> Triggers:
         """Return all triggers of a stream."""
-        found = [
-            (table.number(0, "<q"), table.number(1, "<B"))
-            for data in self._packets(number)
-            for table in Table.root(data, b"TRIG").tables(0)
-        ]
+        found = [one for packet in self._trigger_packets(number) for one in packet]
         times = np.array([t for t, _ in found], np.int64)
-        if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
-            raise FormatError("contains triggers with decreasing or invalid times")
         return Triggers(times, np.array([kind for _, kind in found], np.uint8))
+
+    def _trigger_packets(self, number: int) -> Iterator[list[tuple[int, int]]]:
+        """Yield time, us, and kind of all triggers in a packet."""
+        last = 0
+        for data in self._packets(number):
+            tables = Table.root(data, b"TRIG").tables(0)
+            found = [(table.number(0, "<q"), table.number(1, "<B")) for table in tables]
+            for t_us, _ in found:
+                if not last <= t_us < LATEST_US:
+                    raise FormatError("contains triggers with decreasing or invalid times")
+                last = t_us
+            yield found
 
     def pictures(self, number: int) -> Iterator[Picture]:
         """Yield the frames of a stream, colours as grey levels."""
@@ -177,22 +266,33 @@ class Aedat4File:
 
     def _packets(self, number: int) -> Iterator[memoryview]:
         """Yield the unpacked packets of one stream; each is valid until the next."""
-        self._handle.seek(self._begin)
-        while (at := self._handle.tell()) < self._end:
-            stream, size = struct.unpack("<ii", self._exactly(8))
-            if stream not in self.streams or not 0 <= size <= min(self._end - at - 8, _MOST_PACKET):
-                raise FormatError(
-                    f"holds a packet of {size} bytes in stream {stream}, at byte {at}"
-                )
+        for stream, size in self._headers():
             if stream != number:
-                self._handle.seek(size, 1)
                 continue
+            data = self._exactly(size)
             try:
-                yield self._unpacked(self._exactly(size))
+                found = self._unpacked(data)
             except (pa.ArrowException, OSError) as error:
                 raise FormatError(
-                    f"contains a packet that cannot be decompressed, at byte {at}: {error}"
+                    f"contains a packet that cannot be decompressed, at byte {self.at}: {error}"
                 ) from None
+            yield found
+
+    def _headers(self) -> Iterator[tuple[int, int]]:
+        """Yield stream and length of every packet, with the file at its content."""
+        at = self._begin
+        while at < self._end:
+            self.at = at
+            self._handle.seek(at)
+            stream, size = struct.unpack("<ii", self._exactly(8))
+            if stream not in self.streams or not 0 <= size <= min(self._end - at - 8, _MOST_PACKET):
+                cut = stream in self.streams and at + 8 + size > self._bytes
+                raise FormatError(
+                    f"{'is cut short: it ' if cut else ''}holds a packet of {size} bytes in stream "
+                    f"{stream}, at byte {at}"
+                )
+            yield stream, size
+            at += 8 + size
 
     def _unpacked(self, data: bytes) -> memoryview:
         """Return a packet's content, perhaps in a buffer that is used again."""
@@ -214,7 +314,7 @@ class Aedat4File:
     def _exactly(self, count: int) -> bytes:
         found = self._handle.read(count)
         if len(found) != count:
-            raise FormatError("is cut short")
+            raise Damage("is cut short")
         return found
 
 
@@ -381,23 +481,39 @@ def read_aedat4(path: Path, name: str) -> ForeignTrial:
         FormatError: it is damaged.
     """
     with Aedat4File(path) as file:
-        events, triggers, frames = (file.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES))
-        if events is None:
-            raise FormatError("contains no event stream")
-        streams = file.streams
+        return _trial(file, path, name, None)
+
+
+def salvage_aedat4(path: Path, name: str) -> ForeignTrial:
+    """Read the whole packets before the first damaged one, as `read_aedat4` reads a whole file.
+
+    Raises:
+        FormatError: its header is damaged.
+    """
+    with Aedat4File(path, path.stat().st_size) as file:
+        lost = file.whole()
+        end = path.stat().st_size if lost is None else lost.at_byte
+        return replace(_trial(file, path, name, end), lost=lost, packets=file.packets())
+
+
+def _trial(file: Aedat4File, path: Path, name: str, end: int | None) -> ForeignTrial:
+    events, triggers, frames = (file.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES))
+    if events is None:
+        raise FormatError("contains no event stream")
+    streams = file.streams
+    frame_px = None
+    with as_damage():
         found = None if triggers is None else file.triggers(triggers)
-        frame_px = None
-        if frames is not None:
-            first = next(file.pictures(frames), None)
-            frame_px = None if first is None else (first.image.shape[1], first.image.shape[0])
+        first = None if frames is None else next(file.pictures(frames), None)
+        frame_px = None if first is None else (first.image.shape[1], first.image.shape[0])
     left_out = [s.name for n, s in streams.items() if n not in {events, triggers, frames}]
 
     def all_events() -> Iterator[EventChunk]:
-        with Aedat4File(path) as again:
+        with Aedat4File(path, end) as again:
             yield from again.events(events)
 
     def all_frames() -> Iterator[FrameChunk]:
-        with Aedat4File(path) as again:
+        with Aedat4File(path, end) as again:
             for number, picture in enumerate(again.pictures(frames or 0)):
                 t_ns = np.full(1, picture.t_ns, np.int64)
                 yield FrameChunk(

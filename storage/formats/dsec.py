@@ -7,7 +7,10 @@ of the file.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator, Mapping, Sized
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +20,25 @@ import numpy as np
 
 from sliplab.storage.formats.foreign import (
     LATEST_US,
+    Damage,
     ForeignTrial,
     FormatError,
     Triggers,
+    as_damage,
     event_chunk,
+    read_head,
     rounded_us,
 )
+from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, EventChunk
 from sliplab.storage.trials.hdf5_reader import RowFile, Rows
 
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""First bytes of an HDF5 file."""
 PIECE = 1 << 20
+_SUPERBLOCK = 52
+_FEW_ROWS = 1 << 12
+_LAB = ("xs", "ys", "ps", "ts")
 _MOST_PACKED = 2000
 """Rows a byte of the file: what columns of equal values are packed to."""
 _MOST_UNSORTED = 1 << 28
@@ -43,26 +55,80 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
     with _opened(path) as (file, rows):
         columns = {key: rows(f"events/{key}") for key in "xypt"}
         _same_length(columns)
-        offset = int(_integers(file.rows("t_offset").read())) if file.has("t_offset") else 0
-        if not 0 <= offset < LATEST_US:
-            raise FormatError(f"t_offset = {offset}: is not a time")
-        triggers = None
-        if file.has("triggers/t"):
-            kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
-            triggers = Triggers(_integers(rows("triggers/t").read()), kinds)
-            _rising(triggers)
+        with as_damage():
+            offset = _offset(file)
+            triggers = _triggers(file, rows)
         simulated = bool(file.attribute("simulated", 0))
     count = len(columns["t"])
 
     def all_events() -> Iterator[EventChunk]:
         with _opened(path) as (_, again):
-            x, y, p, t = (again(f"events/{key}") for key in "xypt")
+            found = {key: again(f"events/{key}") for key in "xypt"}
             for low in range(0, count, PIECE):
-                px, py, sign = (column.read(low, low + PIECE) for column in (x, y, p))
-                yield event_chunk(px, py, sign, _integers(t.read(low, low + PIECE)) + offset)
+                yield _dsec_events(found, offset, low, low + PIECE)
 
+    return _dsec_trial(path, name, all_events, triggers, simulated)
+
+
+def salvage_dsec(path: Path, name: str) -> ForeignTrial:
+    """Read the events before the first piece of a column that cannot be read.
+
+    Raises:
+        FormatError: the description of its columns is damaged, or it has another layout.
+    """
+    with _opened(path, torn=True) as (file, rows):
+        columns = {key: rows(f"events/{key}") for key in "xypt"}
+        offset = _offset(file)
+        simulated = bool(file.attribute("simulated", 0))
+        try:
+            triggers = _triggers(file, rows)
+        except (FormatError, *_FAULTS):
+            triggers = None
+
+        def check(low: int, high: int) -> EventChunk:
+            return _dsec_events(columns, offset, low, high)
+
+        count, lost = _whole_rows(path, columns, check)
+
+    def all_events() -> Iterator[EventChunk]:
+        with _opened(path, torn=True) as (_, again):
+            found = {key: again(f"events/{key}") for key in "xypt"}
+            for low in range(0, count, PIECE):
+                yield _dsec_events(found, offset, low, min(low + PIECE, count))
+
+    return replace(_dsec_trial(path, name, all_events, triggers, simulated), lost=lost)
+
+
+def _offset(file: RowFile) -> int:
+    offset = int(_integers(file.rows("t_offset").read())) if file.has("t_offset") else 0
+    if not 0 <= offset < LATEST_US:
+        raise FormatError(f"t_offset = {offset}: is not a time")
+    return offset
+
+
+def _triggers(file: RowFile, rows: Callable[[str], Rows]) -> Triggers | None:
+    if not file.has("triggers/t"):
+        return None
+    kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
+    found = Triggers(_integers(rows("triggers/t").read()), kinds)
+    _rising(found)
+    return found
+
+
+def _dsec_events(columns: Mapping[str, Rows], offset: int, low: int, high: int) -> EventChunk:
+    x, y, p, t = (columns[key].read(low, high) for key in "xypt")
+    return event_chunk(x, y, p, _integers(t) + offset)
+
+
+def _dsec_trial(
+    path: Path,
+    name: str,
+    events: Callable[[], Iterator[EventChunk]],
+    triggers: Triggers | None,
+    simulated: bool,
+) -> ForeignTrial:
     return ForeignTrial(
-        name, path.name, all_events, "the event camera's own clock, us", triggers=triggers,
+        name, path.name, events, "the event camera's own clock, us", triggers=triggers,
         simulated=simulated, unknown=("sync grade", "poses", "motion", "condition", "frames"),
     )  # fmt: skip
 
@@ -74,31 +140,152 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         FormatError: it is damaged, or has another layout.
     """
     with _opened(path) as (file, rows):
-        columns = {key: rows(f"events/{key}") for key in ("xs", "ys", "ps", "ts")}
+        columns = {key: rows(f"events/{key}") for key in _LAB}
         _same_length(columns)
-        if len(columns["ts"]) > _MOST_UNSORTED:
-            raise FormatError(f"holds {len(columns['ts'])} events, too many events to sort")
-        size = _resolution(file.integers("sensor_resolution"), columns["xs"], columns["ys"])
+        count = len(columns["ts"])
+        if count > _MOST_UNSORTED:
+            raise FormatError(f"holds {count} events, too many events to sort")
+        with as_damage():
+            size = _resolution(file.integers("sensor_resolution"), columns, count)
 
     def all_events() -> Iterator[EventChunk]:
         with _opened(path) as (_, again):
-            xs, ys, ps, ts = (again(f"events/{key}").read() for key in ("xs", "ys", "ps", "ts"))
-        t_us = rounded_us(ts, 1e6)
-        low = int(t_us.min()) if len(t_us) else 0
-        if low < 0:
-            raise FormatError("contains an event before its own clock started")
-        order = np.argsort(t_us, kind="stable")
-        polarity = np.asarray(ps) > 0  # the lab's are 0 and 1, or -1 and 1
-        yield event_chunk(_pixels(xs)[order], _pixels(ys)[order], polarity[order], t_us[order])
+            yield _sorted(*_lab_events({key: again(f"events/{key}") for key in _LAB}, 0, count))
 
+    return _lab_trial(path, name, all_events, size)
+
+
+def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
+    """Read the rows before the first piece of a column that cannot be read, and sort them.
+
+    Raises:
+        FormatError: the description of its columns is damaged, or it has another layout.
+    """
+    with _opened(path, torn=True) as (file, rows):
+        columns = {key: rows(f"events/{key}") for key in _LAB}
+
+        def check(low: int, high: int) -> EventChunk:
+            return _sorted(*_lab_events(columns, low, high))
+
+        count, lost = _whole_rows(path, columns, check, ordered=False)
+        if count > _MOST_UNSORTED:
+            raise FormatError(f"holds {count} events, too many events to sort")
+        size = _resolution(file.integers("sensor_resolution"), columns, count)
+
+    def all_events() -> Iterator[EventChunk]:
+        with _opened(path, torn=True) as (_, again):
+            yield _sorted(*_lab_events({key: again(f"events/{key}") for key in _LAB}, 0, count))
+
+    return replace(_lab_trial(path, name, all_events, size), lost=lost)
+
+
+def _lab_events(columns: Mapping[str, Rows], low: int, high: int) -> tuple[I64, I64, Any, I64]:
+    """Return columns, rows, polarities and times, us, as the file orders them."""
+    xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
+    t_us = rounded_us(ts, 1e6)
+    if len(t_us) and int(t_us.min()) < 0:
+        raise FormatError("contains an event before its own clock started")
+    return _pixels(xs), _pixels(ys), np.asarray(ps) > 0, t_us  # 0 and 1, or -1 and 1
+
+
+def _sorted(x: I64, y: I64, p: Any, t_us: I64) -> EventChunk:
+    order = np.argsort(t_us, kind="stable")
+    return event_chunk(x[order], y[order], p[order], t_us[order])
+
+
+def _lab_trial(
+    path: Path,
+    name: str,
+    events: Callable[[], Iterator[EventChunk]],
+    size: tuple[int, int] | None,
+) -> ForeignTrial:
     return ForeignTrial(
-        name, path.name, all_events, "unknown; seconds as the file has them, rounded to us",
+        name, path.name, events, "unknown; seconds as the file has them, rounded to us",
         lambda: size,
         unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
     )  # fmt: skip
 
 
-def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int] | None:
+def _piece(columns: Mapping[str, Rows]) -> int:
+    """Return the rows that stand or fall together: a piece of the column of times."""
+    *_, times = columns.values()
+    starts = (low for low, *_ in times.stored())
+    with suppress(*_FAULTS):
+        next(starts, None)
+        return min(next(starts, _FEW_ROWS), _FEW_ROWS)
+    return _FEW_ROWS
+
+
+def _whole_rows(
+    path: Path,
+    columns: Mapping[str, Rows],
+    check: Callable[[int, int], EventChunk],
+    *,
+    ordered: bool = True,
+) -> tuple[int, Lost | None]:
+    """Return the number of rows before the first that cannot be read in all columns.
+
+    Args:
+        check: reads rows low to high; raises where they cannot be right.
+        ordered: times must not decrease from one piece to the next.
+    """
+    size = path.stat().st_size
+    lengths = {key: len(column) for key, column in columns.items()}
+    said, count = max(lengths.values()), min(lengths.values())
+    reason = None if said == count else f"has event columns of different lengths: {lengths}"
+    for key, column in columns.items():
+        if (row := _rows_inside(column, count, size)) < count:
+            count, reason = row, f"is cut short in the column events/{key}, at row {row}"
+    low, last, step = 0, 0, PIECE
+    while low < count:
+        high = min(low + step, count)
+        try:
+            chunk = check(low, high)
+            if ordered and len(chunk) and int(chunk.t_us[0]) < last:
+                raise FormatError("contains events with decreasing times")
+        except (FormatError, *_FAULTS) as error:
+            if step > (piece := _piece(columns)):
+                step = piece
+                continue
+            count, reason = low, f"holds rows that cannot be read from row {low} on: {error}"
+            break
+        last = int(chunk.t_us[-1]) if len(chunk) else last
+        low = high
+    if reason is None:
+        return count, None
+    left = [one for column in columns.values() for one in _unread(column, count, size)]
+    at = min((place for place, _ in left), default=size)
+    unread = sum(length for _, length in left)
+    return count, Lost(at_byte=at, unread_bytes=unread, reason=reason, events=said - count)
+
+
+def _rows_inside(column: Rows, count: int, size: int) -> int:
+    """Return how many of the first `count` rows are in a file of `size` bytes."""
+    known = 0
+    with suppress(*_FAULTS):  # the file's list of pieces may be damaged itself
+        for low, length, place in column.stored():
+            known = low
+            if low >= count or place is None or place + length > size:
+                break
+        else:
+            known = count
+    return min(known, count)
+
+
+def _unread(column: Rows, count: int, size: int) -> Iterator[tuple[int, int]]:
+    """Yield place and bytes of the pieces with rows from `count` on that the file has."""
+    pieces: list[tuple[int, int, int | None]] = []
+    with suppress(*_FAULTS):
+        pieces.extend(column.stored())
+    ends = [*(low for low, *_ in pieces[1:]), len(column)]
+    for (_, length, place), end in zip(pieces, ends, strict=False):
+        if place is not None and end > count and place < size:
+            yield place, min(length, size - place)
+
+
+def _resolution(
+    stated: list[int] | None, of: Mapping[str, Rows], count: int
+) -> tuple[int, int] | None:
     """Return columns and rows of the camera, by the attribute `sensor_resolution`.
 
     The lab writes columns first, other programs that share its layout rows first. Sensors are wider
@@ -110,7 +297,7 @@ def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int]
     if stated is None or len(stated) < 2 or min(stated[:2]) <= 0:
         return None
     long, short = max(stated[:2]), min(stated[:2])
-    columns, rows = (_end(column) for column in (xs, ys))
+    columns, rows = (_end(of[key], count) for key in ("xs", "ys"))
     for size in ((long, short), (short, long)):
         if columns <= size[0] and rows <= size[1]:
             return size
@@ -120,10 +307,10 @@ def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int]
     )
 
 
-def _end(column: Rows) -> int:
-    """Return one more than the largest pixel of a column."""
-    starts = range(0, len(column), PIECE)
-    pieces = (_pixels(column.read(start, start + PIECE)) for start in starts)
+def _end(column: Rows, count: int) -> int:
+    """Return one more than the largest pixel of the first `count` rows of a column."""
+    starts = range(0, count, PIECE)
+    pieces = (_pixels(column.read(low, min(low + PIECE, count))) for low in starts)
     return max((int(piece.max()) + 1 for piece in pieces), default=0)
 
 
@@ -141,7 +328,7 @@ def is_lab_hdf5(path: Path) -> bool:
     Raises:
         FormatError: it cannot be opened.
     """
-    with _opened(path) as (file, _):
+    with _opened(path, torn=True) as (file, _):
         return bool(file.has("events/ts"))
 
 
@@ -179,25 +366,45 @@ def write_dsec(
 
 
 class _opened:
-    """An open file and its columns of plain numbers; its faults become `FormatError`."""
+    """An open file and its columns of plain numbers; its faults become `FormatError`.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    Args:
+        torn: open a file that is cut short too, with zeros in place of what is missing.
+    """
+
+    def __init__(self, path: Path, *, torn: bool = False) -> None:
+        self._path, self._torn = path, torn
+        self._padded: _Padded | None = None
 
     def __enter__(self) -> tuple[RowFile, Callable[[str], Rows]]:
+        size = self._path.stat().st_size
         try:
-            self._file = RowFile(self._path)
+            end = _stated_end(self._path)
+            if self._torn and end > size:
+                self._padded = _Padded(self._path, end)
+            self._file = RowFile(self._path, self._padded)
         except _FAULTS as error:
+            self._close()
+            if read_head(self._path).startswith(SIGNATURE):
+                cut = f"is cut short: it says that it has {end} bytes, and has {size}"
+                raise Damage(cut if end > size else f"is damaged: {error}") from None
             raise FormatError(f"is not an HDF5 file, or is damaged: {error}") from None
-        self._most = self._path.stat().st_size * _MOST_PACKED
+        self._most = size * _MOST_PACKED
         return self._file, self._rows
 
     def __exit__(self, kind: Any, error: BaseException | None, at: Any) -> None:
-        self._file.close()
+        try:
+            self._file.close()
+        finally:
+            self._close()
         if isinstance(error, FormatError):
             return
         if isinstance(error, _FAULTS):
-            raise FormatError(f"cannot be read: {error}") from None
+            raise Damage(f"cannot be read: {error}") from None
+
+    def _close(self) -> None:
+        if self._padded is not None:
+            self._padded.close()
 
     def _rows(self, name: str) -> Rows:
         if not self._file.has(name):
@@ -206,6 +413,50 @@ class _opened:
         if len(found.shape) != 1 or found.shape[0] > self._most:
             raise FormatError(f"{name} has the shape {found.shape}")
         return found
+
+
+def _stated_end(path: Path) -> int:
+    """Return the number of bytes that a file says it has; 0 where it says none."""
+    with path.open("rb") as file:
+        head = file.read(_SUPERBLOCK)
+    at = {0: 40, 1: 44, 2: 28, 3: 28}.get(head[8] if len(head) == _SUPERBLOCK else -1)
+    # versions of the superblock (HDF5 file format, II.A), with places of 8 bytes
+    width = head[13:14] if at in {40, 44} else head[9:10]
+    if at is None or not head.startswith(SIGNATURE) or width != b"\x08":
+        return 0
+    return int.from_bytes(head[at : at + 8], "little")
+
+
+class _Padded(io.RawIOBase):
+    """A file as long as it says it is: zeros in place of what is missing at its end."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._file, self._size, self._at = path.open("rb"), size, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at}.get(whence, self._size)
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        room = memoryview(buffer).cast("B")
+        self._file.seek(self._at)
+        filled = self._file.readinto(room)
+        room[filled:] = bytes(len(room) - filled)
+        self._at += len(room)
+        return len(room)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
 
 
 def _integers(values: Any) -> I64:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.protocols.errors import InputError
+from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, U8, EventChunk, FrameChunk, Json
 
 RISING = 1
@@ -33,6 +35,23 @@ class FormatError(ValueError):
         """Make one whose `message` continues after the file's name, such as "is truncated"."""
         self.file = file
         super().__init__(message)
+
+
+class Damage(FormatError):
+    """A recording is truncated, or damaged behind its header."""
+
+
+class NoEvents(FormatError):
+    """A recording is whole and contains no events."""
+
+
+@contextmanager
+def as_damage() -> Iterator[None]:
+    """Report a fault in the content of a recording, whose header is read already, as damage."""
+    try:
+        yield
+    except FormatError as error:
+        raise error if isinstance(error, Damage) else Damage(str(error), error.file) from None
 
 
 def read_head(path: Path) -> bytes:
@@ -68,6 +87,11 @@ class ForeignTrial:
         epoch: what the times count from, as text.
         about: further properties in the file, to be kept in the record.
         unknown: names of what nobody knows of it any more.
+        kind: name of its format.
+        lost: what is damaged in its file, if this is what stands whole before the damage.
+        packets: packets that do; None where the format has none.
+        salvage: returns what stands whole in its file, if that turns out to be damaged; raises
+            FormatError where that is nothing.
     """
 
     name: str
@@ -83,6 +107,10 @@ class ForeignTrial:
     simulated: bool = False
     about: Json = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
+    kind: str = ""
+    lost: Lost | None = None
+    packets: int | None = None
+    salvage: Callable[[], ForeignTrial] | None = None
 
 
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
@@ -113,6 +141,22 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
         np.ascontiguousarray(columns[2], np.uint8),
         times,
     )
+
+
+def check_pixels(chunk: EventChunk, size: tuple[int, int] | None) -> None:
+    """Check events against the size that their file gives its camera.
+
+    Raises:
+        FormatError: one lies outside.
+    """
+    if size is None or not len(chunk):
+        return
+    x, y = int(chunk.x.max()), int(chunk.y.max())
+    if x >= size[0] or y >= size[1]:
+        raise FormatError(
+            f"holds events up to column {x} and row {y}, outside of the {size[0]} x {size[1]} "
+            "pixels that it gives its camera"
+        )
 
 
 def rounded_us(times: Any, per_unit: float) -> I64:

@@ -1,7 +1,8 @@
 """Import of foreign trials into a new campaign: each one complete or not at all.
 
 Formats are recognised by a file's first bytes, and otherwise by its extension, so that
-a damaged file is rejected instead of skipped.
+a damaged file is rejected instead of skipped. Of a damaged file what stands whole before the damage
+may be salvaged; the trial's record counts what is lost.
 
 A trial is committed by the store's own rename after all of it was read and checked. Unknown
 properties (relations of clocks, poses, conditions) are marked as unknown and never invented:
@@ -13,7 +14,8 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,22 +23,38 @@ from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
-from sliplab.storage.errors import StoreError
+from sliplab.storage.errors import DamagedFile, StoreError
 from sliplab.storage.files import json_text, read_json, safe_name
-from sliplab.storage.formats.aedat4 import LINE, read_aedat4
-from sliplab.storage.formats.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
+from sliplab.storage.formats.aedat4 import LINE, read_aedat4, salvage_aedat4
+from sliplab.storage.formats.dsec import (
+    SIGNATURE,
+    is_lab_hdf5,
+    read_dsec,
+    read_lab_hdf5,
+    salvage_dsec,
+    salvage_lab_hdf5,
+)
 from sliplab.storage.formats.foreign import (
     EXPORT_FORMAT,
     EXPORT_MANIFEST,
     RISING,
+    Damage,
     ForeignTrial,
     FormatError,
+    NoEvents,
+    as_damage,
+    check_pixels,
     read_head,
 )
-from sliplab.storage.formats.lab_pickles import pairs, read_pair
-from sliplab.storage.formats.mcap_import import MAGIC, read_mcap
+from sliplab.storage.formats.lab_pickles import Pair, pairs, read_pair
+from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
 from sliplab.storage.formats.original import Original, StoredTrial
-from sliplab.storage.formats.prophesee import faery_type, read_by_faery
+from sliplab.storage.formats.prophesee import (
+    check_faery,
+    faery_type,
+    read_by_faery,
+    salvage_by_faery,
+)
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
@@ -44,11 +62,12 @@ from sliplab.storage.schema.trial import (
     Counts,
     DeviceRecord,
     Geometry,
+    Lost,
     Provenance,
     Quality,
     TrialRecord,
 )
-from sliplab.storage.streams import EventChunk, Json, PulseChunk
+from sliplab.storage.streams import Json, PulseChunk
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
 from sliplab.storage.trials.writer import TrialWriter
 
@@ -61,9 +80,19 @@ READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
     "es": ((".es",), read_by_faery),
     "mcap": ((".mcap",), read_mcap),
 }
+SALVAGE: dict[str, Reader] = {
+    "aedat4": salvage_aedat4,
+    "dsec": salvage_dsec,
+    "lab-hdf5": salvage_lab_hdf5,
+    "raw": salvage_by_faery,
+    "es": salvage_by_faery,
+    "mcap": salvage_mcap,
+}
+"""Readers of what stands whole before the damage in a file, by format."""
 LAB_PICKLES = "lab-pickles"
 KINDS = (*READERS, LAB_PICKLES)
-_HDF5 = b"\x89HDF\r\n\x1a\n"
+MIXED = "mixed"
+"""Files of several formats in one folder."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 _LONG_GAP_US = 3_600_000_000
 _FRAME_RATE = 100
@@ -77,6 +106,8 @@ def import_trials(
     origin: Path,
     kind: str,
     on_trial: Callable[[str], None] = lambda name: None,
+    *,
+    salvage: bool = False,
 ) -> Json:
     """Import trials that do not exist yet; the caller holds the store's lock.
 
@@ -84,14 +115,15 @@ def import_trials(
         name: the campaign's, which is made.
         origin: the file or folder that they come from, for messages and the campaign's description.
         kind: the format's name.
+        salvage: of a damaged file, import what stands whole before the damage.
 
     Returns:
         ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
-        and ``warnings`` where there are any.
+        and where there are any, ``warnings`` and ``salvaged``: what is lost of each trial.
 
     Raises:
-        InputError: a file is damaged or cannot be right. Trials before it stay committed; of this
-            one nothing is left.
+        InputError: a file is damaged (`DamagedFile`) or cannot be right. Trials before it stay
+            committed; of this one nothing is left.
     """
     campaign = store.campaign(name)
     fresh = not campaign.begun
@@ -100,6 +132,7 @@ def import_trials(
     skipped: list[str] = []
     counts = {"events": 0, "frames": 0}
     warnings: list[str] = []
+    salvaged: list[Json] = []
     try:
         for trial in trials:
             on_trial(trial.name)
@@ -118,18 +151,88 @@ def import_trials(
             if not campaign.begun:
                 _describe(campaign, trial, origin, kind)
             try:
-                taken, warned = _take(store, campaign, trial, kind)
+                trial, (taken, warned) = _take_whole(store, campaign, trial, kind, salvage)
             except FormatError as error:
                 file = error.file or (origin if origin.is_file() else origin / trial.source)
-                raise InputError(file, "", None, str(error)) from None
+                raise _refusal(file, error) from None
             imported.append(trial.name)
+            if trial.lost is not None:
+                about = {"trial": trial.name, "file": trial.source}
+                salvaged.append({**about, **trial.lost.to_json()})
             warnings += [f"{trial.source}: {text}" for text in warned]
             counts = {key: counts[key] + taken[key] for key in counts}
     finally:
         if fresh and not imported and campaign.folder.exists():
             shutil.rmtree(campaign.folder)
     result = {"campaign": name, "imported": imported, "there": skipped, **counts}
+    if salvaged:
+        result["salvaged"] = salvaged
     return {**result, "warnings": warnings} if warnings else result
+
+
+def _refusal(file: Path, error: FormatError) -> InputError:
+    """Return the error of a file that is not imported: bad data, or else wrong input."""
+    kind = DamagedFile if isinstance(error, Damage) else InputError
+    return kind(file, "", None, str(error))
+
+
+def _take_whole(
+    store: Store, campaign: Campaign, trial: ForeignTrial, kind: str, salvage: bool
+) -> tuple[ForeignTrial, tuple[dict[str, int], list[str]]]:
+    """Commit one trial, or what stands whole of it; return it with its counts and warnings."""
+    try:
+        return trial, _take(store, campaign, trial, kind)
+    except NoEvents:
+        raise
+    except FormatError as error:
+        if trial.salvage is None:
+            raise
+        whole = _before_damage(trial.salvage, error, salvage)
+    trial = replace(
+        trial,
+        events=whole.events,
+        event_px=whole.event_px,
+        triggers=whole.triggers,
+        frames=whole.frames,
+        frame_px=whole.frame_px,
+        lost=whole.lost,
+        packets=whole.packets,
+        salvage=None,
+    )
+    with as_damage():
+        return trial, _take(store, campaign, trial, kind)
+
+
+def _before_damage(
+    read: Callable[[], ForeignTrial], error: FormatError, salvage: bool
+) -> ForeignTrial:
+    """Return what stands whole in a file that could not be read.
+
+    Args:
+        error: the fault that was found.
+
+    Raises:
+        Damage: that is nothing, or it is not to be salvaged, and only offered.
+        FormatError: the fault is no damage.
+    """
+    try:
+        whole = read()
+        if whole.lost is None:
+            raise error
+        if salvage:
+            return whole
+        count, last_us = 0, None
+        for chunk in whole.events():
+            count += len(chunk)
+            last_us = int(chunk.t_us[-1]) if len(chunk) else last_us
+    except FormatError as fault:
+        if fault is error:
+            raise
+        raise Damage(str(fault if isinstance(fault, Damage) else error)) from None
+    if last_us is None:
+        raise Damage(f"{error}; no event stands before that")
+    packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
+    raise Damage(f"{error}; --salvage imports {count:,} events up to {last_us} us{packets}")
 
 
 def _check_campaign(campaign: Campaign, trial: ForeignTrial) -> None:
@@ -164,10 +267,12 @@ def _take(
 ) -> tuple[dict[str, int], list[str]]:
     """Commit one trial; return its counts and warnings."""
     if isinstance(trial, StoredTrial) and trial.original is not None:
-        return _restore(store, campaign, trial, trial.original), []
+        with as_damage():
+            return _restore(store, campaign, trial, trial.original), []
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
         (first_us, last_us), warnings = _fill(writer, trial)
+        warnings = [*_loss_warnings(trial.lost), *warnings]
         counts = writer.counts
         rows = Counts(events=counts["events/t"], frames=counts["frames/t"], poses=0, pulses=0)
         record = _record(campaign, trial, kind, rows, (last_us - first_us) / 1e6, warnings)
@@ -218,10 +323,12 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
         if int(steps[widest]) > gap_us:
             gap_us, gap_end_us = int(steps[widest]), int(chunk.t_us[widest])
         last_us = int(chunk.t_us[-1])
-        _check_pixels(chunk, trial.event_px())
+        check_pixels(chunk, trial.event_px())
         writer.add_events(chunk)
     if first_us is None or last_us is None:
-        raise FormatError("contains no events; nothing to import")
+        if trial.lost is not None:
+            raise Damage(f"{trial.lost.reason}; no event stands before that")
+        raise NoEvents("contains no events; nothing to import")
     if trial.triggers is not None:
         t_ns = trial.triggers.t_us * 1000
         writer.add_triggers(t_ns, trial.triggers.kind)
@@ -236,15 +343,16 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
     return (first_us, last_us), _gap_warnings(gap_us, gap_end_us)
 
 
-def _check_pixels(chunk: EventChunk, size: tuple[int, int] | None) -> None:
-    if size is None:
-        return
-    x, y = int(chunk.x.max()), int(chunk.y.max())
-    if x >= size[0] or y >= size[1]:
-        raise FormatError(
-            f"holds events up to column {x} and row {y}, outside of the {size[0]} x {size[1]} "
-            "pixels that it gives its camera"
-        )
+def _loss_warnings(lost: Lost | None) -> list[str]:
+    if lost is None:
+        return []
+    counts = {"events": lost.events, "frames": lost.frames}
+    missing = [f"{count:,} {what}" for what, count in counts.items() if count]
+    of = f", {' and '.join(missing)} are missing" if missing else ""
+    return [
+        f"is not whole: it {lost.reason} (byte {lost.at_byte:,}); {lost.unread_bytes:,} bytes were "
+        f"not read{of}"
+    ]
 
 
 def _gap_warnings(gap_us: int, end_us: int) -> list[str]:
@@ -269,8 +377,8 @@ def _record(
     clocks: Json = {"reference": "event camera", "events": clock}
     if trial.frames is not None:
         clocks["frames"] = clock
-    origin = {
-        "format": kind,
+    origin: Json = {
+        "format": trial.kind or kind,
         "from": trial.source,
         "epoch": trial.epoch,
         "unknown": [*trial.unknown, *([] if event_px else ["sensor size"])],
@@ -278,6 +386,8 @@ def _record(
     }
     if warnings:
         origin["warnings"] = warnings
+    if trial.lost is not None:
+        origin["lost"] = trial.lost
     fields = {
         "format": TrialRecord.FORMAT,
         "trial": trial.name,
@@ -304,55 +414,149 @@ def _record(
         raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None
 
 
+@dataclass(frozen=True)
+class Skipped:
+    """A part of a folder that is not imported."""
+
+    file: str
+    reason: str
+
+
 def kind_of(path: Path) -> str:
-    """Return the format of a file, or of the files in a folder.
+    """Return the format of a file, or of the files in a folder; `MIXED` for several.
 
     Raises:
-        InputError: none of them is known, or they are of several.
+        InputError: none of them is known, or one is damaged.
     """
-    files = _files(path)
-    found = {_kind(file) for file in files} - {None}
-    if pairs(files):
-        found.add(LAB_PICKLES)
-    if len(found) == 1:
-        return str(found.pop())
-    what = f"holds files of several formats ({', '.join(sorted(map(str, found)))})"
-    raise InputError(
-        path, "", None,
-        f"{what if found else 'contains no known file format'}; name one of {', '.join(KINDS)}",
-    )  # fmt: skip
+    found = _sort(path)
+    if not found:
+        raise InputError(
+            path, "", None, f"contains no known file format; name one of {', '.join(KINDS)}"
+        )
+    kinds = {kind for _, kind, _ in found}
+    return kinds.pop() if len(kinds) == 1 else MIXED
 
 
-def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
+def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[ForeignTrial]:
     """Yield the trials of a file or folder, in the order of their names.
 
+    Args:
+        kind: the format, or `MIXED`: that of each file.
+        salvage: of a file that is damaged already where it begins to be read, yield what stands
+            whole.
+
     Raises:
-        InputError: it does not exist, or a file is damaged.
+        InputError: it does not exist, a file is damaged, or two have one name.
+    """
+    manifest = None
+    if kind != LAB_PICKLES and path.is_dir():
+        manifest = _read_manifest(path)
+    if manifest is not None:
+        for item in manifest["trials"]:
+            file = path / item["file"]
+            if file.is_symlink() or not file.is_file():
+                raise InputError(file, "", None, "is missing or not a regular file")
+            found = _read(
+                _kind(file) or kind if kind == MIXED else kind, file, item["trial"], salvage
+            )
+            yield _as_exported(found, item, manifest["simulated"])
+        return
+    wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)
+    _check_names(path, wanted)
+    for name, of, file in wanted:
+        yield (
+            replace(read_pair(file, name), kind=of)
+            if isinstance(file, Pair)
+            else _read(of, file, name, salvage)
+        )
+
+
+def skipped_in(path: Path, kind: str) -> list[Skipped]:
+    """Return what `trials_in` leaves out of a folder, by name.
+
+    Raises:
+        InputError: as `trials_in`.
+    """
+    if not path.is_dir():
+        return []
+    manifest = _read_manifest(path) if kind != LAB_PICKLES else None
+    taken: set[str | None] = {EXPORT_MANIFEST}
+    if manifest is not None:
+        taken |= {item["file"] for item in manifest["trials"]}
+        other = f"is not in {EXPORT_MANIFEST}"
+    else:
+        for _, _, file in _sort(path) if kind == MIXED else _of_kind(path, kind):
+            taken |= file.names() if isinstance(file, Pair) else {file.name}
+        known = ", ".join(KINDS)
+        other = f"is of no known format ({known})" if kind == MIXED else f"is no {kind} file"
+    return [
+        Skipped(entry.name, _reason(entry, other))
+        for entry in sorted(path.iterdir())
+        if entry.name not in taken
+    ]
+
+
+def _reason(entry: Path, other: str) -> str:
+    if entry.is_symlink():
+        return "is a link"
+    if entry.is_dir():
+        return "is a folder; import it by itself"
+    return other if entry.is_file() else "is no regular file"
+
+
+Wanted = tuple[str, str, "Path | Pair"]
+"""Name of a trial, its format, and its file or files."""
+
+
+def _sort(path: Path) -> list[Wanted]:
+    """Return what is known in a file or folder, each with its own format, by name."""
+    kinds = {file: _kind(file) for file in _files(path)}
+    found: list[Wanted] = [
+        (name_of(_stem(file)), kind, file) for file, kind in kinds.items() if kind is not None
+    ]
+    left = [file for file, kind in kinds.items() if kind is None]
+    found += [(name_of(pair.stem), LAB_PICKLES, pair) for pair in pairs(left)]
+    return sorted(found, key=lambda item: item[0])
+
+
+def _of_kind(path: Path, kind: str) -> list[Wanted]:
+    """Return what a file or folder holds of one format.
+
+    Raises:
+        InputError: that is nothing.
     """
     files = _files(path)
     if kind == LAB_PICKLES:
         found = pairs(files)
         if not found:
             raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
-        for pair in found:
-            yield read_pair(pair, name_of(pair.stem))
-        return
-    suffixes, reader = READERS[kind]
-    manifest = _read_manifest(path) if path.is_dir() else None
-    if manifest is not None:
-        for item in manifest["trials"]:
-            file = path / item["file"]
-            if file.is_symlink() or not file.is_file():
-                raise InputError(file, "", None, "is missing or not a regular file")
-            yield _as_exported(_read(reader, file, item["trial"]), item, manifest["simulated"])
-        return
+        return [(name_of(pair.stem), kind, pair) for pair in found]
     wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
     if not wanted:
-        raise InputError(
-            path, "", None, f"holds no {kind} file; such files end in {' or '.join(suffixes)}"
-        )
-    for file in wanted:
-        yield _read(reader, file, name_of(_stem(file)))
+        endings = " or ".join(READERS[kind][0])
+        raise InputError(path, "", None, f"holds no {kind} file; such files end in {endings}")
+    return [(name_of(_stem(file)), kind, file) for file in wanted]
+
+
+def _check_names(path: Path, wanted: list[Wanted]) -> None:
+    """Check that no two files have the name of one trial, and that their libraries are there.
+
+    Two files of one name are mostly one recording in two formats, which must not count twice.
+    """
+    seen: dict[str, Path | Pair] = {}
+    for name, kind, file in wanted:
+        if (other := seen.setdefault(name, file)) is not file:
+            one, two = (
+                item.name if isinstance(item, Path) else ", ".join(sorted(item.names()))
+                for item in (other, file)
+            )
+            raise InputError(
+                path, "", None,
+                f"holds two files for the trial {name}: {one} and {two}; keep one of them, rename "
+                "one, or import one format alone: sliplab import KIND PATH",
+            )  # fmt: skip
+        if kind in {"raw", "es"} and isinstance(file, Path):
+            check_faery(file)
 
 
 def name_of(stem: str) -> str:
@@ -361,11 +565,23 @@ def name_of(stem: str) -> str:
     return plain or "trial"
 
 
-def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
+def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
+    """Return the trial in a file, or what stands whole of it.
+
+    Raises:
+        InputError: it is damaged, or of another format.
+    """
+    _, reader = READERS[kind]
+    again = partial(SALVAGE[kind], file, name) if kind in SALVAGE else None
     try:
-        return reader(file, name)
+        try:
+            return replace(reader(file, name), kind=kind, salvage=again)
+        except Damage as error:
+            if again is None:
+                raise
+            return replace(_before_damage(again, error, salvage), kind=kind)
     except FormatError as error:
-        raise InputError(file, "", None, str(error)) from None
+        raise _refusal(file, error) from None
 
 
 def _stem(file: Path) -> str:
@@ -392,7 +608,7 @@ def _possible(file: Path) -> tuple[str, ...]:
         return ("aedat4",)
     if head.startswith(MAGIC):
         return ("mcap",)
-    if head.startswith(_HDF5):
+    if head.startswith(SIGNATURE):
         return ("dsec", "lab-hdf5")
     if form := faery_type(head):
         return ("es",) if form == "es" else ("raw",)
@@ -406,7 +622,7 @@ def _kind(file: Path) -> str | None:
         try:
             return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
         except FormatError as error:
-            raise InputError(file, "", None, str(error)) from None
+            raise _refusal(file, error) from None
     return kinds[0] if kinds else None
 
 

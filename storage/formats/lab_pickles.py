@@ -20,6 +20,7 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.foreign import (
+    Damage,
     ForeignTrial,
     FormatError,
     event_chunk,
@@ -59,6 +60,10 @@ class Pair:
     stem: str
     on: Path | None
     off: Path | None
+
+    def names(self) -> set[str]:
+        """Return the names of its files."""
+        return {path.name for path in (self.on, self.off) if path is not None}
 
 
 def pairs(files: list[Path]) -> list[Pair]:
@@ -104,7 +109,7 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
             try:
                 shape, *columns = _events(path, polarity)
             except FormatError as error:
-                raise FormatError(str(error), path) from None
+                raise type(error)(str(error), path) from None
             shapes.add(shape)
             parts.append(columns)
         if len(shapes) > 1:
@@ -205,7 +210,7 @@ def _from_numpy(data: bytes, path: Path) -> Any:
     if math.prod(shape) > _MOST_EVEN:
         raise FormatError(f"holds {math.prod(shape)} times, as many in every pixel; {_RIGHT}")
     if math.prod(shape) * dtype.itemsize != len(data) - at:
-        raise FormatError(f"is truncated: {len(data) - at} bytes for an array of shape {shape}")
+        raise Damage(f"is truncated: {len(data) - at} bytes for an array of shape {shape}")
     numbers = np.frombuffer(data, dtype, offset=at).reshape(shape, order="F" if fortran else "C")
     cells = np.empty(shape[:2], object)
     for index in np.ndindex(shape[:2]):

@@ -12,7 +12,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,21 +26,25 @@ from sliplab.storage.files import json_text, safe_name
 from sliplab.storage.formats import ros2_messages as ros2
 from sliplab.storage.formats.foreign import (
     MOST_PX,
+    Damage,
     ForeignTrial,
     FormatError,
+    as_damage,
     event_chunk,
+    read_head,
 )
 from sliplab.storage.formats.mcap_trials import (
     FORMAT,
     LABEL_ARRAYS,
     LABEL_JSON,
+    LIBRARY,
     METADATA,
     SYNC_JSON,
 )
 from sliplab.storage.formats.original import CampaignTexts, Original, StoredTrial
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.label import TrialLabel
-from sliplab.storage.schema.trial import Provenance, SyncResult, TrialRecord
+from sliplab.storage.schema.trial import Lost, Provenance, SyncResult, TrialRecord
 from sliplab.storage.streams import U8, EventChunk, FrameChunk, Json
 from sliplab.storage.trials.checksums import PROVENANCE, RECORD
 from sliplab.storage.trials.store import INFO, PROTOCOL, RIG
@@ -56,6 +60,10 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 class _Found:
     """What a file holds, but its events and frames."""
 
+    def first(self, kind: str) -> str | None:
+        """Return the first topic of a type of message."""
+        return next((topic for topic, of in self.topics.items() if of == kind), None)
+
     topics: dict[str, str] = field(default_factory=dict)
     """Message type by topic, in the order of the file."""
     cameras: dict[str, str] = field(default_factory=dict)
@@ -65,6 +73,20 @@ class _Found:
     columns: dict[tuple[str, str], list[ros2.Rows]] = field(default_factory=dict)
     size: tuple[int, int] | None = None
     """Columns and rows of the events of other files, once they were read."""
+    library: str = ""
+    """The program that wrote the file."""
+
+
+@dataclass
+class _Part:
+    """The beginning of a file: the records before the byte `end`, all by default.
+
+    `at` is the byte of the record that is being read.
+    """
+
+    end: float = float("inf")
+    at: int = 0
+    records: int = 0
 
 
 def read_mcap(path: Path, name: str) -> ForeignTrial:
@@ -76,8 +98,72 @@ def read_mcap(path: Path, name: str) -> ForeignTrial:
     """
     found = _scan(path)
     if found.about is not None:
-        return _ours(path, found)
-    return _other(path, name, found)
+        with as_damage():
+            return _ours(path, found)
+    return _other(path, name, found, float("inf"))
+
+
+def salvage_mcap(path: Path, name: str) -> ForeignTrial:
+    """Read the records before the first damaged one, chunks whole or not at all.
+
+    Raises:
+        FormatError: there is nothing whole, or it is a published trial: its record is at its end,
+            which a file that is cut short has lost, and it is imported whole or not at all.
+        ModuleNotFoundError: the extra `publish` is missing.
+    """
+    found, part = _Found(), _Part()
+    reader = _Checked(found)
+    try:
+        for message in _messages(path, found, {ros2.EVENTS, ros2.IMAGE}, part=part):
+            reader.check(*message)
+    except FormatError as error:
+        size = path.stat().st_size
+        reason = str(error)
+        lost = Lost(at_byte=part.at, unread_bytes=size - part.at, reason=reason)
+    else:
+        return read_mcap(path, name)
+    if found.about is not None or found.library.startswith(LIBRARY):
+        raise Damage(
+            f"{reason}; a published trial is imported whole or not at all, for its record, which "
+            "says whether it is simulated, is at its end: publish it again"
+        )
+    # topics behind the damage are not the file's any more
+    found = _Found()
+    for _ in _messages(path, found, {ros2.EVENTS}, part=_Part(part.at)):
+        pass
+    return replace(_other(path, name, found, part.at), lost=lost, packets=part.records)
+
+
+class _Checked:
+    """Checks events and frames of a recording by another program, message by message."""
+
+    def __init__(self, found: _Found) -> None:
+        self._found = found
+        self._last_us = self._last_ns = 0
+        self._frame_px: tuple[int, ...] | None = None
+
+    def check(self, kind: str, topic: str, data: bytes) -> None:
+        """Check one message. Raises FormatError where it cannot be right."""
+        if topic != self._found.first(kind):
+            return
+        if kind == ros2.EVENTS:
+            packet = ros2.EventPacket.parse(data)
+            chunk = _checked(ros2.unpack_mono(packet)[1], packet)
+            if len(chunk) and int(chunk.t_us[0]) < self._last_us:
+                raise FormatError("contains events with decreasing times")
+            self._last_us = int(chunk.t_us[-1]) if len(chunk) else self._last_us
+            return
+        one = ros2.Image.parse(data)
+        _check_time(one.t_ns, self._last_ns)
+        self._last_ns = one.t_ns
+        self._frame_px = self._frame_px or one.image.shape
+        if one.image.shape != self._frame_px:
+            raise FormatError("holds a frame of another size than the first")
+
+
+def _check_time(t_ns: int, last_ns: int) -> None:
+    if not last_ns <= t_ns < _LATEST_NS:
+        raise FormatError(f"holds a frame at {t_ns} ns after one at {last_ns} ns")
 
 
 def _scan(path: Path) -> _Found:
@@ -96,15 +182,19 @@ def _scan(path: Path) -> _Found:
 
 
 def _messages(
-    path: Path, found: _Found | None, kinds: Collection[str], topic: str | None = None
+    path: Path,
+    found: _Found | None,
+    kinds: Collection[str],
+    topic: str | None = None,
+    part: _Part | None = None,
 ) -> Iterator[tuple[str, str, bytes]]:
     """Yield messages of some types, and of one topic: type, topic and bytes, as the file has them.
 
     Raises:
         FormatError: the file is damaged.
     """
-    from mcap.exceptions import McapError
-    from mcap.records import Attachment, Channel, Chunk, DataEnd, Message, Metadata, Schema
+    from mcap.exceptions import InvalidMagic, McapError
+    from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Message, Metadata, Schema
     from mcap.stream_reader import StreamReader
 
     schemas: dict[int, str] = {}
@@ -130,19 +220,27 @@ def _messages(
             found.attached[record.name] = record.data
         elif isinstance(record, Metadata) and found is not None and record.name == METADATA:
             found.about = dict(record.metadata)
+        elif isinstance(record, Header) and found is not None:
+            found.library = record.library
 
+    part = part or _Part()
     try:
         with path.open("rb") as handle:
             reader = StreamReader(handle, emit_chunks=True, record_size_limit=_MOST_RECORD)
-            for record in reader.records:
-                if isinstance(record, DataEnd):
-                    continue
-                for part in _opened(record) if isinstance(record, Chunk) else (record,):
-                    yield from one(part)
-    except FormatError:
-        raise
+            records = iter(reader.records)
+            while part.at < part.end and (record := next(records, None)) is not None:
+                if not isinstance(record, DataEnd):
+                    for item in _opened(record) if isinstance(record, Chunk) else (record,):
+                        yield from one(item)
+                part.at, part.records = handle.tell(), part.records + 1
+    except FormatError as error:
+        raise Damage(str(error)) from None
+    except InvalidMagic as error:
+        if part.at or MAGIC.startswith(read_head(path)):
+            raise Damage(f"is cut short: {error}") from None
+        raise FormatError(f"is not an MCAP file: {error}") from None
     except McapError as error:
-        raise FormatError(f"is damaged: {str(error) or type(error).__name__}") from None
+        raise Damage(f"is damaged or cut short: {str(error) or type(error).__name__}") from None
     except (
         struct.error,
         OverflowError,
@@ -153,7 +251,7 @@ def _messages(
         OSError,
         EOFError,
     ) as error:
-        raise FormatError(f"is damaged or cut short: {error}") from None
+        raise Damage(f"is damaged or cut short: {error}") from None
 
 
 def _opened(chunk: Any) -> list[Any]:
@@ -303,13 +401,9 @@ def _checked(chunk: EventChunk, packet: ros2.EventPacket) -> EventChunk:
     return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
 
 
-def _other(path: Path, name: str, found: _Found) -> ForeignTrial:
-    """Return the trial of a recording by other programs."""
-    topics = {
-        kind: next((t for t, of in found.topics.items() if of == kind), None)
-        for kind in (ros2.EVENTS, ros2.IMAGE)
-    }
-    events, images = topics[ros2.EVENTS], topics[ros2.IMAGE]
+def _other(path: Path, name: str, found: _Found, end: float) -> ForeignTrial:
+    """Return the trial of a recording by other programs, read up to the byte `end`."""
+    events, images = found.first(ros2.EVENTS), found.first(ros2.IMAGE)
     if events is None:
         there = ", ".join(sorted({kind for kind in found.topics.values() if kind})) or "none"
         raise FormatError(
@@ -318,7 +412,7 @@ def _other(path: Path, name: str, found: _Found) -> ForeignTrial:
     left = sorted(topic for topic in found.topics if topic not in (events, images))
 
     def all_events() -> Iterator[EventChunk]:
-        for _, _, data in _messages(path, None, {ros2.EVENTS}, events):
+        for _, _, data in _messages(path, None, {ros2.EVENTS}, events, _Part(end)):
             packet = ros2.EventPacket.parse(data)
             if 0 < packet.width <= MOST_PX and 0 < packet.height <= MOST_PX:
                 found.size = packet.width, packet.height
@@ -326,11 +420,10 @@ def _other(path: Path, name: str, found: _Found) -> ForeignTrial:
 
     def all_frames() -> Iterator[FrameChunk]:
         last = 0
-        messages = _messages(path, None, {ros2.IMAGE}, images)
+        messages = _messages(path, None, {ros2.IMAGE}, images, _Part(end))
         for number, (_, _, data) in enumerate(messages):
             one = ros2.Image.parse(data)
-            if not last <= one.t_ns < _LATEST_NS:
-                raise FormatError(f"holds a frame at {one.t_ns} ns after one at {last} ns")
+            _check_time(one.t_ns, last)
             last = one.t_ns
             times = np.array([one.t_ns], np.int64)
             yield FrameChunk(
@@ -339,7 +432,8 @@ def _other(path: Path, name: str, found: _Found) -> ForeignTrial:
 
     frame_px = None
     if images is not None:
-        first = next(all_frames(), None)
+        with as_damage():
+            first = next(all_frames(), None)
         frame_px = None if first is None else (first.images.shape[2], first.images.shape[1])
     return ForeignTrial(
         name, path.name, all_events, "ROS time, rounded to us", lambda: found.size,

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 METADATA, FORMAT = "sliplab", "1"
 """Name of the metadata of a file of ours, and version of what is in it."""
+LIBRARY = "sliplab"
+"""Name of the program in the header of a file of ours."""
 COLUMNS_TOPIC = "/columns"
 LABEL_JSON, LABEL_ARRAYS, SYNC_JSON = "label.json", "label.npz", "sync.json"
 ARM, BASE = "arm", "arm_base"
@@ -73,7 +75,7 @@ def write_mcap(
 
     with path.open("xb") as handle:
         writer = Writer(handle)
-        writer.start(profile="ros2", library="sliplab")
+        writer.start(profile="ros2", library=LIBRARY)
         trial = _Trial(writer, store, campaign, recording)
         counts = trial.write()
         trial.attach(personal)

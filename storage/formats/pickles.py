@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import DamagedFile
 
 MAX_BYTES = 1 << 29
 MEMORY = 4 << 30
@@ -69,7 +70,8 @@ def parse_pickle(data: bytes, path: str | Path, before: int = 0) -> Any:
             path, f"byte {before + at}", None,
             f"holds {text}; only {_KINDS} are read from a pickle, nothing was run",
         )  # fmt: skip
-    raise InputError(
+    fault = DamagedFile if at or not data else InputError
+    raise fault(
         path, f"byte {before + at}", None,
         f"is no whole pickle: {text}; a file as Python's pickle.dump writes it is read, with "
         f"{_KINDS} in it",

@@ -226,6 +226,21 @@ class Given(Part):
     """Classes other than those of slip."""
 
 
+class Lost(Part):
+    """The part of a damaged file that was not read: the trial is what stands whole before it."""
+
+    at_byte: Int
+    """Byte of the file at which the damage begins: of the first packet that cannot be read."""
+    unread_bytes: Int
+    """Bytes of the file that were not read."""
+    reason: str
+    """The fault, in words."""
+    events: Int | None = None
+    """Events lost, where the file says how many it should hold."""
+    frames: Int | None = None
+    """Frames lost, likewise."""
+
+
 class Imported(Part):
     """Origin of a trial that was not collected here."""
 
@@ -243,6 +258,8 @@ class Imported(Part):
     """Start and end of the recording on the time line, where its steps do not say."""
     given: Given | None = None
     """Labels that came with it."""
+    lost: Lost | None = None
+    """What is missing, of a trial that was salvaged from a damaged file."""
 
 
 class StreamRecord(Part):

@@ -42,6 +42,8 @@ _NAME, _ROW, _INODE, _CHANGED, _SYNC = (
     f"index.{name}" for name in ("name", "row", "inode", "changed", "sync")
 )
 _META = b"sliplab"
+UNREAD = "unread_bytes"
+"""Column of a catalogue with trials that are not whole: what was not read of their files."""
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
@@ -212,6 +214,7 @@ def _row(campaign: str, recording: Recording) -> Row:
         "frame_source": recording.frame_source,
         "sync_uncertainty_us": None if uncertainty_ns is None else uncertainty_ns / 1000,
         "passed": record.quality.passed,
+        **_missing(recording),
         **condition_columns(record.condition),
         **{
             f"{name}_{figure}": value
@@ -224,6 +227,12 @@ def _row(campaign: str, recording: Recording) -> Row:
             if stream.of_camera
         },
     }
+
+
+def _missing(recording: Recording) -> Row:
+    """Return the cell of a trial that was salvaged from a damaged file; of others there is none."""
+    origin = recording.record.imported
+    return {} if origin is None or origin.lost is None else {UNREAD: origin.lost.unread_bytes}
 
 
 @dataclass

@@ -6,8 +6,10 @@ must be in the file itself: links, external and virtual data are rejected.
 
 from __future__ import annotations
 
+import math
 import os
 from bisect import bisect_left
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -62,13 +64,21 @@ def _access() -> Any:
 class RowFile:
     """An HDF5 file that is open for reading.
 
+    Args:
+        content: its bytes as an open binary file, read in place of what is at `path`.
+
     Raises:
         OSError: it cannot be opened, or is none.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, content: Any = None) -> None:
         self.path = path
-        self._file = h5py.h5f.open(os.fsencode(path), h5py.h5f.ACC_RDONLY, fapl=_access())
+        name, access = os.fsencode(path), _access()
+        if content is not None:
+            access = access.copy()
+            access.set_fileobj_driver(h5py.h5fd.fileobj_driver, content)
+            name = repr(content).encode()
+        self._file = h5py.h5f.open(name, h5py.h5f.ACC_RDONLY, fapl=access)
         self._opened: dict[str, Rows] = {}
 
     def close(self) -> None:
@@ -192,6 +202,29 @@ class Rows:
 
     def __len__(self) -> int:
         return self.shape[0]
+
+    def stored(self) -> Iterator[tuple[int, int, int | None]]:
+        """Yield the pieces in which the rows are stored: first row, bytes, and place in the file.
+
+        The place is None where the file has none for a piece. Each is read once, for the file's
+        index of them may be damaged.
+        """
+        kept = self._data.get_create_plist()
+        row, others = self._dtype.itemsize * math.prod(self.shape[1:]), (0,) * len(self.shape[1:])
+        if kept.get_layout() == h5py.h5d.CHUNKED:
+            for low in range(0, len(self), kept.get_chunk()[0]):
+                found = self._data.get_chunk_info_by_coord((low, *others))
+                # in a damaged index that search may find what reading does not, which then returns
+                # zeros; this call fails instead
+                self._data.read_direct_chunk((low, *others))
+                yield low, found.size, found.byte_offset or None
+        elif kept.get_layout() == h5py.h5d.CONTIGUOUS:
+            place = self._data.get_offset()
+            for low in range(0, len(self), _BLOCK):
+                rows = min(_BLOCK, len(self) - low)
+                yield low, rows * row, None if place is None else place + low * row
+        else:  # a few rows, in the header of the column
+            yield 0, len(self) * row, 0
 
     def read(self, low: int = 0, high: int | None = None) -> Array:
         """Read rows low to high, the last one not included; all by default."""

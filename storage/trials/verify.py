@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from sliplab.storage.trials.checksums import (
 )
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP, TIMING, TRACKS
-from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
+from sliplab.storage.trials.store import CAUSE, IMPORTED, INFO, PROTOCOL, RIG, Campaign, Store
 from sliplab.storage.trials.video import count_frames
 
 _KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
@@ -92,6 +93,24 @@ def trial_folders(campaign: Campaign) -> list[Path]:
     """Return everything that is among the committed trials, complete or not."""
     folder = campaign.folder / "trials"
     return sorted(folder.iterdir()) if folder.is_dir() else []
+
+
+def salvaged(store: Store) -> list[str]:
+    """Return the trials that were salvaged from damaged files, as ``campaign/trial``.
+
+    They are intact, but not all that was recorded. Trials that cannot be read are left out.
+    """
+    found = []
+    for campaign in store.campaigns():
+        names: list[str] = []
+        with suppress(StoreError, ValueError):
+            names = sorted(campaign.committed()) if IMPORTED in campaign.info else []
+        for name in names:
+            with suppress(StoreError):
+                origin = campaign.recording(name).record.imported
+                if origin is not None and origin.lost is not None:
+                    found.append(f"{campaign.name}/{name}")
+    return found
 
 
 def verify_trial(folder: Path) -> list[Problem]:

@@ -1,0 +1,412 @@
+"""Damaged recordings: a prefix of what the whole file has, its loss counted, or nothing at all."""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import DamagedFile
+from sliplab.storage.formats import ros2_messages as ros2
+from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
+from sliplab.storage.formats.flatbuffers import events_buffer
+from sliplab.storage.formats.foreign import Triggers
+from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
+from sliplab.storage.schema.trial import Lost
+from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.catalogue import UNREAD, catalogue
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import salvaged, verify
+
+COUNT, PACKET = 3000, 100
+SIZE = (640, 480)
+
+
+def _events(count: int = COUNT) -> EventChunk:
+    rng = np.random.default_rng(7)
+    return EventChunk(
+        rng.integers(0, SIZE[0], count).astype(np.uint16),
+        rng.integers(0, SIZE[1], count).astype(np.uint16),
+        rng.integers(0, 2, count).astype(np.uint8),
+        np.cumsum(rng.integers(0, 60, count)).astype(np.int64),
+    )
+
+
+def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
+    return EventChunk(chunk.x[low:high], chunk.y[low:high], chunk.p[low:high], chunk.t_us[low:high])
+
+
+def _aedat4(path: Path) -> None:
+    """Packets of 100 events, a trigger with each, a frame with every tenth."""
+    streams = {
+        0: Stream("EVTS", "events", SIZE, "camera"),
+        1: Stream("FRME", "frames", (8, 6), "camera"),
+        2: Stream("TRIG", "triggers", None, "camera"),
+    }
+    whole = _events()
+    with Aedat4Writer(path, streams) as file:
+        for number, low in enumerate(range(0, COUNT, PACKET)):
+            file._write(0, events_buffer(_part(whole, low, low + PACKET)))
+            t_us = int(whole.t_us[low])
+            file.triggers(2, Triggers(np.array([t_us]), np.array([1], np.uint8)))
+            if number % 10 == 0:
+                file.picture(1, np.full((6, 8), number, np.uint8), t_us)
+
+
+def _dsec(path: Path, *, swapped: bool = False, **storage: Any) -> None:
+    """Chunks that were appended as a recorder appends them: the columns take turns."""
+    whole = _events()
+    columns = {"x": whole.x, "y": whole.y, "p": whole.p, "t": whole.t_us}
+    storage = storage or dict(hdf5plugin.Blosc(cname="zstd"))
+    with h5py.File(path, "w", libver="latest" if swapped else "earliest") as file:
+        for name, values in columns.items():
+            file.create_dataset(f"events/{name}", (0,), values.dtype, maxshape=(None,),
+                                chunks=(PACKET,), **storage)  # fmt: skip
+        for low in range(0, COUNT, PACKET):
+            for name, values in columns.items():
+                file[f"events/{name}"].resize((low + PACKET,))
+                file[f"events/{name}"][low:] = values[low : low + PACKET]
+            file.flush()
+
+
+def _contiguous(path: Path) -> None:
+    whole = _events()
+    with h5py.File(path, "w") as file:
+        file["events/x"], file["events/y"] = whole.x, whole.y
+        file["events/p"], file["events/t"] = whole.p, whole.t_us
+
+
+def _lab(path: Path) -> None:
+    whole = _events()
+    columns = {"xs": whole.x, "ys": whole.y, "ps": whole.p, "ts": whole.t_us / 1e6}
+    with h5py.File(path, "w") as file:
+        for name, values in columns.items():
+            file.create_dataset(f"events/{name}", data=values, chunks=(500,), compression="gzip")
+        file.attrs["sensor_resolution"] = np.array(SIZE)
+
+
+def _mcap(path: Path, chunk_bytes: int = 2000) -> None:
+    from mcap.writer import CompressionType, Writer
+
+    whole = _events()
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="a recorder")
+        channels = {}
+        for topic, kind in (("/dvs/events", ros2.EVENTS), ("/image", ros2.IMAGE)):
+            schema = writer.register_schema(kind, "ros2msg", ros2.definition(kind))
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for seq, low in enumerate(range(0, COUNT, PACKET)):
+            part = _part(whole, low, low + PACKET)
+            t_ns = int(part.t_us[0]) * 1000
+            data = ros2.event_packet(t_ns, "dvs", SIZE, seq, part)
+            writer.add_message(channels["/dvs/events"], t_ns, data, t_ns, seq)
+            if seq % 10 == 0:
+                image = ros2.image(t_ns, "dvs", np.full((6, 8), seq, np.uint8))
+                writer.add_message(channels["/image"], t_ns, image, t_ns, seq)
+        writer.finish()
+
+
+def _es(path: Path) -> None:
+    """Change events: 7 bits of time with the polarity, column and row; 255 lets 127 us pass."""
+    whole = _events()
+    made = bytearray(b"Event Stream\2\0\0\1" + struct.pack("<HH", *SIZE))
+    steps = np.diff(whole.t_us, prepend=0).tolist()
+    for x, y, p, step in zip(whole.x, whole.y, whole.p, steps, strict=True):
+        made += b"\xff" * (step // 127)
+        made += struct.pack("<BHH", step % 127 << 1 | int(p), int(x), SIZE[1] - 1 - int(y))
+    path.write_bytes(made)
+
+
+def _evt2(path: Path) -> None:
+    whole = _events()
+    words = []
+    high = -1
+    for x, y, p, t in zip(*(column.tolist() for column in vars(whole).values()), strict=True):
+        if t >> 6 != high:
+            high = t >> 6
+            words.append(8 << 28 | high)
+        words.append(p << 28 | (t & 63) << 22 | x << 11 | y)
+    path.write_bytes(
+        b"% evt 2.0\n% format EVT2;width=640;height=480\n" + struct.pack(f"<{len(words)}I", *words)
+    )
+
+
+def _dat(path: Path) -> None:
+    whole = _events()
+    x, y, p, t = (column.astype(np.uint64) for column in vars(whole).values())
+    words = t | x << np.uint64(32) | y << np.uint64(46) | p << np.uint64(60)
+    path.write_bytes(b"% Version 2\n% Width 640\n% Height 480\n\x0c\x08" + words.tobytes())
+
+
+FILES: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "aedat4": ("a.aedat4", _aedat4),
+    "dsec": ("a.h5", _dsec),
+    "dsec newest": ("a.h5", lambda path: _dsec(path, swapped=True)),
+    "dsec checked": ("a.h5", lambda path: _dsec(path, fletcher32=True)),
+    "contiguous": ("a.h5", _contiguous),
+    "lab": ("a.h5", _lab),
+    "mcap": ("a.mcap", _mcap),
+    "es": ("a.es", _es),
+    "evt2": ("a.raw", _evt2),
+    "dat": ("a.dat", _dat),
+}
+SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6))]
+CHECKED = {"dsec checked", "mcap"}
+"""Formats whose packets have checksums, so that no damage goes by unseen."""
+
+
+@dataclass
+class Outcome:
+    """What became of a file: the error or the trial."""
+
+    error: InputError | None = None
+    found: Recording | None = None
+
+    @property
+    def lost(self) -> Lost | None:
+        assert self.found is not None
+        assert self.found.record.imported is not None
+        return self.found.record.imported.lost
+
+
+def _import(folder: Path, path: Path, *, salvage: bool) -> Outcome:
+    """Import into a new store; where that is refused, nothing is left of it."""
+    store = Store.create(folder)
+    try:
+        kind = kind_of(path)
+        found = trials_in(path, kind, salvage=salvage)
+        import_trials(store, "theirs", found, path, kind, salvage=salvage)
+    except InputError as error:
+        _check_refused(folder, path, error.message)
+        return Outcome(error)
+    assert verify(store) == []
+    (recording,) = store.campaign("theirs").recordings()
+    return Outcome(None, recording)
+
+
+def _check_refused(folder: Path, path: Path, message: str) -> None:
+    assert path.name in message
+    assert [item.name for item in folder.rglob("*") if item.is_file()] == ["store.json"]
+    assert Store.open(folder).campaigns() == []
+
+
+def _is_prefix(found: Recording) -> int:
+    """Check that a trial's events are the first of the whole file's; return their number."""
+    events, whole = found.events(), _events()
+    count = len(events)
+    for name in ("t_us", "x", "y", "p"):
+        np.testing.assert_array_equal(getattr(events, name), getattr(whole, name)[:count])
+    return count
+
+
+def _try(folder: Path, name: str, data: bytes) -> tuple[Outcome, Outcome]:
+    """Import a file as it is, and salvaged; check what holds for every damage."""
+    path = folder / FILES[name][0]
+    path.write_bytes(data)
+    plain = _import(folder / "plain", path, salvage=False)
+    saved = _import(folder / "saved", path, salvage=True)
+    if plain.error is None:
+        assert saved.error is None
+        assert saved.lost is None
+    elif saved.error is None:
+        assert isinstance(plain.error, DamagedFile)
+        assert "; --salvage imports " in plain.error.message
+        lost = saved.lost
+        assert lost is not None
+        assert 0 <= lost.at_byte <= len(data)
+        assert 0 <= lost.unread_bytes <= len(data)
+        assert lost.reason
+    return plain, saved
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes of a whole file of each format."""
+    found = {}
+    for name, (file, write) in FILES.items():
+        path = tmp_path_factory.mktemp("whole") / file
+        write(path)
+        found[name] = path.read_bytes()
+    return found
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_whole_file_loses_nothing(tmp_path: Path, name: str, whole: dict[str, bytes]) -> None:
+    for outcome in _try(tmp_path, name, whole[name]):
+        assert outcome.found is not None
+        assert _is_prefix(outcome.found) == COUNT
+        assert outcome.lost is None
+
+
+def _cut(folder: Path, name: str, data: bytes, at: int) -> int:
+    """Try the first `at` bytes of a file; return the number of events salvaged."""
+    plain, saved = _try(folder, name, data[:at])
+    if saved.error is not None:
+        # of a header that ends early nothing may be left that says what it was
+        wrong = isinstance(saved.error, DamagedFile)
+        assert wrong or "contains no events" in str(saved.error) or "no format" in str(saved.error)
+        return 0
+    assert saved.found is not None
+    if plain.error is None:
+        assert name in {"aedat4", "es", "evt2", "dat"}, "formats that do not say where they end"
+    return _is_prefix(saved.found)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_cut_short_gives_a_prefix(
+    tmp_path: Path, name: str, seed: int, whole: dict[str, bytes]
+) -> None:
+    rng = random.Random(seed)
+    data = whole[name]
+    places = sorted(rng.randrange(len(data)) for _ in range(4 if seed == 1 else 24))
+    counts = []
+    for at in places:
+        folder = tmp_path / str(at)
+        folder.mkdir(exist_ok=True)
+        counts.append(_cut(folder, name, data, at))
+    assert counts == sorted(counts), "a longer file holds less"
+
+
+@pytest.mark.parametrize(
+    ("name", "share"),
+    [("aedat4", 0.9), ("dsec", 0.5), ("dsec newest", 0.5), ("mcap", 0.8), ("es", 0.9),
+     ("evt2", 0.9), ("dat", 0.9)],
+)  # fmt: skip
+def test_most_of_a_file_that_lost_its_end_is_salvaged(
+    tmp_path: Path, name: str, share: float, whole: dict[str, bytes]
+) -> None:
+    at = int(len(whole[name]) * 0.95) | 1
+    assert _cut(tmp_path, name, whole[name], at) >= share * COUNT
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", FILES)
+def test_flipped_bits_give_no_traceback_and_where_seen_a_prefix(
+    tmp_path: Path, name: str, seed: int, whole: dict[str, bytes]
+) -> None:
+    rng = random.Random(seed)
+    for number in range(4 if seed == 1 else 24):
+        data = bytearray(whole[name])
+        for _ in range(rng.choice((1, 8))):
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        plain, saved = _try(folder, name, bytes(data))
+        if plain.error is not None and saved.found is not None and name in CHECKED:
+            _is_prefix(saved.found)
+
+
+def test_the_table_at_the_end_of_aedat4_counts_what_is_lost(tmp_path: Path) -> None:
+    """As dv-processing writes it: place, stream and items of every packet."""
+    path = tmp_path / "a.aedat4"
+    _aedat4(path)
+    data = bytearray(path.read_bytes())
+    with Aedat4File(path) as file:
+        packets = [(file.at, stream, size) for stream, size in file._headers()]
+    items = {0: PACKET, 1: 1, 2: 1}
+    table = _table([(at + 8, stream, size, items[stream]) for at, stream, size in packets])
+    begin = packets[0][0]
+    place = data.index(struct.pack("<q", -1), 0, begin)
+    data[place : place + 8] = struct.pack("<q", len(data))
+    import pyarrow as pa
+
+    data += pa.compress(table, codec="zstd", asbytes=True)
+    at, _, size = [packet for packet in packets if packet[1] == 0][17]
+    data[at + 8 : at + 8 + size] = bytes(size)
+    path.write_bytes(data)
+    outcome = _import(tmp_path / "store", path, salvage=True)
+    assert outcome.found is not None
+    assert _is_prefix(outcome.found) == 17 * PACKET
+    lost = outcome.lost
+    assert lost is not None
+    assert (lost.at_byte, lost.unread_bytes) == (at, len(data) - at)
+    assert (lost.events, lost.frames) == (13 * PACKET, 1)
+    assert outcome.found.record.counts.frames == 2
+    with outcome.found.open() as reader:
+        assert len(reader.pulses("event_pulses")) == 17
+
+
+def _table(rows: list[tuple[int, int, int, int]]) -> bytes:
+    """A flatbuffer `FTAB`: a vector of tables of place (q), stream and size (ii), and items (q)."""
+    vtable = struct.pack("<5H", 10, 28, 4, 12, 20) + bytes(2)
+    first = 24 + 4 + 4 * len(rows)
+    at = first + (-first) % 4
+    places = []
+    body = bytearray()
+    for place, stream, size, items in rows:
+        places.append(at + len(body) + len(vtable))
+        body += vtable + struct.pack("<iqiiq", len(vtable), place, stream, size, items)
+    head = struct.pack("<I", 16) + b"FTAB" + struct.pack("<4H", 6, 8, 4, 0)
+    head += struct.pack("<iI", 8, 4) + struct.pack("<I", len(rows))
+    made = bytearray(head)
+    for place in places:
+        made += struct.pack("<I", place - len(made))
+    made += bytes(at - len(made)) + body
+    return struct.pack("<I", len(made)) + bytes(made)
+
+
+def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    _dsec(path, fletcher32=True)
+    with h5py.File(path) as file:
+        info = file["events/y"].id.get_chunk_info(11)
+    data = bytearray(path.read_bytes())
+    data[info.byte_offset] ^= 1
+    path.write_bytes(data)
+    outcome = _import(tmp_path / "store", path, salvage=True)
+    assert outcome.found is not None
+    assert _is_prefix(outcome.found) == 11 * PACKET
+    assert outcome.lost is not None
+    assert outcome.lost.events == 19 * PACKET
+    assert outcome.lost.at_byte <= info.byte_offset
+
+
+def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a.aedat4"
+    _aedat4(path)
+    path.write_bytes(path.read_bytes()[:-10])
+    store = Store.create(tmp_path / "store")
+    found = trials_in(path, "aedat4", salvage=True)
+    result = import_trials(store, "theirs", found, path, "aedat4", salvage=True)
+    (lost,) = result["salvaged"]
+    assert (lost["trial"], lost["file"]) == ("a", "a.aedat4")
+    (text,) = result["warnings"]
+    assert text.startswith("a.aedat4: is not whole: it is cut short")
+    assert f"{lost['unread_bytes']:,} bytes were not read" in text
+    (recording,) = store.campaign("theirs").recordings()
+    assert recording.record.imported is not None
+    assert [f"a.aedat4: {one}" for one in recording.record.imported.warnings] == [text]
+    assert salvaged(store) == ["theirs/a"]
+    assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]
+    assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]  # from the index
+    again = import_trials(
+        store, "theirs", trials_in(path, "aedat4", salvage=True), path, "aedat4", salvage=True
+    )
+    assert again["there"] == ["a"]
+
+
+def test_a_published_trial_that_is_cut_short_is_not_taken_for_a_recording(tmp_path: Path) -> None:
+    """Its record is at the end: nobody would know that it was simulated."""
+    from sliplab.storage.formats.mcap_trials import write_mcap
+    from tests.storage.trial_files import campaign, commit
+
+    where = campaign(tmp_path / "ours")
+    commit(where, "t")
+    path = tmp_path / "t.mcap"
+    write_mcap(path, Store.open(tmp_path / "ours"), where, where.recording("t"))
+    path.write_bytes(path.read_bytes()[:-2000])
+    outcome = _import(tmp_path / "store", path, salvage=True)
+    assert isinstance(outcome.error, DamagedFile)
+    assert "publish it again" in outcome.error.message
