@@ -27,6 +27,14 @@ def test_the_guide_works_as_printed(guide: Path, checkout: Path) -> None:
     assert walk(guide, checkout) >= 1
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "guide", [g for g in GUIDES if any("long" in b.flags for b in blocks(g))], ids=lambda p: p.stem
+)
+def test_the_guide_s_long_commands_work_too(guide: Path, checkout: Path) -> None:
+    assert walk(guide, checkout, long=True) > walk(guide, checkout)
+
+
 def test_the_notebook_prints_what_it_shows(
     checkout: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

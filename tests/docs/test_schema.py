@@ -95,7 +95,9 @@ def test_nothing_is_refused_in_a_document_that_its_reader_takes(older: Path, kin
         "evaluation": "derived/evaluation/*.json", "summary": "report/summary.json",
     }  # fmt: skip
     path = min(older.glob(patterns[kind]))
-    data, refused = read_json(path), 0
+    data, refused = _short(read_json(path)), 0
+    assert CHECKERS[kind].is_valid(data)
+    assert DOCUMENTS[kind].parse(data, path).to_json() == data
     for at in _leaves(data):
         if any(isinstance(key, int) and key for key in at):
             continue  # of a list the first entry stands for all
@@ -107,6 +109,16 @@ def test_nothing_is_refused_in_a_document_that_its_reader_takes(older: Path, kin
             with pytest.raises(DocumentError, match=path.name):
                 DOCUMENTS[kind].parse(wrong, path)
     assert refused > 100
+
+
+def _short(part: Any) -> Any:
+    """The same with one of the mappings in each list: all of them are looked at every time."""
+    if isinstance(part, dict):
+        return {key: _short(value) for key, value in part.items()}
+    if isinstance(part, list):
+        rows = all(isinstance(item, dict) for item in part)
+        return [_short(item) for item in (part[:1] if rows else part)]
+    return part
 
 
 def _leaves(part: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:

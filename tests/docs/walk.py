@@ -55,17 +55,18 @@ def _sliplab(words: list[str], folder: Path) -> Done:
     return Done(done.returncode, done.stdout, done.stderr)
 
 
-def walk(page: Path, folder: Path) -> int:
+def walk(page: Path, folder: Path, *, long: bool = False) -> int:
     """Do what `page` says in `folder`; the number of commands that were run.
 
     A block with a title is a file, or (``diff``) a change to one. A console block is run, and what
     it shows is held against what is printed: ``...`` stands for anything, and after
-    ``<!-- test: digits -->`` numbers may differ. ``<!-- test: skip -->`` leaves a block out.
+    ``<!-- test: digits -->`` numbers may differ. ``<!-- test: skip -->`` leaves a block out,
+    ``<!-- test: long -->`` all but in `long` tests.
     ``/SHARED/`` is a folder in `folder`.
     """
     count = 0
     for block in blocks(page):
-        if "skip" in block.flags:
+        if "skip" in block.flags or ("long" in block.flags and not long):
             continue
         if block.title is not None:
             _write(folder / block.title, block)

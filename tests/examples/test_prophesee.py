@@ -313,7 +313,7 @@ def test_a_camera_that_is_absent_is_a_fault(
 # -- installed -----------------------------------------------------------------------------
 
 
-@pytest.mark.programs
+@realtime
 def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
     before = checkout()
     sliplab = Lab(tmp_path, "prophesee")

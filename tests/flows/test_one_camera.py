@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -49,9 +51,32 @@ def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
     return Store.open(requests[0].store), outcome
 
 
+@pytest.fixture(scope="module")
+def studied(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str], tuple[Store, Outcome]]:
+    """The study of each camera, made when it is first asked for."""
+    return cache(lambda camera: take(camera, tmp_path_factory.mktemp(camera)))
+
+
+Take = Callable[[str], Store]
+
+
+@pytest.fixture
+def taken(studied: Callable[[str], tuple[Store, Outcome]], tmp_path: Path) -> Take:
+    """A copy of a camera's store, to be changed at will."""
+
+    def copied(camera: str) -> Store:
+        return Store.open(shutil.copytree(studied(camera)[0].folder, tmp_path / "store"))
+
+    return copied
+
+
 @pytest.mark.parametrize("camera", ["events", "frames"])
-def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path) -> None:
-    store, outcome = take(camera, tmp_path)
+def test_a_study_with_one_camera_runs_to_its_report(
+    camera: str, studied: Callable[[str], tuple[Store, Outcome]]
+) -> None:
+    store, outcome = studied(camera)
     states = {row.name: (row.state, row.note) for row in outcome.rows}
     json.dumps([outcome.steps, outcome.collected], default=plain, allow_nan=False)  # as --json
     missing = {"events": "frames", "frames": "events"}[camera]
@@ -113,9 +138,9 @@ def test_a_study_with_one_camera_runs_to_its_report(camera: str, tmp_path: Path)
     assert "spiking network and its detectors" in page or camera == "events"
 
 
-def test_training_and_evaluation_repeat_and_say_what_is_stale(tmp_path: Path) -> None:
+def test_training_and_evaluation_repeat_and_say_what_is_stale(taken: Take) -> None:
     """The same bytes and figures from the same seed; nothing is made twice."""
-    store, _ = take("frames", tmp_path)
+    store = taken("frames")
     campaigns = collected(store)
     model = store.folder / "models" / "markers-seed0.model"
     first, before = model.read_bytes(), summary_json(store)
@@ -149,8 +174,8 @@ def test_training_and_evaluation_repeat_and_say_what_is_stale(tmp_path: Path) ->
     assert {rule.choose for rule in summary.detection.values()} == {"protocol"}
 
 
-def test_a_report_on_events_says_which_steps_are_still_to_do(tmp_path: Path) -> None:
-    store, _ = take("events", tmp_path)
+def test_a_report_on_events_says_which_steps_are_still_to_do(taken: Take) -> None:
+    store = taken("events")
     campaigns = collected(store)
     for name, then in (("evaluation", ["train", "evaluate"]), ("labels", ["label"])):
         shutil.rmtree(store.folder / "derived" / name)
@@ -190,8 +215,8 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     assert "time to the first slip" in page
 
 
-def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) -> None:
-    store, _ = take("events", tmp_path)
+def test_the_report_is_made_again_only_when_something_changed(taken: Take) -> None:
+    store = taken("events")
     assert {each.beyond for each in against(store, store.folder)[0].figures} <= {False, None}
     assert report(store, collected(store))["done"] == 0
     before = summary_json(store)
@@ -202,10 +227,10 @@ def test_the_report_is_made_again_only_when_something_changed(tmp_path: Path) ->
     assert before == after
 
 
-def test_a_report_on_frames_is_not_compared(tmp_path: Path) -> None:
+def test_a_report_on_frames_is_not_compared(taken: Take) -> None:
     from sliplab.analysis.report.against import load_other
 
-    store, _ = take("frames", tmp_path)
+    store = taken("frames")
     with pytest.raises(InputError, match="one camera"):
         load_other(store.folder)
     with pytest.raises(InputError, match="one camera"):
