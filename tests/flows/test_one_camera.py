@@ -215,8 +215,10 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     assert "time to the first slip" in page
 
 
-def test_the_report_is_made_again_only_when_something_changed(taken: Take) -> None:
-    store = taken("events")
+def test_the_report_is_made_again_only_when_something_changed(
+    studied: Callable[[str], tuple[Store, Outcome]],
+) -> None:
+    store, _ = studied("events")
     assert {each.beyond for each in against(store, store.folder)[0].figures} <= {False, None}
     assert report(store, collected(store))["done"] == 0
     before = summary_json(store)
