@@ -101,7 +101,9 @@ def _evaluated(
 
 
 def _planned_bytes(item: Collected) -> int:
-    """Return the bytes that the committed trials were expected to take."""
+    """Return the bytes that the committed trials were expected to take; 0 of imported ones."""
+    if item.recorded is not None:
+        return 0
     rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
     done = {trial.id for trial, _ in item.trials}
     return round(plan_bytes(rig, item.plan, {trial.id for trial in item.plan} - done))

@@ -156,6 +156,22 @@ class Plan:
         factors = self.protocol.collection.all_factors
         return {name: factors[name].text(level) for name, level in trial.condition}
 
+    @property
+    def name(self) -> str:
+        """The protocol's name."""
+        return self.protocol.name
+
+    @property
+    def seed(self) -> int:
+        """The protocol's seed."""
+        return self.protocol.collection.seed
+
+    @cached_property
+    def levels(self) -> dict[str, tuple[str, ...]]:
+        """Levels of each factor as text with unit, in the order of the file."""
+        factors = self.protocol.collection.all_factors
+        return {name: tuple(map(factors[name].text, of)) for name, of in self.enabled.items()}
+
     def level_texts(self, field: Decimal | FactorRef, unit: str) -> tuple[str, ...]:
         """A phase's field as text (``2.8 mm``): its one value, or the levels of its factor."""
         if not isinstance(field, FactorRef):

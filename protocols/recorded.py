@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from functools import cached_property
+from typing import ClassVar
 
 from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.errors import InputError
@@ -52,6 +53,14 @@ class RecordedPlan:
     adapter: Adapter
     file: str
     recorded: tuple[RecordedTrial, ...] = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """The adapter's name."""
+        return self.adapter.name
+
+    seed: ClassVar[None] = None
+    """Nothing was drawn."""
 
     def __len__(self) -> int:
         return len(self.recorded)

@@ -209,10 +209,10 @@ def _card(
         CardCampaign(
             name=item.name,
             experiment=item.experiment,
-            protocol=item.plan.protocol.name,
-            collection_hash=item.plan.collection_hash,
-            analysis_hash=item.plan.analysis_hash,
-            rig=item.info["rig"],
+            protocol=item.planned.name,
+            collection_hash=item.planned.collection_hash,
+            analysis_hash=item.planned.analysis_hash,
+            rig=item.info.get("rig", "imported"),
             simulated=item.info["simulated"],
             trials={split: sum(1 for _ in item.of_split(split)) for split in SPLITS},
         )

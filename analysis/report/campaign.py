@@ -14,7 +14,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.quality import hold_rate
 from sliplab.analysis.report.figures import campaign as figures
 from sliplab.analysis.report.page import Content, Figure, Table, number
-from sliplab.protocols.factors import Level
+from sliplab.protocols import Trial
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.summary import (
     OneCameraSummary,
@@ -68,7 +68,7 @@ def collected_section(
         minutes = (known.seconds / 60, known.seconds_collected / 60)
         megabytes = (known.bytes / 1e6, known.bytes_collected / 1e6)
         rows.append([
-            item.name, item.experiment, str(len(item.plan)), str(len(item.trials)),
+            item.name, item.experiment, str(len(item.planned)), str(len(item.trials)),
             *(number(value, 2) for value in minutes), *(number(value, 1) for value in megabytes),
         ])  # fmt: skip
     columns = (
@@ -103,31 +103,34 @@ def source_words(summary: Summary | OneCameraSummary) -> str:
 
 def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | None:
     """Draw the trials by the first two factors; None if there are fewer."""
-    factors = item.plan.protocol.collection.all_factors
-    names = list(factors)[:2]
+    names = list(item.planned.levels)[:2]
     if len(names) < 2:
         return None
-    levels = [item.plan.enabled[name] for name in names]
+    levels = [item.planned.levels[name] for name in names]
     shape = (len(levels[0]), len(levels[1]))
     counts, planned = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
 
-    def cell(condition: tuple[tuple[str, Level], ...]) -> tuple[int, int]:
-        there = dict(condition)
+    def cell(trial: Trial) -> tuple[int, int]:
+        there = item.describe(trial)
         return levels[0].index(there[names[0]]), levels[1].index(there[names[1]])
 
-    for of, trials in ((planned, item.plan), (counts, [trial for trial, _ in item.trials])):
+    for of, trials in ((planned, item.planned), (counts, [trial for trial, _ in item.trials])):
         for trial in trials:
             if trial.role == "measured":
-                of[cell(trial.condition)] += 1
-    axes = [f"{name} ({factors[name].unit})" if factors[name].unit else name for name in names]
+                of[cell(trial)] += 1
+    axes, shown = [], []
+    for name, texts in zip(names, levels, strict=True):
+        unit = texts[0].partition(" ")[2] if texts else ""
+        axes.append(f"{name} ({unit})" if unit else name)
+        shown.append([text.removesuffix(f" {unit}") for text in texts])
     data: dict[str, Sequence[object]] = {
-        axes[0]: [str(level) for level in levels[0] for _ in levels[1]],
-        axes[1]: [str(level) for _ in levels[0] for level in levels[1]],
+        axes[0]: [level for level in shown[0] for _ in shown[1]],
+        axes[1]: [level for _ in shown[0] for level in shown[1]],
         "committed (trials)": counts.ravel().tolist(),
         "planned (trials)": planned.ravel().tolist(),
     }
     svg = figures.collected_grid(
-        levels[0], levels[1], counts, planned, axes[0], axes[1], simulated=simulated
+        shown[0], shown[1], counts, planned, axes[0], axes[1], simulated=simulated
     )
     return item.name, names[0], names[1], Figure(svg, name=f"collected-{item.name}", data=data)
 
@@ -157,9 +160,11 @@ class QualitySection(Content):
 
 def quality_section(
     campaigns: Sequence[Collected], references: Mapping[str, References], *, simulated: bool
-) -> QualitySection:
-    """Look at every campaign in the order in which it was taken."""
-    taken = [item for item in campaigns if item.trials]
+) -> QualitySection | None:
+    """Look at every campaign in the order in which it was taken; None where all were imported."""
+    taken = [item for item in campaigns if item.trials and item.recorded is None]
+    if not taken and any(item.recorded is not None for item in campaigns):
+        return None
     stream = "frames" if any(item.missing_stream == "events" for item in taken) else "events"
     return QualitySection(
         stream,
@@ -179,7 +184,7 @@ def _over_campaign(item: Collected, stream: str, simulated: bool) -> Figure:
     records = [recording.record for _, recording in item.trials]
     rates = [getattr(record.counts, stream) / record.recorded_s for record in records]
     nearest = [_nearest(record.quality.gates) for record in records]
-    places = {trial.id: trial.index + 1 for trial in item.plan}
+    places = {trial.id: trial.index + 1 for trial in item.planned}
     failed = Counter(
         places[known["trial"]] for known in item.campaign.quarantined() if known["trial"] in places
     )

@@ -10,7 +10,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures.clocks import uncertainty_by_trial
 from sliplab.analysis.report.page import Content, Figure, number
 from sliplab.protocols.timing import WIRED
-from sliplab.storage.schema.summary import Sync
+from sliplab.storage.schema.summary import Labels, Sync
 from sliplab.storage.schema.trial import DEVICES
 
 PAGE = "sync.html"
@@ -33,8 +33,21 @@ def unwired(sync: Sync) -> bool:
     return any(grade not in WIRED for grade in frames_grade(sync).split(" or "))
 
 
-def latency_note(sync: Sync) -> str:
-    """Return what is under every table of latencies: the grade, and how far off it may be."""
+def given_note(labels: Labels) -> str:
+    """Return how far onsets may be off that came with the recordings."""
+    if labels.given_within_ms is None:
+        return "onsets of the data set, whose uncertainty is unknown"
+    return f"onsets of the data set, within {number(labels.given_within_ms, 1, 'ms')}"
+
+
+def latency_note(sync: Sync, labels: Labels | None = None) -> str:
+    """Return what is under every table of latencies: the grade, and how far off it may be.
+
+    Args:
+        labels: names the onsets' origin where they came with the recordings.
+    """
+    if labels is not None and "given" in labels.error_ms.rule:
+        return f"Latencies are against the {given_note(labels)}."
     if "events" not in sync.grades:
         return "Onsets and detections are both read from the frames: no clock lies between them."
     if "frames" not in sync.grades:
@@ -56,8 +69,10 @@ def figure_note(sync: Sync) -> str:
     return f" {latency_note(sync)}" if unwired(sync) and both else ""
 
 
-def short_note(sync: Sync) -> str:
+def short_note(sync: Sync, labels: Labels | None = None) -> str:
     """Return the same for a headline latency."""
+    if labels is not None and "given" in labels.error_ms.rule:
+        return given_note(labels)
     if "frames" not in sync.grades:
         return "onsets by events"
     within = f", within {frames_uncertainty(sync)}" if unwired(sync) else ""
@@ -91,12 +106,14 @@ class ClockSection(Content):
 
 def clock_section(
     campaigns: Sequence[Collected], sync: Sync, *, page: bool, simulated: bool
-) -> ClockSection:
-    """Draw the clocks of all trials.
+) -> ClockSection | None:
+    """Draw the clocks of all trials; None where all of them were imported, without sync pulses.
 
     Args:
         page: the page about clocks exists in the report's folder.
     """
+    if all(item.recorded is not None for item in campaigns):
+        return None
     figure = _figure(campaigns, sync, simulated) if sync.grades else None
     return ClockSection(sync, figure, PAGE if page else None)
 

@@ -20,7 +20,7 @@ from sliplab.storage.trials.store import Store
 RULES = {"paper": "paper's rule", "change_point": "change point"}
 RULING = {
     "paper": "the paper's rule", "change_point": "the change points",
-    "force": "the force along the plate",
+    "force": "the force along the plate", "given": "the data set's own labels",
 }  # fmt: skip
 
 

@@ -131,7 +131,7 @@ def latency_section(
         experiment, numbers, PAPER, DISTURBANCE_LEAD_STD_MS, by, late,
         sorted({choice_note(rule) for rule in rules} - {""}),
         {NAMES[name]: trends for name in shown if (trends := _trends(found, name))},
-        clocks.latency_note(summary.sync), clocks.figure_note(summary.sync),
+        clocks.latency_note(summary.sync, summary.labels), clocks.figure_note(summary.sync),
         _figures(experiment, found, by, summary.simulated), _statistics(numbers, kinds),
         _accounts(experiment, numbers.accounted),
         [] if kinematic else [_by_level(found, factor) for factor in found.varied()],

@@ -109,7 +109,7 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
         inputs.append([judged.evaluation.key])
     if is_evaluated(store, campaigns):
         inputs.append([report_key(store, campaigns)])
-    plans = [[item.plan.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
+    plans = [[item.planned.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
     return make_key("report, one camera", VERSION, [inputs, plans], None)
 
 
@@ -236,6 +236,8 @@ class LeftOutSection(Content):
 
     template: ClassVar[str] = "left_out.html"
     camera: str
+    given: bool
+    """The onsets came with the recordings."""
     steps: Table
 
 
@@ -259,7 +261,8 @@ class RateSection(Content):
 def left_out_section(summary: OneCameraSummary) -> LeftOutSection:
     """Say which camera is missing, and what is left out for it."""
     rows = [[each.name, each.reason] for each in summary.left_out]
-    return LeftOutSection(summary.one_camera, Table(("step", "why it is left out"), rows))
+    given = summary.labels is not None and "given" in summary.labels.error_ms.rule
+    return LeftOutSection(summary.one_camera, given, Table(("step", "why it is left out"), rows))
 
 
 def rate_section(campaigns: Sequence[Collected], summary: OneCameraSummary) -> RateSection | None:

@@ -84,7 +84,7 @@ def account(
     for item in campaigns:
         if item.experiment == experiment:
             there = {trial.id for trial, _ in item.trials}
-            for trial in item.plan:
+            for trial in item.planned:
                 if trial.split == "test":
                     other = "not_evaluated" if trial.id in there else "not_taken"
                     counts[judged.get((item.name, trial.id), other)] += 1
@@ -119,10 +119,9 @@ class Conditions:
         self.factors: dict[str, list[str]] = {}
         names = {item.name for item in campaigns if item.experiment == experiment}
         for item in campaigns:
-            factors = item.plan.protocol.collection.all_factors
-            for name, levels in item.plan.enabled.items() if item.name in names else ():
+            for name, levels in item.planned.levels.items() if item.name in names else ():
                 there = self.factors.setdefault(name, [])
-                there += [t for t in map(factors[name].text, levels) if t not in there]
+                there += [text for text in levels if text not in there]
         self._rows = [(trial_outcome(row), row.condition) for row in rows if row.campaign in names]
 
     @property

@@ -99,7 +99,7 @@ def headline(summary: Summary) -> list[Number]:
     accuracy, quality = summary.kinematic.accuracy, summary.quality
     latency, lead = summary.kinematic.latency_ms.incipient, summary.gravity.lead_ms
     uncertain, device = clocks.worst_clock(summary.sync)
-    note = clocks.short_note(summary.sync)
+    note = clocks.short_note(summary.sync, summary.labels)
     if any(rule.choose == "test" for rule in summary.detection.values()):
         note += "; smoothing and margin chosen on test trials"
     return [

@@ -75,7 +75,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
     collected = [
         [
             item.name,
-            item.plan.collection_hash,
+            item.planned.collection_hash,
             len(item.campaign.quarantined()),
             [recording.checksum for _, recording in item.trials],
         ]

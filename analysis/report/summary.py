@@ -55,7 +55,9 @@ def package_versions() -> dict[str, str]:
 def protocol_hashes(campaigns: Sequence[Collected]) -> dict[str, Hashes]:
     """Return the hashes of the campaigns' protocols."""
     return {
-        item.name: Hashes(collection=item.plan.collection_hash, analysis=item.plan.analysis_hash)
+        item.name: Hashes(
+            collection=item.planned.collection_hash, analysis=item.planned.analysis_hash
+        )
         for item in campaigns
     }
 
@@ -85,6 +87,7 @@ def make_summary(sources: Sources) -> Summary:
             "reviewed": evaluation.reviewed,
             "check": sources.label_check,
             "holds": sources.holds,
+            **_given(campaigns),
         },
         "detection": plain_rules(evaluation.detection),
         "choices": evaluation.choices,
@@ -101,7 +104,9 @@ def make_summary(sources: Sources) -> Summary:
         "seeds": {
             "network": sources.settings.training.seeds,
             "chosen": evaluation.seed,
-            "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
+            "collection": {
+                item.name: item.planned.seed for item in campaigns if item.planned.seed is not None
+            },
         },
     })  # fmt: skip
 
@@ -162,7 +167,7 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
     depths = {
         text
         for item in campaigns
-        if item.experiment != "kinematic"
+        if item.experiment != "kinematic" and item.recorded is None
         for phase in item.plan.protocol.collection.motion
         if isinstance(phase, Press)
         for field, unit in ((phase.depth, "mm"), (phase.force, "N"))
@@ -200,6 +205,21 @@ def _in_words(value: Any) -> str:
             return str(value)
 
 
+def _given(campaigns: Sequence[Collected]) -> dict[str, float | None]:
+    """Return the largest uncertainty of onsets that came with recordings, as part of a document."""
+    found = [
+        given.uncertainty_ns
+        for item in campaigns
+        if item.settings.labelling.rule == "given"
+        for _, recording in item.trials
+        if (origin := recording.record.imported) is not None and (given := origin.given) is not None
+    ]
+    if not found:
+        return {}
+    known = [value for value in found if value is not None]
+    return {"given_within_ms": max(known) / 1e6 if len(known) == len(found) else None}
+
+
 def label_sources(campaigns: Sequence[Collected]) -> dict[str, int]:
     """Count trials with a video, with tracks in its place, and, if there are, with neither."""
     found = Counter(recording.frame_source for item in campaigns for _, recording in item.trials)
@@ -232,7 +252,7 @@ def quality_part(campaigns: Sequence[Collected]) -> Quality:
     quarantined = [known for item in campaigns for known in item.campaign.quarantined()]
     broken_off = sum(known["cause"] == "interrupted" for known in quarantined)
     return Quality(
-        planned=sum(len(item.plan) for item in campaigns),
+        planned=sum(len(item.planned) for item in campaigns),
         committed=sum(len(item.trials) for item in campaigns),
         retaken=sum(str(known["cause"]).startswith("gate") for known in quarantined),
         quarantined=len(quarantined) - broken_off,
@@ -241,15 +261,24 @@ def quality_part(campaigns: Sequence[Collected]) -> Quality:
 
 
 def planned_part(item: Collected, planned_bytes: int) -> Planned:
-    """Compare the plan's seconds and bytes with what the committed trials really took."""
+    """Compare the plan's seconds and bytes with what the committed trials really took.
+
+    Of an imported campaign nothing was planned beyond what is there.
+    """
+    seconds = sum(item.planned.seconds(trial) for trial, _ in item.trials)
+    taken = sum(
+        path.stat().st_size
+        for _, r in item.trials
+        for path in r.folder.iterdir()
+        if path.name != "provenance.json"
+    )
+    if item.recorded is not None:
+        return Planned(
+            seconds=seconds, seconds_collected=seconds, bytes=taken, bytes_collected=taken
+        )
     return Planned(
-        seconds=sum(item.plan.seconds(trial) for trial, _ in item.trials),
+        seconds=seconds,
         seconds_collected=sum(r.record.motion_s or 0.0 for _, r in item.trials),
         bytes=planned_bytes,
-        bytes_collected=sum(
-            path.stat().st_size
-            for _, r in item.trials
-            for path in r.folder.iterdir()
-            if path.name != "provenance.json"
-        ),
+        bytes_collected=taken,
     )

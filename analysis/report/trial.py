@@ -96,6 +96,8 @@ class TrialSection(Content):
     condition: str
     rates: Mapping[str, float]
     tracks: str
+    markers: bool
+    """Their displacements are drawn."""
     paper: str
     figure: Figure
 
@@ -103,21 +105,25 @@ class TrialSection(Content):
 def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSection:
     """Draw the trial."""
     item, recording = example.item, example.recording
-    arrays = Derived.of(store, LABELS, item.name).arrays(recording.trial_id)
-    displacement_px = arrays["displacement_px"]
+    frame_ns, displacement_px = np.empty(0, np.int64), np.empty((0, 0))
+    if "displacement_px" in (
+        kept := Derived.of(store, LABELS, item.name).arrays(recording.trial_id)
+    ):
+        frame_ns, displacement_px = kept["frame_ns"], kept["displacement_px"]
     start, end = dataset.recorded_span(recording)
     event_s, cell = _events(item, recording, start)
     onsets = example.onsets_s()
-    motion_s = (recording.motion_ns[0] - start) / 1e9
-    frame_s = (arrays["frame_ns"] - start) / 1e9
+    motion_s = (recording.motion_ns[0] - start) / 1e9 if recording.record.steps else None
+    frame_s = (frame_ns - start) / 1e9
     svg = figures.trial_overview(
         frame_s, displacement_px, event_s, cell - 0.5, onsets, motion_s,
-        item.settings.labelling.threshold_px, simulated=simulated,
+        item.settings.labelling.threshold_px, item.settings.windows.cells, simulated=simulated,
     )  # fmt: skip
     return TrialSection(
         example.condition,
         _rates(event_s, [0.0, motion_s, *onsets, (end - start) / 1e9]),
         tracks_words(simulated) if recording.frame_source == "tracks" else "",
+        len(frame_ns) > 0,
         PAPER["event_rate"].text,
         Figure(svg, name="trial", data=_data(frame_s, displacement_px, event_s, cell)),
     )

@@ -74,6 +74,11 @@ def marker_displacements(labels: Labels, item: Collected, recording: Recording) 
         FileNotFoundError: the trial was never labelled.
     """
     kept = Derived.of(labels.store, LABELS, item.name).arrays(recording.folder.name)
+    if "xy_px" not in kept:
+        raise StoreError(
+            f"{item.name}: {recording.trial_id}: its label came with the recording, so no markers "
+            "were tracked, which the classifier on frames needs"
+        )
     plate, plane = None, None
     if "plate_px" in kept:
         corners, seen = kept["plate_corners_px"].astype(np.float64), kept["plate_seen"]

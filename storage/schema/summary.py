@@ -232,6 +232,9 @@ class Labels(Part):
     reviewed: dict[str, Int] | None = None
     check: LabelCheck | None = None
     holds: dict[str, Hold] = Field(default_factory=dict)
+    given_within_ms: Number | None = None
+    """Largest uncertainty that is stated of onsets that came with recordings; null where one states
+    none; written only for such onsets."""
 
 
 class HoldoutWindows(Part):

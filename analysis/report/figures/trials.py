@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter
 
 from sliplab.analysis.report.figures.style import (
@@ -30,30 +31,33 @@ def trial_overview(
     event_s: Array,
     event_cell: Array,
     onsets_s: Sequence[float | None],
-    motion_s: float,
+    motion_s: float | None,
     threshold_px: float,
+    cells: int,
     *,
     simulated: bool,
 ) -> str:
     """Marker displacements, event rate and event raster of one trial over time.
 
     Args:
-        frame_s: (n,) seconds; displacement_px: (n, m), the centre marker first.
-        event_s: (k,) seconds of positive events; event_cell: (k,) their cell rows, 0..19.
+        frame_s: (n,) seconds; displacement_px: (n, m), the centre marker first; without markers
+            there are only events.
+        event_s: (k,) seconds of positive events; event_cell: (k,) their cell rows.
         onsets_s: incipient and gross onset, seconds; None if there is none.
-        motion_s: when the slide or retraction begins.
+        motion_s: when the slide or retraction begins; None where nobody knows.
+        cells: rows of cells.
     """
     with plt.rc_context(STYLE):
-        figure, (top, middle, low) = plt.subplots(
-            3, 1, figsize=(6.4, 6.2), sharex=True, height_ratios=(3, 1.6, 2.2)
-        )
-        top.plot(frame_s, displacement_px[:, 1:], color=GREY, lw=0.7, alpha=0.7)
-        top.plot([], [], color=GREY, lw=0.7, label="other papillae")
-        top.plot(frame_s, displacement_px[:, 0], color=RED, lw=1.6, label="centre papilla")
-        top.axhline(threshold_px, color=BLUE, lw=0.8, ls=":", label=f"{threshold_px:g} px")
-        top.set_ylabel("marker displacement (px)")
-        low_limit = float(np.nanmax(displacement_px)) if np.isfinite(displacement_px).any() else 1.0
-        top.set_ylim(-0.03 * low_limit, 1.02 * low_limit)
+        if displacement_px.shape[1]:
+            figure, (top, middle, low) = plt.subplots(
+                3, 1, figsize=(6.4, 6.2), sharex=True, height_ratios=(3, 1.6, 2.2)
+            )
+            _displacements(top, frame_s, displacement_px, threshold_px)
+        else:
+            figure, (middle, low) = plt.subplots(
+                2, 1, figsize=(6.4, 4.2), sharex=True, height_ratios=(1.6, 2.2)
+            )
+            top = middle
         span = float(frame_s[-1]) if len(frame_s) else float(event_s.max(initial=1.0))
         edges = np.arange(0.0, span + 0.03, 0.03)
         rate = np.histogram(event_s, edges)[0] / 0.03 / 1000
@@ -61,22 +65,34 @@ def trial_overview(
         middle.set_ylabel("positive events\n(thousand/s)")
         middle.set_ylim(bottom=0)
         low.plot(event_s, event_cell, ",", color="black", alpha=0.25, rasterized=True)
-        low.set_ylim(19.5, -0.5)
-        low.set_ylabel("cell row (of 20)")
+        low.set_ylim(cells - 0.5, -0.5)
+        low.set_ylabel(f"cell row (of {cells})")
         low.set_xlabel("time since the recording began (s)")
         names = ("incipient onset", "gross onset")
-        for axes in (top, middle, low):
-            axes.axvline(motion_s, color=GREEN, lw=1, ls="--")
+        for axes in dict.fromkeys((top, middle, low)):
+            if motion_s is not None:
+                axes.axvline(motion_s, color=GREEN, lw=1, ls="--")
             for onset, colour in zip(onsets_s, (ORANGE, RED), strict=True):
                 if onset is not None:
                     axes.axvline(onset, color=colour, lw=1.2)
-        top.plot([], [], color=GREEN, lw=1, ls="--", label="motion begins")
+        if motion_s is not None:
+            top.plot([], [], color=GREEN, lw=1, ls="--", label="motion begins")
         for name, colour in zip(names, (ORANGE, RED), strict=True):
             top.plot([], [], color=colour, lw=1.2, label=name)
         handles, titles = top.get_legend_handles_labels()
         figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
         low.set_xlim(0, span)
         return svg_text(figure, simulated)
+
+
+def _displacements(axes: Axes, frame_s: Array, displacement_px: Array, threshold_px: float) -> None:
+    axes.plot(frame_s, displacement_px[:, 1:], color=GREY, lw=0.7, alpha=0.7)
+    axes.plot([], [], color=GREY, lw=0.7, label="other papillae")
+    axes.plot(frame_s, displacement_px[:, 0], color=RED, lw=1.6, label="centre papilla")
+    axes.axhline(threshold_px, color=BLUE, lw=0.8, ls=":", label=f"{threshold_px:g} px")
+    axes.set_ylabel("marker displacement (px)")
+    most = float(np.nanmax(displacement_px)) if np.isfinite(displacement_px).any() else 1.0
+    axes.set_ylim(-0.03 * most, 1.02 * most)
 
 
 def outputs(

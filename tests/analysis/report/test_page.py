@@ -120,7 +120,7 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     figure = Figure(SVG, "name", {})
     commands = Table((EVIL, "command"), [[EVIL, f"sliplab view {EVIL}"]], commands=(1,))
     sections = (
-        TrialSection(EVIL, {EVIL: 1.0}, EVIL, EVIL, figure),
+        TrialSection(EVIL, {EVIL: 1.0}, EVIL, True, EVIL, figure),
         FailureSection(1, 2, [(EVIL, 1)], 1, commands, EVIL),
         SkinSection(EVIL),
     )
@@ -133,7 +133,7 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     assert "Paper, on its own robot:" in page
     assert "What is drawn here is simulated." in page
     assert '<td class="command"><code>sliplab view ' in page
-    plain = render(TrialSection("a", {}, "", "", Figure(SVG)))
+    plain = render(TrialSection("a", {}, "", False, "", Figure(SVG)))
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]
     assert plain.startswith("<!doctype html>")
