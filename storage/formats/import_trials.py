@@ -16,6 +16,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import util
 from pathlib import Path
 
 import numpy as np
@@ -446,7 +447,8 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
             whole.
 
     Raises:
-        InputError: it does not exist, a file is damaged, or two have one name.
+        InputError: it does not exist, a file is damaged, two have one name, or faery is missing.
+        ModuleNotFoundError: the extra `publish` is missing, for MCAP files.
     """
     manifest = None
     if kind != LAB_PICKLES and path.is_dir():
@@ -557,6 +559,8 @@ def _check_names(path: Path, wanted: list[Wanted]) -> None:
             )  # fmt: skip
         if kind in {"raw", "es"} and isinstance(file, Path):
             check_faery(file)
+        if kind == "mcap" and util.find_spec("mcap") is None:
+            raise ModuleNotFoundError("No module named 'mcap'", name="mcap")
 
 
 def name_of(stem: str) -> str:

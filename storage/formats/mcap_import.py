@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -134,6 +134,17 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
     return replace(_other(path, name, found, part.at), lost=lost, packets=part.records)
 
 
+class _Within:
+    """A file of which no more is asked than it has: memory is allocated for what is asked."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._size = file, size
+
+    def read(self, count: int) -> bytes:
+        """Return up to `count` bytes."""
+        return self._file.read(min(count, max(self._size - self._file.tell(), 0)))
+
+
 class _Checked:
     """Checks events and frames of a recording by another program, message by message."""
 
@@ -226,7 +237,8 @@ def _messages(
     part = part or _Part()
     try:
         with path.open("rb") as handle:
-            reader = StreamReader(handle, emit_chunks=True, record_size_limit=_MOST_RECORD)
+            within = _Within(handle, path.stat().st_size)
+            reader = StreamReader(within, emit_chunks=True, record_size_limit=_MOST_RECORD)  # type: ignore[arg-type]  # it calls read alone
             records = iter(reader.records)
             while part.at < part.end and (record := next(records, None)) is not None:
                 if not isinstance(record, DataEnd):
@@ -261,15 +273,15 @@ def _opened(chunk: Any) -> list[Any]:
 
     if chunk.uncompressed_size > _MOST_CHUNK:
         raise FormatError(f"holds a chunk of {chunk.uncompressed_size} bytes")
-    if chunk.compression == "zstd":
-        # the library allocates what the frame says
-        if zstandard.frame_content_size(chunk.data) not in (-1, chunk.uncompressed_size):
-            raise FormatError("holds a chunk of another size than it says")
-    elif chunk.compression == "lz4":
-        chunk = _unpacked_lz4(chunk)
-    elif chunk.compression:
-        raise FormatError(f"is compressed by {chunk.compression!r:.40}, which is unknown")
     try:
+        if chunk.compression == "zstd":
+            # the library allocates what the frame says
+            if zstandard.frame_content_size(chunk.data) not in (-1, chunk.uncompressed_size):
+                raise FormatError("holds a chunk of another size than it says")
+        elif chunk.compression == "lz4":
+            chunk = _unpacked_lz4(chunk)
+        elif chunk.compression:
+            raise FormatError(f"is compressed by {chunk.compression!r:.40}, which is unknown")
         return breakup_chunk(chunk, validate_crc=True)
     except zstandard.ZstdError as error:
         raise FormatError(f"holds a damaged chunk: {error}") from None

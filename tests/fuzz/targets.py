@@ -196,9 +196,11 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
         if name.endswith(".mcap"):  # may hold a whole trial of a store
             shutil.rmtree(box / "again", ignore_errors=True)
             made = Store.create(box / "again")
-            import_trials(made, "again", trials_in(where, "mcap"), where, "mcap")
+            salvage = bool(len(data) % 2)
+            found = trials_in(where, "mcap", salvage=salvage)
+            import_trials(made, "again", found, where, "mcap", salvage=salvage)
             return
-        for trial in trials_in(where, kind_of(where)):
+        for trial in trials_in(where, kind_of(where), salvage=bool(len(data) % 2)):
             sum(len(chunk) for chunk in trial.events())
             sum(len(chunk) for chunk in (trial.frames or (lambda: iter(())))())
             json.dumps([trial.about, trial.condition], allow_nan=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.formats.files import lab_hdf5
+from tests.storage.formats.recordings import FILES, HEADERS, write_aedat4
 from tests.storage.trial_files import campaign, commit
 
 
@@ -90,6 +92,109 @@ def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
     )
     code, *_ = sliplab("verify", store)
     assert code == 0
+
+
+def test_a_damaged_recording_is_exit_1_and_salvaged_when_asked(
+    tmp_path: Path, sliplab: Any
+) -> None:
+    path, store = tmp_path / "a.aedat4", tmp_path / "store"
+    write_aedat4(path)
+    path.write_bytes(path.read_bytes()[:-5000])
+    command = ("import", path, "--store", store, "--name", "a", "--json")
+    code, reported, said = sliplab(*command)
+    assert code == 1
+    error = json.loads(reported)["error"]
+    assert (error["file"], error["exit_code"]) == (str(path), 1)
+    assert "is cut short" in error["message"]
+    assert "--salvage imports 2,300 events up to 68" in error["message"]
+    assert not list(store.glob("campaigns/*"))
+    code, reported, said = sliplab(*command, "--salvage")
+    assert code == 0
+    result = json.loads(reported)
+    (lost,) = result["salvaged"]
+    assert (result["events"], lost["trial"]) == (2300, "a")
+    assert 0 < lost["unread_bytes"] < 2000
+    assert lost["at_byte"] + lost["unread_bytes"] == path.stat().st_size
+    assert "warning: a.aedat4: is not whole" in " ".join(said.split())
+    code, reported, said = sliplab("trials", store)
+    assert "unread_bytes" in reported
+    code, reported, said = sliplab("verify", store, "--json")
+    assert (code, json.loads(reported)["salvaged"]) == (0, ["a/a"])
+    assert "a/a: was salvaged from a damaged file" in " ".join(said.split())
+
+
+def test_a_file_damaged_before_its_first_packet_is_exit_1(tmp_path: Path, sliplab: Any) -> None:
+    path = tmp_path / "a.aedat4"
+    write_aedat4(path)
+    whole = path.read_bytes()
+    for length in (0, 5, 20, HEADERS["aedat4"] - 1, HEADERS["aedat4"] + 20):
+        path.write_bytes(whole[:length])
+        for options in ((), ("--salvage",)):
+            code, *_ = sliplab("import", path, "--store", tmp_path / "s", "--name", "a", *options)
+            assert code == 1
+    assert not list(tmp_path.glob("s/campaigns/*"))
+
+
+def test_what_is_skipped_in_a_folder_is_listed(tmp_path: Path, sliplab: Any) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    write_aedat4(folder / "a.aedat4")
+    lab_hdf5(folder / "b.h5")
+    (folder / "notes.txt").write_text("a note")
+    command = ("import", folder, "--store", tmp_path / "store", "--name", "a", "--json")
+    code, reported, said = sliplab(*command)
+    result = json.loads(reported)
+    assert (code, result["imported"]) == (0, ["a", "b"])
+    assert [item["file"] for item in result["skipped"]] == ["notes.txt"]
+    assert "skipped: notes.txt: is of no known format" in " ".join(said.split())
+
+
+def _mutated(head: bytes, rng: random.Random) -> bytes:
+    """A header with some bytes changed, taken out, put in, or digits made others."""
+    made = bytearray(head)
+    for _ in range(rng.choice((1, 1, 2, 8))):
+        at = rng.randrange(len(made))
+        what = rng.randrange(5)
+        if what == 0:
+            made[at] ^= 1 << rng.randrange(8)
+        elif what == 1:
+            made[at : at + rng.choice((1, 4, 8))] = rng.choice((b"", b"\xff" * 8, bytes(8)))
+        elif what == 2:
+            made[at:at] = rng.randbytes(rng.choice((1, 4, 30)))
+        elif what == 3:
+            del made[at : at + rng.randrange(1, 30)]
+        else:
+            digits = [n for n, value in enumerate(made) if 48 <= value < 58] or [at]
+            made[rng.choice(digits)] = rng.choice(b"0123456789-.x")
+        made = made or bytearray(b"\0")
+    return bytes(made)
+
+
+@pytest.mark.parametrize("count", [5, pytest.param(100, marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", FILES)
+def test_mutated_headers_give_one_message_and_leave_nothing(
+    tmp_path: Path, sliplab: Any, name: str, count: int
+) -> None:
+    file, write = FILES[name]
+    path = tmp_path / file
+    write(path)
+    whole = path.read_bytes()
+    rng = random.Random(f"{name} {count}")
+    refused = 0
+    for number in range(count):
+        size = min(HEADERS[name], len(whole))
+        path.write_bytes(_mutated(whole[:size], rng) + whole[size:])
+        store = tmp_path / str(number)
+        options = ("--salvage",) if rng.random() < 0.3 else ()
+        code, _, said = sliplab("import", path, "--store", store, "--name", "a", *options)
+        assert code in {0, 1, 2}, said
+        assert "Traceback" not in said
+        if code:
+            refused += 1
+            assert "error: " in said
+            assert file in said.replace("\n", "")
+            assert not list(store.glob("campaigns/*"))
+    assert refused
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
-from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
+from sliplab.storage.formats.import_trials import import_trials, kind_of, skipped_in, trials_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -292,3 +292,66 @@ def test_a_size_that_no_header_gives_is_unknown(
     assert ("sensor size" in found.record.imported.unknown) == (size is None)
     events = found.events()
     assert [events.x.tolist(), events.y.tolist()] == [[5, 1500], [7, 1400]]
+
+
+def _mixed(folder: Path) -> None:
+    """One recording of each kind, and what is none."""
+    folder.mkdir()
+    _aedat4(folder / "b.aedat4", _events([3, 4]))
+    lab_hdf5(folder / "a.h5")
+    with h5py.File(folder / "d.hdf5", "w") as file:
+        for name in "xypt":
+            file[f"events/{name}"] = np.arange(2)
+    _pickled(folder / "c_events_on", lab_cells(SIZE, {(3, 5): [10, 12]}))
+    (folder / "notes.txt").write_text("a note")
+    (folder / "video_on").write_text("a note")
+    (folder / "more").mkdir()
+    (folder / "link.h5").symlink_to(folder / "a.h5")
+
+
+@pytest.mark.usefixtures("small")
+def test_a_folder_of_several_formats_is_sorted(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    _mixed(folder)
+    found = _import(tmp_path / "store", folder)
+    origins = [(one.trial_id, one.record.imported) for one in found]
+    assert [(name, about.format) for name, about in origins if about is not None] == [
+        ("a", "lab-hdf5"), ("b", "aedat4"), ("c", "lab-pickles"), ("d", "dsec"),
+    ]  # fmt: skip
+    assert [len(one.events()) for one in found] == [50, 2, 2, 2]
+    skipped = {item.file: item.reason for item in skipped_in(folder, kind_of(folder))}
+    assert list(skipped) == ["link.h5", "more", "notes.txt", "video_on"]
+    assert [skipped["link.h5"], skipped["more"]] == [
+        "is a link",
+        "is a folder; import it by itself",
+    ]
+    assert skipped["notes.txt"].startswith("is of no known format (aedat4, dsec, ")
+    others = {item.file: item.reason for item in skipped_in(folder, "aedat4")}
+    assert others["a.h5"] == "is no aedat4 file"
+    assert "b.aedat4" not in others
+
+
+def test_two_formats_of_one_name_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    """They are mostly one recording, which must not count twice."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    _aedat4(folder / "a.aedat4", _events([3, 4]))
+    for name in ("b.aedat4", "b.h5"):
+        (lab_hdf5 if name == "b.h5" else lambda path: _aedat4(path, _events([3])))(folder / name)
+    with pytest.raises(InputError, match=r"two files for the trial b: b\.aedat4 and b\.h5; .*KIND"):
+        _import(tmp_path / "store", folder)
+    assert Store.open(tmp_path / "store").campaigns() == []
+    assert [one.trial_id for one in _import(tmp_path / "store", folder, "aedat4")] == ["a", "b"]
+
+
+def test_a_missing_library_is_said_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sliplab.storage.formats.prophesee.LIBRARY", "no_such_library")
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    _aedat4(folder / "a.aedat4", _events([3, 4]))
+    _raw(folder / "b.raw", words=EVT2)
+    with pytest.raises(InputError, match=r"b\.raw: .*pip install 'sliplab\[formats\]'"):
+        _import(tmp_path / "store", folder)
+    assert Store.open(tmp_path / "store").campaigns() == []

@@ -4,166 +4,33 @@ from __future__ import annotations
 
 import random
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
-import hdf5plugin
 import numpy as np
 import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
-from sliplab.storage.formats import ros2_messages as ros2
-from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
-from sliplab.storage.formats.flatbuffers import events_buffer
-from sliplab.storage.formats.foreign import Triggers
+from sliplab.storage.formats.aedat4 import Aedat4File
 from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
 from sliplab.storage.schema.trial import Lost
-from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import UNREAD, catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import salvaged, verify
+from tests.storage.formats.recordings import (
+    CHECKED,
+    COUNT,
+    FILES,
+    PACKET,
+    all_events,
+    write_aedat4,
+    write_dsec,
+)
 
-COUNT, PACKET = 3000, 100
-SIZE = (640, 480)
-
-
-def _events(count: int = COUNT) -> EventChunk:
-    rng = np.random.default_rng(7)
-    return EventChunk(
-        rng.integers(0, SIZE[0], count).astype(np.uint16),
-        rng.integers(0, SIZE[1], count).astype(np.uint16),
-        rng.integers(0, 2, count).astype(np.uint8),
-        np.cumsum(rng.integers(0, 60, count)).astype(np.int64),
-    )
-
-
-def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
-    return EventChunk(chunk.x[low:high], chunk.y[low:high], chunk.p[low:high], chunk.t_us[low:high])
-
-
-def _aedat4(path: Path) -> None:
-    """Packets of 100 events, a trigger with each, a frame with every tenth."""
-    streams = {
-        0: Stream("EVTS", "events", SIZE, "camera"),
-        1: Stream("FRME", "frames", (8, 6), "camera"),
-        2: Stream("TRIG", "triggers", None, "camera"),
-    }
-    whole = _events()
-    with Aedat4Writer(path, streams) as file:
-        for number, low in enumerate(range(0, COUNT, PACKET)):
-            file._write(0, events_buffer(_part(whole, low, low + PACKET)))
-            t_us = int(whole.t_us[low])
-            file.triggers(2, Triggers(np.array([t_us]), np.array([1], np.uint8)))
-            if number % 10 == 0:
-                file.picture(1, np.full((6, 8), number, np.uint8), t_us)
-
-
-def _dsec(path: Path, *, swapped: bool = False, **storage: Any) -> None:
-    """Chunks that were appended as a recorder appends them: the columns take turns."""
-    whole = _events()
-    columns = {"x": whole.x, "y": whole.y, "p": whole.p, "t": whole.t_us}
-    storage = storage or dict(hdf5plugin.Blosc(cname="zstd"))
-    with h5py.File(path, "w", libver="latest" if swapped else "earliest") as file:
-        for name, values in columns.items():
-            file.create_dataset(f"events/{name}", (0,), values.dtype, maxshape=(None,),
-                                chunks=(PACKET,), **storage)  # fmt: skip
-        for low in range(0, COUNT, PACKET):
-            for name, values in columns.items():
-                file[f"events/{name}"].resize((low + PACKET,))
-                file[f"events/{name}"][low:] = values[low : low + PACKET]
-            file.flush()
-
-
-def _contiguous(path: Path) -> None:
-    whole = _events()
-    with h5py.File(path, "w") as file:
-        file["events/x"], file["events/y"] = whole.x, whole.y
-        file["events/p"], file["events/t"] = whole.p, whole.t_us
-
-
-def _lab(path: Path) -> None:
-    whole = _events()
-    columns = {"xs": whole.x, "ys": whole.y, "ps": whole.p, "ts": whole.t_us / 1e6}
-    with h5py.File(path, "w") as file:
-        for name, values in columns.items():
-            file.create_dataset(f"events/{name}", data=values, chunks=(500,), compression="gzip")
-        file.attrs["sensor_resolution"] = np.array(SIZE)
-
-
-def _mcap(path: Path, chunk_bytes: int = 2000) -> None:
-    from mcap.writer import CompressionType, Writer
-
-    whole = _events()
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="a recorder")
-        channels = {}
-        for topic, kind in (("/dvs/events", ros2.EVENTS), ("/image", ros2.IMAGE)):
-            schema = writer.register_schema(kind, "ros2msg", ros2.definition(kind))
-            channels[topic] = writer.register_channel(topic, "cdr", schema)
-        for seq, low in enumerate(range(0, COUNT, PACKET)):
-            part = _part(whole, low, low + PACKET)
-            t_ns = int(part.t_us[0]) * 1000
-            data = ros2.event_packet(t_ns, "dvs", SIZE, seq, part)
-            writer.add_message(channels["/dvs/events"], t_ns, data, t_ns, seq)
-            if seq % 10 == 0:
-                image = ros2.image(t_ns, "dvs", np.full((6, 8), seq, np.uint8))
-                writer.add_message(channels["/image"], t_ns, image, t_ns, seq)
-        writer.finish()
-
-
-def _es(path: Path) -> None:
-    """Change events: 7 bits of time with the polarity, column and row; 255 lets 127 us pass."""
-    whole = _events()
-    made = bytearray(b"Event Stream\2\0\0\1" + struct.pack("<HH", *SIZE))
-    steps = np.diff(whole.t_us, prepend=0).tolist()
-    for x, y, p, step in zip(whole.x, whole.y, whole.p, steps, strict=True):
-        made += b"\xff" * (step // 127)
-        made += struct.pack("<BHH", step % 127 << 1 | int(p), int(x), SIZE[1] - 1 - int(y))
-    path.write_bytes(made)
-
-
-def _evt2(path: Path) -> None:
-    whole = _events()
-    words = []
-    high = -1
-    for x, y, p, t in zip(*(column.tolist() for column in vars(whole).values()), strict=True):
-        if t >> 6 != high:
-            high = t >> 6
-            words.append(8 << 28 | high)
-        words.append(p << 28 | (t & 63) << 22 | x << 11 | y)
-    path.write_bytes(
-        b"% evt 2.0\n% format EVT2;width=640;height=480\n" + struct.pack(f"<{len(words)}I", *words)
-    )
-
-
-def _dat(path: Path) -> None:
-    whole = _events()
-    x, y, p, t = (column.astype(np.uint64) for column in vars(whole).values())
-    words = t | x << np.uint64(32) | y << np.uint64(46) | p << np.uint64(60)
-    path.write_bytes(b"% Version 2\n% Width 640\n% Height 480\n\x0c\x08" + words.tobytes())
-
-
-FILES: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "aedat4": ("a.aedat4", _aedat4),
-    "dsec": ("a.h5", _dsec),
-    "dsec newest": ("a.h5", lambda path: _dsec(path, swapped=True)),
-    "dsec checked": ("a.h5", lambda path: _dsec(path, fletcher32=True)),
-    "contiguous": ("a.h5", _contiguous),
-    "lab": ("a.h5", _lab),
-    "mcap": ("a.mcap", _mcap),
-    "es": ("a.es", _es),
-    "evt2": ("a.raw", _evt2),
-    "dat": ("a.dat", _dat),
-}
 SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6))]
-CHECKED = {"dsec checked", "mcap"}
-"""Formats whose packets have checksums, so that no damage goes by unseen."""
 
 
 @dataclass
@@ -203,7 +70,7 @@ def _check_refused(folder: Path, path: Path, message: str) -> None:
 
 def _is_prefix(found: Recording) -> int:
     """Check that a trial's events are the first of the whole file's; return their number."""
-    events, whole = found.events(), _events()
+    events, whole = found.events(), all_events()
     count = len(events)
     for name in ("t_us", "x", "y", "p"):
         np.testing.assert_array_equal(getattr(events, name), getattr(whole, name)[:count])
@@ -311,7 +178,7 @@ def test_flipped_bits_give_no_traceback_and_where_seen_a_prefix(
 def test_the_table_at_the_end_of_aedat4_counts_what_is_lost(tmp_path: Path) -> None:
     """As dv-processing writes it: place, stream and items of every packet."""
     path = tmp_path / "a.aedat4"
-    _aedat4(path)
+    write_aedat4(path)
     data = bytearray(path.read_bytes())
     with Aedat4File(path) as file:
         packets = [(file.at, stream, size) for stream, size in file._headers()]
@@ -359,7 +226,7 @@ def _table(rows: list[tuple[int, int, int, int]]) -> bytes:
 
 def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
-    _dsec(path, fletcher32=True)
+    write_dsec(path, fletcher32=True)
     with h5py.File(path) as file:
         info = file["events/y"].id.get_chunk_info(11)
     data = bytearray(path.read_bytes())
@@ -375,7 +242,7 @@ def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
 
 def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.aedat4"
-    _aedat4(path)
+    write_aedat4(path)
     path.write_bytes(path.read_bytes()[:-10])
     store = Store.create(tmp_path / "store")
     found = trials_in(path, "aedat4", salvage=True)
