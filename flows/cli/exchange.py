@@ -39,8 +39,8 @@ def import_(
 ) -> None:
     """Import recordings of other programs into a new campaign; unknown values are marked.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw or es; by default the content decides,
-    for each file of a folder.
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw, es, croissant or lerobot; by default the
+    content decides, for each file of a folder.
     """
     from dataclasses import replace
 

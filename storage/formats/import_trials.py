@@ -49,13 +49,14 @@ from sliplab.storage.formats.foreign import (
 )
 from sliplab.storage.formats.lab_pickles import Pair, pairs, read_pair
 from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
-from sliplab.storage.formats.original import Original, StoredTrial
+from sliplab.storage.formats.original import StoredTrial
 from sliplab.storage.formats.prophesee import (
     check_faery,
     faery_type,
     read_by_faery,
     salvage_by_faery,
 )
+from sliplab.storage.formats.published_import import publication_at, read_publication
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
@@ -91,7 +92,9 @@ SALVAGE: dict[str, Reader] = {
 }
 """Readers of what stands whole before the damage in a file, by format."""
 LAB_PICKLES = "lab-pickles"
-KINDS = (*READERS, LAB_PICKLES)
+DATA_SETS: dict[str, Callable[[Path], Iterator[ForeignTrial]]] = {"croissant": read_publication}
+"""Readers of folders that are one data set, by format."""
+KINDS = (*READERS, LAB_PICKLES, *DATA_SETS)
 MIXED = "mixed"
 """Files of several formats in one folder."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
@@ -268,8 +271,10 @@ def _take(
 ) -> tuple[dict[str, int], list[str]]:
     """Commit one trial; return its counts and warnings."""
     if isinstance(trial, StoredTrial) and trial.original is not None:
+        about = {"imported": now(), "from": trial.source}
         with as_damage():
-            return _restore(store, campaign, trial, trial.original), []
+            rows = trial.original.restore(store, campaign, safe_name(trial.name), about)
+        return {"events": rows.events, "frames": rows.frames}, []
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
         (first_us, last_us), warnings = _fill(writer, trial)
@@ -282,26 +287,6 @@ def _take(
         writer.discard()
         raise
     return {"events": rows.events, "frames": rows.frames}, warnings
-
-
-def _restore(
-    store: Store, campaign: Campaign, trial: StoredTrial, original: Original
-) -> dict[str, int]:
-    """Commit a trial of a store as it was, with its label and clocks; return its counts."""
-    writer = campaign.begin(safe_name(trial.name), original.frame_px(), original.rate_hz)
-    try:
-        original.keep_label(store, campaign.name, trial.name)
-        kept = {"imported": now(), "from": trial.source}
-        original.commit(
-            writer, Provenance.model_validate({**original.provenance.to_json(), **kept})
-        )
-    except BaseException:
-        writer.discard()
-        original.drop_label(store, campaign.name, trial.name)
-        raise
-    original.keep_sync(campaign, campaign.recording(trial.name))
-    counts = original.record.counts
-    return {"events": counts.events, "frames": counts.frames}
 
 
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
@@ -429,6 +414,8 @@ def kind_of(path: Path) -> str:
     Raises:
         InputError: none of them is known, or one is damaged.
     """
+    if (whole := _data_set(path)) is not None:
+        return whole
     found = _sort(path)
     if not found:
         raise InputError(
@@ -436,6 +423,11 @@ def kind_of(path: Path) -> str:
         )
     kinds = {kind for _, kind, _ in found}
     return kinds.pop() if len(kinds) == 1 else MIXED
+
+
+def _data_set(path: Path) -> str | None:
+    """Return the format of a folder that is one data set; None for any other path."""
+    return "croissant" if publication_at(path) is not None else None
 
 
 def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[ForeignTrial]:
@@ -450,6 +442,11 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
         InputError: it does not exist, a file is damaged, two have one name, or faery is missing.
         ModuleNotFoundError: the extra `publish` is missing, for MCAP files.
     """
+    if kind in DATA_SETS:
+        if not path.is_dir():
+            raise InputError(path, "", None, f"is no folder; {kind} is a folder of files")
+        yield from DATA_SETS[kind](path)
+        return
     manifest = None
     if kind != LAB_PICKLES and path.is_dir():
         manifest = _read_manifest(path)
@@ -479,7 +476,7 @@ def skipped_in(path: Path, kind: str) -> list[Skipped]:
     Raises:
         InputError: as `trials_in`.
     """
-    if not path.is_dir():
+    if not path.is_dir() or kind in DATA_SETS:
         return []
     manifest = _read_manifest(path) if kind != LAB_PICKLES else None
     taken: set[str | None] = {EXPORT_MANIFEST}

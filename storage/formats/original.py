@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import islice
-from typing import Any
+from typing import Any, Protocol
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy.typing as npt
 from sliplab.storage.files import make_folder, write_bytes, write_json
 from sliplab.storage.formats.foreign import ForeignTrial, FormatError
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.schema.trial import Provenance, SyncResult, TrialRecord
+from sliplab.storage.schema.trial import Counts, Provenance, SyncResult, TrialRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
@@ -29,6 +29,7 @@ from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
     FrameChunk,
+    Json,
     PoseChunk,
     PulseChunk,
     ScalarChunk,
@@ -100,7 +101,7 @@ class Original:
         for (file, name), values in self.columns.items():
             self._check_column(file, name, values)
         if self.label_arrays is not None:
-            _check_arrays(self.label_arrays)
+            check_arrays(self.label_arrays)
 
     def _check_column(self, file: str, name: str, values: Array) -> None:
         streams, known = self.record.streams, {**COLUMNS, **TRACKS, **TIMING}
@@ -125,6 +126,19 @@ class Original:
         if first is None:
             return self.record.geometry.frame_px or (1, 1)  # tracks, whose frames nobody has
         return first.shape[1], first.shape[0]
+
+    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
+        """Commit the trial with its label and clocks; as `Restorable`."""
+        writer = campaign.begin(name, self.frame_px(), self.rate_hz)
+        try:
+            self.keep_label(store, campaign.name, name)
+            self.commit(writer, Provenance.model_validate({**self.provenance.to_json(), **about}))
+        except BaseException:
+            writer.discard()
+            self.drop_label(store, campaign.name, name)
+            raise
+        self.keep_sync(campaign, campaign.recording(name))
+        return self.record.counts
 
     def commit(self, writer: TrialWriter, provenance: Provenance) -> None:
         """Write the trial and make it visible.
@@ -240,11 +254,32 @@ class Original:
         write_json(campaign.sync_file(recording.folder.name), kept.to_json())
 
 
+class Restorable(Protocol):
+    """A trial of a store that can be committed to another store as it was."""
+
+    @property
+    def campaign(self) -> CampaignTexts:
+        """The campaign that it is of."""
+
+    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
+        """Commit the trial with its label and clocks.
+
+        Args:
+            about: what its provenance keeps of the import.
+
+        Returns:
+            Rows of its streams.
+
+        Raises:
+            FormatError: it is damaged.
+        """
+
+
 @dataclass(frozen=True)
 class StoredTrial(ForeignTrial):
     """A foreign trial that is a trial of a store, with all that belongs to it."""
 
-    original: Original | None = None
+    original: Restorable | None = None
 
 
 def _group(data: Mapping[str, Array], group: str, parts: tuple[str, ...]) -> list[Array]:
@@ -256,7 +291,8 @@ def _group(data: Mapping[str, Array], group: str, parts: tuple[str, ...]) -> lis
     return [column for column in found if column is not None]
 
 
-def _check_arrays(data: bytes) -> None:
+def check_arrays(data: bytes) -> None:
+    """Check the arrays of a label, an ``.npz`` file. Raises FormatError where they are damaged."""
     try:
         with ZipFile(BytesIO(data)) as file:
             if sum(item.file_size for item in file.infolist()) > _MOST_ARRAYS:

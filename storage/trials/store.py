@@ -222,13 +222,21 @@ class Campaign:
         self, trial_id: str, frame_px: tuple[int, int] | None, rate_hz: int, *, spool: bool = False
     ) -> TrialWriter:
         """Begin to write a trial; an interrupted attempt under its id is quarantined first."""
+        incoming, target = self.places(trial_id)
+        return TrialWriter(incoming, target, frame_px, rate_hz, spool=spool)
+
+    def places(self, trial_id: str) -> tuple[Path, Path]:
+        """Return a trial's folder while it is written, and once it is committed; both are free.
+
+        An interrupted attempt under its id is quarantined first.
+        """
         incoming = self.inside(self.folder / "incoming" / safe_name(trial_id))
         target = self.inside(self.folder / "trials" / trial_id)
         if incoming.exists():
             self.quarantine(incoming, "interrupted")
         if target.is_dir() and (cause := incomplete(target)) is not None:
             self.quarantine(target, f"damaged: {cause}")
-        return TrialWriter(incoming, target, frame_px, rate_hz, spool=spool)
+        return incoming, target
 
     def sweep(self) -> int:
         """Clean up after a killed program or a failing disk, before trials are taken.
