@@ -90,6 +90,7 @@ class TrialSection(Content):
         rates: positive events a second by phase.
         tracks: the tracks in a video's place, as text; nothing where there is a video.
         paper: the event rate that the paper shows.
+        fault: that of the file from which it was salvaged; nothing for a whole trial.
     """
 
     template: ClassVar[str] = "trial.html"
@@ -100,6 +101,7 @@ class TrialSection(Content):
     """Their displacements are drawn."""
     paper: str
     figure: Figure
+    fault: str = ""
 
 
 def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSection:
@@ -126,6 +128,7 @@ def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSe
         len(frame_ns) > 0,
         PAPER["event_rate"].text,
         Figure(svg, name="trial", data=_data(frame_s, displacement_px, event_s, cell)),
+        "" if recording.record.lost is None else recording.record.lost.reason,
     )
 
 

@@ -242,6 +242,16 @@ def _limits(publication: Publication) -> Iterable[str]:
         yield from _SIMULATED_LIMITS
     if any(IMPORTED in campaign.info for campaign in publication.campaigns):
         yield from _IMPORTED_LIMITS
+    torn = [
+        f"`{campaign.name}/{recording.trial_id}`"
+        for campaign, recording in publication.recordings
+        if recording.record.lost is not None
+    ]
+    if torn:
+        yield (
+            "These trials were salvaged from damaged files and are not whole; `imported.lost` in "
+            f"their record says what is missing: {', '.join(torn)}."
+        )
 
 
 def _rows(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -334,6 +334,11 @@ class TrialRecord(Document):
     streams: dict[str, StreamRecord] = Field(default_factory=dict)
     """Named streams besides those counted, by name; written only where there are any."""
 
+    @property
+    def lost(self) -> Lost | None:
+        """What is missing, of a trial that was salvaged from a damaged file."""
+        return None if self.imported is None else self.imported.lost
+
     @classmethod
     def parse(cls, data: Json, path: Path) -> TrialRecord:
         """Check the record of a trial, committed or not.

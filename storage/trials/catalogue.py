@@ -231,8 +231,8 @@ def _row(campaign: str, recording: Recording) -> Row:
 
 def _missing(recording: Recording) -> Row:
     """Return the cell of a trial that was salvaged from a damaged file; of others there is none."""
-    origin = recording.record.imported
-    return {} if origin is None or origin.lost is None else {UNREAD: origin.lost.unread_bytes}
+    lost = recording.record.lost
+    return {} if lost is None else {UNREAD: lost.unread_bytes}
 
 
 @dataclass

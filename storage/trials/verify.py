@@ -107,8 +107,7 @@ def salvaged(store: Store) -> list[str]:
             names = sorted(campaign.committed()) if IMPORTED in campaign.info else []
         for name in names:
             with suppress(StoreError):
-                origin = campaign.recording(name).record.imported
-                if origin is not None and origin.lost is not None:
+                if campaign.recording(name).record.lost is not None:
                     found.append(f"{campaign.name}/{name}")
     return found
 

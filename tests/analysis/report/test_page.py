@@ -133,7 +133,10 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     assert "Paper, on its own robot:" in page
     assert "What is drawn here is simulated." in page
     assert '<td class="command"><code>sliplab view ' in page
+    torn = render(TrialSection("a", {}, "", False, "", Figure(SVG), "is cut short"))
+    assert "It is not whole: it was salvaged from a file that is cut short." in torn
     plain = render(TrialSection("a", {}, "", False, "", Figure(SVG)))
+    assert "not whole" not in plain
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]
     assert plain.startswith("<!doctype html>")

@@ -15,6 +15,7 @@ from rocrate.rocrate import ROCrate
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.export_trials import label_table
+from sliplab.storage.formats.import_trials import import_trials, trials_in
 from sliplab.storage.formats.publication import About, Publication
 from sliplab.storage.formats.publish import publish
 from sliplab.storage.schema.trial import Provenance
@@ -23,6 +24,7 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify_trial
 from tests.flows.older import older_store
+from tests.storage.formats.recordings import write_aedat4
 from tests.storage.trial_files import FRAME, campaign, commit, fill, record
 
 # of mlcroissant's own calls of rdflib and pandas
@@ -228,3 +230,22 @@ def test_a_licence_of_ones_own_has_a_name_and_no_address(tmp_path: Path) -> None
     publish(publication(Store.open(tmp_path / "store"), about=about), output, "croissant")
     assert json.loads((output / "croissant.json").read_text())["license"] == "LicenseRef-Lab"
     assert ROCrate(output).root_dataset["license"].id == "#LicenseRef-Lab"
+
+
+def test_a_published_store_says_which_trials_are_not_whole(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "store")
+    for name in ("a", "b"):
+        path = tmp_path / f"{name}.aedat4"
+        write_aedat4(path)
+        if name == "b":
+            path.write_bytes(path.read_bytes()[:-5000])
+    trials = trials_in(tmp_path, "aedat4", salvage=True)
+    import_trials(store, "theirs", trials, tmp_path, "aedat4", salvage=True)
+    publish(publication(store), tmp_path / "out", "croissant")
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "salvaged from damaged files and are not whole" in card
+    assert "is missing: `theirs/b`." in card
+    data = mlcroissant.Dataset(tmp_path / "out" / "croissant.json")
+    unread = [one["trials/unread_bytes"] for one in data.records("trials")]
+    assert len(unread) == 2
+    assert unread[1] > 0
