@@ -264,12 +264,17 @@ class Trial:
             pixels, shape (n, m), NaN where a marker was not seen.
 
         Raises:
-            StoreError: the trial has no label yet.
+            StoreError: the trial has no label yet, or one that came with its recording.
         """
         try:
             found = Derived.of(self._store, "labels", self.campaign).arrays(self.id)
         except FileNotFoundError:
             raise self._unlabelled() from None
+        if "displacement_px" not in found:
+            raise StoreError(
+                f"{self.campaign}/{self.id}: its label came with the recording, so no marker was "
+                "tracked"
+            )
         return found["frame_ns"], found["displacement_px"].astype(np.float64)
 
     def _unlabelled(self) -> StoreError:

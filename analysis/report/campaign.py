@@ -78,7 +78,10 @@ def collected_section(
     frames = summary.labels is not None and any(
         count for name, count in summary.labels.source.items() if name != "events"
     )
-    kept = source_words(summary) if frames else "nothing, for this rig has no frame camera"
+    without = "nothing, for this rig has no frame camera"
+    if all(item.recorded is not None for item in campaigns):
+        without = "nothing: the recordings have no frames"
+    kept = source_words(summary) if frames else without
     return CollectedSection(summary.quality, kept, grids, Table(columns, rows))
 
 

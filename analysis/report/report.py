@@ -137,8 +137,14 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         trial = trial_section(store, example, simulated=simulated)
         rule = sources.evaluation.detection[example.item.name]
         outputs = output_section(example, counts, rule, simulated=simulated)
-    holdout, sensitivity = None, None
-    if simulated:
+    holdout, sensitivity, skins = None, None, None
+    collected_here = any(item.recorded is None for item in campaigns)
+    if collected_here:
+        skins = skin_section(
+            programs.get("generalisation"), command(store, "generalisation"),
+            kinematic.accuracy.strict, simulated=simulated,
+        )  # fmt: skip
+    if simulated and collected_here:
         how = command(store, "holdout")
         holdout = holdout_section(summary.holdout, kinematic, how, FILES["holdout"])
         found = programs.get("guesses")
@@ -165,12 +171,9 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
             campaigns, summary.sync, page=(store.folder / "report" / clocks.PAGE).exists(),
             simulated=simulated,
         ),
-        skin_section(
-            programs.get("generalisation"), command(store, "generalisation"),
-            kinematic.accuracy.strict, simulated=simulated,
-        ),
+        skins,
         sensitivity,
-        tradeoff_section(store, programs),
+        tradeoff_section(store, programs) if collected_here else None,
         _provenance(summary),
     ]  # fmt: skip
     return [section for section in sections if section is not None]
