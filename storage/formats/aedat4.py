@@ -177,7 +177,11 @@ class Aedat4File:
             yield picture
 
     def _inside(self, number: int) -> Iterator[EventChunk]:
-        for chunk in self.events(number, 0):
+        last = 0
+        for data in self._packets(number):
+            words = _event_words(data)
+            chunk = _empty(len(words) // 2)
+            last = _split(words, chunk, last)
             check_pixels(chunk, self.streams[number].size)
             yield chunk
 
@@ -199,30 +203,23 @@ class Aedat4File:
         except (FormatError, pa.ArrowException, OSError):
             return None
 
-    def events(self, number: int, together: int = _PACKET_EVENTS) -> Iterator[EventChunk]:
-        """Yield the events of a stream, packets together up to `together` events.
+    def events(self, number: int) -> Iterator[EventChunk]:
+        """Yield the events of a stream, packets together up to `_PACKET_EVENTS` events.
 
         A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
         """
-        room = _empty(together)
+        room = _empty(_PACKET_EVENTS)
         filled = last = 0
         for data in self._packets(number):
-            rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], "<u8")
-            count = len(rows) // 2
+            words = _event_words(data)
+            count = len(words) // 2
             if filled and filled + count > len(room):
                 yield _part(room, 0, filled)
                 filled = 0
-                room = _empty(together)
+                room = _empty(_PACKET_EVENTS)
             if count > len(room):
                 room = _empty(count)
-            if not rows.flags.aligned:
-                rows = rows.copy()
-            rows.flags.writeable = False  # `_split_events` is compiled for such
-            new = _part(room, filled, filled + count)
-            last = _split_events(rows, new.x, new.y, new.p, new.t_us, last)
-            if last < 0:
-                event_chunk(new.x, new.y, new.p, new.t_us)
-                raise FormatError("contains events with decreasing times")
+            last = _split(words, _part(room, filled, filled + count), last)
             filled += count
         if filled:
             yield _part(room, 0, filled)
@@ -330,6 +327,31 @@ def _middle_ns(frame: Table) -> int:
     if end < start:
         raise FormatError(f"holds a frame whose exposure starts at {start} us and ends at {end} us")
     return (start + end) * 500
+
+
+def _event_words(data: memoryview) -> Any:
+    """Return two 64-bit words an event of a packet."""
+    words = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], "<u8")
+    if not words.flags.aligned:
+        words = words.copy()
+    words.flags.writeable = False  # `_split_events` is compiled for such
+    return words
+
+
+def _split(words: Any, chunk: EventChunk, last: int) -> int:
+    """Fill a chunk from the words of its events; return the time of the last, us.
+
+    Args:
+        last: that of the event before.
+
+    Raises:
+        FormatError: a pixel or time is none, or a time earlier than the one before.
+    """
+    last = int(_split_events(words, chunk.x, chunk.y, chunk.p, chunk.t_us, last))
+    if last < 0:
+        event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
+        raise FormatError("contains events with decreasing times")
+    return last
 
 
 @njit(cache=True, nogil=True)

@@ -12,6 +12,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -51,6 +52,12 @@ from sliplab.storage.trials.store import INFO, PROTOCOL, RIG
 
 MAGIC = b"\x89MCAP0\r\n"
 _MOST_RECORD, _MOST_CHUNK, _MOST_KEPT = 1 << 28, 1 << 28, 1 << 30
+_FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI"), 2
+"""Kind and length of a footer's record, places of the summary and of its index, checksum."""
+_FAULTS = (
+    struct.error, OverflowError, ValueError, KeyError, RuntimeError, MemoryError, OSError, EOFError,
+)  # fmt: skip
+"""What the `mcap` library raises, besides its own errors, where a file is damaged."""
 _FRAMES_AT_ONCE = 32
 _LATEST_NS = 1 << 62
 DocumentT = TypeVar("DocumentT", bound=Document)
@@ -117,9 +124,7 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
         for message in _messages(path, found, {ros2.EVENTS, ros2.IMAGE}, part=part):
             reader.check(*message)
     except FormatError as error:
-        size = path.stat().st_size
         reason = str(error)
-        lost = Lost(at_byte=part.at, unread_bytes=size - part.at, reason=reason)
     else:
         return read_mcap(path, name)
     if found.about is not None or found.library.startswith(LIBRARY):
@@ -128,10 +133,40 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
             "says whether it is simulated, is at its end: publish it again"
         )
     # topics behind the damage are not the file's any more
-    found = _Found()
-    for _ in _messages(path, found, {ros2.EVENTS}, part=_Part(part.at)):
-        pass
+    found, frames = _Found(), 0
+    for kind, topic, _ in _messages(path, found, {ros2.IMAGE}, part=_Part(part.at)):
+        frames += topic == found.first(kind)
+    lost = Lost(at_byte=part.at, unread_bytes=path.stat().st_size - part.at, reason=reason)
+    said = _messages_said(path, found.first(ros2.IMAGE))
+    if said is not None:
+        lost = lost.model_copy(update={"frames": max(said - frames, 0)})
     return replace(_other(path, name, found, part.at), lost=lost, packets=part.records)
+
+
+def _messages_said(path: Path, topic: str | None) -> int | None:
+    """Return the number of messages of a topic by the statistics at a file's end, if it has any."""
+    from mcap.exceptions import McapError
+    from mcap.records import Channel, Statistics
+    from mcap.stream_reader import StreamReader
+
+    channels: set[int] = set()
+    counts: dict[int, int] | None = None
+    with path.open("rb") as handle, suppress(McapError, *_FAULTS):
+        size = path.stat().st_size
+        handle.seek(size - _FOOTER.size - len(MAGIC))
+        code, _, start, *_ = _FOOTER.unpack(handle.read(_FOOTER.size))
+        if topic is None or code != _FOOTER_CODE or not 0 < start < size:
+            return None
+        handle.seek(start)
+        within = _Within(handle, size)
+        reader = StreamReader(within, skip_magic=True, record_size_limit=_MOST_RECORD)  # type: ignore[arg-type]  # it calls read alone
+        for record in reader.records:
+            if isinstance(record, Channel) and record.topic == topic:
+                channels.add(record.id)
+            elif isinstance(record, Statistics):
+                counts = record.channel_message_counts
+    found = None if counts is None else sum(counts.get(channel, 0) for channel in channels)
+    return found if found is not None and channels and found < _LATEST_NS else None
 
 
 class _Within:
@@ -253,16 +288,7 @@ def _messages(
         raise FormatError(f"is not an MCAP file: {error}") from None
     except McapError as error:
         raise Damage(f"is damaged or cut short: {str(error) or type(error).__name__}") from None
-    except (
-        struct.error,
-        OverflowError,
-        ValueError,
-        KeyError,
-        RuntimeError,
-        MemoryError,
-        OSError,
-        EOFError,
-    ) as error:
+    except _FAULTS as error:
         raise Damage(f"is damaged or cut short: {error}") from None
 
 

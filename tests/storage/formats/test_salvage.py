@@ -13,7 +13,7 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
-from sliplab.storage.formats.aedat4 import Aedat4File
+from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
 from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.trials.catalogue import UNREAD, catalogue
@@ -26,8 +26,10 @@ from tests.storage.formats.recordings import (
     FILES,
     PACKET,
     all_events,
+    part_of,
     write_aedat4,
     write_dsec,
+    write_mcap,
 )
 
 SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6))]
@@ -86,15 +88,22 @@ def _try(folder: Path, name: str, data: bytes) -> tuple[Outcome, Outcome]:
     if plain.error is None:
         assert saved.error is None
         assert saved.lost is None
-    elif saved.error is None:
+    elif saved.error is not None:
+        assert "--salvage imports" not in plain.error.message
+    else:
         assert isinstance(plain.error, DamagedFile)
-        assert "; --salvage imports " in plain.error.message
+        assert f"; --salvage imports {_counted(saved)} events up to " in plain.error.message
         lost = saved.lost
         assert lost is not None
         assert 0 <= lost.at_byte <= len(data)
         assert 0 <= lost.unread_bytes <= len(data)
         assert lost.reason
     return plain, saved
+
+
+def _counted(outcome: Outcome) -> str:
+    assert outcome.found is not None
+    return f"{outcome.found.record.counts.events:,}"
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +233,18 @@ def _table(rows: list[tuple[int, int, int, int]]) -> bytes:
     return struct.pack("<I", len(made)) + bytes(made)
 
 
+def test_a_packet_with_an_event_outside_of_the_camera_is_damaged(tmp_path: Path) -> None:
+    path, whole = tmp_path / "a.aedat4", all_events()
+    whole.x[17 * PACKET + 5] = 640
+    with Aedat4Writer(path, {0: Stream("EVTS", "events", (640, 480), "camera")}) as file:
+        for low in range(0, COUNT, PACKET):
+            file.events(0, part_of(whole, low, low + PACKET))
+    plain, saved = _try(tmp_path, "aedat4", path.read_bytes())
+    assert "outside of the 640 x 480 pixels" in str(plain.error)
+    assert saved.found is not None
+    assert _is_prefix(saved.found) == 17 * PACKET
+
+
 def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write_dsec(path, fletcher32=True)
@@ -238,6 +259,24 @@ def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
     assert outcome.lost is not None
     assert outcome.lost.events == 19 * PACKET
     assert outcome.lost.at_byte <= info.byte_offset
+
+
+def test_the_statistics_of_mcap_count_the_frames_that_are_lost(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_mcap(path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    outcome = _import(tmp_path / "store", path, salvage=True)
+    assert outcome.found is not None
+    assert 0 < _is_prefix(outcome.found) < COUNT
+    assert outcome.lost is not None
+    assert outcome.lost.frames == 3 - outcome.found.record.counts.frames
+    assert outcome.lost.events is None
+    path.write_bytes(data[:-1])
+    cut = _import(tmp_path / "cut", path, salvage=True)
+    assert cut.lost is not None
+    assert cut.lost.frames is None
 
 
 def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
