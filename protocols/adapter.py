@@ -12,6 +12,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from sliplab.protocols.adapter_parts import (
+    AdaptedStreams,
+    Factor,
+    FieldName,
+    FieldRule,
+    GivenMotion,
+    Labels,
+    TrialFiles,
+)
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel, load
 
@@ -19,6 +28,7 @@ CLASSES = "classes"
 """The experiment whose recordings show one of several classes each, instead of a slip."""
 Experiment = Literal["kinematic", "gravity", "disturbance", "classes"]
 Role = Literal["train", "validation", "test"]
+FactorName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -65,6 +75,15 @@ class Adapter(StrictModel):
     """What the trials are; ``classes``: each recording shows one of several classes."""
     classes: tuple[str, ...] = ()
     """Names of the classes in their order; by default those that occur."""
+    trials: TrialFiles
+    fields: dict[FieldName, FieldRule] = Field(default_factory=dict)
+    """Fields that are made from others, in their order."""
+    factors: dict[FactorName, Factor] = Field(default_factory=dict)
+    """What was varied, each the values of a field."""
+    streams: AdaptedStreams
+    labels: Labels = Labels()
+    motion: GivenMotion | None = None
+    """When the slide begins and ends, where that is known."""
     split: AdapterSplit = AdapterSplit()
     analysis: AnalysisSettings = AnalysisSettings()
 
@@ -87,6 +106,33 @@ class Adapter(StrictModel):
         if len(set(self.classes)) != len(self.classes):
             raise KeyedError("classes", list(self.classes), "names a class twice")
         return self
+
+    @model_validator(mode="after")
+    def _labels_of_a_kind(self) -> Adapter:
+        if self.labels.whole is not None and self.experiment != CLASSES:
+            raise KeyedError("labels.class", self.labels.whole, "is for experiment: classes")
+        if self.labels.onsets is not None and self.experiment == CLASSES:
+            raise KeyedError(
+                "labels.onsets", None, "are of slip; an experiment of classes has class or spans"
+            )
+        if self.motion is not None and self.experiment == CLASSES:
+            raise KeyedError("motion", None, "is for experiments of slip")
+        return self
+
+    @model_validator(mode="after")
+    def _clocks_there(self) -> Adapter:
+        for key, part in (
+            ("labels.onsets", self.labels.onsets),
+            ("labels.spans", self.labels.spans),
+            ("motion", self.motion),
+        ):
+            if part is not None and getattr(self.streams, part.clock, part) is None:
+                raise KeyedError(f"{key}.clock", part.clock, "is of a stream that there is not")
+        return self
+
+    def of_the_trials(self) -> dict[str, Any]:
+        """Return all that decides what the trials are, as plain data by key."""
+        return self.model_dump(mode="json", exclude={"analysis", "split", "title", "about"})
 
 
 def load_adapter(path: Path) -> Adapter:

@@ -126,8 +126,7 @@ class RecordedPlan:
     @cached_property
     def collection_hash(self) -> str:
         """Hash of all of the adapter that decides what the trials are."""
-        data = self.adapter.model_dump(mode="json", exclude={"analysis", "split", "title"})
-        return hash_data(data)
+        return hash_data(self.adapter.of_the_trials())
 
     @cached_property
     def analysis_hash(self) -> str:

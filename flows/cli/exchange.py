@@ -25,7 +25,18 @@ def import_(
     ],
     path: Annotated[Path | None, typer.Argument(metavar="", show_default=False)] = None,
     store: StoreOption = ...,  # type: ignore[assignment]  # typer's word for: must be given
-    name: Annotated[str, typer.Option("--name", help="Name of the new campaign.")] = ...,  # type: ignore[assignment]  # as above
+    name: Annotated[
+        str | None,
+        typer.Option("--name", help="Name of the new campaign; by default the adapter's."),
+    ] = None,
+    adapter: Annotated[
+        Path | None,
+        typer.Option("--adapter", help="Adapter (YAML) of a data set with labels and factors."),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="With --adapter: list what would be imported."),
+    ] = False,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Mark the trials as simulated.")
     ] = False,
@@ -40,8 +51,24 @@ def import_(
     """Import recordings of other programs into a new campaign; unknown values are marked.
 
     KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw, es, croissant or lerobot; by default the
-    content decides, for each file of a folder.
+    content decides, for each file of a folder. --adapter imports a data set with its labels and
+    factors, from a folder or .zip, as a campaign to train and evaluate on (docs/adapters.md).
     """
+    if adapter is not None:
+        for option, given in (("KIND", path is not None), ("--salvage", salvage),
+                              ("--simulated", simulated)):  # fmt: skip
+            if given:
+                raise InputError(option, "", None, "cannot be given beside --adapter")
+        from sliplab.flows.cli.adapted import import_by_adapter
+
+        import_by_adapter(
+            adapter, Path(kind_or_path), store, name, dry_run=dry_run, as_json=as_json
+        )
+        return
+    if dry_run:
+        raise InputError("--dry-run", "", None, "is for an import with --adapter")
+    if name is None:
+        raise InputError("--name", "", None, "is missing: the name of the new campaign")
     from dataclasses import replace
 
     from sliplab.flows.collecting.requests import store_lock

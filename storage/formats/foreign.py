@@ -68,6 +68,14 @@ def read_head(path: Path) -> bytes:
 
 
 @dataclass(frozen=True)
+class Skipped:
+    """A part of a folder that is not imported."""
+
+    file: str
+    reason: str
+
+
+@dataclass(frozen=True)
 class Triggers:
     """Triggers of the event camera as the file has them, shape (n,)."""
 

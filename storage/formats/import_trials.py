@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib import util
 from pathlib import Path
@@ -43,6 +43,7 @@ from sliplab.storage.formats.foreign import (
     ForeignTrial,
     FormatError,
     NoEvents,
+    Skipped,
     as_damage,
     check_pixels,
     read_head,
@@ -398,14 +399,6 @@ def _record(
     except ValidationError as error:
         key, value, expected = first_fault(error)
         raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None
-
-
-@dataclass(frozen=True)
-class Skipped:
-    """A part of a folder that is not imported."""
-
-    file: str
-    reason: str
 
 
 def kind_of(path: Path) -> str:

@@ -13,7 +13,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from sliplab.storage.formats.foreign import (
     read_head,
     rounded_us,
 )
+from sliplab.storage.formats.numpy_files import MAGIC, read_header
 from sliplab.storage.formats.pickles import parse_pickle, read_bounded
 from sliplab.storage.streams import EventChunk
 
@@ -38,14 +38,6 @@ _PART = re.compile(
 )
 SIZES = ((480, 640), (260, 346), (180, 240), (128, 128))
 """Rows and columns of the lab's cameras: DVXplorer, DAVIS346, DAVIS240, eDVS."""
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-_HEADER_FAULTS = (
-    ValueError, KeyError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError,
-)  # fmt: skip
-NUMPY = np.lib.format.MAGIC_PREFIX
 _MOST_EVEN = 1 << 24
 """Times of a `.npy` file with as many in every pixel, which few recordings have."""
 _PICKLES = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
@@ -88,7 +80,7 @@ def pairs(files: list[Path]) -> list[Pair]:
 
 def _is_pickle(path: Path) -> bool:
     """Check how a file begins that only half of its name calls the lab's."""
-    return read_head(path).startswith((NUMPY, *_PICKLES))
+    return read_head(path).startswith((MAGIC, *_PICKLES))
 
 
 def read_pair(pair: Pair, name: str) -> ForeignTrial:
@@ -135,7 +127,7 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
 def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, Any]:
     """Rows and columns of the camera, and columns x, y, p and t of one file, by pixel."""
     data = read_bounded(path)
-    found = _from_numpy(data, path) if data.startswith(NUMPY) else parse_pickle(data, path)
+    found = _from_numpy(data, path) if data.startswith(MAGIC) else parse_pickle(data, path)
     if not isinstance(found, np.ndarray):
         found = _as_array(found)
     if found.dtype != object or found.ndim != 2 or not _is_camera(found.shape):
@@ -193,11 +185,7 @@ def _as_array(found: Any) -> Any:
 def _from_numpy(data: bytes, path: Path) -> Any:
     """The array of a `.npy` file, whose objects are a pickle behind numpy's header."""
     file = io.BytesIO(data)
-    try:
-        version = np.lib.format.read_magic(file)
-        shape, fortran, dtype = _HEADERS[version](file)
-    except _HEADER_FAULTS as error:
-        raise FormatError(f"has a damaged numpy header ({' '.join(str(error).split())})") from None
+    shape, fortran, dtype = read_header(file)
     at = file.tell()
     if dtype.kind == "O":
         found = parse_pickle(data[at:], path, at)

@@ -1,0 +1,355 @@
+"""Streams of a foreign data set from its files: events, frames, poses, forces and readings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+
+from sliplab.protocols.adapter_parts import (
+    EventFiles,
+    FrameFiles,
+    PoseFiles,
+    ScalarFiles,
+    WrenchFiles,
+)
+from sliplab.storage.formats.data_folder import DataFolder
+from sliplab.storage.formats.foreign import MOST_PX, ForeignTrial, FormatError, event_chunk
+from sliplab.storage.formats.import_trials import LAB_PICKLES, READERS
+from sliplab.storage.formats.lab_pickles import pairs, read_pair
+from sliplab.storage.formats.numpy_files import array_of
+from sliplab.storage.formats.tables import read_columns, times_ns
+from sliplab.storage.streams import (
+    F64,
+    I64,
+    U8,
+    EventChunk,
+    FrameChunk,
+    PoseChunk,
+    ScalarChunk,
+    WrenchChunk,
+)
+
+_BLOCK_CELLS = 1 << 24
+_BLOCK_EVENTS = 1 << 22
+_FRAMES_AT_ONCE = 32
+MOST_EVENTS = 1 << 32
+"""Events that an array of counts may state."""
+
+
+@dataclass(frozen=True)
+class EventSource:
+    """Events that can be read.
+
+    Attributes:
+        chunks: in order of time.
+        size_px: columns and rows of the sensor; called once `chunks` were read.
+        span_us: begin and end of the recording, where the file says them.
+        foreign: the recording of a format that may hold more than events.
+    """
+
+    chunks: Callable[[], Iterator[EventChunk]]
+    size_px: Callable[[], tuple[int, int] | None]
+    span_us: tuple[int, int] | None = None
+    foreign: ForeignTrial | None = None
+
+
+def read_counts(array: Any, part: EventFiles) -> EventSource:
+    """Turn counts per time step into events.
+
+    A count c in step k becomes c events at ``k step + i step / c`` for i from 0 to c - 1, cut to
+    microseconds: steps of the same length give the counts back exactly.
+
+    Args:
+        array: counts, with the axes that `part` names.
+
+    Raises:
+        FormatError: other axes, another size, or a count that is none.
+    """
+    axes: list[str] = list(part.axes)
+    if array.ndim != len(axes):
+        raise FormatError(
+            f"holds an array of shape {array.shape}; the adapter names {len(axes)} axes "
+            f"({', '.join(axes)})"
+        )
+    if array.dtype.kind not in "iufb":
+        raise FormatError(f"holds {array.dtype}, which are no counts")
+    for axis in ("polarity", "y"):
+        if axis not in axes:
+            array, axes = np.expand_dims(array, -1), [*axes, axis]
+    places = "taxel" if "taxel" in axes else "x"
+    array = array.transpose([axes.index(axis) for axis in ("step", "y", places, "polarity")])
+    steps, rows, columns, polarities = array.shape
+    order = part.polarity_order if "polarity" in part.axes else ("positive",)
+    if polarities != len(order):
+        raise FormatError(
+            f"holds {polarities} polarities; polarity_order of the adapter names {len(order)}"
+        )
+    if 0 in array.shape or max(rows, columns) > MOST_PX:
+        raise FormatError(f"holds counts of {columns} x {rows} places in {steps} steps")
+    if part.size_px is not None and (columns, rows) != part.size_px:
+        raise FormatError(
+            f"holds {columns} x {rows} places; size_px of the adapter is {list(part.size_px)}"
+        )
+    step_us = round((part.step_ms or 0.0) * 1000)
+    polarity = np.array([name == "positive" for name in order], np.uint8)
+    block = max(1, _BLOCK_CELLS // (rows * columns * polarities))
+
+    def chunks() -> Iterator[EventChunk]:
+        total = 0
+        for first in range(0, steps, block):
+            counts = _whole(array[first : first + block], part)
+            total += int(counts.sum())
+            if total > MOST_EVENTS:
+                raise FormatError(f"holds more than {MOST_EVENTS} events")
+            yield _spread(counts, first, step_us, polarity)
+
+    return EventSource(chunks, lambda: (columns, rows), (0, steps * step_us))
+
+
+def _whole(counts: Any, part: EventFiles) -> I64:
+    if counts.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            good = (counts >= 0) & (counts == np.floor(counts)) & (counts <= MOST_EVENTS)
+    else:
+        good = (counts >= 0) & (counts <= MOST_EVENTS)
+    if not good.all():
+        step, row, column, polarity = (int(i) for i in np.argwhere(~good)[0])
+        raise FormatError(
+            f"holds {counts[step, row, column, polarity]} where a count belongs: step {step} of "
+            f"its block, row {row}, {'taxel' if 'taxel' in part.axes else 'column'} {column}, "
+            f"polarity {polarity}"
+        )
+    return np.asarray(counts, np.int64)
+
+
+def _spread(counts: I64, first: int, step_us: int, polarity: U8) -> EventChunk:
+    step, y, x, p = np.nonzero(counts)
+    each = counts[step, y, x, p]
+    begin = np.repeat(np.cumsum(each) - each, each)
+    index = np.arange(len(begin)) - begin
+    step, y, x, p, each = (np.repeat(column, each) for column in (step, y, x, p, each))
+    t = (first + step) * step_us + index * step_us // each
+    order = np.argsort(t, kind="stable")
+    return event_chunk(x[order], y[order], polarity[p[order]], t[order])
+
+
+def read_events(
+    folder: DataFolder, names: Sequence[str], part: EventFiles, paths: Sequence[Path]
+) -> EventSource:
+    """Open the events of a trial.
+
+    Args:
+        names: its files; paths: them on the disk, for formats that need it.
+
+    Raises:
+        FormatError: a file cannot be right.
+    """
+    if part.format == "counts":
+        return read_counts(array_of(folder.read(names[0])), part)
+    if part.format in {"csv", "numpy"}:
+        return _event_table(folder, names[0], part)
+    if part.format == LAB_PICKLES:
+        found = pairs(list(paths))
+        if len(found) != 1:
+            raise FormatError(f"are files of {len(found)} trials of the lab's names, not of one")
+        foreign = read_pair(found[0], found[0].stem)
+    else:
+        if len(paths) != 1:
+            raise FormatError(f"are {len(paths)} files for one trial")
+        foreign = READERS[part.format][1](paths[0], "trial")
+    return EventSource(foreign.events, foreign.event_px, None, foreign)
+
+
+def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource:
+    assert part.columns is not None
+    assert part.unit is not None
+    columns = {
+        key: column for key, column in part.columns.model_dump().items() if column is not None
+    }
+    unit, size, positive = part.unit, part.size_px, part.positive
+
+    def chunks() -> Iterator[EventChunk]:
+        found = read_columns(folder, name, part.format, columns)
+        t_us = times_ns(found["t"], unit)
+        t_us = (t_us + 500) // 1000 if unit != "us" else t_us // 1000
+        x = _places(found["x"], "x")
+        y = _places(found["y"], "y") if "y" in found else np.zeros(len(x), np.int64)
+        if "p" in found:
+            p = np.isin(found["p"], positive) if positive else found["p"] > 0
+        else:
+            p = np.ones(len(x), bool)
+        if len(t_us) and np.any(t_us[1:] < t_us[:-1]):
+            order = np.argsort(t_us, kind="stable")
+            t_us, x, y, p = t_us[order], x[order], y[order], p[order]
+        for first in range(0, len(t_us), _BLOCK_EVENTS):
+            cut = slice(first, first + _BLOCK_EVENTS)
+            yield event_chunk(x[cut], y[cut], p[cut], t_us[cut])
+
+    return EventSource(chunks, lambda: size)
+
+
+def _places(values: Any, name: str) -> Any:
+    if values.dtype.kind != "f":
+        return values
+    with np.errstate(invalid="ignore"):
+        whole = values.astype(np.int64)
+        bad = np.flatnonzero(whole != values)
+    if len(bad):
+        raise FormatError(f"has {name} = {values[bad[0]]} in row {bad[0] + 1}, which is no place")
+    return whole
+
+
+def read_frames(
+    folder: DataFolder,
+    names: Sequence[str],
+    times: Sequence[str],
+    part: FrameFiles,
+    paths: Sequence[Path],
+) -> tuple[tuple[int, int], Callable[[], Iterator[FrameChunk]]]:
+    """Open the frames of a trial; return width and height, and what reads them.
+
+    Raises:
+        FormatError: a file cannot be right, or has another number of frames than of times.
+    """  # fmt: skip
+    images = _images(folder, names, part, paths)
+    first = next(images(), None)
+    if first is None:
+        raise FormatError("holds no frame")
+    size = (first.shape[1], first.shape[0])
+    stated: I64 | None = None
+    if part.times is not None:
+        form = "csv" if not times[0].lower().endswith((".npy", ".npz")) else "numpy"
+        if form == "numpy":
+            stated = times_ns(_one_column(folder, times[0], part.times.column), part.times.unit)
+        else:
+            found = read_columns(folder, times[0], form, {"t": part.times.column})
+            stated = times_ns(found["t"], part.times.unit)
+        if np.any(stated[1:] <= stated[:-1]):
+            raise FormatError("has times of frames that do not rise")
+
+    def chunks() -> Iterator[FrameChunk]:
+        held: list[U8] = []
+        count = 0
+        for image in images():
+            if image.shape != first.shape:
+                raise FormatError(f"holds frames of {image.shape} and of {first.shape}")
+            held.append(image)
+            if len(held) == _FRAMES_AT_ONCE:
+                yield _frames(held, count, stated, part)
+                count += len(held)
+                held = []
+        if held:
+            yield _frames(held, count, stated, part)
+        count += len(held)
+        if stated is not None and count != len(stated):
+            raise FormatError(f"holds {count} frames, and {len(stated)} times of frames")
+
+    return size, chunks
+
+
+def _one_column(folder: DataFolder, name: str, column: str | int) -> Any:
+    data = folder.read(name)
+    if name.lower().endswith(".npy"):
+        array = array_of(data)
+        if array.ndim == 1 and array.dtype.kind in "iuf":
+            return array
+    return read_columns(folder, name, "numpy", {"t": column})["t"]
+
+
+def _frames(images: list[U8], first: int, stated: I64 | None, part: FrameFiles) -> FrameChunk:
+    number = np.arange(first, first + len(images), dtype=np.int64)
+    if stated is None:
+        t_ns = np.rint(number * (1e9 / float(part.rate_hz or 1))).astype(np.int64)
+    else:
+        t_ns = stated[first : first + len(images)]
+        if len(t_ns) != len(images):
+            raise FormatError(f"holds more than {first + len(t_ns)} frames, as there are times")
+    return FrameChunk(np.stack(images), number, t_ns, t_ns, np.zeros(len(images), np.uint8))
+
+
+def _images(
+    folder: DataFolder, names: Sequence[str], part: FrameFiles, paths: Sequence[Path]
+) -> Callable[[], Iterator[U8]]:
+    if part.format == "images":
+
+        def from_images() -> Iterator[U8]:
+            for name in names:
+                data = np.frombuffer(folder.read(name), np.uint8)
+                try:
+                    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+                except cv2.error:
+                    image = None
+                if image is None:
+                    raise FormatError(f"holds no image that can be read: {name}")
+                yield np.asarray(image, np.uint8)
+
+        return from_images
+    if part.format == "numpy":
+        array = array_of(folder.read(names[0]))
+        if array.ndim != 3 or array.dtype != np.uint8 or 0 in array.shape:
+            raise FormatError(
+                f"holds {array.dtype} of shape {array.shape}; frames are uint8 of shape (frames, "
+                "height, width)"
+            )
+        return lambda: iter(array)
+
+    def from_video() -> Iterator[U8]:
+        try:
+            with av.open(str(paths[0])) as video:
+                for frame in video.decode(video=0):
+                    yield frame.to_ndarray(format="gray")
+        except (av.FFmpegError, IndexError, ValueError) as error:
+            raise FormatError(f"is no video that can be read: {error}") from None
+
+    return from_video
+
+
+def read_poses(folder: DataFolder, name: str, part: PoseFiles) -> PoseChunk:
+    """Read the poses of a trial. Raises FormatError: the table cannot be right."""
+    t_ns, found = _samples(folder, name, part)
+    metres, radians = part.length == "m", part.angle == "rad"
+    xyz = _vectors(found, ("x", "y", "z"), len(t_ns)) * (1000.0 if metres else 1.0)
+    turned = _vectors(found, ("rx", "ry", "rz"), len(t_ns))
+    return PoseChunk(t_ns, t_ns, xyz, np.rad2deg(turned) if radians else turned)
+
+
+def read_wrench(folder: DataFolder, name: str, part: WrenchFiles) -> WrenchChunk:
+    """Read forces and torques. Raises FormatError: the table cannot be right."""
+    t_ns, found = _samples(folder, name, part)
+    force = _vectors(found, ("fx", "fy", "fz"), len(t_ns))
+    return WrenchChunk(t_ns, t_ns, force, _vectors(found, ("tx", "ty", "tz"), len(t_ns)))
+
+
+def read_scalar(folder: DataFolder, name: str, part: ScalarFiles) -> ScalarChunk:
+    """Read one quantity. Raises FormatError: the table cannot be right."""
+    t_ns, found = _samples(folder, name, part)
+    return ScalarChunk(t_ns, t_ns, found["value"].astype(np.float64), part.quantity_unit)
+
+
+def _samples(
+    folder: DataFolder, name: str, part: PoseFiles | WrenchFiles | ScalarFiles
+) -> tuple[I64, dict[str, Any]]:
+    columns = {
+        key: column for key, column in part.columns.model_dump().items() if column is not None
+    }
+    found = read_columns(folder, name, part.format, columns)
+    t_ns = times_ns(found["t"], part.unit)
+    if np.any(t_ns[1:] < t_ns[:-1]):
+        at = int(np.flatnonzero(t_ns[1:] < t_ns[:-1])[0])
+        raise FormatError(f"has times that run backwards after row {at + 1}")
+    for key, values in found.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            at = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise FormatError(f"has {columns[key]} = {values[at]} in row {at + 1}")
+    return t_ns, found
+
+
+def _vectors(found: dict[str, Any], keys: tuple[str, str, str], rows: int) -> F64:
+    columns = [found.get(key, np.zeros(rows)) for key in keys]
+    return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)

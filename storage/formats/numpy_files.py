@@ -1,0 +1,76 @@
+"""Arrays of numpy's files: checked against the bytes that are there, and never unpickled."""
+
+from __future__ import annotations
+
+import io
+import math
+from tokenize import TokenError
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+
+from sliplab.storage.formats.foreign import FormatError
+
+MAGIC = np.lib.format.MAGIC_PREFIX
+ZIP_MAGIC = b"PK\x03\x04"
+_HEAD_BYTES = 1 << 16
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+_FAULTS = (
+    ValueError, KeyError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError,
+)  # fmt: skip
+
+
+def read_header(file: Any) -> tuple[tuple[int, ...], bool, Any]:
+    """Return shape, order (True: columns first) and type of the array that follows in a file.
+
+    Raises:
+        FormatError: the header is damaged.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        return _HEADERS[version](file)
+    except _FAULTS as error:
+        raise FormatError(f"has a damaged numpy header ({' '.join(str(error).split())})") from None
+
+
+def array_of(data: Any) -> Any:
+    """Return the array in the bytes of a ``.npy`` file, without a copy.
+
+    Raises:
+        FormatError: it is no such file, is damaged, or holds objects instead of numbers.
+    """
+    head = io.BytesIO(bytes(data[:_HEAD_BYTES]))
+    if head.getvalue()[: len(MAGIC)] != MAGIC:
+        raise FormatError("is no array of numpy (.npy)")
+    shape, fortran, dtype = read_header(head)
+    if dtype.hasobject:
+        raise FormatError("holds Python objects, which are not read; save numbers")
+    there, wanted = len(data) - head.tell(), math.prod(shape) * dtype.itemsize
+    if there != wanted:
+        raise FormatError(f"holds {there} bytes for an array of shape {shape}, not {wanted}")
+    if not wanted:
+        return np.empty(shape, dtype)
+    numbers = np.frombuffer(data, dtype, offset=head.tell())
+    return numbers.reshape(shape, order="F" if fortran else "C")
+
+
+def arrays_of(data: Any, most_bytes: int) -> dict[str, Any]:
+    """Return the arrays in the bytes of an ``.npz`` file by name.
+
+    Raises:
+        FormatError: as `array_of`, or they are larger than `most_bytes` together.
+    """
+    try:
+        with ZipFile(io.BytesIO(bytes(data))) as packed:
+            items = [item for item in packed.infolist() if item.filename.endswith(".npy")]
+            if sum(item.file_size for item in items) > most_bytes:
+                raise FormatError(f"holds more than {most_bytes >> 20} MiB")
+            return {item.filename[:-4]: array_of(packed.read(item)) for item in items}
+    except (BadZipFile, OSError, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"is a damaged .npz file ({error})") from None

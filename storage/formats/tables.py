@@ -1,0 +1,292 @@
+"""Tables of a foreign data set: small ones of text, row by row, and long ones of numbers.
+
+Small tables (trials, labels) are CSV, a JSON list of objects, or JSON lines; their values stay the
+text that they were, so that no digit of a time is lost. Long ones (events, poses) are CSV or
+numpy's arrays, read column by column.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv as arrow_csv
+
+from sliplab.protocols.adapter_parts import TIME_UNITS
+from sliplab.protocols.errors import InputError
+from sliplab.storage.formats.data_folder import MOST_BYTES, DataFolder
+from sliplab.storage.formats.foreign import LATEST_US, FormatError
+from sliplab.storage.formats.numpy_files import ZIP_MAGIC, array_of, arrays_of
+from sliplab.storage.streams import I64
+
+MOST_TABLE = 1 << 26
+_SEPARATORS = "\t;, "
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a small table.
+
+    Attributes:
+        number: of its line, or of the object in a JSON list, from 1.
+        values: by column; empty cells are left out.
+    """
+
+    place: str
+    number: int
+    values: Mapping[str, str]
+
+    def error(self, column: str, expected: str) -> InputError:
+        """Return the error of one cell."""
+        return InputError(
+            self.place, f"row {self.number}, {column}", self.values.get(column), expected
+        )
+
+    def time_ns(self, column: str, unit: str) -> int | None:
+        """Return a time; None where the cell is empty.
+
+        Raises:
+            InputError: it is no number, or beyond any time.
+        """
+        text = self.values.get(column)
+        if text is None:
+            return None
+        found = exact_ns(text, unit)
+        if found is None:
+            raise self.error(column, f"must be a time in {unit}, or empty")
+        return found
+
+
+def exact_ns(text: str, unit: str) -> int | None:
+    """Return a time as whole nanoseconds; None for what is no number, or beyond any time."""
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        return None
+    if not value.is_finite() or value.copy_abs() > Decimal("1e30"):
+        return None
+    found = int((value * TIME_UNITS[unit]).to_integral_value())
+    return found if abs(found) < LATEST_US * 1000 else None
+
+
+def read_rows(folder: DataFolder, name: str) -> list[Row]:
+    """Read a small table; the ending says which: ``.json``, ``.jsonl``, ``.ndjson``, else CSV.
+
+    Raises:
+        InputError: it is damaged, has no heading, a column twice, or is larger than 64 MiB.
+    """
+    place = folder.place(name)
+    data = bytes(folder.read(name)[: MOST_TABLE + 1])
+    if len(data) > MOST_TABLE:
+        raise InputError(place, "", None, f"is larger than {MOST_TABLE >> 20} MiB")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(place, f"byte {error.start}", None, "is not UTF-8 text") from None
+    ending = name.lower().rpartition(".")[2]
+    if ending == "json":
+        return _from_json(place, _json(place, text, None), "list")
+    if ending in {"jsonl", "ndjson"}:
+        lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
+        return [
+            row
+            for number, line in lines
+            for row in _from_json(place, [_json(place, line, number)], "lines", number)
+        ]
+    return _from_csv(place, text)
+
+
+def _json(place: str, text: str, line: int | None) -> Any:
+    try:  # numbers stay text, with all of their digits
+        return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
+    except (ValueError, RecursionError) as error:
+        where = "" if line is None else f"row {line}"
+        raise InputError(place, where, None, f"is not JSON: {error}") from None
+
+
+def _from_json(place: str, found: Any, what: str, first: int = 1) -> list[Row]:
+    if not isinstance(found, list):
+        raise InputError(place, "", None, "must be a list of objects, one a row")
+    rows = []
+    for number, item in enumerate(found, first):
+        if not isinstance(item, dict):
+            raise InputError(place, f"row {number}", None, "must be an object: {column: value}")
+        values = {}
+        for column, value in item.items():
+            if isinstance(value, list | dict):
+                raise InputError(place, f"row {number}, {column}", None, "must be text or a number")
+            if value is not None and value != "":
+                values[column] = str(value).lower() if isinstance(value, bool) else value.strip()
+        rows.append(Row(place, number, values))
+    return rows
+
+
+def _separator(line: str) -> str:
+    """Return what separates the columns of a line of CSV."""
+    return next((each for each in _SEPARATORS[:3] if each in line), " " if " " in line else ",")
+
+
+def _from_csv(place: str, text: str) -> list[Row]:
+    reader = csv.reader(
+        io.StringIO(text), delimiter=_separator(text.partition("\n")[0]), strict=True
+    )
+    rows: list[Row] = []
+    columns: list[str] | None = None
+    try:
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if columns is None:
+                columns = [cell.strip() for cell in cells]
+                if twice := next((c for c in columns if columns.count(c) > 1), None):
+                    raise InputError(place, "row 1", twice, "is the name of two columns")
+                continue
+            if len(cells) != len(columns):
+                raise InputError(
+                    place, f"row {reader.line_num}", None,
+                    f"has {len(cells)} cells below a heading of {len(columns)} columns",
+                )  # fmt: skip
+            values = {
+                column: cell.strip()
+                for column, cell in zip(columns, cells, strict=True)
+                if cell.strip()
+            }
+            rows.append(Row(place, reader.line_num, values))
+    except csv.Error as error:
+        raise InputError(place, f"row {reader.line_num}", None, f"is not CSV: {error}") from None
+    if columns is None:
+        raise InputError(place, "", None, "is empty; its first line names the columns")
+    return rows
+
+
+def read_columns(
+    folder: DataFolder, name: str, form: str, columns: Mapping[str, str | int]
+) -> dict[str, Any]:
+    """Read columns of numbers from a long table.
+
+    Args:
+        form: ``csv`` or ``numpy``: a structured array, a two-dimensional one, or an ``.npz`` with
+            an array a column.
+        columns: name or index of each column.
+
+    Returns:
+        One-dimensional arrays of one length, by the keys of `columns`.
+
+    Raises:
+        FormatError: it is damaged, lacks a column, or a cell is no number.
+    """
+    data = folder.read(name)
+    if form == "csv":
+        return _csv_columns(data, columns)
+    is_npz = bytes(data[: len(ZIP_MAGIC)]) == ZIP_MAGIC
+    found: Any = arrays_of(data, MOST_BYTES) if is_npz else array_of(data)
+    if isinstance(found, dict):
+        there = found
+    elif found.dtype.names is not None:
+        there = {column: found[column] for column in found.dtype.names}
+    elif found.ndim == 2:
+        there = {str(index): found[:, index] for index in range(found.shape[1])}
+    else:
+        raise FormatError(
+            f"holds an array of shape {found.shape}; a table has rows and columns, or is structured"
+        )
+    arrays = {key: _column(there, column) for key, column in columns.items()}
+    if len({len(array) for array in arrays.values()}) > 1:
+        raise FormatError("has columns of different lengths")
+    return arrays
+
+
+def _column(there: Mapping[str, Any], column: str | int) -> Any:
+    array = there.get(str(column))
+    if array is None:
+        raise FormatError(f"has no column {column}; there are {', '.join(there) or 'none'}")
+    if array.ndim != 1 or array.dtype.kind not in "iufb":
+        raise FormatError(f"has a column {column} that is not one number a row")
+    return array
+
+
+def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
+    head = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace")
+    first = head.partition("\n")[0].rstrip("\r")
+    separator = _separator(first)
+    cells = [cell.strip().strip('"') for cell in first.split(separator)]
+    headed = not all(_is_number(cell) for cell in cells)
+    if headed:
+        there = {cell: str(index) for index, cell in enumerate(cells)}
+        there |= {str(index): str(index) for index in range(len(cells)) if str(index) not in there}
+    else:
+        there = {str(index): str(index) for index in range(len(cells))}
+    for column in columns.values():
+        if str(column) not in there:
+            raise FormatError(f"has no column {column}; there are {', '.join(cells)}")
+    wanted = {key: f"f{there[str(column)]}" for key, column in columns.items()}
+    names = list(dict.fromkeys(wanted.values()))
+    try:
+        table = arrow_csv.read_csv(
+            pa.BufferReader(pa.py_buffer(data)),
+            arrow_csv.ReadOptions(
+                autogenerate_column_names=True, skip_rows=int(headed), block_size=1 << 24
+            ),
+            arrow_csv.ParseOptions(delimiter=separator),
+            arrow_csv.ConvertOptions(include_columns=names),
+        )
+    except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
+        if "Empty CSV file" in str(error):
+            return {key: np.empty(0, np.int64) for key in wanted}
+        raise FormatError(f"is not CSV: {' '.join(str(error).split())}") from None
+    return {
+        key: _numbers(table.column(name), columns[key], 1 + headed) for key, name in wanted.items()
+    }
+
+
+def _numbers(column: Any, name: str | int, first_row: int) -> Any:
+    kind = column.type
+    if pa.types.is_null(kind) and not len(column):
+        return np.empty(0, np.int64)
+    number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    if not number:
+        values = column.slice(0, 1 << 20).to_pylist()
+        at = next((k for k, v in enumerate(values) if not _is_number(str(v))), None)
+        where = "" if at is None else f": row {first_row + at} is {values[at]!r:.40}"
+        raise FormatError(f"has a column {name} that is not all numbers{where}")
+    if column.null_count:
+        at = int(np.flatnonzero(column.is_null().to_numpy())[0])
+        raise FormatError(f"has an empty cell in column {name}: row {first_row + at}")
+    return column.to_numpy()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def times_ns(times: Any, unit: str, what: str = "time") -> I64:
+    """Return times in a unit as nanoseconds: whole ones exactly, fractions rounded.
+
+    Raises:
+        FormatError: one is not a number, or beyond any time.
+    """
+    factor = TIME_UNITS[unit]
+    limit = LATEST_US * 1000 // factor
+    if not len(times):
+        return np.empty(0, np.int64)
+    if times.dtype.kind == "f":
+        good = np.isfinite(times) & (np.abs(np.where(np.isfinite(times), times, 0)) < limit)
+    else:
+        good = (times < limit) & (times > -limit if times.dtype.kind == "i" else True)
+    if not good.all():
+        at = int(np.flatnonzero(~good)[0])
+        raise FormatError(f"has a {what} that is no time in {unit}: row {at + 1} is {times[at]}")
+    if times.dtype.kind == "f":
+        return np.asarray(np.rint(times.astype(np.float64) * factor), np.int64)
+    return np.asarray(times, np.int64) * factor
