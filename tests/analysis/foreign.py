@@ -31,6 +31,9 @@ def chunk(t_us: Any, x: Any = 0, y: Any = 0, p: Any = 1) -> EventChunk:
     return EventChunk(x_.astype(np.uint16), y_.astype(np.uint16), p_.astype(np.uint8), times)
 
 
+_FILES = "\ntrials: {files: '*.raw'}\nstreams: {events: {format: raw}}\n"
+
+
 def foreign_campaign(
     folder: Path,
     adapter: str,
@@ -43,12 +46,13 @@ def foreign_campaign(
     """Write a campaign of a store, each trial with its events and its `imported` part.
 
     Args:
+        adapter: without `trials` and `streams`, which nothing but the import reads.
         trials: by id; a part without ``span_ns`` gets one second.
     """
     campaign = Store.create(folder).campaign(name)
     about = {"adapter": 1, "from": "data", "format": "adapter", "when": "2026-11-24T00:00:00Z"}
     info: Any = {"name": name, "simulated": False, "experiment": experiment, "imported": about}
-    campaign.update(info, adapter, "# No rig.\n")
+    campaign.update(info, adapter + _FILES, "# No rig.\n")
     clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
     for trial, (events, origin) in trials.items():
         span = origin.get("span_ns", (0, 1_000_000_000))
