@@ -38,6 +38,7 @@ from sliplab.storage.formats.foreign import (
     as_damage,
     check_pixels,
     event_chunk,
+    grey,
 )
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import U8, EventChunk, FrameChunk
@@ -259,7 +260,8 @@ class Aedat4File:
             if not last <= t_ns < LATEST_US * 1000:
                 raise FormatError("contains frames with decreasing or invalid times")
             last = t_ns
-            yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
+            levels = np.frombuffer(pixels, np.uint8).reshape(height, width, channels)
+            yield Picture(grey(levels), t_ns)
 
     def _packets(self, number: int) -> Iterator[memoryview]:
         """Yield the unpacked packets of one stream; each is valid until the next."""
@@ -411,14 +413,6 @@ def _zstd_size(frame: bytes) -> int:
     return int.from_bytes(frame[at : at + width], "little") + (256 if width == 2 else 0)
 
 
-def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
-    if channels == 1:
-        return np.array(pixels, np.uint8).reshape(height, width)
-    levels = pixels.reshape(height, width, channels)[..., :3].astype(np.uint32)  # blue, green, red
-    weighed = levels @ np.array([114, 587, 299], np.uint32) + 500
-    return np.asarray(weighed // 1000, np.uint8)
-
-
 def _streams(text: bytes) -> dict[int, Stream]:
     if b"<!" in text:
         raise FormatError("has a header with entity definitions")
@@ -520,10 +514,10 @@ def salvage_aedat4(path: Path, name: str) -> ForeignTrial:
 
 def _trial(file: Aedat4File, path: Path, name: str, end: int | None) -> ForeignTrial:
     events, triggers, frames = (file.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES))
-    if events is None:
+    main = frames if events is None else events
+    if main is None:
         raise FormatError("contains no event stream")
     streams = file.streams
-    frame_px = None
     with as_damage():
         found = None if triggers is None else file.triggers(triggers)
         first = None if frames is None else next(file.pictures(frames), None)
@@ -532,7 +526,7 @@ def _trial(file: Aedat4File, path: Path, name: str, end: int | None) -> ForeignT
 
     def all_events() -> Iterator[EventChunk]:
         with Aedat4File(path, end) as again:
-            yield from again.events(events)
+            yield from again.events(events) if events is not None else ()
 
     def all_frames() -> Iterator[FrameChunk]:
         with Aedat4File(path, end) as again:
@@ -547,11 +541,11 @@ def _trial(file: Aedat4File, path: Path, name: str, end: int | None) -> ForeignT
         path.name,
         all_events,
         "as the file has it: Unix time, us, where a camera wrote it",
-        lambda: streams[events].size,
+        lambda: None if events is None else streams[events].size,
         found,
         None if frame_px is None else all_frames,
         frame_px,
-        simulated=SIMULATED in streams[events].source,
-        about={"camera": streams[events].source, "left_out": left_out},
+        simulated=SIMULATED in streams[main].source,
+        about={"camera": streams[main].source, "left_out": left_out},
         unknown=("sync grade", "poses", "motion", "condition"),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +12,15 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.trial import Lost
-from sliplab.storage.streams import I64, U8, EventChunk, FrameChunk, Json
+from sliplab.storage.streams import (
+    I64,
+    U8,
+    EventChunk,
+    FrameChunk,
+    Json,
+    PoseChunk,
+    StreamChunk,
+)
 
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
@@ -98,6 +106,8 @@ class ForeignTrial:
         kind: name of its format.
         lost: what is damaged in its file, if this is what stands whole before the damage.
         packets: packets that do; None where the format has none.
+        poses: of the arm, on its own clock; cameras: frames of further cameras by stream.
+        streams: forces and scalars by stream.
         salvage: returns what stands whole in its file, if that turns out to be damaged; raises
             FormatError where that is nothing.
     """
@@ -119,6 +129,9 @@ class ForeignTrial:
     lost: Lost | None = None
     packets: int | None = None
     salvage: Callable[[], ForeignTrial] | None = None
+    poses: PoseChunk | None = None
+    streams: Mapping[str, StreamChunk] = field(default_factory=dict)
+    cameras: Mapping[str, Callable[[], Iterator[FrameChunk]]] = field(default_factory=dict)
 
 
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
@@ -165,6 +178,19 @@ def check_pixels(chunk: EventChunk, size: tuple[int, int] | None) -> None:
             f"holds events up to column {x} and row {y}, outside of the {size[0]} x {size[1]} "
             "pixels that it gives its camera"
         )
+
+
+def grey(levels: U8) -> U8:
+    """Return a picture's grey levels (ITU-R BT.601), as an array of its own.
+
+    Args:
+        levels: shape (height, width), or with a last axis of grey, or of blue, green, red and
+            perhaps opacity, as OpenCV orders them.
+    """
+    if levels.ndim == 2 or levels.shape[2] == 1:
+        return np.array(levels, np.uint8).reshape(levels.shape[:2])
+    weighed = levels[..., :3].astype(np.uint32) @ np.array([114, 587, 299], np.uint32) + 500
+    return np.asarray(weighed // 1000, np.uint8)
 
 
 def rounded_us(times: Any, per_unit: float) -> I64:

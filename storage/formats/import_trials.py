@@ -6,7 +6,7 @@ may be salvaged; the trial's record counts what is lost.
 
 A trial is committed by the store's own rename after all of it was read and checked. Unknown
 properties (relations of clocks, poses, conditions) are marked as unknown and never invented:
-the time line is the event camera's own clock.
+the time line is the event camera's own clock, or that of the frames where there are no events.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ from sliplab.storage.formats.foreign import (
     read_head,
 )
 from sliplab.storage.formats.lab_pickles import Pair, pairs, read_pair
+from sliplab.storage.formats.lerobot_import import is_lerobot, read_lerobot
 from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
 from sliplab.storage.formats.original import StoredTrial
 from sliplab.storage.formats.prophesee import (
@@ -68,9 +69,10 @@ from sliplab.storage.schema.trial import (
     Lost,
     Provenance,
     Quality,
+    StreamRecord,
     TrialRecord,
 )
-from sliplab.storage.streams import Json, PulseChunk
+from sliplab.storage.streams import FRAMES_KIND, Json, PulseChunk, ScalarChunk
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
 from sliplab.storage.trials.writer import TrialWriter
 
@@ -93,7 +95,10 @@ SALVAGE: dict[str, Reader] = {
 }
 """Readers of what stands whole before the damage in a file, by format."""
 LAB_PICKLES = "lab-pickles"
-DATA_SETS: dict[str, Callable[[Path], Iterator[ForeignTrial]]] = {"croissant": read_publication}
+DATA_SETS: dict[str, Callable[[Path], Iterator[ForeignTrial]]] = {
+    "croissant": read_publication,
+    "lerobot": read_lerobot,
+}
 """Readers of folders that are one data set, by format."""
 KINDS = (*READERS, LAB_PICKLES, *DATA_SETS)
 MIXED = "mixed"
@@ -279,10 +284,16 @@ def _take(
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
         (first_us, last_us), warnings = _fill(writer, trial)
+        streams = _fill_further(writer, trial)
         warnings = [*_loss_warnings(trial.lost), *warnings]
         counts = writer.counts
-        rows = Counts(events=counts["events/t"], frames=counts["frames/t"], poses=0, pulses=0)
-        record = _record(campaign, trial, kind, rows, (last_us - first_us) / 1e6, warnings)
+        rows = Counts(
+            events=counts["events/t"],
+            frames=counts["frames/t"],
+            poses=counts.get("poses/t", 0),
+            pulses=0,
+        )
+        record = _record(campaign, trial, kind, rows, (last_us - first_us) / 1e6, warnings, streams)
         writer.commit(record, Provenance.model_validate({"imported": now(), "from": trial.source}))
     except BaseException:
         writer.discard()
@@ -293,9 +304,11 @@ def _take(
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
     """Write all streams; return the times of the first and last event, us, and warnings.
 
+    Of a recording without events the times are those of its frames.
+
     Raises:
-        FormatError: there is no event, one lies outside of the camera's pixels, or times run
-            backwards.
+        FormatError: there is neither event nor frame, an event lies outside of the camera's pixels,
+            or times run backwards.
     """
     first_us = last_us = None
     gap_us = gap_end_us = 0
@@ -312,10 +325,8 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
         last_us = int(chunk.t_us[-1])
         check_pixels(chunk, trial.event_px())
         writer.add_events(chunk)
-    if first_us is None or last_us is None:
-        if trial.lost is not None:
-            raise Damage(f"{trial.lost.reason}; no event stands before that")
-        raise NoEvents("contains no events; nothing to import")
+    if first_us is None and trial.lost is not None:
+        raise Damage(f"{trial.lost.reason}; no event stands before that")
     if trial.triggers is not None:
         t_ns = trial.triggers.t_us * 1000
         writer.add_triggers(t_ns, trial.triggers.kind)
@@ -327,7 +338,35 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
                 f"holds a frame of {width} x {height} among others of {trial.frame_px}"
             )
         writer.add_frames(frames)
+        if not writer.counts["events/t"]:
+            first_us = int(frames.t_ns[0]) // 1000 if first_us is None else first_us
+            last_us = int(frames.t_ns[-1]) // 1000
+    if first_us is None or last_us is None:
+        raise NoEvents("contains no events; nothing to import")
     return (first_us, last_us), _gap_warnings(gap_us, gap_end_us)
+
+
+def _fill_further(writer: TrialWriter, trial: ForeignTrial) -> dict[str, StreamRecord]:
+    """Write poses, named streams and further cameras; return what the record says of them."""
+    if trial.poses is not None:
+        writer.add_poses(trial.poses)
+    found: dict[str, StreamRecord] = {}
+    for name, chunk in trial.streams.items():
+        writer.add_stream(name, chunk)
+        said = StreamRecord(kind=chunk.KIND, rows=len(chunk))
+        if isinstance(chunk, ScalarChunk) and chunk.unit:
+            said = StreamRecord(kind=chunk.KIND, rows=len(chunk), unit=chunk.unit)
+        found[name] = said
+    for name, read in trial.cameras.items():
+        size, rows = None, 0
+        for frames in read():
+            height, width = frames.images.shape[1:]
+            if (size := size or (width, height)) != (width, height):
+                raise FormatError(f"holds a frame of {width} x {height} among others of {size}")
+            writer.add_stream(name, frames)
+            rows += len(frames)
+        found[name] = StreamRecord(kind=FRAMES_KIND, rows=rows, size_px=size)
+    return found
 
 
 def _loss_warnings(lost: Lost | None) -> list[str]:
@@ -358,17 +397,27 @@ def _record(
     counts: Counts,
     seconds: float,
     warnings: list[str],
+    streams: dict[str, StreamRecord],
 ) -> TrialRecord:
     clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
     event_px = trial.event_px()
-    clocks: Json = {"reference": "event camera", "events": clock}
-    if trial.frames is not None:
-        clocks["frames"] = clock
+    there = {
+        "events": counts.events > 0,
+        "frames": trial.frames is not None,
+        "arm": trial.poses is not None,
+    }
+    clocks: Json = {
+        "reference": "event camera" if counts.events else "frame camera",
+        **{device: clock for device, known in there.items() if known},
+    }
+    if streams:
+        clocks["streams"] = dict.fromkeys(streams, clock)
+    missing = ("sensor size",) if counts.events else ("events",)
     origin: Json = {
         "format": trial.kind or kind,
         "from": trial.source,
         "epoch": trial.epoch,
-        "unknown": [*trial.unknown, *([] if event_px else ["sensor size"])],
+        "unknown": [*trial.unknown, *(() if event_px else missing)],
         **trial.about,
     }
     if warnings:
@@ -394,6 +443,8 @@ def _record(
         "geometry": Geometry(event_px=event_px, frame_px=trial.frame_px),
         "imported": origin,
     }
+    if streams:
+        fields["streams"] = streams
     try:
         return TrialRecord.model_validate(fields)
     except ValidationError as error:
@@ -420,7 +471,9 @@ def kind_of(path: Path) -> str:
 
 def _data_set(path: Path) -> str | None:
     """Return the format of a folder that is one data set; None for any other path."""
-    return "croissant" if publication_at(path) is not None else None
+    if publication_at(path) is not None:
+        return "croissant"
+    return "lerobot" if is_lerobot(path) else None
 
 
 def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[ForeignTrial]:
