@@ -501,9 +501,10 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
             file = path / item["file"]
             if file.is_symlink() or not file.is_file():
                 raise InputError(file, "", None, "is missing or not a regular file")
-            found = _read(
-                _kind(file) or kind if kind == MIXED else kind, file, item["trial"], salvage
-            )
+            of = (_kind(file) or "") if kind == MIXED else kind
+            if of not in READERS:
+                raise InputError(file, "", None, f"is of no known format ({', '.join(READERS)})")
+            found = _read(of, file, item["trial"], salvage)
             yield _as_exported(found, item, manifest["simulated"])
         return
     wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import pickle
 import struct
 from collections.abc import Callable
@@ -15,7 +16,14 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
-from sliplab.storage.formats.import_trials import import_trials, kind_of, skipped_in, trials_in
+from sliplab.storage.formats.foreign import EXPORT_MANIFEST
+from sliplab.storage.formats.import_trials import (
+    MIXED,
+    import_trials,
+    kind_of,
+    skipped_in,
+    trials_in,
+)
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -355,3 +363,27 @@ def test_a_missing_library_is_said_before_anything_is_written(
     with pytest.raises(InputError, match=r"b\.raw: .*pip install 'sliplab\[formats\]'"):
         _import(tmp_path / "store", folder)
     assert Store.open(tmp_path / "store").campaigns() == []
+
+
+def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    _aedat4(folder / "a.aedat4", _events([3, 4]))
+    lab_hdf5(folder / "b.h5")
+    item = {
+        "trial": "t", "file": "a.aedat4", "condition": {}, "events": 2, "frames": 0, "triggers": 0,
+        "repetition": 0,
+    }  # fmt: skip
+    manifest = {"sliplab_export": 1, "simulated": True, "trials": [item]}
+    (folder / EXPORT_MANIFEST).write_text(json.dumps(manifest))
+    assert kind_of(folder) == MIXED
+    (found,) = _import(tmp_path / "store", folder)
+    assert (found.trial_id, found.simulated, len(found.events())) == ("t", True, 2)
+    assert [(one.file, one.reason) for one in skipped_in(folder, MIXED)] == [
+        ("b.h5", f"is not in {EXPORT_MANIFEST}")
+    ]
+    item["file"] = "notes.txt"
+    (folder / "notes.txt").write_text("a note")
+    (folder / EXPORT_MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"notes\.txt: is of no known format"):
+        _import(tmp_path / "again", folder)
