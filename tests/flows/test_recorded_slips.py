@@ -1,0 +1,119 @@
+"""Slips that were recorded elsewhere: what an adapter brings in is analysed as what was collected.
+
+The foreign data set is a store of this program as it would be handed on: event files, and a table
+with onsets on the event camera's clock. Nothing else of the store is used.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sliplab.analysis.campaigns import Collected, collected
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.metrics.classification import GROSS, NO_SLIP
+from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.flows.__main__ import _run
+from sliplab.storage.schema.label import LABELS, TrialLabel
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
+from tests.flows.older import older_store
+
+ADAPTER = """adapter: 1
+name: slides
+title: Four slides of another lab
+simulated: true
+experiment: kinematic
+trials:
+  table: trials.csv
+  files: "{file}"
+  id: "{trial}"
+factors:
+  direction: {field: direction, unit: deg}
+streams:
+  events: {format: aedat4}
+labels:
+  onsets: {incipient: incipient_us, gross: gross_us, unit: us, uncertainty_ms: 2}
+motion: {start: "{start_us}", end: "{end_us}", unit: us}
+split: {given: part}
+analysis:
+  samples: {per_class: 10}
+"""
+
+
+@pytest.fixture
+def sliplab(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Run a command in this process and return its JSON."""
+
+    def run(*arguments: object) -> Any:
+        monkeypatch.setattr(sys, "argv", ["sliplab", *map(str, arguments), "--json"])
+        code = _run()
+        reported = capsys.readouterr()
+        assert code == 0, reported.err
+        return json.loads(reported.out)
+
+    return run
+
+
+def other_labs_folder(store: Store, item: Collected, folder: Path, sliplab: Any) -> None:
+    """Write the data set: events as AEDAT4, and a table with what belongs to each trial."""
+    files = sliplab("export", store.folder, item.name, "--output", folder)["files"]
+    (folder / "sliplab-export.json").unlink()
+    rows = []
+    for (trial, recording), file in zip(
+        sorted(item.trials, key=lambda t: t[0].id), files, strict=True
+    ):
+        label = Derived.of(store, LABELS, item.name).load(trial.id, TrialLabel)
+        clock = recording.clock("events")
+
+        def camera_us(time_ns: int | None, clock: Any = clock) -> str:
+            return "" if time_ns is None else f"{int(clock.to_device(time_ns)) / 1000:.3f}"
+
+        start, end = recording.motion_ns
+        rows.append({
+            "trial": f"slide {len(rows) + 1}", "file": Path(file).name,
+            "direction": item.describe(trial)["direction"].split()[0], "part": trial.split,
+            "incipient_us": camera_us(label.incipient_ns), "gross_us": camera_us(label.gross_ns),
+            "start_us": camera_us(start), "end_us": camera_us(end),
+        })  # fmt: skip
+    pd.DataFrame(rows).to_csv(folder / "trials.csv", index=False)
+
+
+def test_slides_of_another_lab_go_through_every_step(tmp_path: Path, sliplab: Any) -> None:
+    here = Store.open(older_store(tmp_path / "here"))
+    (item,) = collected(here)
+    other_labs_folder(here, item, tmp_path / "theirs", sliplab)
+    (tmp_path / "adapter.yaml").write_text(ADAPTER)
+    there = tmp_path / "there"
+    taken = sliplab("import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs",
+                    "--store", there)  # fmt: skip
+    assert len(taken["imported"]) == 4
+    for step in ("label", "train", "evaluate", "report"):
+        assert sliplab(step, there)["done"] > 0
+        assert sliplab(step, there)["done"] == 0
+
+    store = Store.open(there)
+    (foreign,) = collected(store)
+    assert [trial.split for trial, _ in foreign.trials] == [
+        trial.split for trial, _ in sorted(item.trials, key=lambda t: t[0].id)
+    ]
+    # the same windows: those of the two stores begin within the rounding of both clocks
+    ours, theirs = (load_samples(Labels(each), collected(each), "train") for each in (here, store))
+    # an event file goes on for some windows after the slide, where a collected trial has ended
+    counts = [np.bincount(part.y, minlength=3) for part in (ours, theirs)]
+    np.testing.assert_array_equal(counts[0][:GROSS], counts[1][:GROSS])
+    assert counts[0][GROSS] <= counts[1][GROSS] <= counts[0][NO_SLIP]
+    before, other = (np.sort(part.windows.totals[part.y == NO_SLIP]) for part in (ours, theirs))
+    assert np.abs(before - other).max() <= 2
+    summary = json.loads((there / "report" / "summary.json").read_text())
+    assert summary["simulated"] is True
+    assert summary["labels"]["given_within_ms"] == 2.0
+    page = (there / "report" / "index.html").read_text()
+    assert "onsets of the data set, within 2.0 ms" in page
+    assert "sliplab holdout" not in page
