@@ -247,17 +247,16 @@ def read_text(path: Path, what: str) -> str:
     Raises:
         InputError: missing, no plain file, unreadable, over 1 MiB, or not UTF-8.
     """
+    of_one = f"give the path of {'an' if what[0] in 'aeiou' else 'a'} {what}"
     try:
         with open(path, "rb", opener=_at_once) as handle:
             if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
-                raise InputError(
-                    path, "", None, f"is not a regular file; give the path of a {what}"
-                )
+                raise InputError(path, "", None, f"is not a regular file; {of_one}")
             data = handle.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise InputError(path, "", None, f"no such file; give the path of a {what}") from None
+        raise InputError(path, "", None, f"no such file; {of_one}") from None
     except IsADirectoryError:
-        raise InputError(path, "", None, f"is a folder; give the path of a {what}") from None
+        raise InputError(path, "", None, f"is a folder; {of_one}") from None
     except OSError as error:
         raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
     if len(data) > MAX_BYTES:
