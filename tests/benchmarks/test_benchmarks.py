@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import kept, measure
+from benchmarks import exchange, kept, measure
 from benchmarks.trials import open_session
 
 TINY: dict[str, dict[str, Any]] = {
@@ -162,3 +162,10 @@ def test_a_stretch_takes_whole_trials_and_knows_how_long_they_are() -> None:
         assert work.collector.taken == 1
         assert [left.id for left in work.trials] != [trial.id]
         assert work.collector.campaign.committed() == {trial.id}
+
+
+def test_files_of_other_programs_are_read_and_compared() -> None:
+    """What is read is what was written, or the benchmark itself fails."""
+    figures = exchange.measure("aedat4", events=20_000, runs=1)
+    assert {"aedat4_read_faery_ratio", "aedat4_write_faery_ratio"} <= figures.keys()
+    assert all(value > 0 for value in figures.values())
