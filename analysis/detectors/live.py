@@ -225,7 +225,12 @@ class _Open:
 
 
 def counting_of(fitted: Fitted) -> Counting:
-    """The network's spike counts by the event-driven kernels, in the calling thread alone."""
+    """The network's spike counts by the event-driven kernels, in the calling thread alone.
+
+    Raises:
+        InputError: its classes are not those of slip.
+    """
+    fitted.check_slip("the model", "detection")
     fast = engine(fitted)
     return lambda x: fast.counts(x, 1)
 

@@ -212,7 +212,9 @@ def _stateful(recording: Recording, inference: _Inference, fitted: training.Fitt
 
 @lru_cache(maxsize=2)
 def _fitted(model: bytes) -> training.Fitted:
-    return model_file.parse(model, "the model")
+    fitted = model_file.parse(model, "the model")
+    fitted.check_slip("the model", "detection")
+    return fitted
 
 
 def trial_counts(store: Store, campaign: str, trial_id: str, settings: Detection) -> Arrays:

@@ -269,11 +269,13 @@ def export_files(
         contents by the ending of the file's name, and the figures.
 
     Raises:
-        InputError: the store's windows are others than the model's.
+        InputError: the store's windows are others than the model's, or its classes are not those
+            of slip.
         StoreError: not labelled.
         ExportFailed: the ONNX file gives other counts.
         ModuleNotFoundError: the extra ``onnx`` is not installed.
     """
+    fitted.check_slip(model, "a Speck")
     if training_settings(campaigns).windows != fitted.windows:
         file = training_campaigns(campaigns)[0].campaign.protocol_file
         raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")

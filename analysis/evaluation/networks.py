@@ -22,6 +22,7 @@ from sliplab.analysis.evaluation.windows import intervals_of
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.external_model import Description, ExternalModel, load_external
 from sliplab.analysis.networks.models import comparison_models, rules_of, training_settings
@@ -118,6 +119,7 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
             path, "", None, f"{reason}; a state_dict needs a description beside it, such as "
             f"{path.with_suffix('.yaml').name} (docs/models.md)",
         ) from None  # fmt: skip
+    fitted.check_slip(path, "an evaluation of slip")
     return OtherNetwork(
         f"model-{path.stem}", path.name, content, None, fitted.windows,
         fitted.network.outputs_per_class, engine or "fast", exact=True,
@@ -126,6 +128,11 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
 
 def _described(path: Path, engine: Engines | None) -> OtherNetwork:
     model = load_external(path)
+    if model.description.classes != CLASSES:
+        raise InputError(
+            path, "classes", list(model.description.classes),
+            f"must be {', '.join(CLASSES)} for an evaluation of slip",
+        )  # fmt: skip
     exact = model.on_grid()
     if engine == "fast":
         try:

@@ -7,7 +7,7 @@ over trials (`analysis.metrics.intervals`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,9 @@ TENTHS = 10
 def credit(scores: Counts, labels: Labels) -> FloatArray:
     """Score of each window for argmax accuracy: 1, 1/k where k classes tie, or 0; (n,)."""
     scores, labels = check(scores, labels)
-    top = scores == scores.max(axis=1, keepdims=True) if len(scores) else np.zeros((0, 3), bool)
+    top = (
+        scores == scores.max(axis=1, keepdims=True) if len(scores) else np.zeros(scores.shape, bool)
+    )
     return np.asarray(top[np.arange(len(labels)), labels] / np.maximum(top.sum(axis=1), 1))
 
 
@@ -102,7 +104,11 @@ def by_factor(
 
 
 def by_tenth(
-    hits: FloatArray, labels: Labels, trial: IntArray, fraction: FloatArray
+    hits: FloatArray,
+    labels: Labels,
+    trial: IntArray,
+    fraction: FloatArray,
+    names: Sequence[str] = CLASSES,
 ) -> dict[str, tuple[Tenth, ...]]:
     """Recall of each class by tenths of its phase, ten rows a class.
 
@@ -110,12 +116,13 @@ def by_tenth(
         hits: (n,), 1 where a window was classified correctly.
         fraction: (n,), where in its class's phase the middle of the window lies, 0..1; windows
             outside, or NaN, are left out.
+        names: of the classes.
     """
     result = {}
     inside = (fraction >= 0) & (fraction <= 1)
     tenth = np.zeros(len(labels), np.int64)
     tenth[inside] = np.minimum((fraction[inside] * TENTHS).astype(np.int64), TENTHS - 1)
-    for k, name in enumerate(CLASSES):
+    for k, name in enumerate(names):
         rows = []
         for part in range(TENTHS):
             there = inside & (labels == k) & (tenth == part)
@@ -125,12 +132,17 @@ def by_tenth(
 
 
 def by_trial(
-    counts: Counts, labels: Labels, trial: IntArray, named: Callable[[int], TrialName]
+    counts: Counts,
+    labels: Labels,
+    trial: IntArray,
+    named: Callable[[int], TrialName],
+    names: Sequence[str] = CLASSES,
 ) -> list[TrialWindows]:
     """One row a trial, the worst first: windows, errors, and what was taken for what.
 
     Args:
         named: gives campaign, id and condition of a trial.
+        names: of the classes.
     """
     counts, labels = check(counts, labels)
     said = winners(counts)
@@ -140,11 +152,11 @@ def by_trial(
         true, called = labels[there], said[there]
         wrong = called != true
         taken = {
-            f"{CLASSES[k]} as {'undecided' if j < 0 else CLASSES[j]}": int(
+            f"{names[k]} as {'undecided' if j < 0 else names[j]}": int(
                 ((true == k) & (called == j)).sum()
             )
-            for k in range(len(CLASSES))
-            for j in (*range(len(CLASSES)), -1)
+            for k in range(len(names))
+            for j in (*range(len(names)), -1)
             if j != k and ((true == k) & (called == j)).any()
         }
         campaign, name, condition = named(number)

@@ -1,10 +1,10 @@
 """Baselines: small conventional networks on the same windows, without spikes.
 
-Three of them, each with a few ten thousand weights like the spiking network: convolutions on the
-summed frame (where), convolutions on the volume of steps (where and when), and a gated recurrent
-unit over the steps (when). They see log(1 + counts). Their learning rate falls as the spiking
-network's does, and the best epoch by validation accuracy is kept; everything random comes from one
-seed, so that it repeats on the same number of threads.
+Each has a few ten thousand weights like the spiking network: convolutions on the summed frame
+(where), convolutions on the volume of steps (where and when), a gated recurrent unit over the steps
+(when), and of taxels, which have no frame, convolutions over the steps. They see log(1 + counts).
+Their learning rate falls as the spiking network's does, and the best epoch by validation accuracy
+is kept; everything random comes from one seed, so that it repeats on the same number of threads.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Votes = npt.NDArray[np.float32]
 class _Frame(nn.Module):
     """Two convolutions on the events of each cell over the whole window."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: Shape, classes: int) -> None:
         super().__init__()
         _, channels, rows, columns = shape
         self.layers = nn.Sequential(
@@ -49,18 +49,18 @@ class _Frame(nn.Module):
             nn.Flatten(),
             nn.Linear(16 * math.ceil(rows / 2) * math.ceil(columns / 2), 32),
             nn.ReLU(),
-            nn.Linear(32, len(CLASSES)),
+            nn.Linear(32, classes),
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(n, steps, channels, rows, columns) to (n, 3)."""
+        """(n, steps, channels, rows, columns) to (n, classes)."""
         return self.layers(torch.log1p(x.sum(dim=1)))
 
 
 class _Volume(nn.Module):
     """Two convolutions over steps, rows and columns at once, both of stride 2."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: Shape, classes: int) -> None:
         super().__init__()
         steps, channels, rows, columns = shape
         left = [math.ceil(math.ceil(side / 2) / 2) for side in (steps, rows, columns)]
@@ -72,34 +72,58 @@ class _Volume(nn.Module):
             nn.Flatten(),
             nn.Linear(16 * math.prod(left), 32),
             nn.ReLU(),
-            nn.Linear(32, len(CLASSES)),
+            nn.Linear(32, classes),
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(n, steps, channels, rows, columns) to (n, 3)."""
+        """(n, steps, channels, rows, columns) to (n, classes)."""
         return self.layers(torch.log1p(x).transpose(1, 2))
 
 
 class _Recurrent(nn.Module):
     """A gated recurrent unit that is given one step's cells after the other."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: Shape, classes: int) -> None:
         super().__init__()
         self.unit = nn.GRU(math.prod(shape[1:]), 48, batch_first=True)
-        self.last = nn.Linear(48, len(CLASSES))
+        self.last = nn.Linear(48, classes)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(n, steps, channels, rows, columns) to (n, 3)."""
+        """(n, steps, channels, rows, columns) to (n, classes)."""
         states, _ = self.unit(torch.log1p(x).flatten(2))
         return self.last(states[:, -1])
 
 
-KINDS: dict[str, Callable[[Shape], nn.Module]] = {
+class _Steps(nn.Module):
+    """Three convolutions over the steps, each of stride 2, that mix all cells of a step."""
+
+    def __init__(self, shape: Shape, classes: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv1d(math.prod(shape[1:]), 32, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv1d(32, 32, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv1d(32, 48, 5, stride=2, padding=2),
+            nn.ReLU(),
+        )
+        self.last = nn.Linear(2 * 48, classes)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(n, steps, channels, rows, columns) to (n, classes)."""
+        found = self.layers(torch.log1p(x).flatten(2).transpose(1, 2))
+        return self.last(torch.cat([found.mean(dim=2), found.amax(dim=2)], dim=1))
+
+
+KINDS: dict[str, Callable[[Shape, int], nn.Module]] = {
     "cnn_frame": _Frame,
     "cnn_volume": _Volume,
     "gru": _Recurrent,
 }
-"""Name to network."""
+"""Name to network, of windows with rows and columns of cells."""
+
+TAXEL_KINDS: dict[str, Callable[[Shape, int], nn.Module]] = {"cnn_steps": _Steps, "gru": _Recurrent}
+"""Name to network, of windows with a single cell."""
 
 
 @dataclass(frozen=True)
@@ -119,17 +143,23 @@ def trained_net(
     seed: int = 0,
     on_epoch: Callable[[int, float], None] | None = None,
     mirror: bool = True,
+    classes: int = len(CLASSES),
+    batch: int = BATCH,
 ) -> tuple[Votes, dict[str, Any]]:
-    """Train one of `KINDS`, keep its best epoch by validation accuracy, vote on test samples.
+    """Train one of `KINDS` or `TAXEL_KINDS`, keep its best epoch, vote on test samples.
+
+    The best epoch is that of the best validation accuracy.
 
     Args:
         epochs: over which the rate falls to nothing along half a cosine.
         seed: of the first weights, the order and the mirrors.
         on_epoch: called with each epoch and its validation accuracy.
         mirror: windows are mirrored at random, as the spiking network's are.
+        classes: that there are.
+        batch: windows a step of the optimiser; fewer for few windows.
 
     Returns:
-        logits float32 (n, 3), and what it was: epochs, weights, multiply-adds a window.
+        logits float32 (n, classes), and what it was: epochs, weights, multiply-adds a window.
 
     Raises:
         KeyError: no such kind.
@@ -141,14 +171,15 @@ def trained_net(
         raise ValueError(f"{kind}: {len(train)} training and {len(validation)} validation samples")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        net = KINDS[kind](train.windows.shape)
+        net = (KINDS | TAXEL_KINDS)[kind](train.windows.shape, classes)
     optimizer = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
     best: _Best | None = None
-    steps = epochs * math.ceil(len(train) / BATCH)
+    steps = epochs * math.ceil(len(train) / batch)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for done in range(1, epochs + 1):
-        _one_epoch(net, optimizer, falling, train, np.random.default_rng([seed, done]), mirror)
-        votes = _votes(net, validation.windows)
+        rng = np.random.default_rng([seed, done])
+        _one_epoch(net, optimizer, falling, train, rng, mirror, batch)
+        votes = _votes(net, validation.windows, classes)
         strict = metrics.accuracy(votes, validation.y).strict or 0.0
         loss = float(
             nn.functional.cross_entropy(torch.from_numpy(votes), torch.from_numpy(validation.y))
@@ -167,7 +198,7 @@ def trained_net(
         "weights": sum(p.numel() for p in net.parameters()),
         "multiply_adds": multiply_adds(net, train.windows.shape),
     }
-    return _votes(net, test), said
+    return _votes(net, test, classes), said
 
 
 def _one_epoch(
@@ -177,14 +208,15 @@ def _one_epoch(
     train: SampleSet,
     rng: np.random.Generator,
     mirror: bool,
+    batch: int,
 ) -> None:
     net.train()
     order = rng.permutation(len(train))
     windows = train.windows
     if mirror:
         windows = windows.mirrored(rng.integers(0, 4, len(train), np.uint8))
-    for start in range(0, len(order), BATCH):
-        rows = order[start : start + BATCH]
+    for start in range(0, len(order), batch):
+        rows = order[start : start + batch]
         loss = nn.functional.cross_entropy(
             net(_dense(windows.take(rows))), torch.from_numpy(train.y[rows])
         )
@@ -194,9 +226,9 @@ def _one_epoch(
         falling.step()
 
 
-def _votes(net: nn.Module, x: SparseWindows) -> Votes:
+def _votes(net: nn.Module, x: SparseWindows, classes: int) -> Votes:
     net.eval()
-    out = np.empty((len(x), len(CLASSES)), np.float32)
+    out = np.empty((len(x), classes), np.float32)
     with torch.no_grad():
         for start in range(0, len(x), _CHUNK):
             rows = np.arange(start, min(start + _CHUNK, len(x)))
@@ -226,6 +258,7 @@ def multiply_adds(net: nn.Module, shape: Shape) -> int:
         total += given[0].shape[1] * gates * (layer.input_size + layer.hidden_size)
 
     hooks: dict[type[nn.Module], Callable[..., None]] = {
+        nn.Conv1d: convolution,
         nn.Conv2d: convolution,
         nn.Conv3d: convolution,
         nn.Linear: linear,

@@ -4,12 +4,13 @@ Event rate alone is informative about slip. The report always compares three bas
 network: the majority class, two thresholds on the number of events, and a logistic regression on
 it. They take a second. The positions of the events add information: a logistic regression on the
 events of each cell, gradient boosting on the counts of cells and steps, and ordinary networks
-(`networks.baseline_nets`) take minutes.
+(`networks.baseline_nets`) take minutes. All but the thresholds take any number of classes.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,9 @@ IntArray = npt.NDArray[np.int64]
 RIDGE = 1e-3
 """L2 penalty of a logistic regression on standardised weights, per mean log-likelihood."""
 
+SLICES = 10
+"""Parts of a window for `logistic_slices`."""
+
 
 @dataclass(frozen=True)
 class BaselineScore:
@@ -39,7 +43,7 @@ class BaselineScore:
         argmax: accuracy in 0..1 by `metrics.classification.accuracy` (ties are shared); None where
             there are no test samples.
         parameters: what was fitted, as plain data.
-        votes: (n, 3) for each test sample, the highest is its class.
+        votes: (n, classes) for each test sample, the highest is its class.
     """
 
     name: str
@@ -49,45 +53,54 @@ class BaselineScore:
 
 
 def evaluate_baselines(
-    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows, test_y: Labels
+    train_x: SparseWindows,
+    train_y: Labels,
+    test_x: SparseWindows,
+    test_y: Labels,
+    names: Sequence[str] = CLASSES,
 ) -> dict[str, BaselineScore]:
     """Fit the cheap baselines on the training samples and score them on the test samples.
 
+    Two thresholds cut the totals into three parts, so they are there for three classes only.
+
     Args:
         train_x, test_x: event counts.
-        train_y, test_y: classes, integer (n,), 0..2.
+        train_y, test_y: classes, integer (n,), from 0.
+        names: of the classes.
 
     Raises:
         ValueError: no training samples, lengths that differ, a label that is not a class.
     """
-    train_y, test_y = check_labels(train_y), check_labels(test_y)
+    classes = len(names)
+    train_y, test_y = check_labels(train_y, classes), check_labels(test_y, classes)
     if len(train_x) != len(train_y) or len(test_x) != len(test_y):
         raise ValueError("samples and labels differ in number")
     if not len(train_y):
         raise ValueError("no training samples")
     train_total, test_total = (x.totals.astype(np.float64) for x in (train_x, test_x))
-    each = np.bincount(train_y, minlength=len(CLASSES))
-    low, high, table = fit_rate_thresholds(train_total, train_y)
-    rate = fit_logistic(_of_total(train_total), train_y)
+    each = np.bincount(train_y, minlength=classes)
+    rate = fit_logistic(_of_total(train_total), train_y, classes)
 
     decisions: dict[str, tuple[npt.NDArray[Any], dict[str, Any]]] = {
         "majority": (
             np.tile(each, (len(test_y), 1)),
-            {"training_samples": dict(zip(CLASSES, each.tolist(), strict=True))},
-        ),
-        "rate_threshold": (
+            {"training_samples": dict(zip(names, each.tolist(), strict=True))},
+        )
+    }
+    if classes == len(CLASSES):
+        low, high, table = fit_rate_thresholds(train_total, train_y)
+        decisions["rate_threshold"] = (
             table[np.searchsorted([low, high], test_total)],
             {"thresholds_events": [low, high], "training_samples": table.tolist()},
-        ),
-        "logistic": (
-            rate.scores(_of_total(test_total)),
-            {
-                "weights": rate.weights.tolist(),
-                "mean": rate.mean.tolist(),
-                "scale": rate.scale.tolist(),
-            },
-        ),
-    }
+        )
+    decisions["logistic"] = (
+        rate.scores(_of_total(test_total)),
+        {
+            "weights": rate.weights.tolist(),
+            "mean": rate.mean.tolist(),
+            "scale": rate.scale.tolist(),
+        },
+    )
     return {
         name: BaselineScore(name, accuracy(votes, test_y).argmax, parameters, votes)
         for name, (votes, parameters) in decisions.items()
@@ -95,22 +108,58 @@ def evaluate_baselines(
 
 
 def logistic_cells(
-    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows
+    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows, classes: int = len(CLASSES)
 ) -> tuple[FloatArray, dict[str, Any]]:
     """Logistic regression on the log of 1 + each cell's events: where they are, not when.
 
     Returns:
-        votes (n, 3) for the test samples, and what was fitted, without the weights.
+        votes (n, classes) for the test samples, and what was fitted, without the weights.
     """
-    fitted = fit_logistic(np.log1p(cell_sums(train_x)), check_labels(train_y))
+    return _logistic_of(cell_sums(train_x), train_y, cell_sums(test_x), classes)
+
+
+def logistic_slices(
+    train_x: SparseWindows,
+    train_y: Labels,
+    test_x: SparseWindows,
+    classes: int = len(CLASSES),
+    slices: int = SLICES,
+) -> tuple[FloatArray, dict[str, Any]]:
+    """The same on each cell's events in each of a few equal parts of the window.
+
+    Args:
+        slices: parts; a window of fewer steps has as many as steps.
+    """
+    train, test = (slice_sums(x, slices) for x in (train_x, test_x))
+    votes, said = _logistic_of(train, train_y, test, classes)
+    return votes, {"slices": min(slices, train_x.shape[0]), **said}
+
+
+def _logistic_of(
+    train: IntArray, labels: Labels, test: IntArray, classes: int
+) -> tuple[FloatArray, dict[str, Any]]:
+    fitted = fit_logistic(np.log1p(train), check_labels(labels, classes), classes)
     features = len(fitted.mean)
     said = {
         "ridge": RIDGE,
         "weights": fitted.weights.size,
-        "multiply_adds": features * len(CLASSES),
+        "multiply_adds": features * classes,
         "iterations": fitted.iterations,
     }
-    return fitted.scores(np.log1p(cell_sums(test_x))), said
+    return fitted.scores(np.log1p(test)), said
+
+
+def slice_sums(x: SparseWindows, slices: int) -> IntArray:
+    """Events of each cell in each part of a sample, int64 (n, slices * cells).
+
+    Step t of T is in part ``t * slices // T``.
+    """
+    steps, places = x.shape[0], math.prod(x.shape[1:])
+    slices = min(slices, steps)
+    step = np.repeat(np.arange(len(x) * steps), np.diff(x.offsets))
+    part = step // steps * slices + step % steps * slices // steps
+    flat = np.bincount(part * places + x.cell, x.count, minlength=len(x) * slices * places)
+    return flat.astype(np.int64).reshape(len(x), slices * places)
 
 
 def cell_sums(x: SparseWindows) -> IntArray:
@@ -174,7 +223,7 @@ class Logistic:
     """A fitted multinomial logistic regression.
 
     Attributes:
-        weights: (features + 1, 3), the first row is the offset.
+        weights: (features + 1, classes), the first row is the offset.
         mean, scale: (features,), by which features are standardised.
         iterations: that it took.
     """
@@ -185,11 +234,11 @@ class Logistic:
     iterations: int
 
     def scores(self, features: FloatArray) -> FloatArray:
-        """Log-odds (n, 3) up to a constant a row."""
+        """Log-odds (n, classes) up to a constant a row."""
         return np.asarray(_standard(features, self.mean, self.scale) @ self.weights)
 
 
-def fit_logistic(features: FloatArray, labels: IntArray) -> Logistic:
+def fit_logistic(features: FloatArray, labels: IntArray, classes: int = len(CLASSES)) -> Logistic:
     """Multinomial logistic regression on standardised features, by L-BFGS from zero.
 
     Minimises mean cross-entropy + `RIDGE` / 2 times the squared weights (not the offsets); the
@@ -197,13 +246,13 @@ def fit_logistic(features: FloatArray, labels: IntArray) -> Logistic:
 
     Args:
         features: (n, features).
-        labels: integer (n,), 0..2.
+        labels: integer (n,), 0..classes - 1.
     """
     mean, spread = features.mean(axis=0), features.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
     x = _standard(features, mean, scale)
-    target = np.eye(len(CLASSES))[labels]
-    shape = (x.shape[1], len(CLASSES))
+    target = np.eye(classes)[labels]
+    shape = (x.shape[1], classes)
     penalty = np.full(shape, RIDGE)
     penalty[0] = 0.0
 
@@ -243,19 +292,23 @@ def features(x: SparseWindows) -> npt.NDArray[np.float32]:
 
 
 def boosted(
-    train: SampleSet, validation: SampleSet, test: SparseWindows, rounds: int = ROUNDS
+    train: SampleSet,
+    validation: SampleSet,
+    test: SparseWindows,
+    rounds: int = ROUNDS,
+    classes: int = len(CLASSES),
 ) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
     """Fit on training samples, stop by validation samples, vote on test samples.
 
     Returns:
-        probabilities (n, 3), and what was fitted as text and numbers.
+        probabilities (n, classes), and what was fitted as text and numbers.
 
     Raises:
         ValueError: a class is missing among the training samples.
     """
     from sklearn.ensemble import HistGradientBoostingClassifier  # takes a second
 
-    if set(np.unique(train.y).tolist()) != set(range(len(CLASSES))):
+    if set(np.unique(train.y).tolist()) != set(range(classes)):
         raise ValueError("gradient boosting needs training samples of every class")
     model = HistGradientBoostingClassifier(
         max_iter=rounds,
@@ -271,5 +324,5 @@ def boosted(
             X_val=features(validation.windows),
             y_val=validation.y,
         )
-        votes = model.predict_proba(features(test)) if len(test) else np.empty((0, len(CLASSES)))
+        votes = model.predict_proba(features(test)) if len(test) else np.empty((0, classes))
     return votes, {"rounds": int(model.n_iter_), "most_rounds": rounds, "patience": PATIENCE}

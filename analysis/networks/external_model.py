@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, SingleSpike
 from sinabs.layers import IAFSqueeze, LIFSqueeze, SumPool2d
 from torch import nn
@@ -111,13 +111,28 @@ class Description(StrictModel):
     windows: Windows = Windows()
     """Input of the network: event counts (steps, channels, cells, cells)."""
     layers: tuple[Layer, ...] = Field(min_length=1, max_length=100)
-    outputs: tuple[Literal["no_slip", "incipient", "gross"], ...] = CLASSES  # type: ignore[assignment]
+    classes: tuple[Name, ...] = Field(
+        default=CLASSES, min_length=2, max_length=1024, exclude_if=lambda names: names == CLASSES
+    )
+    """Names of the classes, where they are not those of slip."""
+    outputs: tuple[Name, ...] = Field(default_factory=lambda data: data.get("classes", CLASSES))
     """The class of each output neuron; spikes of a class are added up."""
+
+    @field_validator("classes")
+    @classmethod
+    def _distinct(cls, classes: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(classes)) < len(classes):
+            raise ValueError("must name each class once")
+        return classes
 
     @field_validator("outputs")
     @classmethod
-    def _every_class(cls, outputs: tuple[str, ...]) -> tuple[str, ...]:
-        left = [name for name in CLASSES if name not in outputs]
+    def _every_class(cls, outputs: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        classes = info.data.get("classes", CLASSES)
+        other = [name for name in outputs if name not in classes]
+        if other:
+            raise ValueError(f"must be classes, one of {', '.join(classes)}; {other[0]} is none")
+        left = [name for name in classes if name not in outputs]
         if left:
             raise ValueError(f"must give each class a neuron; none is {left[0]}")
         return outputs
@@ -143,7 +158,7 @@ class ExternalModel:
     @property
     def outputs_per_class(self) -> float:
         """Mean number of output neurons of a class."""
-        return len(self.description.outputs) / len(CLASSES)
+        return len(self.description.outputs) / len(self.description.classes)
 
     def sinabs(self) -> SinabsNet:
         """The network in Sinabs' layers."""
@@ -170,7 +185,7 @@ class SinabsNet:
     """A network in Sinabs' layers, time folded into the batch.
 
     Attributes:
-        classes: int64 (outputs,), the class of each output neuron.
+        classes: int64 (outputs,), the class of each output neuron; each class has one.
     """
 
     net: nn.Sequential
@@ -178,7 +193,7 @@ class SinabsNet:
     classes: npt.NDArray[np.int64]
 
     def counts(self, x: npt.NDArray[Any], batch: int = 64) -> npt.NDArray[np.int64]:
-        """Output spikes int64 (n, 3) of windows (n, steps, channels, cells, cells), from rest.
+        """Output spikes int64 (n, classes) of windows (n, T, C, H, W), from rest.
 
         Raises:
             ValueError: windows of another shape.
@@ -187,7 +202,7 @@ class SinabsNet:
         expected = (settings.steps, settings.channels, settings.cells, settings.cells)
         if x.shape[1:] != expected:
             raise ValueError(f"samples have the shape {x.shape}; expected (n, {expected})")
-        out = np.zeros((len(x), len(CLASSES)), np.int64)
+        out = np.zeros((len(x), int(self.classes.max()) + 1), np.int64)
         with torch.no_grad():
             for start in range(0, len(x), batch):
                 part = torch.from_numpy(x[start : start + batch].astype(np.float32))
@@ -332,7 +347,7 @@ def _assemble(description: Description, tensors: dict[str, torch.Tensor]) -> Sin
         raise KeyedError(
             "outputs", len(description.outputs), f"the last layer gives {list(shape)}; name each"
         )
-    classes = np.array([CLASSES.index(name) for name in description.outputs], np.int64)
+    classes = np.array([description.classes.index(name) for name in description.outputs], np.int64)
     return SinabsNet(nn.Sequential(*layers), windows, classes)
 
 
@@ -432,8 +447,9 @@ def _as_ours(description: Description, tensors: dict[str, torch.Tensor]) -> nn.S
              nn.Linear, IAFSqueeze)  # fmt: skip
     if tuple(map(type, made)) != order:
         raise ValueError("the layers are not two convolutions and two fully connected ones")
-    if description.outputs != CLASSES * (len(description.outputs) // len(CLASSES)):
-        raise ValueError(f"outputs must be {', '.join(CLASSES)}, again and again")
+    classes = description.classes
+    if description.outputs != classes * (len(description.outputs) // len(classes)):
+        raise ValueError(f"outputs must be {', '.join(classes)}, again and again")
     conv1, conv2, fc1, fc2 = weighted = [made[k] for k in (0, 2, 5, 7)]
     said = [layer for layer in description.layers if isinstance(layer, Neurons)]
     if any((each.spikes, each.reset) != ("single", "zero") for each in said):
@@ -460,11 +476,12 @@ def _as_ours(description: Description, tensors: dict[str, torch.Tensor]) -> nn.S
             conv1_kernel=conv1.kernel_size[0],
             conv2_kernel=conv2.kernel_size[0],
             hidden=fc1.out_features,
-            outputs_per_class=fc2.out_features // len(CLASSES),
+            outputs_per_class=fc2.out_features // len(classes),
             biases=fc1.bias is not None,
         ),
         description.windows,
         0,
+        len(classes),
     )
     theirs = dict(zip(WEIGHTED, weighted, strict=True))
     set_weights(

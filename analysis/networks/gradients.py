@@ -33,6 +33,7 @@ from sliplab.analysis.networks.network import (
     WEIGHTED,
     by_class,
     by_parameter,
+    classes_of,
     parameters,
     reset_states,
     set_matrices,
@@ -47,7 +48,7 @@ class Batch:
 
     Attributes:
         loss: summed over windows.
-        counts: output spikes int64 (n, 3).
+        counts: output spikes int64 (n, classes).
         fired: of each spiking layer, spikes per neuron and step, summed over windows.
         gradients: of the summed loss, float32, by parameter; biases that the network has not may
             be among them.
@@ -311,7 +312,7 @@ class OnDevice:
         reset_states(self._net)
         with _exact_sums():
             spikes = self._net(dense.flatten(0, 1)).unflatten(0, (len(rows), -1))
-            counts = by_class(spikes.sum(dim=1))
+            counts = by_class(spikes.sum(dim=1), classes_of(self._net))
             target = torch.from_numpy(y[rows]).to(self._device)
             loss = nn.functional.cross_entropy(
                 self._gain * counts.double(), target, reduction="sum"

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks.training import EpochRecord, Fitted, check_classes, restore
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.storage.files import write_bytes
 
@@ -33,6 +34,8 @@ def save(path: Path, fitted: Fitted) -> None:
         "chosen_epoch": fitted.chosen_epoch,
         "warnings": list(fitted.warnings),
     }
+    if fitted.classes != CLASSES:
+        content["classes"] = list(fitted.classes)
     buffer = io.BytesIO()  # torch writes a file's name into it; a buffer has none
     torch.save(_canonical(content), buffer)
     write_bytes(path, buffer.getvalue())
@@ -85,6 +88,7 @@ def parse(data: bytes, name: str) -> Fitted:
             history=tuple(EpochRecord(**record) for record in content["history"]),
             chosen_epoch=content["chosen_epoch"],
             warnings=tuple(content["warnings"]),
+            classes=check_classes(content.get("classes", CLASSES)),
         )
         restore(fitted)
     except (

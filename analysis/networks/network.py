@@ -44,11 +44,13 @@ Array = npt.NDArray[Any]
 Counts = npt.NDArray[np.int64]
 
 
-def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
+def build(
+    settings: Network, windows: Windows, seed: int, classes: int = len(CLASSES)
+) -> nn.Sequential:
     """A network with fresh weights: conv, conv of stride 2, two fully connected, IAF after each.
 
     Time is folded into the batch: the modules take (n * steps, channels, cells, cells) float32
-    and give (n * steps, outputs) spikes; output j is of class j % 3 (`by_class`). Weights are
+    and give (n * steps, outputs) spikes; output j is of class j % classes (`by_class`). Weights are
     torch's default draw times ``settings.weight_scale``; hidden neurons' biases are drawn from
     `FIRST_BIAS`, outputs begin at `FIRST_DRIVE`, and convolutions have no biases
     (docs/decisions/0054, 0056, 0059); with ``settings.biases`` off no layer has. torch's global
@@ -58,6 +60,7 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
         settings: channels, kernels, hidden neurons, outputs, weight scale.
         windows: shape of a sample.
         seed: the same seed gives the same weights to the bit.
+        classes: that it tells apart, at least 2; `classes_of` the network says it again.
     """
     side = math.ceil(windows.cells / 2)
     k1, k2 = settings.conv1_kernel, settings.conv2_kernel
@@ -74,7 +77,7 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             padding=k2 // 2,
             bias=False,
         )
-        biases, outputs = settings.biases, len(CLASSES) * settings.outputs_per_class
+        biases, outputs = settings.biases, classes * settings.outputs_per_class
         fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden, bias=biases)
         fc2 = nn.Linear(settings.hidden, outputs, bias=biases)
         if biases:
@@ -85,7 +88,7 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             layer.weight.mul_(scale)
         if biases:
             fc2.bias.copy_(FIRST_DRIVE - fc2.weight @ rates_alone(fc1.bias, windows.steps))
-    return nn.Sequential(
+    net = nn.Sequential(
         OrderedDict(
             conv1=conv1,
             iaf1=_iaf(windows.steps),
@@ -98,6 +101,14 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             iaf4=_iaf(windows.steps),
         )
     )
+    net.classes = classes  # type: ignore[assignment]  # torch knows only modules and tensors
+    return net
+
+
+def classes_of(net: nn.Sequential) -> int:
+    """Return the number of classes that a network of `build`, or a copy of one, tells apart."""
+    classes: Any = net.classes
+    return int(classes)
 
 
 def rates_alone(bias: torch.Tensor, steps: int) -> torch.Tensor:
@@ -155,9 +166,12 @@ def set_weights(net: nn.Sequential, values: dict[str, torch.Tensor]) -> None:
             parameter.copy_(values[name])
 
 
-def by_class(spikes: torch.Tensor) -> torch.Tensor:
-    """Output spikes (..., outputs) added up by class (..., 3): output j is of class j % 3."""
-    return spikes.reshape(*spikes.shape[:-1], -1, len(CLASSES)).sum(dim=-2)
+def by_class(spikes: torch.Tensor, classes: int = len(CLASSES)) -> torch.Tensor:
+    """Output spikes (..., outputs) added up by class (..., classes).
+
+    Output j is of class j % classes.
+    """
+    return spikes.reshape(*spikes.shape[:-1], -1, classes).sum(dim=-2)
 
 
 def reset_states(net: nn.Sequential) -> None:
@@ -186,19 +200,20 @@ def spike_counts(net: nn.Sequential, x: Array, batch: int = 64) -> Counts:
         batch: samples at a time.
 
     Returns:
-        int64 (n, 3) in the order of `analysis.metrics.classification.CLASSES`.
+        int64 (n, classes); those of slip in the order of `metrics.classification.CLASSES`.
 
     Raises:
         ValueError: samples of another shape.
     """
     check_samples(net, x.shape)
-    out = np.zeros((len(x), len(CLASSES)), np.int64)
+    classes = classes_of(net)
+    out = np.zeros((len(x), classes), np.int64)
     with torch.no_grad():
         for start in range(0, len(x), batch):
             part = torch.from_numpy(x[start : start + batch].astype(np.float32))
             reset_states(net)
             spikes = net(part.flatten(0, 1))
-            counts = by_class(spikes.unflatten(0, (len(part), -1)).sum(dim=1))
+            counts = by_class(spikes.unflatten(0, (len(part), -1)).sum(dim=1), classes)
             out[start : start + batch] = counts.numpy().astype(np.int64)
     reset_states(net)
     return out

@@ -17,8 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.networks.network import SPIKING, WEIGHTED, parameters, spike_counts
+from sliplab.analysis.networks.network import (
+    SPIKING,
+    WEIGHTED,
+    classes_of,
+    parameters,
+    spike_counts,
+)
 from sliplab.protocols.settings import Windows
 
 OPSET = 17
@@ -35,8 +40,7 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
     """The network as the bytes of an ONNX model; the same network gives the same bytes.
 
     Input ``windows``: uint8 (n, steps, channels, cells, cells), n free. Output ``counts``: int64
-    (n, 3), output spikes in the order of `metrics.classification.CLASSES`. All neurons begin at
-    zero.
+    (n, classes), output spikes in the order of the classes. All neurons begin at zero.
 
     Args:
         net: from `analysis.networks.network.build`.
@@ -60,7 +64,7 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
         for name, value in parameters(net).items()
     ]
     constants += [
-        numpy_helper.from_array(np.array([0, -1, len(CLASSES)], np.int64), "by_class"),
+        numpy_helper.from_array(np.array([0, -1, classes_of(net)], np.int64), "by_class"),
         numpy_helper.from_array(np.array([1], np.int64), "neurons"),
     ]
     states = [*SPIKING, "sum"]
@@ -93,7 +97,7 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
             body=body,
             num_scan_inputs=1,
         ),
-        # neuron j is of class j % 3, and a class's spikes are added up
+        # neuron j is of class j % classes, and a class's spikes are added up
         helper.make_node("Reshape", ["sum.end", "by_class"], ["sums"]),
         helper.make_node("ReduceSum", ["sums", "neurons"], ["counted"], keepdims=0),
         helper.make_node("Cast", ["counted"], [OUTPUT], to=TensorProto.INT64),
@@ -103,7 +107,7 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
         nodes,
         "sliplab",
         [each(INPUT, TensorProto.UINT8, ["n", *sample])],
-        [each(OUTPUT, TensorProto.INT64, ["n", len(CLASSES)])],
+        [each(OUTPUT, TensorProto.INT64, ["n", classes_of(net)])],
         constants,
     )
     model = helper.make_model(
@@ -116,7 +120,7 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
 
 
 def onnx_counts(data: bytes, x: npt.NDArray[np.uint8], batch: int = 64) -> npt.NDArray[np.int64]:
-    """Output spikes int64 (n, 3) by onnxruntime in one thread, for x (n, T, C, H, W) uint8.
+    """Output spikes int64 (n, classes) by onnxruntime in one thread, for x (n, T, C, H, W) uint8.
 
     Raises:
         ModuleNotFoundError: the extra ``onnx`` is not installed.
@@ -130,7 +134,8 @@ def onnx_counts(data: bytes, x: npt.NDArray[np.uint8], batch: int = 64) -> npt.N
         session.run([OUTPUT], {INPUT: x[start : start + batch]})[0]
         for start in range(0, len(x), batch)
     ]
-    return np.concatenate([*parts, np.empty((0, len(CLASSES)), np.int64)])
+    none = np.empty((0, session.get_outputs()[0].shape[1]), np.int64)
+    return np.concatenate([*parts, none])
 
 
 def check_onnx(data: bytes, net: nn.Sequential, x: npt.NDArray[np.uint8]) -> int:

@@ -30,6 +30,7 @@ from sliplab.analysis.networks.network import (
     WEIGHTED,
     build,
     by_class,
+    classes_of,
     parameters,
     set_weights,
 )
@@ -121,7 +122,7 @@ class ChipRun:
     """Result of the chip's arithmetic for some windows.
 
     Attributes:
-        counts: output spikes, int64 (n, 3).
+        counts: output spikes, int64 (n, classes).
         potentials: lowest and highest potential of each spiking layer before saturation.
         saturated: share of each layer's potentials, over neurons and steps, that were cut off.
     """
@@ -159,7 +160,9 @@ def chip_run(net: nn.Sequential, x: npt.NDArray[np.uint8], batch: int = 16) -> C
                 cut[name] += _fire(spikes.numpy(), threshold, LOWEST, HIGHEST, ends[name])
                 whole[name] += spikes.numel()
                 at = spikes.view(at.shape)
-            counts.append(by_class(at.view(n, steps, -1).sum(dim=1)).numpy().astype(np.int64))
+            counts.append(
+                by_class(at.view(n, steps, -1).sum(dim=1), classes_of(net)).numpy().astype(np.int64)
+            )
     return ChipRun(
         np.concatenate(counts),
         {name: (float(low), float(high)) for name, (low, high) in ends.items()},
@@ -193,7 +196,7 @@ def _fire(current: Any, threshold: Any, lowest: Any, highest: Any, ends: Any) ->
 
 
 def compare(real: Counts, whole: Counts, margin: float) -> CountChange:
-    """Compare spike counts `real` with `whole`, both int64 (n, 3).
+    """Compare spike counts `real` with `whole`, both int64 (n, classes).
 
     Raises:
         ValueError: no windows, or not the same number of them.

@@ -18,9 +18,8 @@ import torch
 from sinabs.activation import MembraneReset, SingleExponential, SingleSpike
 from torch import nn
 
-from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import spiking_gradients, spiking_kernels
-from sliplab.analysis.networks.network import SPIKING, matrices
+from sliplab.analysis.networks.network import SPIKING, classes_of, matrices
 from sliplab.analysis.networks.spiking_layout import Layout
 from sliplab.analysis.windows.sparse import SparseWindows
 
@@ -46,6 +45,7 @@ class Engine:
     def __init__(self, net: nn.Sequential, cells: int) -> None:
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
         self.threshold, _, _ = neuron(net)
+        self.classes = classes_of(net)
         weights = matrices(net)
         self._layout = Layout(tuple(w.shape for w in weights), cells)
         self._layers = self._layout.layers(weights)
@@ -53,7 +53,7 @@ class Engine:
         self._idle: list[tuple[Any, Any]] = []
 
     def counts(self, x: Samples, threads: int | None = None) -> I64:
-        """Output spikes int64 (n, 3) of samples, each from rest; see `spikes`."""
+        """Output spikes int64 (n, classes) of samples, each from rest; see `spikes`."""
         return self.spikes(x, threads)[0]
 
     def spikes(self, x: Samples, threads: int | None = None) -> tuple[I64, I64]:
@@ -64,13 +64,13 @@ class Engine:
             threads: those of torch by default; the result does not depend on it.
 
         Returns:
-            int64 (n, 3) in the order of `metrics.classification.CLASSES`, and int64 (n, 4).
+            int64 (n, classes), and int64 (n, 4).
 
         Raises:
             ValueError: samples of another shape, or not uint8.
         """
         x = self.sparse(x)
-        out = np.zeros((len(x), len(CLASSES)), np.int64)
+        out = np.zeros((len(x), self.classes), np.int64)
         fired = np.zeros((len(x), len(SPIKING)), np.int64)
 
         def some(begin: int) -> None:
@@ -121,7 +121,7 @@ class Stream:
         self._fired = np.zeros(len(SPIKING), np.int64)
 
     def push(self, plane: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """The next step's counts (channels, cells, cells): output spikes by class, uint8 (3,).
+        """The next step's counts (channels, cells, cells): output spikes by class, uint8 (K,).
 
         Raises:
             ValueError: another shape, or not uint8.
@@ -134,8 +134,8 @@ class Stream:
             cell, plane.ravel()[cell], 0, len(cell), engine._layers, engine.threshold,
             self._state, self._scratch, self._fired,
         )  # fmt: skip
-        classes = self._scratch[1][-1][:n] % np.uint64(len(CLASSES))
-        return np.bincount(classes.astype(np.int64), minlength=len(CLASSES)).astype(np.uint8)
+        classes = self._scratch[1][-1][:n] % np.uint64(engine.classes)
+        return np.bincount(classes.astype(np.int64), minlength=engine.classes).astype(np.uint8)
 
     def reset(self) -> None:
         """Reset the potentials to rest."""
@@ -175,7 +175,7 @@ class Job:
         gain: what a spike counts in the cross-entropy.
 
     Attributes:
-        counts: output spikes int64 (n, 3), when it was run.
+        counts: output spikes int64 (n, classes), when it was run.
         grads: float32, gradients by the packed weights.
     """
 
@@ -190,7 +190,7 @@ class Job:
         self._gain = gain
         self._trainer, self._windows, self._rows, self._labels = trainer, windows, rows, labels
         self._fired = np.zeros(len(SPIKING), np.int64)
-        self.counts = np.zeros((len(rows), len(CLASSES)), np.int64)
+        self.counts = np.zeros((len(rows), trainer.classes), np.int64)
         self.grads = tuple(np.zeros_like(w) for w in trainer.layers[1])
 
     def run(self) -> float:
@@ -221,6 +221,7 @@ class Trainer:
     def __init__(self, net: nn.Sequential, cells: int) -> None:
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
         self.constants = neuron(net)
+        self.classes = classes_of(net)
         self.layout = Layout(tuple(w.shape for w in matrices(net)), cells)
         self._idle: list[Any] = []
         self.take(matrices(net))

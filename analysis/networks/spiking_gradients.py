@@ -46,7 +46,7 @@ def forward_kept(
         potentials: of each layer float32 (steps, neurons), filled with u inside the spans.
         lists: of each layer, filled with its spikes, one step after the other.
         ends: of each layer uint64 (steps + 1,), filled with where a step's spikes end.
-        out: int64 (3,), grows by the output spikes; those of neuron j belong to class j % 3.
+        out: int64 (classes,), grows by the output spikes; neuron j is of class j % classes.
         the rest: see `analysis.networks.spiking_kernels`.
     """
     reach, weights, shape, bias = layers
@@ -183,8 +183,8 @@ def backward(
 
     Args:
         back: (where layer 1's neurons lie, uint64 (n, 2); pixels, weights (channels of layer 2,
-            taps) and kernel rows of layer 2; weights of layer 3 (H, F), of layer 4 (3, H); all
-            filled up with zeros).
+            taps) and kernel rows of layer 2; weights of layer 3 (H, F), of layer 4
+            (outputs, H); all filled up with zeros).
         constants: threshold, width and scale of the surrogate.
         potentials, lists, ends: from `forward_kept`.
         by_count: float32, gradient by the window's spikes of each output, zero beyond the outputs.

@@ -172,8 +172,8 @@ def windows(
     Args:
         cell, count, offsets: see `analysis.windows.sparse.SparseWindows`.
         rest: potentials of each layer at rest.
-        out: int64 (n, 3), filled in its rows [begin, end): spikes of the outputs by class; output
-            neuron j is of class j % 3.
+        out: int64 (n, classes), filled in its rows [begin, end): spikes of the outputs by class;
+            output neuron j is of class j % classes.
         fired_by: int64 (n, layers), likewise, spikes of each layer.
     """
     classes = np.uint64(out.shape[1])

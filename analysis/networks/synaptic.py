@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED
 from sliplab.analysis.networks.spiking import Trainer, side_by_side
 from sliplab.analysis.networks.spiking_gradients import forward_kept
@@ -77,7 +76,7 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> WindowWo
 
     def some(begin: int) -> None:
         state, scratch, (potentials, lists, ends), *_ = memory = trainer.borrow()
-        out = np.zeros(len(CLASSES), np.int64)
+        out = np.zeros(trainer.classes, np.int64)
         row = begin // CHUNK
         for i in range(begin, min(begin + CHUNK, len(x))):
             forward_kept(

@@ -15,9 +15,10 @@ import io
 import math
 import pickle
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,7 @@ from sliplab.analysis.networks.gradients import work_on
 from sliplab.analysis.networks.network import (
     SPIKING,
     build,
+    classes_of,
     matrices,
     on_grid,
     parameters,
@@ -39,6 +41,7 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.spiking import Engine, Samples
 from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Network, Training, Windows
 
 
@@ -106,7 +109,7 @@ def epoch_record(
     gain: float,
     margin: float,
 ) -> EpochRecord:
-    """The record of an epoch from the output spikes (n, 3) and classes of both parts."""
+    """The record of an epoch from the output spikes (n, classes) and classes of both parts."""
     val = metrics.accuracy(val_counts, val_y, margin)
     train = metrics.accuracy(train_counts, train_y)
     log_p = log_softmax(gain * val_counts, axis=1)
@@ -136,10 +139,13 @@ def layer_warnings(record: EpochRecord) -> tuple[str, ...]:
 class Run:
     """A training between two epochs."""
 
-    def __init__(self, network: Network, windows: Windows, training: Training, seed: int) -> None:
+    def __init__(
+        self, network: Network, windows: Windows, training: Training, seed: int, classes: int
+    ) -> None:
         self.training = training
-        self.fine = build(network, windows, seed)
-        self.trained = build(network, windows, seed)
+        self.classes = classes
+        self.fine = build(network, windows, seed, classes)
+        self.trained = build(network, windows, seed, classes)
         """Network with the fine weights rounded to the grid, between epochs."""
         self.parameters = parameters(self.fine)
         self.optimizer = torch.optim.Adam(
@@ -172,11 +178,11 @@ class Run:
     def one_epoch(
         self, x: SparseWindows, y: metrics.IntArray, order: metrics.IntArray, pool: Executor
     ) -> tuple[float, metrics.IntArray, dict[str, float]]:
-        """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates."""
+        """Mean loss, output spikes (n, classes) in the order of `x`, and the layers' mean rates."""
         batch = self.training.batch
         steps = math.ceil(len(x) / batch)
         loss = 0.0
-        counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
+        counts = np.zeros((len(x), self.classes), np.int64)
         fired = dict.fromkeys(SPIKING, 0.0)
         for start in range(0, len(x), batch):
             chosen = order[start : start + batch]
@@ -249,6 +255,7 @@ class Fitted:
         warnings: as text, what is wrong with the chosen network; empty when nothing is.
         epoch_seconds: wall time of each epoch. Kept apart from the records and not saved, so
             that the same training gives the same file.
+        classes: names of the classes, in the order of the outputs.
     """
 
     state_dict: dict[str, torch.Tensor]
@@ -260,11 +267,30 @@ class Fitted:
     chosen_epoch: int
     warnings: tuple[str, ...]
     epoch_seconds: tuple[float, ...] = field(default=(), compare=False)
+    classes: tuple[str, ...] = metrics.CLASSES
 
     @property
     def chosen(self) -> EpochRecord:
         """The record of the chosen epoch."""
         return self.history[self.chosen_epoch - 1]
+
+    def check_slip(self, model: Path | str, purpose: str) -> None:
+        """Check that the classes are those of slip, for what is made for these alone.
+
+        Args:
+            model: its file, for the message.
+            purpose: what needs them, such as ``detection``.
+
+        Raises:
+            InputError: they are not.
+        """
+        if self.classes != metrics.CLASSES:
+            some = ", ".join(self.classes[:4]) + (" ..." if len(self.classes) > 4 else "")
+            raise InputError(
+                model, "", None,
+                f"the network tells {len(self.classes)} classes apart ({some}); {purpose} needs "
+                f"one of the classes {', '.join(metrics.CLASSES)}",
+            )  # fmt: skip
 
 
 def fit(
@@ -279,6 +305,7 @@ def fit(
     on_epoch: Callable[[EpochRecord], None] | None = None,
     on_state: Callable[[bytes], None] | None = None,
     state: bytes | None = None,
+    classes: Sequence[str] = metrics.CLASSES,
 ) -> Fitted:
     """Train one network and keep its best epoch.
 
@@ -293,19 +320,21 @@ def fit(
 
     Args:
         train_x, val_x: event counts uint8 (n, steps, channels, cells, cells), or sparse.
-        train_y, val_y: classes, integer (n,), 0..2.
+        train_y, val_y: classes, integer (n,), from 0.
         network, windows, training: the settings; ``training.seeds`` is the caller's to loop over.
         seed: decides the first weights and the order of the samples.
         on_epoch: called with each record as soon as it is there, in the calling thread.
         on_state: called after each epoch with all that is needed to resume there.
         state: last state passed to `on_state` by a call with the same arguments: training resumes
             there and ends with the same bits. Records of earlier epochs are reported again.
+        classes: names of the classes, at least 2.
 
     Raises:
-        ValueError: no samples, shapes that do not fit, a label that is not a class, a state of
-            another training.
+        ValueError: no samples, shapes that do not fit, a label that is not a class, fewer than 2
+            classes or two of one name, a state of another training.
     """
-    run = Run(network, windows, training, seed)
+    classes = check_classes(classes)
+    run = Run(network, windows, training, seed, len(classes))
     train, train_y = _check(run.trained, windows, train_x, train_y, "training")
     val, val_y = _check(run.trained, windows, val_x, val_y, "validation")
     if state is not None:
@@ -322,6 +351,11 @@ def fit(
             seen = train
             if training.mirror:
                 seen = train.mirrored(rng.integers(0, 4, len(train), np.uint8))
+            if training.shift_steps:
+                most = training.shift_steps
+                seen = seen.shifted(rng.integers(-most, most + 1, len(train)))
+            if training.drop_events:
+                seen = seen.thinned(training.drop_events, rng)
             loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
             val_counts = Engine(run.trained, windows.cells).counts(val)
             record = epoch_record(
@@ -344,12 +378,21 @@ def fit(
         chosen_epoch=run.best,
         warnings=layer_warnings(run.history[run.best - 1]),
         epoch_seconds=tuple(run.seconds),
+        classes=classes,
     )
+
+
+def check_classes(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of classes; a ValueError unless there are two or more, all distinct."""
+    found = tuple(names)
+    if len(found) < 2 or len(set(found)) < len(found):
+        raise ValueError(f"classes are {', '.join(found) or 'none'}; expected 2 or more, distinct")
+    return found
 
 
 def restore(fitted: Fitted) -> nn.Sequential:
     """The trained network as Sinabs modules."""
-    net = build(fitted.network, fitted.windows, fitted.seed)
+    net = build(fitted.network, fitted.windows, fitted.seed, len(fitted.classes))
     set_weights(net, fitted.state_dict)
     return net
 
@@ -360,7 +403,7 @@ def engine(fitted: Fitted) -> Engine:
 
 
 def predict_counts(fitted: Fitted, x: Samples) -> npt.NDArray[np.int64]:
-    """Output spikes int64 (n, 3) of samples (n, steps, channels, cells, cells).
+    """Output spikes int64 (n, classes) of samples (n, steps, channels, cells, cells).
 
     Raises:
         ValueError: samples of another shape.
@@ -376,7 +419,7 @@ def limit_threads(count: int) -> None:
 def _check(
     net: nn.Sequential, windows: Windows, x: Samples, y: metrics.Labels, what: str
 ) -> tuple[SparseWindows, metrics.IntArray]:
-    y = metrics.check_labels(y)
+    y = metrics.check_labels(y, classes_of(net))
     if not len(y) or len(x) != len(y):
         raise ValueError(f"{len(x)} {what} samples and {len(y)} labels; expected as many, not none")
     try:

@@ -42,7 +42,8 @@ def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
         values = dict(fitted.state_dict)
         for name in ("fc2.weight", "fc2.bias"):
             old = values[name]
-            grouped = old.reshape(-1, len(CLASSES), *old.shape[1:])  # output j is of class j % 3
+            # output j is of class j % classes
+            grouped = old.reshape(-1, len(fitted.classes), *old.shape[1:])
             values[name] = grouped[:, list(order)].reshape(old.shape)
         set_weights(net, values)
         return Engine(net, fitted.windows.cells).counts(x)

@@ -72,6 +72,7 @@ def make_detect_request(
     """
     file, _ = load_rig_file(rig)
     fitted = load_model(model)
+    fitted.check_slip(model, "detection")
     given = (("margin", margin), ("smoothing", smoothing))
     change = {name: value for name, value in given if value is not None}
     if stride_ms is not None and not 0 < stride_ms <= fitted.windows.length_ms:

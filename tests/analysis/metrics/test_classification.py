@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -119,3 +120,39 @@ def test_wrong_input_is_named(counts: np.ndarray, labels: np.ndarray, message: s
 
 def test_class_names_are_the_summary_keys() -> None:
     assert CLASSES == ("no_slip", "incipient", "gross")
+
+
+@given(
+    classes=st.sampled_from([2, 5, 36, 200]),
+    n=st.integers(1, 60),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_ties_of_any_number_of_classes_are_shared_exactly(classes: int, n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    counts, labels = rng.integers(0, 3, (n, classes)), rng.integers(0, classes, n)
+    found = accuracy(counts, labels)
+    shared, alone = Fraction(), 0
+    table = np.zeros((classes, classes + 1), int)
+    for row, label in zip(counts.tolist(), labels.tolist(), strict=True):
+        best = [k for k in range(classes) if row[k] == max(row)]
+        shared += Fraction(label in best, len(best))
+        alone += best == [label]
+        table[label, best[0] if len(best) == 1 else classes] += 1
+    assert found.argmax == float(shared / n)
+    assert found.strict == alone / n
+    np.testing.assert_array_equal(confusion(counts, labels), table)
+    order = rng.permutation(classes)
+    assert accuracy(counts[:, order], np.argsort(order)[labels]) == found
+
+
+def test_many_classes_have_labels_of_their_own() -> None:
+    assert winners(np.eye(256, dtype=int)).tolist() == list(range(256))
+    assert winners(np.eye(127, dtype=int)).dtype == np.int8
+    names = tuple(f"object {k}" for k in range(36))
+    result = score(np.eye(36, dtype=int), np.arange(36), names=names)
+    assert result.recall == dict.fromkeys(names, 1.0)
+    assert result.balance == dict.fromkeys(names, 1 / 36)
+    with pytest.raises(ValueError, match=r"\(1, 36\); expected \(n, 3\)"):
+        score(np.ones((1, 36)), np.array([0]))
+    with pytest.raises(ValueError, match=r"expected 0\.\.35"):
+        accuracy(np.ones((1, 36)), np.array([36]))

@@ -5,7 +5,12 @@ import pytest
 import torch
 
 from sliplab.analysis.metrics.classification import accuracy
-from sliplab.analysis.networks.baseline_nets import KINDS, multiply_adds, trained_net
+from sliplab.analysis.networks.baseline_nets import (
+    KINDS,
+    TAXEL_KINDS,
+    multiply_adds,
+    trained_net,
+)
 from sliplab.analysis.networks.baselines import boosted
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.analysis.windows.sparse import SparseWindows
@@ -30,7 +35,7 @@ def events(n: int, seed: int) -> SampleSet:
 TRAIN, VALIDATION, TEST = events(240, 0), events(60, 1), events(90, 2)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", sorted(KINDS | TAXEL_KINDS))
 def test_each_network_finds_what_it_can_see(kind: str) -> None:
     epochs = 40  # of two steps each, of which the last few are small
     votes, said = trained_net(kind, TRAIN, VALIDATION, TEST.windows, epochs)
@@ -49,7 +54,7 @@ def test_each_network_finds_what_it_can_see(kind: str) -> None:
 
 def test_multiply_adds_are_those_of_the_formulas() -> None:
     cells = 2 * 5 * 5
-    found = {kind: multiply_adds(make(SHAPE), SHAPE) for kind, make in KINDS.items()}
+    found = {kind: multiply_adds(make(SHAPE, 3), SHAPE) for kind, make in KINDS.items()}
     assert found == {
         "cnn_frame": 25 * 8 * 2 * 25 + 9 * 16 * 8 * 9 + 16 * 9 * 32 + 32 * 3,
         "cnn_volume": 27 * 8 * 2 * 27 + 8 * 16 * 8 * 27 + 16 * 8 * 32 + 32 * 3,

@@ -16,6 +16,8 @@ from sliplab.analysis.networks.baselines import (
     fit_logistic,
     fit_rate_thresholds,
     logistic_cells,
+    logistic_slices,
+    slice_sums,
     step_sums,
 )
 from sliplab.analysis.windows.sparse import SparseWindows
@@ -162,3 +164,29 @@ def test_wrong_input_is_named() -> None:
         evaluate_baselines(x, y[:1], x, y)
     with pytest.raises(ValueError, match=r"expected 0\.\.2"):
         evaluate_baselines(x, y + 2, x, y)
+
+
+def test_slices_tell_when_as_well_as_where() -> None:
+    """Five classes with equal events of each cell; two of them by the half of the window alone."""
+    rng = np.random.default_rng(0)
+    y = np.arange(300) % 5
+    dense = rng.poisson(0.1, (300, 10, 4, 1, 1)).astype(np.uint8)
+    for sample, label in zip(dense, y, strict=True):
+        half = slice(0, 5) if label < 4 else slice(5, 10)
+        sample[half, min(label, 3)] += 1
+    x = SparseWindows.of(dense)
+    expected = dense.reshape(300, 2, 5, 4).sum(axis=2).reshape(300, 8)
+    np.testing.assert_array_equal(slice_sums(x, 2), expected)
+    np.testing.assert_array_equal(slice_sums(x, 99), dense.reshape(300, 40))
+    np.testing.assert_array_equal(slice_sums(x, 1), cell_sums(x))
+    first, last = np.arange(200), np.arange(200, 300)
+    parts = (x.take(first), y[first], x.take(last))
+    votes, said = logistic_slices(*parts, 5, 2)
+    assert (said["slices"], said["weights"]) == (2, 9 * 5)
+    assert (votes.argmax(axis=1) == y[last]).mean() > 0.95
+    cells, _ = logistic_cells(*parts, 5)
+    assert 0.5 < (cells.argmax(axis=1) == y[last]).mean() < 0.9
+    names = ("a", "b", "c", "d", "e")
+    found = evaluate_baselines(*parts, y[last], names)
+    assert list(found) == ["majority", "logistic"]
+    assert found["majority"].argmax == 1 / 5

@@ -32,7 +32,7 @@ from sliplab.analysis.networks.speck import CORES, KI, speck_fit
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.storage.schema.export import CardCampaign, CardData, ModelFile
-from tests.analysis.networks.test_spiking import FULL, SMALL, TINY, biased, sparse
+from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -70,6 +70,16 @@ def test_the_graph_counts_as_sinabs_does(network: Network, windows: Windows) -> 
     assert model.metadata_props[0].key == "classes"
     again = biased(build(network, windows, 1), 1)
     assert to_onnx(again, windows, {"classes": "a"}) == data
+
+
+@pytest.mark.parametrize("classes", [2, 36])
+def test_a_graph_of_other_classes_and_taxels(classes: int) -> None:
+    net = biased(build(SMALL, TAXELS, 1, classes), 1)
+    x = sparse(6, TAXELS, 1, 0.13)
+    data = to_onnx(net, TAXELS, {})
+    assert check_onnx(data, net, x) == 6
+    assert onnx_counts(data, x).shape == (6, classes)
+    assert onnx_counts(data, x[:0]).shape == (0, classes)
 
 
 def test_a_graph_that_counts_otherwise_is_not_let_through() -> None:

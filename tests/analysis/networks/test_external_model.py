@@ -309,3 +309,20 @@ def test_the_documented_description_is_one() -> None:
     found = validate(Description, parse_yaml(block, "lab.yaml"), "lab.yaml")
     assert [each.kind for each in found.layers] == [each["kind"] for each in OURS]
     assert found.windows == Windows()
+
+
+def test_other_classes_are_named(tmp_path: Path) -> None:
+    net, x = papers(2.0**-6, 6), windows(40)
+    names = ["cup", "spoon"]
+    found = load_external(saved(tmp_path, net, classes=names, outputs=names * 3))
+    assert found.outputs_per_class == 3
+    counts = found.sinabs().counts(x)
+    expected = by_hand(net, x, 64).reshape(-1, 3, 2).sum(axis=1)
+    np.testing.assert_array_equal(counts, expected)
+    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+    with pytest.raises(InputError, match=r"outputs .*one of cup, spoon; gross is none"):
+        load_external(saved(tmp_path, net, classes=names, outputs=["cup", "spoon", "gross"] * 2))
+    with pytest.raises(InputError, match=r"classes .*must name each class once"):
+        load_external(saved(tmp_path, net, classes=["cup", "cup"], outputs=names * 3))
+    plain = Description.model_validate({"model": 1, "weights": "a", "layers": OURS})
+    assert "classes" not in plain.model_dump()

@@ -32,6 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = Network(conv1_channels=3, conv2_channels=4, hidden=9)
 TINY = Windows(length_ms=10, crop_px=120)
 FULL = Windows()
+TAXELS = Windows(length_ms=250, taxels=39, polarity="both")
 
 
 def put(net: nn.Sequential, values: list[np.ndarray]) -> nn.Sequential:
@@ -288,3 +289,24 @@ def test_weights_off_the_grid_or_too_large_are_not_exact() -> None:
     values[0][0] = 2.0
     assert not exact(values)
     assert exact(values, most=100)
+
+
+@pytest.mark.parametrize("classes", [2, 5, 36])
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_any_number_of_classes(classes: int, outputs: int) -> None:
+    """Of taxels, 78 channels of one cell, over 250 steps; and of a square crop."""
+    for windows, share in ((TAXELS, 0.13), (TINY, 0.3)):
+        network = Network(
+            conv1_channels=9, conv2_channels=7, hidden=11, outputs_per_class=outputs,
+            weight_scale=(1.0, 3.0, 4.0, 3.0),
+        )  # fmt: skip
+        net = on_own_grid(biased(build(network, windows, 4, classes), 4))
+        x = sparse(5, windows, classes, share)
+        expected = spike_counts(net, x)
+        assert expected.shape == (5, classes)
+        assert expected.any()
+        engine = Engine(net, windows.cells)
+        np.testing.assert_array_equal(engine.counts(x), expected)
+        stream = engine.stream()
+        steps = np.array([stream.push(plane) for plane in x[0]])
+        np.testing.assert_array_equal(steps.sum(axis=0), expected[0])

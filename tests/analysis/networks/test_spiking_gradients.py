@@ -14,6 +14,7 @@ from sliplab.analysis.networks.network import (
     WEIGHTED,
     build,
     by_class,
+    classes_of,
     matrices,
     parameters,
     reset_states,
@@ -25,7 +26,9 @@ from sliplab.protocols.settings import Network, Windows
 from tests.analysis.networks.test_spiking import (
     FULL,
     SMALL,
+    TAXELS,
     TINY,
+    biased,
     gridded,
     on_own_grid,
     put,
@@ -52,7 +55,7 @@ def by_sinabs(
             getattr(net, name).register_forward_hook(lambda _m, _i, out: out.double())
     reset_states(net)
     out = net(torch.from_numpy(x.astype(kind)).flatten(0, 1)).unflatten(0, (len(x), -1))
-    loss = nn.functional.cross_entropy(gain * by_class(out.sum(dim=1)), y)
+    loss = nn.functional.cross_entropy(gain * by_class(out.sum(dim=1), classes_of(net)), y)
     wanted = parameters(net)
     grads = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values())), strict=True))
     return [
@@ -106,7 +109,9 @@ def in_double(net: nn.Sequential, x: np.ndarray, y: torch.Tensor) -> list[torch.
             value = _Spike.apply(u)
             states[k] = u * (1 - value.detach())
         out = out + value
-    return list(torch.autograd.grad(nn.functional.cross_entropy(by_class(out), y), weights))
+    return list(
+        torch.autograd.grad(nn.functional.cross_entropy(by_class(out, classes_of(net)), y), weights)
+    )
 
 
 def off(found: list[Any], expected: list[torch.Tensor]) -> list[float]:
@@ -222,3 +227,19 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
         values = matrices(net)
         put(net, [w - 0.05 * g for w, g in zip(values, grads, strict=True)])
     assert min(losses[20:]) < losses[0] - 0.1
+
+
+@pytest.mark.parametrize("classes", [2, 5, 36])
+@pytest.mark.parametrize("windows", [TINY, TAXELS], ids=["crop", "taxels"])
+def test_gradients_of_any_number_of_classes(classes: int, windows: Windows) -> None:
+    network = Network(
+        conv1_channels=9, conv2_channels=7, hidden=11, outputs_per_class=2,
+        weight_scale=(1.0, 3.0, 4.0, 3.0),
+    )  # fmt: skip
+    net = on_own_grid(biased(build(network, windows, 3, classes), 3))
+    x = sparse(4, windows, 5, 0.13 if windows is TAXELS else 0.3)
+    y = torch.arange(4) * 7 % classes
+    counts, fast = by_events(net, x, y, windows.cells)
+    assert counts.shape == (4, classes)
+    assert max(off(fast, by_sinabs(net, x, y))) <= 1e-6
+    assert max(off(fast, in_double(net, x, y))) <= 1e-6

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from sliplab.analysis.detectors.live import counting_of
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks.model_file import FORMAT, load, save
 from sliplab.analysis.networks.network import (
@@ -32,6 +34,7 @@ from sliplab.analysis.networks.training import (
     predict_counts,
     restore,
 )
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Network, Training, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -427,3 +430,88 @@ def test_saturated_and_silent_layers_are_named() -> None:
         "layer iaf2 is saturated",
         "layer iaf4 is silent",
     ]
+
+
+OBJECTS = ("cup", "spoon", "sponge", "ball", "brush")
+SKIN = Windows(length_ms=20, taxels=6, polarity="both")  # (20, 12, 1, 1)
+
+
+def touches(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Five objects: each touches other taxels, and two differ in when they do."""
+    rng = np.random.default_rng(seed)
+    x = rng.poisson(0.05, (n, 20, 12, 1, 1)).astype(np.uint8)
+    y = np.arange(n) % 5
+    for sample, label in zip(x[..., 0, 0], y, strict=True):
+        taxels, begin = (label, 0) if label < 4 else (3, 10)
+        sample[begin : begin + 10, [taxels, taxels + 6]] += rng.poisson(0.8, (10, 2)).astype(
+            np.uint8
+        )
+    return x, y
+
+
+def touched(on_state: Callable[[bytes], None] | None = None, **changes: object) -> Fitted:
+    settings = TRAINING.model_copy(update={"epochs": 8, "patience": 8, **changes})
+    return fit(
+        *touches(200, 0), *touches(50, 1), NETWORK, SKIN, settings, 0, classes=OBJECTS,
+        on_state=on_state,
+    )  # fmt: skip
+
+
+def test_other_classes_are_learned_from_taxels(tmp_path: Path) -> None:
+    states: list[bytes] = []
+    found = touched(states.append)
+    x, y = touches(100, 2)
+    counts = predict_counts(found, x)
+    assert counts.shape == (100, 5)
+    np.testing.assert_array_equal(counts, spike_counts(restore(found), x))
+    strict = metrics.accuracy(counts, y).strict
+    assert strict is not None
+    assert strict > 0.6  # chance is 0.2
+    again = fit(
+        *touches(200, 0), *touches(50, 1), NETWORK, SKIN, found.training, 0, classes=OBJECTS,
+        state=states[2],
+    )  # fmt: skip
+    assert again.history == found.history
+    save(tmp_path / "a.pt", found)
+    read = load(tmp_path / "a.pt")
+    assert (read.classes, read.windows) == (OBJECTS, SKIN)
+    np.testing.assert_array_equal(predict_counts(read, x), counts)
+    with pytest.raises(ValueError, match="shape"):
+        fit(
+            *touches(200, 0), *touches(50, 1), NETWORK, SKIN, found.training, 0,
+            classes=(*OBJECTS, "pen"), state=states[2],
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [{"shift_steps": 3}, {"drop_events": 0.3}])
+def test_varied_windows_are_drawn_from_the_seed(change: dict[str, float]) -> None:
+    found, plain = touched(epochs=2, **change), touched(epochs=2)
+    assert found.history != plain.history
+    assert touched(epochs=2, **change).history == found.history
+    nothing: dict[str, object] = dict.fromkeys(change, 0)
+    assert touched(epochs=2, **nothing).history == plain.history
+
+
+def test_models_of_slip_do_not_name_their_classes(fitted: Fitted, tmp_path: Path) -> None:
+    save(tmp_path / "a.pt", fitted)
+    content = torch.load(tmp_path / "a.pt", weights_only=True)
+    assert "classes" not in content
+    assert not {"shift_steps", "drop_events"} & set(content["training"])
+    assert load(tmp_path / "a.pt").classes == metrics.CLASSES
+    fitted.check_slip("a.pt", "detection")
+
+
+def test_what_is_made_for_slip_refuses_other_classes(fitted: Fitted) -> None:
+    other = replace(fitted, classes=OBJECTS)
+    for work in (lambda: other.check_slip("a.pt", "a Speck"), lambda: counting_of(other)):
+        with pytest.raises(
+            InputError, match=r"tells 5 classes apart \(cup, spoon, sponge, ball \.\.\.\); "
+        ) as caught:
+            work()
+        assert "needs one of the classes no_slip, incipient, gross" in str(caught.value)
+
+
+@pytest.mark.parametrize("classes", [(), ("cup",), ("cup", "spoon", "cup")])
+def test_classes_are_two_or_more(classes: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="expected 2 or more, distinct"):
+        fit(*TRAIN, *VAL, NETWORK, WINDOWS, TRAINING, 0, classes=classes)
