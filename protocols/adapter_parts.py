@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from sliplab.protocols.file_pattern import parse_pattern, template_fields
 from sliplab.protocols.units import all_symbols, find_unit
@@ -392,12 +392,15 @@ class Labels(StrictModel):
         return self
 
 
+TimeText = Annotated[Template, WithJsonSchema({"type": ["string", "number"], "minLength": 1})]
+
+
 class GivenMotion(StrictModel):
     """Begin and end of the slide, which become the record's steps ``hold`` and ``slide``."""
 
-    start: Template
+    start: TimeText
     """A number, or a field such as ``"{slide_start}"``."""
-    end: Template
+    end: TimeText
     unit: TimeUnit
     clock: LabelClock = "events"
 

@@ -1,4 +1,4 @@
-"""`sliplab schema`: JSON Schemas of protocol and rig files, and of the documents in a store."""
+"""`sliplab schema`: JSON Schemas of protocols, rig files, adapters and documents in a store."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-KINDS = ("protocol", "rig", "trial", "label", "evaluation", "summary")
+KINDS = ("protocol", "rig", "adapter", "trial", "label", "evaluation", "summary")
 
 
 @app.command()
@@ -25,7 +25,7 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the JSON Schema of a protocol, a rig file or a document in a store."""
+    """Print the JSON Schema of a protocol, a rig file, an adapter or a document in a store."""
     if kind not in KINDS:
         raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
     from sliplab.flows.planning.schema import file_schema

@@ -1,6 +1,6 @@
-"""JSON Schemas of protocol and rig files, and of the documents in a store.
+"""JSON Schemas of protocol, rig and adapter files, and of the documents in a store.
 
-Editors complete, explain and check YAML by the first two; programs check what they read by the
+Editors complete, explain and check YAML by the first three; programs check what they read by the
 others. They are made from the models that read the files, so they know the same keys. They know
 less than `sliplab plan` and `sliplab check`: a rule over several keys, such as a limit that a level
 breaks, is in the models alone. They are of draft 7, the newest that the YAML language server
@@ -18,6 +18,7 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
+from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
@@ -28,7 +29,7 @@ from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
 
-Kind = Literal["protocol", "rig", "trial", "label", "evaluation", "summary"]
+Kind = Literal["protocol", "rig", "adapter", "trial", "label", "evaluation", "summary"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
 DOCUMENTS: dict[Kind, type[Document]] = {
@@ -69,6 +70,8 @@ def file_schema(kind: Kind) -> Schema:
         return _rig_schema()
     if kind == "protocol":
         return _finished(_made(Protocol), "A protocol of SlipLab")
+    if kind == "adapter":
+        return _finished(_made(Adapter), "An adapter of SlipLab")
     return _finished(_made(DOCUMENTS[kind]), TITLES[kind])
 
 

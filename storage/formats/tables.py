@@ -16,8 +16,7 @@ from decimal import Decimal, InvalidOperation
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import csv as arrow_csv
+import pandas as pd
 
 from sliplab.protocols.adapter_parts import TIME_UNITS
 from sliplab.protocols.errors import InputError
@@ -226,40 +225,33 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
     for column in columns.values():
         if str(column) not in there:
             raise FormatError(f"has no column {column}; there are {', '.join(cells)}")
-    wanted = {key: f"f{there[str(column)]}" for key, column in columns.items()}
-    names = list(dict.fromkeys(wanted.values()))
+    wanted = {key: int(there[str(column)]) for key, column in columns.items()}
     try:
-        table = arrow_csv.read_csv(
-            pa.BufferReader(pa.py_buffer(data)),
-            arrow_csv.ReadOptions(
-                autogenerate_column_names=True, skip_rows=int(headed), block_size=1 << 24
-            ),
-            arrow_csv.ParseOptions(delimiter=separator),
-            arrow_csv.ConvertOptions(include_columns=names),
-        )
-    except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
-        if "Empty CSV file" in str(error):
-            return {key: np.empty(0, np.int64) for key in wanted}
+        table = pd.read_csv(
+            io.BytesIO(data), sep=separator, header=None, skiprows=int(headed),
+            usecols=sorted(set(wanted.values())), low_memory=False, encoding="utf-8-sig",
+        )  # fmt: skip
+    except pd.errors.EmptyDataError:
+        return {key: np.empty(0, np.int64) for key in wanted}
+    except (ValueError, OverflowError) as error:  # also pandas' own errors of parsing
         raise FormatError(f"is not CSV: {' '.join(str(error).split())}") from None
     return {
-        key: _numbers(table.column(name), columns[key], 1 + headed) for key, name in wanted.items()
+        key: _numbers(table[index].to_numpy(), columns[key], 1 + headed)
+        for key, index in wanted.items()
     }
 
 
 def _numbers(column: Any, name: str | int, first_row: int) -> Any:
-    kind = column.type
-    if pa.types.is_null(kind) and not len(column):
-        return np.empty(0, np.int64)
-    number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
-    if not number:
-        values = column.slice(0, 1 << 20).to_pylist()
-        at = next((k for k, v in enumerate(values) if not _is_number(str(v))), None)
-        where = "" if at is None else f": row {first_row + at} is {values[at]!r:.40}"
-        raise FormatError(f"has a column {name} that is not all numbers{where}")
-    if column.null_count:
-        at = int(np.flatnonzero(column.is_null().to_numpy())[0])
-        raise FormatError(f"has an empty cell in column {name}: row {first_row + at}")
-    return column.to_numpy()
+    if column.dtype.kind not in "iufb":
+        at = next((k for k, value in enumerate(column) if not _is_number(str(value))), 0)
+        raise FormatError(
+            f"has a column {name} that is not all numbers: row {first_row + at} is "
+            f"{str(column[at])!r:.40}"
+        )
+    if column.dtype.kind == "f" and np.isnan(column).any():
+        at = int(np.flatnonzero(np.isnan(column))[0])
+        raise FormatError(f"has no number in column {name}: row {first_row + at}")
+    return column
 
 
 def _is_number(text: str) -> bool:

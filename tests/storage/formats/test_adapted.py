@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import json
+import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +21,9 @@ from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
+from tests.command_line import here
 from tests.conftest import ROOT
-
-COUNTS: dict[str, Any] = {
-    "adapter": 1,
-    "name": "touch",
-    "experiment": "classes",
-    "trials": {"files": "**/{part:train|test}/*{object:number}*.npy", "id": "{part}-{stem}"},
-    "streams": {
-        "events": {"format": "counts", "axes": ["taxel", "polarity", "step"], "step_ms": 20}
-    },
-    "labels": {"class": "{object}"},
-    "split": {"given": "part"},
-}
+from tests.storage.formats.adapters import COUNTS, SLIDES, slides, touches
 
 
 def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = None) -> Campaign:
@@ -43,21 +36,6 @@ def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = N
     import_adapted(opened, read.name, found, file.read_text())
     assert not verify(opened)
     return opened.campaign(read.name)
-
-
-def touches(folder: Path, name: Callable[[int], str], classes: int = 3) -> dict[str, Any]:
-    """Write a small data set of counts; return the arrays by name."""
-    rng = np.random.default_rng(4)
-    made = {}
-    for number in range(2 * classes):
-        part = "train" if number < classes else "test"
-        counts = rng.poisson(0.4, (5, 2, 8)).astype(np.float32)
-        counts[:, :, -1] = 0
-        path = folder / part / name(number)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, counts)
-        made[f"{part}-{path.stem}"] = counts
-    return made
 
 
 def test_counts_become_events_that_bin_to_the_counts(tmp_path: Path) -> None:
@@ -95,3 +73,210 @@ def test_a_pattern_that_fits_nothing_says_what_is_there(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"trials.files = \*.mat: fits no file .* 6 files: test/"):
         bring(wrong, tmp_path / "set", tmp_path / "store")
     assert not (tmp_path / "store").exists()
+
+
+def test_a_set_of_slides_comes_with_all_of_its_streams(tmp_path: Path) -> None:
+    names = slides(tmp_path / "set")
+    campaign = bring(SLIDES, tmp_path / "set", tmp_path / "store")
+    assert campaign.committed() == set(names)
+    recording = campaign.recording("ann_0.6_0")
+    record = recording.record
+    assert record.condition == {"speed": "0.6 mm/s", "side": "left"}
+    assert record.imported.fields == {
+        "person": "ann", "speed": "0.6", "number": "0", "side": "left"
+    }  # fmt: skip
+    events = recording.events()
+    np.testing.assert_array_equal(events.t_us, np.arange(101) * 10_000)
+    np.testing.assert_array_equal(events.p, np.arange(101) % 2 == 0)
+    with recording.open() as reader:
+        np.testing.assert_array_equal(reader.poses().xyz_mm[3], [100, 3000, 0])
+    assert record.counts.frames == 4
+    assert record.streams["force"].rows == 5
+    given = record.imported.given
+    assert (given.incipient_ns, given.gross_ns) == (305_000_000, 405_500_000)
+    assert given.uncertainty_ns == 2_500_000
+    assert record.clocks.frames.grade == "given"
+    assert record.clocks.arm.uncertainty_ns is None
+    assert "clock of arm" in record.imported.unknown
+    assert [step.phase for step in record.steps] == ["hold", "slide"]
+    assert recording.motion_ns == (100_000_000, 900_000_000)
+    assert campaign.recording("ann_2_1").record.imported.given.gross_ns is None
+    assert campaign.recording("cid_2_0").record.imported.given is None
+    parts = {trial.id: trial.split for trial in Collected(campaign).planned}
+    assert parts["ann_0.6_0"] == parts["ann_2_1"]
+
+
+def spans_of(folder: Path) -> dict[str, Any]:
+    """The same slides with their labels as intervals in a file a trial, in JSON lines."""
+    for name in slides(folder):
+        lines = [
+            {"a": 0, "b": 0.25, "what": "stick"},
+            {"a": 0.25, "b": 0.500000001, "what": "slip"},
+        ]
+        text = "".join(json.dumps(line) + "\n" for line in lines)
+        (folder / "rec" / name / "marks.jsonl").write_text(text)
+    names = {"stick": "no_slip", "slip": "incipient"}
+    spans = {
+        "file": "rec/{folder}/marks.jsonl", "start": "a", "end": "b", "class": "what",
+        "unit": "s", "clock": "start", "names": names,
+    }  # fmt: skip
+    return {**SLIDES, "labels": {"spans": spans}}
+
+
+def test_intervals_become_onsets_of_slip_or_classes(tmp_path: Path) -> None:
+    adapter = spans_of(tmp_path / "set")
+    campaign = bring(adapter, tmp_path / "set", tmp_path / "store")
+    given = campaign.recording("bob_0.6_1").record.imported.given
+    assert (given.incipient_ns, given.gross_ns, given.spans) == (250_000_000, None, ())
+    adapter = {**adapter, "name": "marks", "experiment": "classes"}
+    del adapter["motion"]
+    adapter["labels"]["spans"].pop("names")
+    campaign = bring(adapter, tmp_path / "set", tmp_path / "store")
+    given = campaign.recording("bob_0.6_1").record.imported.given
+    assert [(s.start_ns, s.end_ns, s.name) for s in given.spans] == [
+        (0, 250_000_000, "stick"), (250_000_000, 500_000_001, "slip")
+    ]  # fmt: skip
+    assert Collected(campaign).planned.classes == ("slip", "stick")
+
+
+def test_a_table_may_say_what_the_trials_are_and_a_zip_is_read_in_place(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    counts = rng.integers(0, 3, (4, 2, 3))
+    with zipfile.ZipFile(tmp_path / "set.zip", "w") as packed:
+        for number in range(4):
+            np.save(tmp_path / "one.npy", counts)
+            packed.write(tmp_path / "one.npy", f"top/data/{number}.npy")
+        table = [{"name": n, "kind": "ab"[n % 2], "who": "x"} for n in range(4)]
+        packed.writestr("top/trials.json", json.dumps(table))
+        packed.writestr("top/.hidden", "")
+        packed.writestr("../out.npy", "")
+    adapter = {
+        "adapter": 1, "name": "packed", "experiment": "classes",
+        "trials": {"table": "**/trials.json", "files": "top/data/{name}.npy", "id": "t{name}"},
+        "streams": {
+            "events": {"format": "counts", "axes": ["step", "y", "x"], "step_ms": 0.5}
+        },
+        "labels": {"class": "{kind}"},
+    }  # fmt: skip
+    campaign = bring(adapter, tmp_path / "set.zip", tmp_path / "store")
+    recording = campaign.recording("t3")
+    again = np.zeros_like(counts)
+    events = recording.events()
+    np.add.at(again, (events.t_us // 500, events.y, events.x), 1)
+    np.testing.assert_array_equal(again, counts)
+    assert recording.event_px == (3, 2)
+    assert recording.record.imported.fields == {"name": "3", "kind": "b", "who": "x"}
+
+
+def _with(*at: Any, to: Any) -> dict[str, Any]:
+    changed: Any = copy.deepcopy(SLIDES)
+    part = changed
+    for key in at[:-1]:
+        part = part[key]
+    part[at[-1]] = to
+    return changed
+
+
+ONSETS = ("labels", "onsets")
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "a field that is none": (
+        _with("fields", "side", "from", to="{nothing}"),
+        r"adapter.yaml: fields.side = '?{nothing}.*is no field of rec/ann_0.6_0",
+    ),
+    "one id for two": (
+        _with("trials", "id", to="{person}"),
+        r"trials.id = '?{person}.*gives .* and .* one id, ann",
+    ),
+    "a word with a unit": (
+        _with("factors", "speed", "field", to="person"),
+        r"factors.speed = '?ann.*must be a number of mm/s",
+    ),
+    "a column that is none": (
+        _with("streams", "events", "columns", "t", to="zeit"),
+        r"events.csv: has no column zeit; there are time, x",
+    ),
+    "a column of words": (
+        _with("streams", "events", "columns", "t", to="trial"), r"events.csv: has no column trial"
+    ),
+    "a label's column": (
+        _with(*ONSETS, "gross", to="fall"), r"labels.onsets.gross = '?fall.*there are first"
+    ),
+    "a time outside": (
+        _with(*ONSETS, "unit", to="s"), r"onsets.csv: row 2, first = '?300.*lies outside of"
+    ),
+    "onsets in a wrong order": (
+        _with(*ONSETS, to={**SLIDES["labels"]["onsets"], "incipient": "full", "gross": "first"}),
+        r"onsets.csv: row 2, first = '?300.*lies before full",
+    ),
+    "an event outside of the sensor": (
+        _with("streams", "events", "size_px", to=[8, 12]), r"events up to column 15 .* 8 x 12"
+    ),
+    "a motion outside": (_with("motion", "end", to=5), r"motion.start = 0.1: to 5: lies outside"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_named_and_nothing_is_written(case: str, tmp_path: Path) -> None:
+    adapter, message = WRONG[case]
+    slides(tmp_path / "set")
+    (tmp_path / "adapter.yaml").write_text(yaml.safe_dump(adapter))
+    done = here(
+        "import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "set",
+        "--store", tmp_path / "store",
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert re.search(message, done.stderr), done.stderr
+    assert not (tmp_path / "store").exists()
+
+
+def test_tables_name_the_row_that_is_wrong(tmp_path: Path) -> None:
+    slides(tmp_path / "set")
+    onsets = tmp_path / "set" / "onsets.csv"
+    for text, message in (
+        ("trial,first,full\nann_0.6_0,nan,1\n", "row 2, first = '?nan"),
+        ("trial,first,full\nann_0.6_0,300,400\nann_0.6_0,310,400\n", "row 3.* same trial as row 2"),
+        ("trial,first,full\nann_0.6_0,300\n", "row 2.*2 cells below a heading of 3"),
+        ("trial,first,first\n", "row 1 = '?first.*two columns"),
+    ):
+        onsets.write_text(text)
+        with pytest.raises(InputError, match=message):
+            bring(SLIDES, tmp_path / "set", tmp_path / "store")
+    events = tmp_path / "set" / "rec" / "ann_0.6_0" / "events.csv"
+    onsets.write_text("trial,first,full\nann_0.6_0,300,400\nzoe,1,2\n")
+    for row, message in (
+        ("0.1,1,1,x", "not all numbers: row 2 is 'x'"),
+        ("nan,1,1,1", "no number in column time: row 2"),
+    ):
+        events.write_text(f"time,x,y,polarity\n{row}\n")
+        with pytest.raises(InputError, match=message):
+            bring(SLIDES, tmp_path / "set", tmp_path / "store")
+
+
+def test_an_import_lists_first_then_adds_what_is_new(tmp_path: Path) -> None:
+    made = touches(tmp_path / "set", lambda n: f"sample_{n}_label_{n % 3}.npy")
+    (tmp_path / "set" / "notes.txt").write_text("mixed")
+    (tmp_path / "set" / "link.npy").symlink_to("/etc/hostname")
+    file = tmp_path / "adapter.yaml"
+    line = ("import", "--adapter", file, tmp_path / "set", "--store", tmp_path / "store", "--json")
+    file.write_text(yaml.safe_dump(COUNTS))
+    listed = json.loads(here(*line, "--dry-run").stdout)
+    assert not (tmp_path / "store").exists()
+    assert {row["trial"]: row["label"] for row in listed["trials"]} == {
+        name: name[-1] for name in made
+    }
+    assert {item["file"]: item["reason"] for item in listed["skipped"]} == {
+        "notes.txt": "matches no pattern of the adapter", "link.npy": "is a link"
+    }  # fmt: skip
+    done = here(*line)
+    assert len(json.loads(done.stdout)["imported"]) == 6, done.stderr
+    np.save(tmp_path / "set" / "train" / "sample_7_label_1.npy", np.ones((5, 2, 8)))
+    file.write_text(yaml.safe_dump({**COUNTS, "title": "Later", "split": {"together": "object"}}))
+    again = json.loads(here(*line).stdout)
+    assert (again["imported"], len(again["there"])) == (["train-sample_7_label_1"], 6)
+    campaign = Store.open(tmp_path / "store").campaign("touch")
+    assert "Later" in campaign.protocol_file.read_text()
+    file.write_text(yaml.safe_dump({**COUNTS, "labels": {}}))
+    refused = here(*line)
+    assert refused.returncode == 2
+    assert "labels: differs from the adapter of campaign 'touch'" in refused.stderr
+    assert not verify(Store.open(tmp_path / "store"))
