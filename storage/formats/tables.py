@@ -216,7 +216,9 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
     first = head.partition("\n")[0].rstrip("\r")
     separator = _separator(first)
     cells = [cell.strip().strip('"') for cell in first.split(separator)]
-    headed = not all(_is_number(cell) for cell in cells)
+    # a heading has no number in a column that is read; others may hold words in every row
+    used = [cells[c] for c in columns.values() if isinstance(c, int) and c < len(cells)]
+    headed = len(used) < len(columns) or not all(map(_is_number, used))
     if headed:
         there = {cell: str(index) for index, cell in enumerate(cells)}
         there |= {str(index): str(index) for index in range(len(cells)) if str(index) not in there}

@@ -19,6 +19,8 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.adapted import import_adapted
 from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
+from sliplab.storage.formats.foreign import FormatError
+from sliplab.storage.formats.tables import read_columns
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
@@ -280,3 +282,35 @@ def test_an_import_lists_first_then_adds_what_is_new(tmp_path: Path) -> None:
     assert refused.returncode == 2
     assert "labels: differs from the adapter of campaign 'touch'" in refused.stderr
     assert not verify(Store.open(tmp_path / "store"))
+
+
+def test_a_table_without_a_heading_keeps_its_first_row(tmp_path: Path) -> None:
+    folder = DataFolder(tmp_path)
+    (tmp_path / "a.csv").write_text("1;on;2.5\n2;off;3\n")
+    (tmp_path / "b.csv").write_text("t;how;x\n1;on;2.5\n")
+    for name, rows in (("a.csv", 2), ("b.csv", 1)):
+        found = read_columns(folder, name, "csv", {"t": 0, "x": 2})
+        assert (len(found["t"]), found["x"][0]) == (rows, 2.5)
+    assert read_columns(folder, "b.csv", "csv", {"t": "t", "x": 2})["t"].tolist() == [1]
+    with pytest.raises(FormatError, match="has no column x; there are 1, on"):
+        read_columns(folder, "a.csv", "csv", {"t": "x"})
+
+
+def test_what_is_committed_stays_when_an_import_is_stopped(tmp_path: Path) -> None:
+    touches(tmp_path / "set", lambda n: f"sample_{n}_label_{n % 3}.npy")
+    file = tmp_path / "adapter.yaml"
+    file.write_text(yaml.safe_dump(COUNTS))
+    found = find_trials(load_adapter(file), file, DataFolder(tmp_path / "set"))
+    store = Store.create(tmp_path / "store")
+    left = iter(range(2))
+
+    def stop(trial: str) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_adapted(store, "touch", found, file.read_text(), stop)
+    assert len(store.campaign("touch").committed()) == 2
+    assert not verify(store)
+    again = import_adapted(store, "touch", found, file.read_text())
+    assert (len(again["imported"]), len(again["there"])) == (4, 2)
