@@ -210,6 +210,19 @@ def class_names(campaigns: list[Collected]) -> tuple[str, ...]:
     return names
 
 
+def need_slip(campaigns: list[Collected]) -> None:
+    """See that recordings show a slip.
+
+    Raises:
+        StoreError: they show classes of their own.
+    """
+    if of_classes(campaigns):
+        raise StoreError(
+            f"campaign '{campaigns[0].name}': its recordings show classes, and this is about slip; "
+            "for classes there are `sliplab label`, `train`, `evaluate` and `report`"
+        )
+
+
 def kinematic_campaigns(campaigns: list[Collected]) -> list[Collected]:
     """The kinematic campaigns, with any streams.
 
@@ -218,6 +231,7 @@ def kinematic_campaigns(campaigns: list[Collected]) -> list[Collected]:
     """
     found = [item for item in campaigns if item.experiment == "kinematic"]
     if not found:
+        need_slip(campaigns)
         raise StoreError("no kinematic campaign to train on; collect one first")
     return found
 

@@ -33,6 +33,16 @@ _DOCUMENTS = {
         "The summary of a report",
         "`report/summary.json`: the numbers of a report ([The report's numbers](../summary.md)).",
     ),
+    "classes": (
+        "An evaluation of classes",
+        "`derived/evaluation/classes.json`: figures of test recordings of classes "
+        "([Metrics](../metrics.md#recordings-of-classes)).",
+    ),
+    "classes-summary": (
+        "The summary of a report of classes",
+        "`report/summary.json` of recordings of classes "
+        "([The report's numbers](../summary.md#recordings-of-classes)).",
+    ),
 }
 """Title and place of each document in a store."""
 _ITEM = re.compile(r"(- |1\. )\S")

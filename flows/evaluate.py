@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.analysis.campaigns import Collected, missing_stream, training_campaigns
+from sliplab.analysis.campaigns import (
+    Collected,
+    missing_stream,
+    of_classes,
+    training_campaigns,
+)
 from sliplab.analysis.detectors.predictions import count_spikes, predict_trials
 from sliplab.analysis.evaluation import evaluation
 from sliplab.analysis.evaluation.evaluation import Job, make_job, score_store
@@ -16,6 +21,7 @@ from sliplab.analysis.networks.models import (
 )
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.flows.classes import evaluate_on_classes
 from sliplab.flows.label import report_states
 from sliplab.flows.markers import evaluate_on_markers
 from sliplab.flows.running.orchestration import Opaque, run
@@ -46,6 +52,8 @@ def evaluate(
         cluster: what counts spikes and makes samples, instead of this machine.
         reviewed: people's decisions are applied to the labels.
     """
+    if of_classes(campaigns):
+        return evaluate_on_classes(store, campaigns, margin, smoothing, cluster, reviewed)
     if missing_stream(campaigns) == "events":
         return evaluate_on_markers(store, campaigns, margin, smoothing, reviewed)
     training_campaigns(campaigns)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from prefect import flow
 
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, need_slip
 from sliplab.analysis.evaluation import networks
 from sliplab.analysis.evaluation.networks import Engines, Judgement, network_of
 from sliplab.analysis.labels.reviewed import Labels
@@ -85,6 +85,7 @@ def judge_model(
         InputError: the model; the message says what would be right.
         StoreError: a trial has no label yet.
     """
+    need_slip(campaigns)
     network, labels = network_of(model, engine), Labels(store, reviewed)
     judgement = networks.file_judgement(labels, campaigns, network, margin, smoothing)
     if network.engine == "fast" and not network.exact:

@@ -11,14 +11,15 @@ from pathlib import Path
 
 from prefect import flow
 
-from sliplab.analysis.campaigns import Collected, missing_stream
+from sliplab.analysis.campaigns import Collected, missing_stream, of_classes
 from sliplab.analysis.report import against as comparison
-from sliplab.analysis.report import one_camera
+from sliplab.analysis.report import classes, one_camera
 from sliplab.analysis.report import report as content
 from sliplab.analysis.report.marker_network import read_judged
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.sources import STEP, read_sources, report_folder, report_key
 from sliplab.analysis.report.summary import make_summary
+from sliplab.flows.classes import write_class_page
 from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
@@ -41,7 +42,9 @@ def report(store: Store, campaigns: list[Collected]) -> StepResult:
     Raises:
         StoreError: there is no evaluation of this version yet.
     """
-    if missing_stream(campaigns) is not None:
+    if of_classes(campaigns):
+        key = classes.class_report_key(store, campaigns)
+    elif missing_stream(campaigns) is not None:
         key = one_camera.one_camera_key(store, campaigns)
     else:
         key = report_key(store, campaigns)
@@ -59,21 +62,29 @@ def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
     with timed(store, "report"):
-        planned = {item.name: _planned_bytes(item) for item in campaigns}
-        if (missing := missing_stream(campaigns)) is not None:
-            judged = read_judged(store, campaigns) if missing == "events" else None
-            shown = one_camera.one_camera_summary(store, campaigns, planned, judged)
-            if one_camera.is_evaluated(store, campaigns):
-                numbers = shown.to_json() | _evaluated(store, campaigns, planned, shown)
-            else:
-                parts = one_camera.one_camera_sections(store, campaigns, shown, judged)
-                write_figures(folder, parts, simulated=shown.simulated)
-                write_text(folder / "index.html", one_camera.render(campaigns, shown, parts))
-                numbers = shown.to_json()
+        if of_classes(campaigns):
+            numbers = write_class_page(store, campaigns)
         else:
-            numbers = _evaluated(store, campaigns, planned)
+            numbers = _write_page(store, campaigns)
     write_json(folder / SUMMARY, {**numbers, "timing_s": step_seconds(store)})
     Derived.of(store, STEP).write(STEP, key, {})
+
+
+def _write_page(store: Store, campaigns: list[Collected]) -> Json:
+    """Write the page about slip; return its numbers."""
+    folder = report_folder(store)
+    planned = {item.name: _planned_bytes(item) for item in campaigns}
+    missing = missing_stream(campaigns)
+    if missing is None:
+        return _evaluated(store, campaigns, planned)
+    judged = read_judged(store, campaigns) if missing == "events" else None
+    shown = one_camera.one_camera_summary(store, campaigns, planned, judged)
+    if one_camera.is_evaluated(store, campaigns):
+        return shown.to_json() | _evaluated(store, campaigns, planned, shown)
+    parts = one_camera.one_camera_sections(store, campaigns, shown, judged)
+    write_figures(folder, parts, simulated=shown.simulated)
+    write_text(folder / "index.html", one_camera.render(campaigns, shown, parts))
+    return shown.to_json()
 
 
 def _evaluated(
@@ -121,9 +132,10 @@ def against(store: Store, other: Path) -> tuple[comparison.Comparison, Path]:
     try:
         here = read_summary(store)
     except DocumentError:
-        if read_one_camera(store) is None:
+        why = comparison.not_compared(report_folder(store) / SUMMARY)
+        if why is None:
             raise
-        raise InputError("STORE", "", str(store.folder), comparison.ONE_CAMERA) from None
+        raise InputError("STORE", "", str(store.folder), why) from None
     compared = comparison.compare(here, comparison.load_other(other))
     path = report_folder(store) / comparison.PAGE
     write_text(path, comparison.render(compared, store.folder, other))

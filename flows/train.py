@@ -1,6 +1,7 @@
 """Training: the network of every seed, from the labelled trials of the kinematic campaigns.
 
-Campaigns without events train a classifier on marker displacements instead (`flows.markers`).
+Campaigns without events train a classifier on marker displacements instead (`flows.markers`). Those
+of recordings that show other classes than slip's train a network of as many outputs.
 """
 
 from __future__ import annotations
@@ -9,16 +10,30 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.analysis.campaigns import Collected, missing_stream, training_campaigns
+from sliplab.analysis.campaigns import (
+    Collected,
+    agreeing,
+    missing_stream,
+    of_classes,
+    training_campaigns,
+)
 from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import gradients, model_file, training
-from sliplab.analysis.networks.models import Model, begun, comparison_models, wanted_models
+from sliplab.analysis.networks.models import (
+    Model,
+    begun,
+    comparison_models,
+    wanted_class_models,
+    wanted_models,
+)
 from sliplab.analysis.trial_work import Done, EachTrial, Make, TrialWork, in_order
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.analysis.windows.sample_sets import load_class_samples, load_samples
 from sliplab.flows.label import report_states
 from sliplab.flows.markers import train_on_markers
 from sliplab.flows.running import console
@@ -55,6 +70,7 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
             on_epoch=progress.epoch,
             on_state=partial(write_bytes, model.state_path),
             state=begun(model),
+            classes=model.classes or CLASSES,
         )
     for warning in fitted.warnings:
         console.say(f"warning: {warning}")
@@ -72,6 +88,11 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
         warnings=fitted.warnings,
     )
     write_json(model.info_path, info.to_json())
+    if model.classes:
+        console.say(
+            f"{model.title}: {len(train)} windows of {len(model.classes)} classes; epoch "
+            f"{fitted.chosen_epoch}, validation {100 * fitted.chosen.val_strict:.1f} %"
+        )
     for left in model.path.parent.glob(f"{model.path.stem}.*.state"):
         left.unlink()
     return model.seed
@@ -84,14 +105,16 @@ def train_flow(
     """Train the seeds that are stale, one after the other."""
     labels, campaigns, models, cluster = argument.content
     simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
+    load = load_class_samples if models[0].classes else load_samples
     with timed(labels.store, "train"):
         train, validation = (
-            load_samples(labels, campaigns, split, sample_maker(labels.store, split, cluster))
+            load(labels, campaigns, split, sample_maker(labels.store, split, cluster))
             for split in ("train", "validation")
         )
         for name, part in (("training", train), ("validation", validation)):
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
+        _warn_of_missing(models[0].classes, train)
         for model in models:
             train_one(Opaque((model, train, validation, simulated)))
     return len(models)
@@ -113,16 +136,21 @@ def train(
         StoreError: labels or samples are missing.
         InputError: there is no such device to train on.
     """
-    if missing_stream(campaigns) == "events":
+    if not of_classes(campaigns) and missing_stream(campaigns) == "events":
         return train_on_markers(store, campaigns, reviewed)
     labels = Labels(store, reviewed)
-    models = [
-        *wanted_models(store, campaigns, reviewed),
-        *comparison_models(store, campaigns, reviewed),
-    ]
+    if of_classes(campaigns):
+        used = agreeing(campaigns)
+        models = wanted_class_models(store, used, reviewed)
+    else:
+        used = training_campaigns(campaigns)
+        models = [
+            *wanted_models(store, campaigns, reviewed),
+            *comparison_models(store, campaigns, reviewed),
+        ]
     stale = [model for model in models if not model.fresh]
     if stale:
-        _check_device(training_campaigns(campaigns)[0])
+        _check_device(used[0])
         run(train_flow, Opaque((labels, campaigns, stale, cluster)), cluster)
     return {
         "step": "train",
@@ -130,6 +158,17 @@ def train(
         "fresh": len(models) - len(stale),
         **report_states(labels, campaigns),
     }
+
+
+def _warn_of_missing(classes: tuple[str, ...], train: SampleSet) -> None:
+    """Warn of classes that a network cannot learn."""
+    there = set(np.unique(train.y).tolist())
+    missing = [name for number, name in enumerate(classes) if number not in there]
+    if missing:
+        console.say(
+            f"warning: no training samples of {', '.join(missing)}: the network cannot learn "
+            + ("it" if len(missing) == 1 else "them")
+        )
 
 
 def _check_device(item: Collected) -> None:

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, need_slip, of_classes
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
@@ -24,7 +24,7 @@ from sliplab.analysis.networks.window_checks import (
     permuted,
     shuffled_chance,
 )
-from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.analysis.windows.sample_sets import load_class_samples, load_samples
 from sliplab.flows.running import console
 from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
@@ -64,23 +64,32 @@ def window_baselines(
     Args:
         reviewed: people's decisions are applied to the labels.
     """
-    load = partial(load_samples, Labels(store, reviewed), campaigns)
-    train, validation, test = map(load, SPLITS)
+    classes = of_classes(campaigns)
+    methods = baselines.class_methods(campaigns) if classes else baselines.slip_methods()
+    of, make = methods.prefix, load_class_samples if classes else load_samples
+    train, validation, test = map(partial(make, Labels(store, reviewed), campaigns), SPLITS)
     kept = Derived.of(store, baselines.STEP)
-    keys = {name: baselines.baseline_key(store, name) for name in baselines.NAMES}
-    stale = [name for name, key in keys.items() if not kept.fresh(name, key)]
+    keys = {name: methods.key(store, name) for name in methods.names}
+    stale = [name for name, key in keys.items() if not kept.fresh(f"{of}{name}", key)]
     if stale:
         with timed(store, "baselines"):
             for name in stale:
                 console.say(f"{name}: {len(train)} training windows")
-                votes, made = baselines.train_baseline(name, train, validation, test, console.say)
+                try:
+                    votes, made = baselines.train_baseline(
+                        name, train, validation, test, console.say, methods
+                    )
+                except ValueError as error:  # too few samples for this one
+                    console.say(f"warning: {name} is left out: {error}")
+                    continue
                 result = BaselineResult(made=made, argmax=metrics.accuracy(votes, test.y).argmax)
-                kept.write(name, keys[name], result, {"votes": votes})
+                kept.write(f"{of}{name}", keys[name], result, {"votes": votes})
+    there = [name for name, key in keys.items() if kept.fresh(f"{of}{name}", key)]
     return {
         "step": "baselines",
-        "done": len(stale),
+        "done": len(set(stale).intersection(there)),
         "fresh": len(keys) - len(stale),
-        "argmax": {name: kept.load(name, BaselineResult).argmax for name in keys},
+        "argmax": {name: kept.load(f"{of}{name}", BaselineResult).argmax for name in there},
     }
 
 
@@ -90,6 +99,7 @@ def window_checks(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     Raises:
         StoreError: a check failed; the message says which figure cannot be trusted.
     """
+    need_slip(campaigns)
     settings = training_settings(campaigns)
     load = partial(load_samples, Labels(store, reviewed), campaigns)
     train, validation, test = map(load, SPLITS)

@@ -7,16 +7,20 @@ and chosen among by validation windows, as the spiking network is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected, agreeing, class_names
 from sliplab.analysis.evaluation import windows as window_scores
+from sliplab.analysis.evaluation.classes import NAME as CLASSES
 from sliplab.analysis.metrics import classification as metrics
-from sliplab.analysis.networks.baseline_nets import EPOCHS, KINDS, trained_net
+from sliplab.analysis.networks.baseline_nets import BATCH, EPOCHS, KINDS, TAXEL_KINDS, trained_net
 from sliplab.analysis.networks.baselines import RIDGE, ROUNDS, boosted, logistic_cells
 from sliplab.analysis.windows.dataset import SampleSet
+from sliplab.analysis.windows.sample_sets import CLASS_PREFIX
 from sliplab.analysis.windows.sample_sets import STEP as SAMPLES
 from sliplab.storage.schema.evaluation import BaselineResult, TrainedBaseline
 from sliplab.storage.trials.derived import Derived, make_key
@@ -33,41 +37,78 @@ NAMES: dict[str, Any] = {
     "boosting": ROUNDS,
     **{kind: [EPOCHS, *SEEDS] for kind in KINDS},
 }
-"""Each baseline, and what else it depends on."""
+"""Each baseline on windows of slip, and what else it depends on."""
+CLASS_EPOCHS, CLASS_BATCH = 40, 16
+"""Of ordinary networks on recordings of classes, which are some hundreds of windows."""
 
 
-def baseline_key(store: Store, name: str) -> str:
-    """Return the key of results on the samples in the store."""
-    kept = Derived.of(store, SAMPLES)
-    samples = [kept.key(split) for split in ("train", "validation", "test")]
-    return make_key(STEP, VERSION, samples, [name, NAMES[name]])
+@dataclass(frozen=True)
+class Methods:
+    """The methods that a network is compared with.
 
-
-def fresh_keys(store: Store) -> list[str]:
-    """Keys of the baselines that are there and belong to today's samples."""
-    kept = Derived.of(store, STEP)
-    return [key for name in NAMES if kept.fresh(name, key := baseline_key(store, name))]
-
-
-def baselines(store: Store) -> dict[str, TrainedBaseline]:
-    """Compare each baseline in the store with the network, by name; see `window_scores.compared`.
-
-    A network's figures of other windows than the baseline's are not compared.
+    Attributes:
+        names: each method, and what else it depends on.
+        classes: that there are.
+        prefix: begins the names of samples and results.
+        evaluation: name of the evaluation of the network.
+        epochs, batch: of ordinary networks.
     """
-    kept = Derived.of(store, STEP)
-    network = window_scores.kept_counts(store, Derived.of(store, EVALUATION).key(EVALUATION))
-    found: dict[str, TrainedBaseline] = {}
-    if network is None:
+
+    names: Mapping[str, Any]
+    classes: int = len(metrics.CLASSES)
+    prefix: str = ""
+    evaluation: str = EVALUATION
+    epochs: int = EPOCHS
+    batch: int = BATCH
+
+    def key(self, store: Store, name: str) -> str:
+        """Return the key of results on the samples in the store."""
+        kept = Derived.of(store, SAMPLES)
+        parts = [kept.key(f"{self.prefix}{split}") for split in ("train", "validation", "test")]
+        return make_key(STEP, VERSION, parts, [name, self.names[name]])
+
+    def fresh_keys(self, store: Store) -> list[str]:
+        """Keys of the baselines that are there and belong to today's samples."""
+        kept = Derived.of(store, STEP)
+        keys = {name: self.key(store, name) for name in self.names}
+        return [key for name, key in keys.items() if kept.fresh(f"{self.prefix}{name}", key)]
+
+    def results(self, store: Store) -> dict[str, TrainedBaseline]:
+        """Compare each baseline in the store with the network, by name; see `compared`.
+
+        A network's figures of other windows than the baseline's are not compared.
+        """
+        kept = Derived.of(store, STEP)
+        evaluated = Derived.of(store, EVALUATION).key(self.evaluation)
+        network = window_scores.kept_counts(store, evaluated, self.prefix)
+        found: dict[str, TrainedBaseline] = {}
+        if network is None:
+            return found
+        for name in self.names:
+            stored = f"{self.prefix}{name}"
+            if not kept.fresh(stored, self.key(store, name)):
+                continue
+            votes = kept.arrays(stored)["votes"]
+            if len(votes) != len(network["y"]):
+                continue
+            row = window_scores.compared(votes, network["counts"], network["y"], network["trial"])
+            found[name] = TrainedBaseline(**dict(row), made=kept.load(stored, BaselineResult).made)
         return found
-    for name in NAMES:
-        if not kept.fresh(name, baseline_key(store, name)):
-            continue
-        votes = kept.arrays(name)["votes"]
-        if len(votes) != len(network["y"]):
-            continue
-        row = window_scores.compared(votes, network["counts"], network["y"], network["trial"])
-        found[name] = TrainedBaseline(**dict(row), made=kept.load(name, BaselineResult).made)
-    return found
+
+
+def slip_methods() -> Methods:
+    """Return the methods on windows of slip."""
+    return Methods(NAMES)
+
+
+def class_methods(campaigns: list[Collected]) -> Methods:
+    """Return the methods on windows of recordings of classes; of taxels there is no frame."""
+    windows = agreeing(campaigns)[0].settings.windows
+    classes = len(class_names(campaigns))
+    kinds = KINDS if windows.taxels is None else TAXEL_KINDS
+    nets = {kind: [CLASS_EPOCHS, CLASS_BATCH, *SEEDS] for kind in kinds}
+    names = {"boosting": [ROUNDS, classes], **nets}
+    return Methods(names, classes, CLASS_PREFIX, CLASSES, CLASS_EPOCHS, CLASS_BATCH)
 
 
 def train_baseline(
@@ -76,21 +117,37 @@ def train_baseline(
     validation: SampleSet,
     test: SampleSet,
     say: Callable[[str], None],
+    methods: Methods,
 ) -> tuple[npt.NDArray[Any], dict[str, Any]]:
-    """Return votes on the test windows, and what was fitted; `say` hears of each epoch."""
+    """Return votes on the test windows, and what was fitted; `say` hears of each epoch.
+
+    Raises:
+        ValueError: there are too few samples for this method.
+    """
+    classes = methods.classes
     if name == "logistic_cells":
-        return logistic_cells(train.windows, train.y, test.windows)
+        return logistic_cells(train.windows, train.y, test.windows, classes)
     if name == "boosting":
-        return boosted(train, validation, test.windows)
+        return boosted(train, validation, test.windows, classes=classes)
     runs = []
     for seed in SEEDS:
 
         def on_epoch(epoch: int, strict: float, seed: int = seed) -> None:
             validated = f"validation {100 * strict:.1f} %"
-            say(f"{name}: seed {seed}, epoch {epoch} of {EPOCHS}, {validated}")
+            say(f"{name}: seed {seed}, epoch {epoch} of {methods.epochs}, {validated}")
 
         runs.append(
-            trained_net(name, train, validation, test.windows, seed=seed, on_epoch=on_epoch)
+            trained_net(
+                name,
+                train,
+                validation,
+                test.windows,
+                methods.epochs,
+                seed,
+                on_epoch,
+                classes=classes,
+                batch=methods.batch,
+            )
         )
     shares = [metrics.accuracy(votes, test.y).argmax for votes, _ in runs]
     each = [

@@ -214,13 +214,18 @@ def compared(
     )
 
 
-def kept_counts(store: Store, evaluated: str | None) -> dict[str, npt.NDArray[Any]] | None:
-    """``counts`` (n, 3), ``y`` (n,) and ``trial`` (n,) of an evaluation's test windows.
+def kept_counts(
+    store: Store, evaluated: str | None, of: str = ""
+) -> dict[str, npt.NDArray[Any]] | None:
+    """``counts`` (n, classes), ``y`` (n,) and ``trial`` (n,) of an evaluation's test windows.
 
     None where they are not of the evaluation with this key.
+
+    Args:
+        of: begins the name that they are kept by.
     """
-    kept = Derived.of(store, STEP)
-    return kept.arrays(NAME) if evaluated is not None and kept.fresh(NAME, evaluated) else None
+    kept, name = Derived.of(store, STEP), f"{of}{NAME}"
+    return kept.arrays(name) if evaluated is not None and kept.fresh(name, evaluated) else None
 
 
 def window_intervals(store: Store, evaluated: str | None) -> WindowIntervals | None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, agreeing, class_names, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.sample_sets import CLASS_PREFIX
 from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
 from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.derived import make_key
@@ -23,6 +24,8 @@ class Model:
     path: Path
     key: str
     settings: AnalysisSettings
+    classes: tuple[str, ...] = ()
+    """Names of the classes of recordings that show others than slip's."""
 
     @property
     def title(self) -> str:
@@ -84,7 +87,8 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     Raises:
         StoreError: a trial has no fresh label yet.
     """
-    return _models(store, campaigns, training_settings(campaigns), reviewed, "")
+    used = training_campaigns(campaigns)
+    return _models(store, used, used[0].settings, reviewed, "")
 
 
 def comparison_models(
@@ -94,17 +98,32 @@ def comparison_models(
     settings = training_settings(campaigns).comparison_settings()
     if settings is None:
         return []
-    return _models(store, campaigns, settings, reviewed, f"{settings.preset}-")
+    return _models(store, training_campaigns(campaigns), settings, reviewed, f"{settings.preset}-")
+
+
+def wanted_class_models(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> list[Model]:
+    """The models of recordings that show classes; see `wanted_models`.
+
+    Raises:
+        StoreError: a trial has no fresh label yet, or there are fewer than two classes.
+        InputError: the campaigns' windows differ.
+    """
+    used, classes = agreeing(campaigns), class_names(campaigns)
+    for item in used:
+        item.need("events", "the network is trained on windows of them")
+    return _models(store, used, used[0].settings, reviewed, CLASS_PREFIX, classes)
 
 
 def _models(
     store: Store,
-    campaigns: list[Collected],
+    used: list[Collected],
     settings: AnalysisSettings,
     reviewed: bool,
     prefix: str,
+    classes: tuple[str, ...] = (),
 ) -> list[Model]:
-    used = training_campaigns(campaigns)
     inputs = []
     labels = Labels(store, reviewed)
     for item in used:
@@ -121,6 +140,8 @@ def _models(
     if settings.network.biases:
         del parameters["network"]["biases"]  # models of before it could be left out stay fresh
     parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
+    if classes:
+        parameters["classes"] = classes
     models = []
     for seed in settings.training.seeds:
         key = make_key(
@@ -130,7 +151,7 @@ def _models(
             {**parameters, "seed": seed, "dataset": dataset.VERSION},
         )
         path = store.folder / "models" / f"{prefix}seed{seed}.pt"
-        models.append(Model(seed, path, key, settings))
+        models.append(Model(seed, path, key, settings, classes))
     return models
 
 

@@ -128,7 +128,11 @@ class Comparison:
         }
 
 
-ONE_CAMERA = "is a report on a rig with one camera, without a spiking network to compare"
+_OTHERS = {
+    "one_camera": "is a report on a rig with one camera, without a spiking network to compare",
+    "classes": "is a report on recordings of classes; only reports on slip are compared",
+}
+"""Summaries that are not compared, each by a key that only it has."""
 
 
 def load_other(place: Path) -> Summary:
@@ -147,11 +151,16 @@ def load_other(place: Path) -> Summary:
         why = f"must be a store with a report, or its report/summary.json ({error})"
     except DocumentError as error:
         why = f"lacks what is compared ({error}); run `sliplab report` on it with this version"
-        if '"one_camera"' in path.read_text(encoding="utf-8", errors="replace"):
-            why = ONE_CAMERA
+        why = not_compared(path) or why
     except NewerFormat as error:
         why = str(error)
     raise InputError("--against", "", str(place), why) from None
+
+
+def not_compared(path: Path) -> str | None:
+    """Return why the summary in a file is not compared with others; None where it is."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return next((why for key, why in _OTHERS.items() if f'"{key}":' in text), None)
 
 
 def compare(here: Summary, there: Summary) -> Comparison:

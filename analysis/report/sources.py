@@ -88,7 +88,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
         collected,
         (report_folder(store) / CLOCKS).exists(),
         sorted(found.key for found in others),
-        window_baselines.fresh_keys(store),
+        window_baselines.slip_methods().fresh_keys(store),
         read_programs(store),
         Derived.of(store, label_errors.CHECK).key(label_errors.CHECK),
         # commands in the page name the store's folder
@@ -118,7 +118,7 @@ def read_sources(
         settings=training_settings(campaigns),
         evaluation=evaluation,
         networks=other_networks.kept(store, campaigns, evaluation.reviewed is not None),
-        baselines=window_baselines.baselines(store),
+        baselines=window_baselines.slip_methods().results(store),
         window_intervals=window_scores.window_intervals(store, evaluation.key),
         label_check=label_errors.read_check(store),
         holds=label_errors.holds_compared(store, campaigns),

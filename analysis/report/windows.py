@@ -18,6 +18,7 @@ from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.analysis.report.published import PAPER, Published
 from sliplab.protocols.quantity import level_order
+from sliplab.storage.schema.classes import JudgedClasses
 from sliplab.storage.schema.evaluation import (
     Accuracy,
     Baseline,
@@ -34,9 +35,11 @@ METHODS = {
     "rate_threshold": "event-rate threshold",
     "logistic": "logistic regression on the event count",
     "logistic_cells": "logistic regression on each cell's events",
+    "logistic_slices": "logistic regression on each cell's events by tenths of the window",
     "boosting": "gradient boosting on counts",
     "cnn_frame": "ordinary convolutions on the summed frame",
     "cnn_volume": "ordinary convolutions on space and time",
+    "cnn_steps": "ordinary convolutions over the steps",
     "gru": "gated recurrent unit over the steps",
     "mean_displacement": "two thresholds on the mean displacement",
     "largest_displacement": "two thresholds on the largest displacement",
@@ -189,7 +192,9 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
             name="recall-by-tenth",
             data={str(name): column for name, column in tenths.to_dict("list").items()},
         ),
-        _factors(kinematic, simulated) if kinematic.by_factor else None,
+        factor_figure(kinematic.by_factor, kinematic.accuracy, simulated=simulated)
+        if kinematic.by_factor
+        else None,
         Table(["factor", "level", "trials", "windows", "right"], levels),
         Table(
             ["no slip", "trials", "windows", "right"],
@@ -200,14 +205,16 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
     )
 
 
-def _factors(kinematic: Kinematic, simulated: bool) -> Figure:
-    """Draw accuracy by each factor's levels."""
-    strict = kinematic.accuracy.strict
+def factor_figure(
+    by_factor: Mapping[str, Mapping[str, Share]], accuracy: Accuracy, *, simulated: bool
+) -> Figure:
+    """Draw accuracy by each factor's levels, beside that of all windows."""
+    strict = accuracy.strict
     groups = {
         factor: [
             intervals.Share(level, row.share, row.low, row.high) for level, row in _in_order(rows)
         ]
-        for factor, rows in kinematic.by_factor.items()
+        for factor, rows in by_factor.items()
     }
     line = None if strict is None else (strict, "all test windows")
     named = [replace(it, name=f"{factor} {it.name}") for factor, of in groups.items() for it in of]
@@ -220,11 +227,13 @@ def _factors(kinematic: Kinematic, simulated: bool) -> Figure:
     )
 
 
-def share_data(rows: Sequence[intervals.Share]) -> dict[str, Sequence[object]]:
+def share_data(
+    rows: Sequence[intervals.Share], what: str = "strict accuracy"
+) -> dict[str, Sequence[object]]:
     """Return drawn shares as columns."""
     return {
         "name": [row.name for row in rows],
-        "strict accuracy (share)": [row.value for row in rows],
+        f"{what} (share)": [row.value for row in rows],
         "95 % interval, low (share)": [row.low for row in rows],
         "95 % interval, high (share)": [row.high for row in rows],
     }
@@ -298,9 +307,9 @@ class WorkSection(Content):
     others: Table
 
 
-def work_section(kinematic: Kinematic) -> WorkSection | None:
+def work_section(scores: Kinematic | JudgedClasses) -> WorkSection | None:
     """Compare computation and accuracy; None where the work was not counted."""
-    work = kinematic.work
+    work = scores.work
     if work is None:
         return None
     synaptic, dense = work.synaptic_operations, work.dense_multiply_adds
@@ -312,18 +321,18 @@ def work_section(kinematic: Kinematic) -> WorkSection | None:
         [name, number(work.spikes[name], 1), percent(rate, 2)] for name, rate in work.rates.items()
     ]
     return WorkSection(
-        work, kinematic.seeds, _rival(kinematic),
+        work, scores.seeds, _rival(scores),
         Table(["layer", "synaptic operations", "dense multiply-adds", "share"], layers),
         Table(["spiking layer", "spikes a window", "of neurons and steps"], fired),
-        _others(kinematic.trained_baselines),
+        _others(scores.trained_baselines),
     )  # fmt: skip
 
 
-def _rival(kinematic: Kinematic) -> Rival | None:
+def _rival(scores: Kinematic | JudgedClasses) -> Rival | None:
     """Find the best other method, where stronger ones were trained."""
-    every: dict[str, Baseline] = {**kinematic.beside, **kinematic.trained_baselines}
+    every: dict[str, Baseline] = {**scores.beside, **scores.trained_baselines}
     known = {name: row for name, row in every.items() if row.argmax is not None}
-    if not kinematic.trained_baselines or not known:
+    if not scores.trained_baselines or not known:
         return None
     best = max(known, key=lambda name: known[name].argmax or 0.0)
     found = known[best]

@@ -22,6 +22,8 @@ from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 
 STEP = "samples"
+CLASS_PREFIX = "classes-"
+"""Begins the names of samples of recordings of classes, and of what is made of them."""
 _FORMAT = "trials by name"
 _BY_PLACE = "numbered by place"
 """Part of keys over several campaigns, since windows are identified by their trial."""
@@ -98,7 +100,7 @@ def _load(
     parameters: list[Any] = [windows.model_dump(mode="json"), settings]
     key = make_key(STEP, dataset.VERSION, inputs, [*parameters, classes] if classes else parameters)
     kept = Derived.of(labels.store, STEP)
-    name = f"classes-{split}" if classes else split
+    name = f"{CLASS_PREFIX}{split}" if classes else split
     path = kept.folder / f"{name}.arrays"
     if not (kept.fresh(name, key) and path.exists()):
         made = _make(labels, trials, windows, each, classes)

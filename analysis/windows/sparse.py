@@ -68,13 +68,26 @@ class SparseWindows:
 
     def take(self, rows: npt.NDArray[np.integer[Any]]) -> SparseWindows:
         """Some of the samples, in this order."""
+        return self._taken(np.asarray(rows, np.int64), self.shape[0])
+
+    def first_steps(self, steps: int) -> SparseWindows:
+        """The same samples, each cut off after its first steps.
+
+        Raises:
+            ValueError: they have fewer.
+        """
+        if not 1 <= steps <= self.shape[0]:
+            raise ValueError(f"{steps} of {self.shape[0]} steps")
+        return self._taken(np.arange(len(self)), steps)
+
+    def _taken(self, rows: I64, kept: int) -> SparseWindows:
         steps = self.shape[0]
-        rows = np.asarray(rows, np.int64)
-        sizes = np.diff(self.offsets).reshape(-1, steps)[rows].ravel()
+        sizes = np.diff(self.offsets).reshape(-1, steps)[rows, :kept].ravel()
         offsets = np.concatenate([[0], sizes.cumsum()]).astype(np.int64)
-        begin = self.offsets[:-1].reshape(-1, steps)[rows].ravel()
+        begin = self.offsets[:-1].reshape(-1, steps)[rows, :kept].ravel()
         entries = np.arange(offsets[-1]) + np.repeat(begin - offsets[:-1], sizes)
-        return SparseWindows(self.shape, offsets, self.cell[entries], self.count[entries])
+        shape = (kept, *self.shape[1:])
+        return SparseWindows(shape, offsets, self.cell[entries], self.count[entries])
 
     def mirrored(self, how: npt.NDArray[np.integer[Any]]) -> SparseWindows:
         """Each sample as it is (0), its columns (1), its rows (2) or both (3) in reverse order.

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-KINDS = ("protocol", "rig", "adapter", "trial", "label", "evaluation", "summary")
+KINDS = (
+    "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
+    "classes-summary",
+)  # fmt: skip
 
 
 @app.command()

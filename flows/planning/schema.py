@@ -23,13 +23,17 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
+from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
 
-Kind = Literal["protocol", "rig", "adapter", "trial", "label", "evaluation", "summary"]
+Kind = Literal[
+    "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
+    "classes-summary",
+]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
 DOCUMENTS: dict[Kind, type[Document]] = {
@@ -37,12 +41,16 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "label": TrialLabel,
     "evaluation": Evaluation,
     "summary": Summary,
+    "classes": ClassEvaluation,
+    "classes-summary": ClassSummary,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
     "label": "The label of a trial of SlipLab",
     "evaluation": "An evaluation of SlipLab",
     "summary": "The summary of a report of SlipLab",
+    "classes": "An evaluation of SlipLab on recordings of classes",
+    "classes-summary": "The summary of a report of SlipLab on recordings of classes",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

@@ -14,9 +14,10 @@ from typing import Literal
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected, has_plan
+from sliplab.analysis.campaigns import Collected, has_plan, need_slip
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.windows.dataset import recorded_span
+from sliplab.protocols.adapter import CLASSES
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
@@ -169,6 +170,10 @@ class TrialList:
         # a store with nothing else is refused by the first imported campaign's own message
         names = self._names or ours or sorted(found)
         items = {name: Collected(found[name]) for name in names}
+        slips = {name: item for name, item in items.items() if item.experiment != CLASSES}
+        if not slips:
+            need_slip(list(items.values()))
+        items = slips
         rows: list[Row] = []
         for item in items.values():
             whole = item.campaign.committed()

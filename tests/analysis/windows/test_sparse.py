@@ -30,6 +30,10 @@ def test_dense_there_and_back(x: np.ndarray, data: st.DataObject) -> None:
     if len(x):
         rows = np.array(data.draw(st.lists(st.integers(0, len(x) - 1))), np.int64)
         np.testing.assert_array_equal(found.take(rows).dense(), x[rows])
+    steps = data.draw(st.integers(1, x.shape[1]))
+    begun = found.first_steps(steps)
+    assert begun.shape == (steps, *found.shape[1:])
+    np.testing.assert_array_equal(begun.dense(), x[:, :steps])
     joined = SparseWindows.join([found, SparseWindows.of(x[::-1])], found.shape)
     np.testing.assert_array_equal(joined.dense(), np.concatenate([x, x[::-1]]))
 
@@ -53,6 +57,13 @@ def test_mirrored_is_reversed(x: np.ndarray, data: st.DataObject) -> None:
 def test_there_are_four_ways_to_see_a_sample(how: list[int]) -> None:
     with pytest.raises(ValueError, match="mirrors of 0 to 3 for 2 samples"):
         SparseWindows.of(np.zeros((2, 1, 1, 3, 3), np.uint8)).mirrored(np.array(how))
+
+
+def test_no_more_steps_than_there_are() -> None:
+    two = SparseWindows.of(np.ones((1, 2, 1, 3, 3), np.uint8))
+    for steps in (0, 3):
+        with pytest.raises(ValueError, match=f"{steps} of 2 steps"):
+            two.first_steps(steps)
 
 
 def test_what_is_no_sample_is_refused() -> None:
