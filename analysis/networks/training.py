@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from scipy.special import log_softmax
+from threadpoolctl import threadpool_limits
 from torch import nn
 
 from sliplab.analysis.metrics import classification as metrics
@@ -342,7 +343,8 @@ def fit(
         if on_epoch is not None:
             for record in run.history:
                 on_epoch(record)
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    # the library's own threads would wait for each other busily inside those of the pool
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(torch.get_num_threads()) as pool:
         while not run.ended:
             started = time.perf_counter()
             epoch = len(run.history) + 1
