@@ -95,7 +95,7 @@ class WindowCounts:
     """Output spikes of a network in consecutive windows of one trial, n of them."""
 
     counts: I64
-    """Spikes of each class, shape (n, 3): no slip, incipient slip, gross slip."""
+    """Spikes of each class, shape (n, classes), in the order of `Model.classes`."""
     end_ns: I64
     """End of each window on the time line, nanoseconds, shape (n,)."""
 
@@ -398,10 +398,17 @@ class Store:
 class Model:
     """A trained network, run on events by the event-driven kernels."""
 
-    classes = ("no slip", "incipient slip", "gross slip")
-
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the counts."""
+        from sliplab.analysis.metrics.classification import CLASSES
+
+        if self.fitted.classes == CLASSES:
+            return ("no slip", "incipient slip", "gross slip")
+        return self.fitted.classes
 
     def counts(self, trial: Trial) -> WindowCounts:
         """Output spikes in consecutive windows of a trial, as the evaluation counts them.
@@ -426,7 +433,7 @@ class Model:
             size_px: columns and rows of the camera.
 
         Returns:
-            spikes of each class, int64, shape (n, 3).
+            spikes of each class, int64, shape (n, classes).
 
         Raises:
             ValueError: events are not in time order or lie outside of the camera, or the network's

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,8 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.yaml_file import StrictModel, validate
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.files import json_text, read_json
-from sliplab.storage.schema.document import DocumentError
 from tests.conftest import ROOT
+from tests.docs.nonsense import CHECKERS, JUNK, changed_at, check_refusals, leaves
 from tests.flows.older import older_store
 from tests.storage.formats.adapters import SLIDES
 
@@ -31,7 +30,6 @@ FILES: list[tuple[Kind, Path]] = [
     ("adapter", ROOT / "examples" / "ev-objects" / "adapter.yaml"),
 ]
 MODELS: dict[Kind, type[StrictModel]] = {"protocol": Protocol, "rig": RigFile, "adapter": Adapter}
-CHECKERS = {kind: Draft7Validator(file_schema(kind)) for kind in KINDS}
 
 
 def _read(path: Path) -> Any:
@@ -90,58 +88,19 @@ def test_documents_of_a_store_are_accepted_and_read(
         assert DOCUMENTS[kind].parse(data, path).to_json() == data
 
 
-@pytest.mark.parametrize("kind", DOCUMENTS)
-def test_nothing_is_refused_in_a_document_that_its_reader_takes(older: Path, kind: Kind) -> None:
-    """With every value made nonsense, one at a time, the readers refuse what the schema does."""
-    patterns: dict[Kind, str] = {
-        "trial": "campaigns/*/trials/*/record.json", "label": "derived/labels/*/*.json",
-        "evaluation": "derived/evaluation/*.json", "summary": "report/summary.json",
-    }  # fmt: skip
-    path = min(older.glob(patterns[kind]))
-    data, refused = _short(read_json(path)), 0
-    assert CHECKERS[kind].is_valid(data)
-    assert DOCUMENTS[kind].parse(data, path).to_json() == data
-    for at in _leaves(data):
-        if any(isinstance(key, int) and key for key in at):
-            continue  # of a list the first entry stands for all
-        for junk in JUNK:
-            wrong = _set(data, at, junk)
-            if CHECKERS[kind].is_valid(wrong):
-                continue
-            refused += 1
-            with pytest.raises(DocumentError, match=path.name):
-                DOCUMENTS[kind].parse(wrong, path)
-    assert refused > 100
-
-
-def _short(part: Any) -> Any:
-    """The same with one of the mappings in each list: all of them are looked at every time."""
-    if isinstance(part, dict):
-        return {key: _short(value) for key, value in part.items()}
-    if isinstance(part, list):
-        rows = all(isinstance(item, dict) for item in part)
-        return [_short(item) for item in (part[:1] if rows else part)]
-    return part
-
-
-def _leaves(part: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    items = part.items() if isinstance(part, dict) else enumerate(part)
-    for key, value in items:
-        if isinstance(value, dict | list):
-            yield from _leaves(value, (*at, key))
-        yield (*at, key)
-
-
-def _set(data: Any, at: tuple[Any, ...], value: Any) -> Any:
-    changed = copy.deepcopy(data)
-    part = changed
-    for key in at[:-1]:
-        part = part[key]
-    part[at[-1]] = value
-    return changed
-
-
-JUNK: tuple[Any, ...] = ("no such thing", -1.5, None, {"no_such_key": 1})
+@pytest.mark.parametrize(
+    ("kind", "pattern"),
+    [
+        ("trial", "campaigns/*/trials/*/record.json"), ("label", "derived/labels/*/*.json"),
+        ("evaluation", "derived/evaluation/*.json"), ("summary", "report/summary.json"),
+    ],
+)  # fmt: skip
+def test_nothing_is_refused_in_a_document_that_its_reader_takes(
+    older: Path, kind: Kind, pattern: str
+) -> None:
+    """Documents of classes are tested where a store has them (tests/flows/test_classes.py)."""
+    path = min(older.glob(pattern))
+    assert check_refusals(kind, path) > 100
 
 
 @pytest.mark.parametrize(
@@ -156,9 +115,9 @@ JUNK: tuple[Any, ...] = ("no such thing", -1.5, None, {"no_such_key": 1})
 def test_nothing_is_refused_that_the_readers_take(kind: Kind, data: Any) -> None:
     """With every value made nonsense, one at a time, the readers refuse what the schema does."""
     refused = 0
-    for at in _leaves(data):
+    for at in leaves(data):
         for junk in JUNK:
-            wrong = _set(data, at, junk)
+            wrong = changed_at(data, at, junk)
             if CHECKERS[kind].is_valid(wrong):
                 continue
             refused += 1
@@ -206,7 +165,7 @@ WRONG_PROTOCOLS = {
 
 @pytest.mark.parametrize("at_to", WRONG_PROTOCOLS.values(), ids=WRONG_PROTOCOLS.keys())
 def test_wrong_protocols_are_refused(at_to: tuple[tuple[Any, ...], Any]) -> None:
-    assert not CHECKERS["protocol"].is_valid(_set(PILOT, *at_to))
+    assert not CHECKERS["protocol"].is_valid(changed_at(PILOT, *at_to))
 
 
 @pytest.mark.parametrize("key", ["protocol", "name", "collection"])
@@ -236,7 +195,7 @@ WRONG_RIGS = {
 
 @pytest.mark.parametrize(("data", "at_to"), WRONG_RIGS.values(), ids=WRONG_RIGS.keys())
 def test_wrong_rig_files_are_refused(data: Any, at_to: tuple[tuple[Any, ...], Any]) -> None:
-    assert not CHECKERS["rig"].is_valid(_set(data, *at_to))
+    assert not CHECKERS["rig"].is_valid(changed_at(data, *at_to))
 
 
 def test_only_a_file_that_extends_may_leave_keys_out() -> None:

@@ -29,6 +29,7 @@ from sliplab.storage.files import read_json
 from sliplab.storage.schema.classes import ClassSummary
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import answer, here
+from tests.docs.nonsense import check_refusals
 from tests.flows.class_store import (
     CLASSES,
     LENGTH_MS,
@@ -154,8 +155,10 @@ def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> 
     assert [row["true class"] for row in rows] == list(CLASSES)
     drawn = [int(row["called pen (windows)"]) for row in rows]
     assert drawn == [row[-2] for row in summary.classes.confusion]
-    kept = read_json(judged.folder / "derived" / "evaluation" / "classes.json")
-    Draft7Validator(file_schema("classes")).validate(kept)
+    kept = judged.folder / "derived" / "evaluation" / "classes.json"
+    Draft7Validator(file_schema("classes")).validate(read_json(kept))
+    assert check_refusals("classes", kept) > 50
+    assert check_refusals("classes-summary", folder / "summary.json") > 50
 
 
 def test_nothing_is_made_twice_and_other_methods_join(

@@ -1,0 +1,71 @@
+"""Documents with a value made nonsense, for schemas and the readers that they describe."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jsonschema import Draft7Validator
+
+from sliplab.flows.planning.schema import DOCUMENTS, KINDS, Kind, file_schema
+from sliplab.storage.files import read_json
+from sliplab.storage.schema.document import DocumentError
+
+CHECKERS = {kind: Draft7Validator(file_schema(kind)) for kind in KINDS}
+
+
+def check_refusals(kind: Kind, path: Path) -> int:
+    """Make every value nonsense, one at a time: the reader refuses what the schema does.
+
+    Returns:
+        how many were refused.
+    """
+    data, refused = short(read_json(path)), 0
+    assert CHECKERS[kind].is_valid(data)
+    assert DOCUMENTS[kind].parse(data, path).to_json() == data
+    for at in leaves(data):
+        if any(isinstance(key, int) and key for key in at):
+            continue  # of a list the first entry stands for all
+        for junk in JUNK:
+            wrong = changed_at(data, at, junk)
+            if CHECKERS[kind].is_valid(wrong):
+                continue
+            refused += 1
+            with pytest.raises(DocumentError, match=path.name):
+                DOCUMENTS[kind].parse(wrong, path)
+    return refused
+
+
+def short(part: Any) -> Any:
+    """The same with one of the mappings in each list: all of them are looked at every time."""
+    if isinstance(part, dict):
+        return {key: short(value) for key, value in part.items()}
+    if isinstance(part, list):
+        rows = all(isinstance(item, dict) for item in part)
+        return [short(item) for item in (part[:1] if rows else part)]
+    return part
+
+
+def leaves(part: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the place of every value, those of containers too."""
+    items = part.items() if isinstance(part, dict) else enumerate(part)
+    for key, value in items:
+        if isinstance(value, dict | list):
+            yield from leaves(value, (*at, key))
+        yield (*at, key)
+
+
+def changed_at(data: Any, at: tuple[Any, ...], value: Any) -> Any:
+    """Return a copy with another value at a place."""
+    changed = copy.deepcopy(data)
+    part = changed
+    for key in at[:-1]:
+        part = part[key]
+    part[at[-1]] = value
+    return changed
+
+
+JUNK: tuple[Any, ...] = ("no such thing", -1.5, None, {"no_such_key": 1})
