@@ -359,4 +359,6 @@ def _opened(folder: Path, names: list[str] | None) -> tuple[Store, list[Collecte
 
     store = open_store(folder)
     prepare_store(folder)
-    return store, collected(store, names)
+    # what is made anew from a protocol leaves imported campaigns out, unless somebody names them
+    found = collected(store, names)
+    return store, [item for item in found if names or item.recorded is None] or found

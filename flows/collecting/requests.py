@@ -220,7 +220,12 @@ def known_trials(
         InputError: a trial is in no campaign's plan, or in several.
         StoreError: the store holds no campaign.
     """
-    plans = {item.name: {trial.id for trial in item.plan} for item in collected(store, names)}
+    # what was imported is neither skipped nor taken again, unless somebody names it
+    plans = {
+        item.name: {trial.id for trial in item.plan}
+        for item in collected(store, names)
+        if names or item.recorded is None
+    }
     found: dict[str, list[str]] = {}
     for trial in dict.fromkeys(trials):
         where = [name for name, ids in plans.items() if trial in ids]

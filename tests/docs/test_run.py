@@ -27,6 +27,14 @@ ORDER = (
 ELSEWHERE = ("--rig loopback", "--dask", "s3://", "--follow", "KIND", "lab-pickles", "--help")
 """Needs a rig in real time, other machines or a running campaign, or stands for a word."""
 
+ADAPTER = """adapter: 1
+name: touches
+simulated: true
+experiment: kinematic
+trials: {files: "*.aedat4"}
+streams: {events: {format: aedat4}}
+"""
+
 
 def test_cheap_commands_run_as_printed(checkout: Path) -> None:
     (checkout / "lab.yaml").write_text(load_rig_file(Path("rehearsal"))[1])
@@ -34,6 +42,13 @@ def test_cheap_commands_run_as_printed(checkout: Path) -> None:
     assert run("sliplab export data pilot --format aedat4 --output recordings", checkout).code == 0
     # what publish.md takes in
     assert run("sliplab publish data --as mcap --output bags", checkout).code == 0
+    assert run("sliplab publish data --as croissant --output slides", checkout).code == 0
+    # a recording that was cut short, and a data set with its adapter
+    whole = min((checkout / "recordings").glob("*.aedat4"))
+    (checkout / "cut.aedat4").write_bytes(whole.read_bytes()[:-5000])
+    (checkout / "folder").mkdir()
+    (checkout / "folder" / "touch.aedat4").write_bytes(whole.read_bytes())
+    (checkout / "theirs.yaml").write_text(ADAPTER)
 
     trials = [trial.id for trial in load_plan(ROOT / "protocols" / "pilot.yaml")]
     wanted = sorted(
