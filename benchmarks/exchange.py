@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.measure import Figures, Seconds, machine, one_core, rate, ratio
 from benchmarks.slides import many_events
 from sliplab.storage.formats.aedat4 import EVENTS, Aedat4Writer, Stream
-from sliplab.storage.formats.import_trials import READERS
+from sliplab.storage.formats.recognition import READERS
 from sliplab.storage.streams import EventChunk
 
 SIZE = (640, 480)

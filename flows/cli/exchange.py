@@ -73,13 +73,8 @@ def import_(
 
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
-    from sliplab.storage.formats.import_trials import (
-        KINDS,
-        import_trials,
-        kind_of,
-        skipped_in,
-        trials_in,
-    )
+    from sliplab.storage.formats.import_trials import import_trials
+    from sliplab.storage.formats.recognition import KINDS, kind_of, skipped_in, trials_in
     from sliplab.storage.trials.store import Store, StoreError
 
     where = Path(kind_or_path) if path is None else path

@@ -20,9 +20,9 @@ from sliplab.protocols.adapter_parts import (
 )
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import MOST_PX, ForeignTrial, FormatError, event_chunk
-from sliplab.storage.formats.import_trials import LAB_PICKLES, READERS
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
 from sliplab.storage.formats.numpy_files import array_of
+from sliplab.storage.formats.recognition import LAB_PICKLES, READERS
 from sliplab.storage.formats.tables import read_columns, times_ns
 from sliplab.storage.streams import (
     F64,

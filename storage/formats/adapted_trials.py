@@ -19,7 +19,7 @@ from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
 from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
-from sliplab.storage.formats.import_trials import LAB_PICKLES, name_of
+from sliplab.storage.formats.recognition import LAB_PICKLES, name_of
 from sliplab.storage.formats.tables import Row, read_rows
 
 EVENTS, FRAMES, FRAME_TIMES, POSES = "events", "frames", "frames.times", "poses"

@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.schema.trial import Lost
+from sliplab.storage.errors import DamagedFile
+from sliplab.storage.schema.trial import DeviceRecord, Given, Lost, Step
 from sliplab.storage.streams import (
     I64,
     U8,
@@ -21,6 +22,7 @@ from sliplab.storage.streams import (
     PoseChunk,
     StreamChunk,
 )
+from sliplab.storage.trials.store import Campaign
 
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
@@ -92,6 +94,42 @@ class Triggers:
     """Kinds as AEDAT4 numbers them; 1 is a rising edge of the external input."""
 
 
+class ForeignCampaign(Protocol):
+    """The campaign that foreign trials are of."""
+
+    def join(self, campaign: Campaign, source: str) -> None:
+        """Describe a new campaign of a store, or check that the one there is this one.
+
+        Args:
+            source: of the trial that joins, for messages.
+
+        Raises:
+            InputError: it is another one.
+        """
+
+
+@dataclass(frozen=True)
+class Seen:
+    """First and last time of what was read of a trial, each on its own clock; None without any."""
+
+    events_us: tuple[int, int] | None
+    frames_ns: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What is known of a trial once all of it was read, on the time line.
+
+    Attributes:
+        span_ns: begin and end of the recording.
+        given: labels that came with it. steps: phases of its motion, on the arm's clock.
+    """
+
+    span_ns: tuple[int, int]
+    given: Given | None = None
+    steps: tuple[Step, ...] = ()
+
+
 @dataclass(frozen=True)
 class ForeignTrial:
     """A trial that can be read.
@@ -110,6 +148,10 @@ class ForeignTrial:
         streams: forces and scalars by stream.
         salvage: returns what stands whole in its file, if that turns out to be damaged; raises
             FormatError where that is nothing.
+        campaign: the one that it is of; None for one of its own.
+        clocks: those that are known, by device and stream. experiment: see the record.
+        whole: what follows from all that was read; a trial with it may be without events. Raises
+            InputError where that cannot be right.
     """
 
     name: str
@@ -132,6 +174,48 @@ class ForeignTrial:
     poses: PoseChunk | None = None
     streams: Mapping[str, StreamChunk] = field(default_factory=dict)
     cameras: Mapping[str, Callable[[], Iterator[FrameChunk]]] = field(default_factory=dict)
+    campaign: ForeignCampaign | None = None
+    clocks: Mapping[str, DeviceRecord] = field(default_factory=dict)
+    experiment: str = "imported"
+    whole: Callable[[Seen], Whole] | None = None
+
+
+def refusal(file: Path, error: FormatError) -> InputError:
+    """Return the error of a file that is not imported: bad data, or else wrong input."""
+    kind = DamagedFile if isinstance(error, Damage) else InputError
+    return kind(file, "", None, str(error))
+
+
+def before_damage(
+    read: Callable[[], ForeignTrial], error: FormatError, salvage: bool
+) -> ForeignTrial:
+    """Return what stands whole in a file that could not be read.
+
+    Args:
+        error: the fault that was found.
+
+    Raises:
+        Damage: that is nothing, or it is not to be salvaged, and only offered.
+        FormatError: the fault is no damage.
+    """
+    try:
+        whole = read()
+        if whole.lost is None:
+            raise error
+        if salvage:
+            return whole
+        count, last_us = 0, None
+        for chunk in whole.events():
+            count += len(chunk)
+            last_us = int(chunk.t_us[-1]) if len(chunk) else last_us
+    except FormatError as fault:
+        if fault is error:
+            raise
+        raise Damage(str(fault if isinstance(fault, Damage) else error)) from None
+    if last_us is None:
+        raise Damage(f"{error}; no event stands before that")
+    packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
+    raise Damage(f"{error}; --salvage imports {count:,} events up to {last_us} us{packets}")
 
 
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:

@@ -359,7 +359,7 @@ def _ours(path: Path, found: _Found) -> ForeignTrial:
         if found.topics[topic] == ros2.IMAGE
     }
     original = Original(
-        record, _document(found, PROVENANCE, Provenance), _campaign(path, found),
+        record, _document(found, PROVENANCE, Provenance),
         {key: _column(parts) for key, parts in found.columns.items()}, events, frames,
         {key[1].split("/")[1]: parts[0].unit for key, parts in found.columns.items()
          if key[1].startswith("streams/") and key[1].endswith("/value")},
@@ -367,7 +367,7 @@ def _ours(path: Path, found: _Found) -> ForeignTrial:
     )  # fmt: skip
     return StoredTrial(
         record.trial, path.name, events.get("events", lambda: iter(())), "the trial's time line",
-        simulated=record.simulated, original=original,
+        simulated=record.simulated, original=original, campaign=_campaign(path, found),
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_bytes, write_json
 from sliplab.storage.formats.foreign import ForeignTrial, FormatError
 from sliplab.storage.schema.label import LABELS, TrialLabel
@@ -59,16 +60,17 @@ class CampaignTexts:
     protocol: str
     rig: str
 
-    def begin(self, campaign: Campaign) -> None:
-        """Make a campaign of this description under its own name."""
-        campaign.update(self._info(campaign), self.protocol, self.rig)
-
-    def is_of(self, campaign: Campaign) -> bool:
-        """Return whether a campaign of a store has this description."""
-        return campaign.info == self._info(campaign)
-
-    def _info(self, campaign: Campaign) -> CampaignInfo:
-        return {**self.info, "name": campaign.name}
+    def join(self, campaign: Campaign, source: str) -> None:
+        """Describe a new campaign, under its own name; as `ForeignCampaign`."""
+        info: CampaignInfo = {**self.info, "name": campaign.name}
+        if not campaign.begun:
+            campaign.update(info, self.protocol, self.rig)
+        elif campaign.info != info:
+            raise InputError(
+                "--name", "", campaign.name,
+                f"has another protocol or rig than {source}; choose another name, and "
+                "import one campaign at a time",
+            )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,6 @@ class Original:
 
     record: TrialRecord
     provenance: Provenance
-    campaign: CampaignTexts
     columns: Mapping[tuple[str, str], Array]
     events: Mapping[str, Callable[[], Iterator[EventChunk]]]
     frames: Mapping[str, Callable[[], Iterator[U8]]]
@@ -256,10 +257,6 @@ class Original:
 
 class Restorable(Protocol):
     """A trial of a store that can be committed to another store as it was."""
-
-    @property
-    def campaign(self) -> CampaignTexts:
-        """The campaign that it is of."""
 
     def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
         """Commit the trial with its label and clocks.

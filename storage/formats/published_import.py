@@ -111,8 +111,9 @@ def _trial(
     return StoredTrial(
         folder.name, source, lambda: iter(()), "the trial's time line",
         simulated=record.simulated,
+        campaign=texts,
         original=PublishedTrial(
-            folder, texts, record.counts,
+            folder, record.counts,
             {step: [f for f in files if f.exists()] for step, files in kept.items()},
         ),
     )  # fmt: skip
@@ -127,7 +128,6 @@ class PublishedTrial:
     """
 
     folder: Path
-    campaign: CampaignTexts
     counts: Counts
     derived: dict[str, list[Path]]
 

@@ -181,7 +181,8 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     """A file of another program, found by its name and read to its end."""
     from sliplab.protocols.errors import InputError
     from sliplab.storage.formats.foreign import FormatError
-    from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
+    from sliplab.storage.formats.import_trials import import_trials
+    from sliplab.storage.formats.recognition import kind_of, trials_in
     from sliplab.storage.trials.store import Store
 
     _read_pickles_here()

@@ -11,7 +11,8 @@ from sliplab.analysis.labels.reviewed import Labels
 from sliplab.flows.label import report_states
 from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial, reasons_for_doubt
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.import_trials import import_trials, trials_in
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived

@@ -15,9 +15,10 @@ from rocrate.rocrate import ROCrate
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.export_trials import label_table
-from sliplab.storage.formats.import_trials import import_trials, trials_in
+from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.publication import About, Publication
 from sliplab.storage.formats.publish import publish
+from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording

@@ -25,7 +25,8 @@ from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
 from sliplab.storage.formats.export_trials import export_trials, label_table
 from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST, FormatError, Triggers
-from sliplab.storage.formats.import_trials import import_trials, kind_of, name_of, trials_in
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.recognition import kind_of, name_of, trials_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import catalogue, write_table
 from sliplab.storage.trials.derived import Derived

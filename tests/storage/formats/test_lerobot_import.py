@@ -20,8 +20,9 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
-from sliplab.storage.formats.import_trials import import_trials, kind_of, skipped_in, trials_in
+from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.publish import publish
+from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.store import Store

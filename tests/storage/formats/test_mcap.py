@@ -23,9 +23,10 @@ from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.formats import ros2_messages as ros2
 from sliplab.storage.formats.export_trials import label_table
 from sliplab.storage.formats.foreign import FormatError
-from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
+from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.mcap_trials import write_mcap
 from sliplab.storage.formats.publish import publish
+from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Clocks, Provenance, SyncResult
 from sliplab.storage.streams import (

@@ -17,13 +17,8 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST
-from sliplab.storage.formats.import_trials import (
-    MIXED,
-    import_trials,
-    kind_of,
-    skipped_in,
-    trials_in,
-)
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

@@ -14,7 +14,8 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
-from sliplab.storage.formats.import_trials import import_trials, kind_of, trials_in
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.trials.catalogue import UNREAD, catalogue
 from sliplab.storage.trials.recording import Recording

@@ -1,0 +1,353 @@
+"""Recognition of foreign recordings: which files are trials, of which format, under which names.
+
+Formats are recognised by a file's first bytes, and otherwise by its extension, so that
+a damaged file is rejected instead of skipped.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from importlib import util
+from pathlib import Path
+
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json, safe_name
+from sliplab.storage.formats.aedat4 import LINE, read_aedat4, salvage_aedat4
+from sliplab.storage.formats.dsec import (
+    SIGNATURE,
+    is_lab_hdf5,
+    read_dsec,
+    read_lab_hdf5,
+    salvage_dsec,
+    salvage_lab_hdf5,
+)
+from sliplab.storage.formats.foreign import (
+    EXPORT_FORMAT,
+    EXPORT_MANIFEST,
+    Damage,
+    ForeignTrial,
+    FormatError,
+    Skipped,
+    before_damage,
+    read_head,
+    refusal,
+)
+from sliplab.storage.formats.lab_pickles import Pair, pairs, read_pair
+from sliplab.storage.formats.lerobot_import import is_lerobot, read_lerobot
+from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
+from sliplab.storage.formats.prophesee import (
+    check_faery,
+    faery_type,
+    read_by_faery,
+    salvage_by_faery,
+)
+from sliplab.storage.formats.published_import import publication_at, read_publication
+from sliplab.storage.streams import Json
+
+Reader = Callable[[Path, str], ForeignTrial]
+READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
+    "aedat4": ((".aedat4",), read_aedat4),
+    "dsec": ((".h5", ".hdf5"), read_dsec),
+    "lab-hdf5": ((".h5", ".hdf5"), read_lab_hdf5),
+    "raw": ((".raw", ".dat"), read_by_faery),
+    "es": ((".es",), read_by_faery),
+    "mcap": ((".mcap",), read_mcap),
+}
+SALVAGE: dict[str, Reader] = {
+    "aedat4": salvage_aedat4,
+    "dsec": salvage_dsec,
+    "lab-hdf5": salvage_lab_hdf5,
+    "raw": salvage_by_faery,
+    "es": salvage_by_faery,
+    "mcap": salvage_mcap,
+}
+"""Readers of what stands whole before the damage in a file, by format."""
+LAB_PICKLES = "lab-pickles"
+DATA_SETS: dict[str, Callable[[Path], Iterator[ForeignTrial]]] = {
+    "croissant": read_publication,
+    "lerobot": read_lerobot,
+}
+"""Readers of folders that are one data set, by format."""
+KINDS = (*READERS, LAB_PICKLES, *DATA_SETS)
+MIXED = "mixed"
+"""Files of several formats in one folder."""
+_UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
+
+
+def kind_of(path: Path) -> str:
+    """Return the format of a file, or of the files in a folder; `MIXED` for several.
+
+    Raises:
+        InputError: none of them is known, or one is damaged.
+    """
+    if (whole := _data_set(path)) is not None:
+        return whole
+    found = _sort(path)
+    if not found:
+        raise InputError(
+            path, "", None, f"contains no known file format; name one of {', '.join(KINDS)}"
+        )
+    kinds = {kind for _, kind, _ in found}
+    return kinds.pop() if len(kinds) == 1 else MIXED
+
+
+def _data_set(path: Path) -> str | None:
+    """Return the format of a folder that is one data set; None for any other path."""
+    if publication_at(path) is not None:
+        return "croissant"
+    return "lerobot" if is_lerobot(path) else None
+
+
+def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[ForeignTrial]:
+    """Yield the trials of a file or folder, in the order of their names.
+
+    Args:
+        kind: the format, or `MIXED`: that of each file.
+        salvage: of a file that is damaged already where it begins to be read, yield what stands
+            whole.
+
+    Raises:
+        InputError: it does not exist, a file is damaged, two have one name, or faery is missing.
+        ModuleNotFoundError: the extra `publish` is missing, for MCAP files.
+    """
+    if kind in DATA_SETS:
+        if not path.is_dir():
+            raise InputError(path, "", None, f"is no folder; {kind} is a folder of files")
+        yield from DATA_SETS[kind](path)
+        return
+    manifest = None
+    if kind != LAB_PICKLES and path.is_dir():
+        manifest = _read_manifest(path)
+    if manifest is not None:
+        for item in manifest["trials"]:
+            file = path / item["file"]
+            if file.is_symlink() or not file.is_file():
+                raise InputError(file, "", None, "is missing or not a regular file")
+            of = (_kind(file) or "") if kind == MIXED else kind
+            if of not in READERS:
+                raise InputError(file, "", None, f"is of no known format ({', '.join(READERS)})")
+            found = _read(of, file, item["trial"], salvage)
+            yield _as_exported(found, item, manifest["simulated"])
+        return
+    wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)
+    _check_names(path, wanted)
+    for name, of, file in wanted:
+        yield (
+            replace(read_pair(file, name), kind=of)
+            if isinstance(file, Pair)
+            else _read(of, file, name, salvage)
+        )
+
+
+def skipped_in(path: Path, kind: str) -> list[Skipped]:
+    """Return what `trials_in` leaves out of a folder, by name.
+
+    Raises:
+        InputError: as `trials_in`.
+    """
+    if not path.is_dir() or kind in DATA_SETS:
+        return []
+    manifest = _read_manifest(path) if kind != LAB_PICKLES else None
+    taken: set[str | None] = {EXPORT_MANIFEST}
+    if manifest is not None:
+        taken |= {item["file"] for item in manifest["trials"]}
+        other = f"is not in {EXPORT_MANIFEST}"
+    else:
+        for _, _, file in _sort(path) if kind == MIXED else _of_kind(path, kind):
+            taken |= file.names() if isinstance(file, Pair) else {file.name}
+        known = ", ".join(KINDS)
+        other = f"is of no known format ({known})" if kind == MIXED else f"is no {kind} file"
+    return [
+        Skipped(entry.name, _reason(entry, other))
+        for entry in sorted(path.iterdir())
+        if entry.name not in taken
+    ]
+
+
+def _reason(entry: Path, other: str) -> str:
+    if entry.is_symlink():
+        return "is a link"
+    if entry.is_dir():
+        return "is a folder; import it by itself"
+    return other if entry.is_file() else "is no regular file"
+
+
+Wanted = tuple[str, str, "Path | Pair"]
+"""Name of a trial, its format, and its file or files."""
+
+
+def _sort(path: Path) -> list[Wanted]:
+    """Return what is known in a file or folder, each with its own format, by name."""
+    kinds = {file: _kind(file) for file in _files(path)}
+    found: list[Wanted] = [
+        (name_of(_stem(file)), kind, file) for file, kind in kinds.items() if kind is not None
+    ]
+    left = [file for file, kind in kinds.items() if kind is None]
+    found += [(name_of(pair.stem), LAB_PICKLES, pair) for pair in pairs(left)]
+    return sorted(found, key=lambda item: item[0])
+
+
+def _of_kind(path: Path, kind: str) -> list[Wanted]:
+    """Return what a file or folder holds of one format.
+
+    Raises:
+        InputError: that is nothing.
+    """
+    files = _files(path)
+    if kind == LAB_PICKLES:
+        found = pairs(files)
+        if not found:
+            raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
+        return [(name_of(pair.stem), kind, pair) for pair in found]
+    wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
+    if not wanted:
+        endings = " or ".join(READERS[kind][0])
+        raise InputError(path, "", None, f"holds no {kind} file; such files end in {endings}")
+    return [(name_of(_stem(file)), kind, file) for file in wanted]
+
+
+def _check_names(path: Path, wanted: list[Wanted]) -> None:
+    """Check that no two files have the name of one trial, and that their libraries are there.
+
+    Two files of one name are mostly one recording in two formats, which must not count twice.
+    """
+    seen: dict[str, Path | Pair] = {}
+    for name, kind, file in wanted:
+        if (other := seen.setdefault(name, file)) is not file:
+            one, two = (
+                item.name if isinstance(item, Path) else ", ".join(sorted(item.names()))
+                for item in (other, file)
+            )
+            raise InputError(
+                path, "", None,
+                f"holds two files for the trial {name}: {one} and {two}; keep one of them, rename "
+                "one, or import one format alone: sliplab import KIND PATH",
+            )  # fmt: skip
+        if kind in {"raw", "es"} and isinstance(file, Path):
+            check_faery(file)
+        if kind == "mcap" and util.find_spec("mcap") is None:
+            raise ModuleNotFoundError("No module named 'mcap'", name="mcap")
+
+
+def name_of(stem: str) -> str:
+    """Make the name of a trial from a file's name: other characters become ``_``."""
+    plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", stem)).lstrip("=,._+-")[:200]
+    return plain or "trial"
+
+
+def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
+    """Return the trial in a file, or what stands whole of it.
+
+    Raises:
+        FormatError: it is damaged, or of another format.
+    """
+    _, reader = READERS[kind]
+    again = partial(SALVAGE[kind], file, name) if kind in SALVAGE else None
+    try:
+        return replace(reader(file, name), kind=kind, salvage=again)
+    except Damage as error:
+        if again is None:
+            raise
+        return replace(before_damage(again, error, salvage), kind=kind)
+
+
+def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
+    try:
+        return read_file(kind, file, name, salvage)
+    except FormatError as error:
+        raise refusal(file, error) from None
+
+
+def _stem(file: Path) -> str:
+    """Return a file's name without its ending; a name without one may have dots in it."""
+    known = {ending for endings, _ in READERS.values() for ending in endings}
+    return file.stem if file.suffix.lower() in known else file.name
+
+
+def _files(path: Path) -> list[Path]:
+    """List plain files; links are left out, for they may lead anywhere."""
+    if path.is_dir():
+        found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
+    elif path.is_file():
+        found = [path]
+    else:
+        raise InputError(path, "", None, "no such file or folder")
+    return found
+
+
+def _possible(file: Path) -> tuple[str, ...]:
+    """Return the formats that a file may have: by its first bytes, else by its name's ending."""
+    head = read_head(file)
+    if head.startswith(LINE):
+        return ("aedat4",)
+    if head.startswith(MAGIC):
+        return ("mcap",)
+    if head.startswith(SIGNATURE):
+        return ("dsec", "lab-hdf5")
+    if form := faery_type(head):
+        return ("es",) if form == "es" else ("raw",)
+    suffix = file.suffix.lower()
+    return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
+
+
+def _kind(file: Path) -> str | None:
+    kinds = _possible(file)
+    if "dsec" in kinds:
+        try:
+            return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
+        except FormatError as error:
+            raise refusal(file, error) from None
+    return kinds[0] if kinds else None
+
+
+def _read_manifest(folder: Path) -> Json | None:
+    """Read and check the manifest of an exported campaign; None if there is none.
+
+    Raises:
+        InputError: it is damaged, or names a file outside of its folder.
+    """
+    path = folder / EXPORT_MANIFEST
+    if not path.is_file() or path.is_symlink():
+        return None
+    try:
+        found = read_json(path)
+        if found.get("sliplab_export") != EXPORT_FORMAT:
+            raise ValueError(f"{path}: sliplab_export must be {EXPORT_FORMAT}")
+        if not isinstance(found.get("simulated"), bool):
+            raise ValueError(f"{path}: simulated must be true or false")
+        for item in found["trials"]:
+            safe_name(item["trial"])
+            safe_name(item["file"])
+            _check_exported(item, path)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, StoreError) as error:
+        text = str(error).removeprefix(f"{path}: ")
+        raise InputError(path, "", None, f"is damaged: {text}") from None
+    return found
+
+
+def _check_exported(item: Json, path: Path) -> None:
+    texts = item["condition"]
+    if not isinstance(texts, dict) or not all(isinstance(t, str) for t in texts.values()):
+        raise ValueError(f"{path}: a condition that is not text")
+    for name in ("events", "frames", "triggers", "repetition"):
+        if type(item[name]) is not int:
+            raise ValueError(f"{path}: {name} must be an integer")
+
+
+def _as_exported(trial: ForeignTrial, item: Json, simulated: bool) -> ForeignTrial:
+    """Return a trial with what the manifest states of it."""
+    about = {**trial.about, "exported": item.get("record", {})}
+    return replace(
+        trial,
+        condition=dict(item["condition"]),
+        repetition=item["repetition"],
+        simulated=simulated or trial.simulated,
+        about=about,
+        unknown=tuple(what for what in trial.unknown if what != "condition"),
+    )
