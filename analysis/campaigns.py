@@ -11,10 +11,15 @@ from sliplab.protocols.adapter import CLASSES, load_adapter
 from sliplab.protocols.recorded import RecordedPlan, RecordedTrial, natural
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
+from sliplab.storage.trials.store import (
+    ADAPTER,
+    IMPORTED,
+    Campaign,
+    CampaignInfo,
+    Store,
+    StoreError,
+)
 
-ADAPTER = "adapter"
-"""Key of a campaign's `imported` part: it came by an adapter, which it keeps."""
 _NO_PLAN = "was imported without an adapter: it has neither labels nor a split (docs/adapters.md)"
 
 

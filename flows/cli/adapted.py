@@ -25,7 +25,14 @@ _SHOWN = 10
 
 
 def import_by_adapter(
-    file: Path, path: Path, place: Path, name: str | None, *, dry_run: bool, as_json: bool
+    file: Path,
+    path: Path,
+    place: Path,
+    name: str | None,
+    *,
+    salvage: bool,
+    dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Import the data set at `path` by the adapter `file`, or list what would be imported.
 
@@ -51,9 +58,13 @@ def import_by_adapter(
         bar = console.bar("import (trials)", len(found.trials))
         with _new_store(place) as store, store_lock(store), bar as progress:
             result = import_adapted(
-                store, name, found, text, lambda trial: progress.advance(1, trial)
-            )
-        result |= {"split": dict(Counter(parts.values())), "warnings": list(found.warnings)}
+                store, name, found, text, lambda trial: progress.advance(1, trial),
+                salvage=salvage,
+            )  # fmt: skip
+        for warning in result.get("warnings", ()):
+            console.say(f"warning: {warning}")
+        warnings = [*found.warnings, *result.get("warnings", ())]
+        result |= {"split": dict(Counter(parts.values())), "warnings": warnings}
         _finish(result, found, f"imported into {place}", as_json)
 
 
@@ -124,5 +135,6 @@ def _finish(result: Json, found: AdaptedSet, title: str, as_json: bool) -> None:
         if key in result:
             result[key] = len(result[key])
     split = ", ".join(f"{count} {part}" for part, count in result.pop("split").items())
-    result.pop("warnings")
+    for key in ("warnings", "salvaged"):
+        result.pop(key, None)
     finish({**result, "split": split, "skipped": len(skipped)}, title, False)

@@ -55,15 +55,15 @@ def import_(
     factors, from a folder or .zip, as a campaign to train and evaluate on (docs/adapters.md).
     """
     if adapter is not None:
-        for option, given in (("KIND", path is not None), ("--salvage", salvage),
-                              ("--simulated", simulated)):  # fmt: skip
+        for option, given in (("KIND", path is not None), ("--simulated", simulated)):
             if given:
                 raise InputError(option, "", None, "cannot be given beside --adapter")
         from sliplab.flows.cli.adapted import import_by_adapter
 
         import_by_adapter(
-            adapter, Path(kind_or_path), store, name, dry_run=dry_run, as_json=as_json
-        )
+            adapter, Path(kind_or_path), store, name,
+            salvage=salvage, dry_run=dry_run, as_json=as_json,
+        )  # fmt: skip
         return
     if dry_run:
         raise InputError("--dry-run", "", None, "is for an import with --adapter")

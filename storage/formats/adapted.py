@@ -1,22 +1,21 @@
-"""Import of a foreign data set by an adapter: each trial complete or not at all."""
+"""Trials of a foreign data set as its adapter describes them, opened one after the other."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
-
-from sliplab.protocols.adapter import Adapter, load_adapter
+from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.adapter_parts import StreamClock
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.formats.adapted_labels import FoundTime, find_motion
 from sliplab.storage.formats.adapted_streams import (
+    EventSource,
     read_events,
     read_frames,
     read_poses,
@@ -31,33 +30,17 @@ from sliplab.storage.formats.adapted_trials import (
     AdaptedSet,
     AdaptedTrial,
 )
-from sliplab.storage.formats.foreign import RISING, FormatError, check_pixels
+from sliplab.storage.formats.foreign import ForeignTrial, FormatError, Seen, Whole, refusal
+from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.process import now
-from sliplab.storage.schema.document import first_fault
-from sliplab.storage.schema.trial import (
-    Clocks,
-    Counts,
-    DeviceRecord,
-    Geometry,
-    Given,
-    GivenSpan,
-    Imported,
-    Provenance,
-    Quality,
-    Step,
-    StreamRecord,
-    TrialRecord,
-)
-from sliplab.storage.streams import Json, PulseChunk
-from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
-from sliplab.storage.trials.writer import TrialWriter
+from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, Step
+from sliplab.storage.streams import Json, StreamChunk
+from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo, Store
 
-ADAPTER = "adapter"
-"""Key of a campaign's `imported` part, and its format."""
 GIVEN, UNKNOWN = "given", "unknown"
 """Grades of clocks: stated by the adapter, or not."""
-_FRAME_RATE = 100
 _RIG = "# Imported: there is no rig file.\nimported: adapter\n"
+T = TypeVar("T")
 
 
 def import_adapted(
@@ -66,242 +49,265 @@ def import_adapted(
     found: AdaptedSet,
     text: str,
     on_trial: Callable[[str], None] = lambda name: None,
+    *,
+    salvage: bool = False,
 ) -> Json:
-    """Import the trials of a data set that are not there yet; the caller holds the store's lock.
+    """Import the trials of a data set that are not there yet; see `import_trials`.
 
     Args:
         name: the campaign's, which is made, or was made by the same adapter.
         text: the adapter's, which the campaign keeps.
-        on_trial: called with each trial's id before it is read; what it raises ends the import
-            between two trials.
-
-    Returns:
-        ``campaign``, ``imported`` and ``there`` with ids, ``events`` and ``frames`` imported.
 
     Raises:
         InputError: the campaign is another one, or a file cannot be right. Trials before it stay
             committed; of this one nothing is left.
     """
-    campaign = store.campaign(name)
-    fresh = not campaign.begun
-    if not fresh:
-        _check_same(campaign, found)
-    existing = campaign.committed()
-    imported: list[str] = []
-    counts = {"events": 0, "frames": 0}
-    wanted = [trial for trial in found.trials if trial.id not in existing]
-    try:
-        for trial in wanted:
-            on_trial(trial.id)
-            if not imported:
-                _describe(campaign, found, text)
-            taken = _take(campaign, found, trial)
-            imported.append(trial.id)
-            counts = {key: counts[key] + taken[key] for key in counts}
-        if not wanted:
-            _describe(campaign, found, text)
-    finally:
-        if fresh and not imported and campaign.folder.exists():
-            shutil.rmtree(campaign.folder)
-    there = [trial.id for trial in found.trials if trial.id in existing]
-    return {"campaign": name, "imported": imported, "there": there, **counts}
-
-
-def _check_same(campaign: Campaign, found: AdaptedSet) -> None:
-    """Check that a campaign came by this adapter, which may differ in how it is analysed."""
-    info = campaign.info
-    if ADAPTER not in info.get(IMPORTED, {}):
-        raise InputError(
-            "--name", "", campaign.name,
-            "is a campaign that did not come by an adapter; choose another name",
-        )  # fmt: skip
-    kept, new = load_adapter(campaign.protocol_file).of_the_trials(), found.adapter.of_the_trials()
-    differing = [key for key in new if new[key] != kept.get(key)]
-    if differing:
-        raise InputError(
-            found.file, differing[0], None,
-            f"differs from the adapter of campaign '{campaign.name}' (in "
-            f"{', '.join(differing)}), whose trials would not be alike; choose another --name",
-        )  # fmt: skip
-
-
-def _describe(campaign: Campaign, found: AdaptedSet, text: str) -> None:
-    about: Json = {
-        "from": found.folder.path.name, "format": ADAPTER, ADAPTER: found.adapter.adapter,
-        "when": now(),
-    }  # fmt: skip
-    if campaign.begun:
-        about = campaign.info.get(IMPORTED, about)
-    info: CampaignInfo = {
-        "name": campaign.name, "simulated": found.adapter.simulated,
-        "experiment": found.adapter.experiment, IMPORTED: about,
-    }  # fmt: skip
-    campaign.update(info, text, _RIG)
-
-
-def _take(campaign: Campaign, found: AdaptedSet, trial: AdaptedTrial) -> dict[str, int]:
-    """Commit one trial; return its counts."""
-    with ExitStack() as stack:
-        made = _Trial(campaign, found, trial, stack)
-        try:
-            record = made.fill()
-            provenance = {"imported": now(), "from": trial.source}
-            made.writer.commit(record, Provenance.model_validate(provenance))
-        except BaseException:
-            made.writer.discard()
-            raise
-    return {"events": record.counts.events, "frames": record.counts.frames}
-
-
-class _Trial:
-    """A trial while it is imported."""
-
-    def __init__(
-        self, campaign: Campaign, found: AdaptedSet, trial: AdaptedTrial, stack: ExitStack
-    ) -> None:
-        self._campaign, self._found, self._trial, self._stack = campaign, found, trial, stack
-        self._adapter: Adapter = found.adapter
-        self._clocks: dict[str, DeviceRecord] = {}
-        self._streams: dict[str, StreamRecord] = {}
-        self._unknown: list[str] = []
-        self._ends_ns: list[tuple[int, int]] = []
-        self._event_px: tuple[int, int] | None = None
-        self._frames = self._open_frames()
-        size = None if self._frames is None else self._frames[0]
-        self.writer: TrialWriter = campaign.begin(trial.id, size, _FRAME_RATE)
-
-    def fill(self) -> TrialRecord:
-        """Write all streams; return the record.
-
-        Raises:
-            InputError: a file cannot be right, or a label lies outside of the recording.
-        """
-        span = self._reading(EVENTS, self._add_events)
-        self._reading(FRAMES, self._add_frames)
-        self._reading(POSES, self._add_poses)
-        parts = self._adapter.streams
-        for key, named in (("wrenches", parts.wrenches), ("scalars", parts.scalars)):
-            for name in named:
-                self._reading(f"{key}.{name}", partial(self._add, key, name))
-        if span is None:
-            if not self._ends_ns:
-                raise self._error(self._names(EVENTS), "contains no event: its length is unknown")
-            span = (min(a for a, _ in self._ends_ns), max(b for _, b in self._ends_ns))
-        return self._record(span)
-
-    def _names(self, stream: str) -> tuple[str, ...]:
-        return self._trial.files.get(stream, ())
-
-    def _paths(self, stream: str) -> list[Path]:
-        return self._stack.enter_context(self._found.folder.local(*self._names(stream)))
-
-    def _error(self, names: tuple[str, ...], text: str) -> InputError:
-        where = self._found.folder.place(names[0]) if names else str(self._found.folder.path)
-        return InputError(where, "", None, text)
-
-    def _reading(self, stream: str, read: Callable[[], Any]) -> Any:
-        """Read a stream that is there; a fault in its file becomes the error of that file."""
-        try:
-            return read() if self._names(stream) else None
-        except FormatError as error:
-            raise self._error(self._names(stream), str(error)) from None
-
-    def _open_frames(self) -> Any:
-        part = self._adapter.streams.frames
-        if part is None or not self._names(FRAMES):
-            return None
-        times = self._names(FRAME_TIMES)
-        if part.times is not None and not times:
-            return None
-        paths = self._paths(FRAMES) if part.format == "video" else []
-        return self._reading(
-            FRAMES,
-            lambda: read_frames(self._found.folder, self._names(FRAMES), times, part, paths),
+    existing = store.campaign(name).committed()
+    campaign = AdaptedCampaign(found, text)
+    with closing(_opened(found, campaign, existing, salvage)) as trials:
+        return import_trials(
+            store, name, trials, found.folder.path, ADAPTER, on_trial, salvage=salvage
         )
 
-    def _add_events(self) -> tuple[int, int] | None:
-        part = self._adapter.streams.events
+
+def _opened(
+    found: AdaptedSet, campaign: AdaptedCampaign, existing: set[str], salvage: bool
+) -> Generator[ForeignTrial]:
+    """Yield the trials; of those that exist nothing is opened."""
+    for trial in found.trials:
+        with ExitStack() as stack:
+            made = ForeignTrial(
+                trial.id, trial.source, lambda: iter(()), "as its files have them",
+                campaign=campaign,
+            )  # fmt: skip
+            if trial.id not in existing:
+                try:
+                    made = _Opening(found, trial, stack, salvage).open(made)
+                except FormatError as error:
+                    raise refusal(error.file or found.folder.path, error) from None
+            yield made
+
+
+def _salvaged(salvage: Callable[[], ForeignTrial], made: ForeignTrial) -> ForeignTrial:
+    """Return what stands whole of the events' file, with the frames of another file."""
+    return replace(salvage(), frames=made.frames, frame_px=made.frame_px)
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptedCampaign:
+    """The campaign of a data set, which keeps the adapter's text in a protocol's place."""
+
+    found: AdaptedSet
+    text: str
+
+    def join(self, campaign: Campaign, source: str) -> None:
+        """Keep the adapter, which may differ from one before in how the data are analysed."""
+        found = self.found
+        about: Json = {
+            "from": found.folder.path.name, "format": ADAPTER, ADAPTER: found.adapter.adapter,
+            "when": now(),
+        }  # fmt: skip
+        if campaign.begun:
+            self._check(campaign)
+            about = campaign.info.get(IMPORTED, about)
+        info: CampaignInfo = {
+            "name": campaign.name, "simulated": found.adapter.simulated,
+            "experiment": found.adapter.experiment, IMPORTED: about,
+        }  # fmt: skip
+        campaign.update(info, self.text, _RIG)
+
+    def _check(self, campaign: Campaign) -> None:
+        if ADAPTER not in campaign.info.get(IMPORTED, {}):
+            raise InputError(
+                "--name", "", campaign.name,
+                "is a campaign that did not come by an adapter; choose another name",
+            )  # fmt: skip
+        kept = load_adapter(campaign.protocol_file).of_the_trials()
+        new = self.found.adapter.of_the_trials()
+        differing = [key for key in new if new[key] != kept.get(key)]
+        if differing:
+            raise InputError(
+                self.found.file, differing[0], None,
+                f"differs from the adapter of campaign '{campaign.name}' (in "
+                f"{', '.join(differing)}), whose trials would not be alike; choose another --name",
+            )  # fmt: skip
+
+
+@dataclass
+class _Opening:
+    """A trial while it is opened.
+
+    Attributes:
+        stack: closes what was unpacked, once the trial is imported.
+        clocks: of devices and streams on the time line, which is the events' clock.
+    """
+
+    found: AdaptedSet
+    trial: AdaptedTrial
+    stack: ExitStack
+    salvage: bool
+    clocks: dict[str, DeviceRecord] = field(default_factory=dict)
+    unknown: list[str] = field(default_factory=list)
+    span_ns: tuple[int, int] | None = None
+
+    def open(self, made: ForeignTrial) -> ForeignTrial:
+        """Open its files.
+
+        Raises:
+            FormatError: one cannot be right; it names the file.
+        """
+        adapter, trial, parts = self.found.adapter, self.trial, self.found.adapter.streams
+        if self._names(EVENTS):
+            made = self._with_events(made, self._read(EVENTS, self._open_events))
+        if self._names(FRAMES) and (parts.frames is not None) and self._timed():
+            size, frames = self._read(FRAMES, self._open_frames)
+            made = replace(made, frames=lambda: self._of(FRAMES, frames()), frame_px=size)
+            self._clock(parts.frames.clock, "frames")
+        if parts.poses is not None and self._names(POSES):
+            read = partial(read_poses, self.found.folder, self._names(POSES)[0], parts.poses)
+            made = replace(made, poses=self._read(POSES, read))
+            self._clock(parts.poses.clock, "arm")
+        if made.salvage is not None:
+            made = replace(made, salvage=partial(_salvaged, made.salvage, made))
+        made = replace(made, streams=self._streams())
+        motion = self._motion()
+        return replace(
+            made,
+            condition=trial.condition,
+            simulated=adapter.simulated,
+            experiment=adapter.experiment,
+            about={"fields": trial.fields},
+            unknown=(*self.unknown, *(f"{name} (no file)" for name in trial.missing)),
+            clocks=self.clocks,
+            whole=lambda seen: self._whole(seen, motion),
+        )
+
+    def _names(self, stream: str) -> tuple[str, ...]:
+        return self.trial.files.get(stream, ())
+
+    def _paths(self, stream: str) -> list[Path]:
+        return self.stack.enter_context(self.found.folder.local(*self._names(stream)))
+
+    @contextmanager
+    def _named(self, stream: str) -> Iterator[None]:
+        """Give a fault the stream's file."""
+        try:
+            yield
+        except FormatError as error:
+            error.file = error.file or Path(self.found.folder.place(self._names(stream)[0]))
+            raise
+
+    def _read(self, stream: str, read: Callable[[], T]) -> T:
+        with self._named(stream):
+            return read()
+
+    def _of(self, stream: str, chunks: Iterator[T]) -> Iterator[T]:
+        with self._named(stream):
+            yield from chunks
+
+    def _open_events(self) -> EventSource:
+        part = self.found.adapter.streams.events
         assert part is not None
         here = part.format in {"counts", "csv", "numpy"}
         paths = [] if here else self._paths(EVENTS)
-        source = read_events(self._found.folder, self._names(EVENTS), part, paths)
-        last_us: int | None = None
-        for chunk in source.chunks():
-            if not len(chunk):
-                continue
-            if last_us is not None and int(chunk.t_us[0]) < last_us:
-                raise FormatError("contains events with decreasing times")
-            first_us = int(chunk.t_us[0])
-            last_us = int(chunk.t_us[-1])
-            self._ends_ns.append((first_us * 1000, (last_us + 1) * 1000))
-            check_pixels(chunk, source.size_px())
-            self.writer.add_events(chunk)
-        self._event_px = source.size_px()
-        if self._event_px is None:
-            self._unknown.append("sensor size")
-        self._clocks["events"] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
+        return read_events(self.found.folder, self._names(EVENTS), part, paths, self.salvage)
+
+    def _with_events(self, made: ForeignTrial, source: EventSource) -> ForeignTrial:
+        if source.span_us is not None:
+            self.span_ns = source.span_us[0] * 1000, source.span_us[1] * 1000
+        self.clocks["events"] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
+        made = replace(
+            made, events=lambda: self._of(EVENTS, source.chunks()), event_px=source.size_px
+        )
         foreign = source.foreign
-        if foreign is not None:
-            self._unknown += [what for what in foreign.unknown if what != "condition"]
-            if foreign.triggers is not None:
-                t_ns = foreign.triggers.t_us * 1000
-                self.writer.add_triggers(t_ns, foreign.triggers.kind)
-                self.writer.add_event_pulses(PulseChunk(t_ns[foreign.triggers.kind == RISING]))
-        if source.span_us is None:
-            return None
-        return source.span_us[0] * 1000, source.span_us[1] * 1000
+        if foreign is None:
+            return made
+        self.unknown += [what for what in foreign.unknown if what != "condition"]
+        return replace(
+            made, triggers=foreign.triggers, lost=foreign.lost, packets=foreign.packets,
+            salvage=foreign.salvage,
+        )  # fmt: skip
 
-    def _add_frames(self) -> None:
-        part = self._adapter.streams.frames
-        if self._frames is None or part is None:
-            return
-        clock = self._clock(part.clock, "frames")
-        for chunk in self._frames[1]():
-            if len(chunk):
-                self._saw(clock, int(chunk.t_ns[0]), int(chunk.t_ns[-1]))
-            self.writer.add_frames(chunk)
+    def _timed(self) -> bool:
+        part = self.found.adapter.streams.frames
+        return part is not None and (part.times is None or bool(self._names(FRAME_TIMES)))
 
-    def _add_poses(self) -> None:
-        part = self._adapter.streams.poses
+    def _open_frames(self) -> Any:
+        part = self.found.adapter.streams.frames
         assert part is not None
-        chunk = read_poses(self._found.folder, self._names(POSES)[0], part)
-        self.writer.add_poses(chunk)
-        self._clock(part.clock, "arm")
+        paths = self._paths(FRAMES) if part.format == "video" else []
+        return read_frames(
+            self.found.folder, self._names(FRAMES), self._names(FRAME_TIMES), part, paths
+        )
 
-    def _add(self, kind: str, name: str) -> None:
-        file = self._names(f"{kind}.{name}")[0]
-        parts = self._adapter.streams
-        if kind == "wrenches":
-            wrench = parts.wrenches[name]
-            chunk: Any = read_wrench(self._found.folder, file, wrench)
-            clock, unit = wrench.clock, None
-        else:
-            scalar = parts.scalars[name]
-            chunk = read_scalar(self._found.folder, file, scalar)
-            clock, unit = scalar.clock, scalar.quantity_unit or None
-        self.writer.add_stream(name, chunk)
-        self._clock(clock, name)
-        self._streams[name] = StreamRecord(kind=chunk.KIND, rows=len(chunk), unit=unit)
+    def _streams(self) -> dict[str, StreamChunk]:
+        folder, parts = self.found.folder, self.found.adapter.streams
+        chunks: dict[str, StreamChunk] = {}
+        for kind, named in (("wrenches", parts.wrenches), ("scalars", parts.scalars)):
+            for name in named:
+                if not (files := self._names(key := f"{kind}.{name}")):
+                    continue
+                if kind == "wrenches":
+                    wrench = partial(read_wrench, folder, files[0], parts.wrenches[name])
+                    chunks[name] = self._read(key, wrench)
+                else:
+                    scalar = partial(read_scalar, folder, files[0], parts.scalars[name])
+                    chunks[name] = self._read(key, scalar)
+                self._clock(named[name].clock, name)
+        return chunks
 
-    def _clock(self, clock: StreamClock | None, device: str) -> DeviceRecord:
-        """Keep the clock of a device on the time line, which is the events' clock."""
-        if not self._clocks or clock is None:
-            if self._clocks:
-                self._unknown.append(f"clock of {device}")
-            record = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
-        else:
-            error = clock.uncertainty_ms
-            record = DeviceRecord(
-                grade=GIVEN,
-                map=ClockMap.line(0, round(clock.offset_ms * 1e6), round(clock.drift_ppm * 1000)),
-                uncertainty_ns=None if error is None else error * 1e6,
-            )
-        self._clocks[device] = record
-        return record
+    def _clock(self, clock: StreamClock | None, device: str) -> None:
+        """Keep the clock of a device; the first one is the time line."""
+        if not self.clocks or clock is None:
+            if self.clocks:
+                self.unknown.append(f"clock of {device}")
+            self.clocks[device] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
+            return
+        error = clock.uncertainty_ms
+        self.clocks[device] = DeviceRecord(
+            grade=GIVEN,
+            map=ClockMap.line(0, round(clock.offset_ms * 1e6), round(clock.drift_ppm * 1000)),
+            uncertainty_ns=None if error is None else error * 1e6,
+        )
 
-    def _saw(self, clock: DeviceRecord, first_ns: int, last_ns: int) -> None:
-        line = clock.map.to_reference
-        self._ends_ns.append((line(first_ns), line(last_ns) + 1000))
+    def _motion(self) -> tuple[int, int] | None:
+        """Return begin and end of the slide on the clock that the adapter names."""
+        motion = self.found.adapter.motion
+        if motion is None:
+            return None
+        fields = {**self.trial.fields, "id": self.trial.id}
+        found = find_motion(motion, fields, self.found.file, self.trial.id)
+        if found is None:
+            self.unknown.append("motion")
+        return found
+
+    def _whole(self, seen: Seen, motion: tuple[int, int] | None) -> Whole:
+        """Return span, labels and steps.
+
+        Raises:
+            FormatError: nothing was recorded. InputError: a label lies outside of the recording.
+        """
+        span = self.span_ns or self._span(seen)
+        return Whole(span, self._given(span), () if motion is None else self._steps(span, motion))
+
+    def _span(self, seen: Seen) -> tuple[int, int]:
+        """Return begin and end of events and frames on the time line."""
+        ends = []
+        if seen.events_us is not None:
+            ends.append((seen.events_us[0] * 1000, (seen.events_us[1] + 1) * 1000))
+        if seen.frames_ns is not None:
+            line = self.clocks["frames"].map.to_reference
+            ends.append((line(seen.frames_ns[0]), line(seen.frames_ns[1]) + 1000))
+        if not ends:
+            with self._named(EVENTS):
+                raise FormatError("contains no event: its length is unknown")
+        return min(a for a, _ in ends), max(b for _, b in ends)
+
+    def _line_ns(self, ns: int, clock: str, span: tuple[int, int]) -> int:
+        if clock == "start":
+            return span[0] + ns
+        known = self.clocks.get(clock)
+        return ns if known is None else known.map.to_reference(ns)
 
     def _on_line(self, time: FoundTime, clock: str, span: tuple[int, int]) -> int:
         """A label's time on the time line.
@@ -312,19 +318,13 @@ class _Trial:
         ns = self._line_ns(time.ns, clock, span)
         if not span[0] <= ns <= span[1]:
             raise time.row.error(
-                time.column, f"lies outside of the recording of trial {self._trial.id}, which is "
+                time.column, f"lies outside of the recording of trial {self.trial.id}, which is "
                 f"from {span[0] / 1e9:g} to {span[1] / 1e9:g} s",
             )  # fmt: skip
         return ns
 
-    def _line_ns(self, ns: int, clock: str, span: tuple[int, int]) -> int:
-        if clock == "start":
-            return span[0] + ns
-        known = self._clocks.get(clock)
-        return ns if known is None else known.map.to_reference(ns)
-
     def _given(self, span: tuple[int, int]) -> Given | None:
-        label = self._trial.label
+        label = self.trial.label
         if label is None:
             return None
         if label.whole is not None:
@@ -342,7 +342,7 @@ class _Trial:
             None if time is None else self._on_line(time, label.clock, span)
             for time in (label.incipient, label.gross)
         )
-        known = self._clocks.get(label.clock)
+        known = self.clocks.get(label.clock)
         error = label.uncertainty_ns
         if error is not None and known is not None and label.clock != "events":
             clock_error = known.uncertainty_ns
@@ -352,78 +352,20 @@ class _Trial:
             uncertainty_ns=error,
         )  # fmt: skip
 
-    def _steps(self, span: tuple[int, int]) -> tuple[Step, ...]:
-        motion = self._adapter.motion
-        if motion is None:
-            return ()
-        fields = {**self._trial.fields, "id": self._trial.id}
-        found = find_motion(motion, fields, self._found.file, self._trial.id)
-        if found is None:
-            self._unknown.append("motion")
-            return ()
+    def _steps(self, span: tuple[int, int], found: tuple[int, int]) -> tuple[Step, ...]:
+        motion = self.found.adapter.motion
+        assert motion is not None
         start, end = (self._line_ns(ns, motion.clock, span) for ns in found)
         if not span[0] <= start < end <= span[1]:
             raise InputError(
-                self._found.file, "motion.start", motion.start,
-                f"to {motion.end}: lies outside of the recording of trial {self._trial.id}, which "
+                self.found.file, "motion.start", motion.start,
+                f"to {motion.end}: lies outside of the recording of trial {self.trial.id}, which "
                 f"is from {span[0] / 1e9:g} to {span[1] / 1e9:g} s",
             )  # fmt: skip
-        if "arm" not in self._clocks:  # the motion's times are on the time line
-            self._clocks["arm"] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
-        times = [int(self._clocks["arm"].map.to_device(ns)) for ns in (span[0], start, end)]
+        # without poses the motion's times are on the time line
+        arm = self.clocks.get("arm")
+        line = IDENTITY if arm is None else arm.map
+        times = [int(line.to_device(ns)) for ns in (span[0], start, end)]
         hold = Step(phase="hold", start_ns=times[0], end_ns=times[1])
         slide = Step(phase="slide", start_ns=times[1], end_ns=times[2])
         return (hold, slide) if times[1] > times[0] else (slide,)
-
-    def _all_clocks(self) -> Clocks:
-        seen = self._adapter.streams.events is not None
-        known = self._clocks
-        return Clocks(
-            reference="event camera" if seen else "frame camera",
-            events=known.get("events"),
-            frames=known.get("frames"),
-            arm=known.get("arm"),
-            streams={name: clock for name, clock in known.items() if name in self._streams},
-        )
-
-    def _record(self, span: tuple[int, int]) -> TrialRecord:
-        trial, adapter = self._trial, self._adapter
-        rows = self.writer.counts
-        steps = self._steps(span)
-        frame_px = None if self._frames is None else self._frames[0]
-        origin = {
-            "format": ADAPTER,
-            "from": trial.source,
-            "unknown": [*self._unknown, *(f"{name} (no file)" for name in trial.missing)],
-            "fields": trial.fields,
-            "span_ns": span,
-            "given": self._given(span),
-        }
-        try:
-            return TrialRecord(
-                trial=trial.id,
-                campaign=self._campaign.name,
-                experiment=adapter.experiment,
-                role="measured",
-                block=0,
-                repetition=0,
-                attempt=0,
-                condition=trial.condition,
-                simulated=adapter.simulated,
-                recorded_s=(span[1] - span[0]) / 1e9,
-                counts=Counts(
-                    events=rows["events/t"], frames=rows["frames/t"], poses=rows["poses/t"],
-                    pulses=0,
-                ),
-                clocks=self._all_clocks(),
-                quality=Quality(passed=True, gates={}),
-                steps=steps,
-                geometry=Geometry(event_px=self._event_px, frame_px=frame_px),
-                imported=Imported.model_validate(origin),
-                streams=self._streams,
-            )  # fmt: skip
-        except ValidationError as error:
-            key, value, expected = first_fault(error)
-            raise InputError(
-                self._found.file, key, value, f"{expected}, in the record of trial {trial.id}"
-            ) from None

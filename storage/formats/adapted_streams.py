@@ -22,7 +22,7 @@ from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import MOST_PX, ForeignTrial, FormatError, event_chunk
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
 from sliplab.storage.formats.numpy_files import array_of
-from sliplab.storage.formats.recognition import LAB_PICKLES, READERS
+from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
 from sliplab.storage.formats.tables import read_columns, times_ns
 from sliplab.storage.streams import (
     F64,
@@ -140,12 +140,17 @@ def _spread(counts: I64, first: int, step_us: int, polarity: U8) -> EventChunk:
 
 
 def read_events(
-    folder: DataFolder, names: Sequence[str], part: EventFiles, paths: Sequence[Path]
+    folder: DataFolder,
+    names: Sequence[str],
+    part: EventFiles,
+    paths: Sequence[Path],
+    salvage: bool = False,
 ) -> EventSource:
     """Open the events of a trial.
 
     Args:
         names: its files; paths: them on the disk, for formats that need it.
+        salvage: of a file that is damaged where it begins to be read, take what stands whole.
 
     Raises:
         FormatError: a file cannot be right.
@@ -162,7 +167,7 @@ def read_events(
     else:
         if len(paths) != 1:
             raise FormatError(f"are {len(paths)} files for one trial")
-        foreign = READERS[part.format][1](paths[0], "trial")
+        foreign = read_file(part.format, paths[0], "trial", salvage)
     return EventSource(foreign.events, foreign.event_px, None, foreign)
 
 

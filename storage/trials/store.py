@@ -54,6 +54,8 @@ INFO, PROTOCOL, RIG, STORE, CAUSE = (
 )  # fmt: skip
 IMPORTED: Final = "imported"
 """Key of a campaign's description: where its trials come from, if they were imported."""
+ADAPTER = "adapter"
+"""Key of that part, and format, of a campaign that came by an adapter, which it keeps."""
 AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that a person wants anew; mark of a failed attempt that counts no
 longer."""

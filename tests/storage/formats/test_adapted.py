@@ -6,6 +6,7 @@ import copy
 import json
 import re
 import zipfile
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import yaml
 from sliplab.analysis.campaigns import Collected
 from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.adapted import import_adapted
 from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
@@ -26,6 +28,7 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.storage.formats.adapters import COUNTS, SLIDES, slides, touches
+from tests.storage.formats.recordings import write_aedat4
 
 
 def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = None) -> Campaign:
@@ -314,3 +317,30 @@ def test_what_is_committed_stays_when_an_import_is_stopped(tmp_path: Path) -> No
     assert not verify(store)
     again = import_adapted(store, "touch", found, file.read_text())
     assert (len(again["imported"]), len(again["there"])) == (4, 2)
+
+
+def test_of_a_damaged_file_what_stands_whole_is_taken_with_its_labels(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    write_aedat4(folder / "slip.aedat4")
+    whole = (folder / "slip.aedat4").read_bytes()
+    (folder / "slip.aedat4").write_bytes(whole[:-5000])
+    file = tmp_path / "a.yaml"
+    file.write_text(
+        "adapter: 1\nname: slips\nexperiment: classes\ntrials: {files: '{object}.aedat4'}\n"
+        "streams: {events: {format: aedat4}}\nlabels: {class: '{object}'}\n"
+    )
+    store = Store.create(tmp_path / "store")
+    with closing(DataFolder(folder)) as opened:
+        found = find_trials(load_adapter(file), file, opened)
+        with pytest.raises(DamagedFile, match=r"slip\.aedat4: is cut short: .*--salvage imports"):
+            import_adapted(store, "slips", found, file.read_text())
+        assert not store.campaigns()
+        done = import_adapted(store, "slips", found, file.read_text(), salvage=True)
+    (lost,) = done["salvaged"]
+    assert (done["events"], lost["file"]) == (2300, "slip.aedat4")
+    record = store.campaign("slips").recording("slip").record
+    assert record.imported is not None
+    assert record.imported.lost is not None
+    assert record.imported.given is not None
+    assert [span.name for span in record.imported.given.spans] == ["slip"]
