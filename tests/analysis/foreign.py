@@ -20,7 +20,7 @@ from sliplab.storage.schema.trial import (
     TrialRecord,
 )
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import Campaign, Store
 
 
 def chunk(t_us: Any, x: Any = 0, y: Any = 0, p: Any = 1) -> EventChunk:
@@ -53,23 +53,41 @@ def foreign_campaign(
     about = {"adapter": 1, "from": "data", "format": "adapter", "when": "2026-11-24T00:00:00Z"}
     info: Any = {"name": name, "simulated": False, "experiment": experiment, "imported": about}
     campaign.update(info, adapter + _FILES, "# No rig.\n")
-    clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
     for trial, (events, origin) in trials.items():
-        span = origin.get("span_ns", (0, 1_000_000_000))
-        writer = campaign.begin(trial, None, 100)
-        writer.add_events(events)
-        record = TrialRecord.model_validate({
-            "format": 1, "trial": trial, "campaign": name, "experiment": experiment,
-            "role": "imported", "block": 0, "repetition": 0, "attempt": 0,
-            "condition": dict(origin.get("condition", {})), "simulated": False,
-            "recorded_s": (span[1] - span[0]) / 1e9,
-            "counts": Counts(events=len(events), frames=0, poses=0, pulses=0),
-            "clocks": Clocks(reference="event camera", events=clock),
-            "quality": Quality(passed=True), "geometry": Geometry(event_px=event_px),
-            "imported": {
-                "format": "adapter", "from": trial, "span_ns": span,
-                **{key: value for key, value in origin.items() if key != "condition"},
-            },
-        })  # fmt: skip
-        writer.commit(record, Provenance.model_validate({"imported": "now", "from": trial}))
+        commit_foreign(campaign, trial, events, origin, event_px, experiment)
     return Collected(campaign)
+
+
+def commit_foreign(
+    campaign: Campaign,
+    trial: str,
+    events: EventChunk,
+    origin: Mapping[str, Any],
+    event_px: tuple[int, int],
+    experiment: str = "classes",
+    *,
+    simulated: bool = False,
+) -> None:
+    """Commit a trial.
+
+    Args:
+        origin: its `imported` part, and ``condition``; without ``span_ns`` it gets one second.
+    """
+    clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
+    span = origin.get("span_ns", (0, 1_000_000_000))
+    writer = campaign.begin(trial, None, 100)
+    writer.add_events(events)
+    record = TrialRecord.model_validate({
+        "format": 1, "trial": trial, "campaign": campaign.name, "experiment": experiment,
+        "role": "imported", "block": 0, "repetition": 0, "attempt": 0,
+        "condition": dict(origin.get("condition", {})), "simulated": simulated,
+        "recorded_s": (span[1] - span[0]) / 1e9,
+        "counts": Counts(events=len(events), frames=0, poses=0, pulses=0),
+        "clocks": Clocks(reference="event camera", events=clock),
+        "quality": Quality(passed=True), "geometry": Geometry(event_px=event_px),
+        "imported": {
+            "format": "adapter", "from": trial, "span_ns": span,
+            **{key: value for key, value in origin.items() if key != "condition"},
+        },
+    })  # fmt: skip
+    writer.commit(record, Provenance.model_validate({"imported": "now", "from": trial}))

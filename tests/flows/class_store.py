@@ -9,21 +9,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sliplab.storage.clockmap import IDENTITY
-from sliplab.storage.schema.trial import (
-    Clocks,
-    Counts,
-    DeviceRecord,
-    Geometry,
-    Given,
-    GivenSpan,
-    Imported,
-    Provenance,
-    Quality,
-    TrialRecord,
-)
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Campaign, Store
+from tests.analysis.foreign import commit_foreign
 
 CLASSES = ("ball", "box 2", "box 10", "cup", "pen")
 TAXELS = 6
@@ -86,28 +74,16 @@ def add_trial(
     Args:
         spans: start and end in ms, and the class.
     """
-    end_ms = max(end for _, end, _ in spans)
-    clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
-    writer = campaign.begin(name, None, 100)
-    writer.add_events(chunk)
-    given = tuple(
-        GivenSpan(start_ns=start * 1_000_000, end_ns=end * 1_000_000, name=shown)
+    given = [
+        {"start_ns": start * 1_000_000, "end_ns": end * 1_000_000, "name": shown}
         for start, end, shown in spans
-    )
-    origin = Imported.model_validate({
-        "format": "adapter", "from": f"{name}.npy", "unknown": ["clocks"], "fields": dict(fields),
-        "span_ns": (0, end_ms * 1_000_000), "given": Given(source="file name", spans=given),
-    })  # fmt: skip
-    record = TrialRecord(
-        format=TrialRecord.FORMAT, trial=name, campaign=campaign.name, experiment="classes",
-        role="imported", block=0, repetition=0, attempt=0, condition=dict(condition or {}),
-        simulated=simulated, recorded_s=end_ms / 1000,
-        counts=Counts(events=len(chunk), frames=0, poses=0, pulses=0),
-        clocks=Clocks.model_validate({"reference": "event camera", "events": clock}),
-        quality=Quality(passed=True, gates={}), steps=(),
-        geometry=Geometry(event_px=(TAXELS, 1), frame_px=None), imported=origin,
-    )  # fmt: skip
-    writer.commit(record, Provenance.model_validate({"imported": "2026-11-24T00:00:00+00:00"}))
+    ]
+    origin = {
+        "unknown": ["clocks"], "fields": dict(fields), "condition": dict(condition or {}),
+        "span_ns": (0, max(end for _, end, _ in spans) * 1_000_000),
+        "given": {"source": "file name", "spans": given},
+    }  # fmt: skip
+    commit_foreign(campaign, name, chunk, origin, (TAXELS, 1), simulated=simulated)
 
 
 def begin_campaign(store: Store, head: Mapping[str, Any], *, simulated: bool = False) -> Campaign:

@@ -7,22 +7,20 @@ with onsets on the event camera's clock. Nothing else of the store is used.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics.classification import GROSS, NO_SLIP
 from sliplab.analysis.windows.sample_sets import load_samples
-from sliplab.flows.__main__ import _run
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
+from tests.command_line import answer
 from tests.flows.older import older_store
 
 ADAPTER = """adapter: 1
@@ -47,23 +45,9 @@ analysis:
 """
 
 
-@pytest.fixture
-def sliplab(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Run a command in this process and return its JSON."""
-
-    def run(*arguments: object) -> Any:
-        monkeypatch.setattr(sys, "argv", ["sliplab", *map(str, arguments), "--json"])
-        code = _run()
-        reported = capsys.readouterr()
-        assert code == 0, reported.err
-        return json.loads(reported.out)
-
-    return run
-
-
-def other_labs_folder(store: Store, item: Collected, folder: Path, sliplab: Any) -> None:
+def other_labs_folder(store: Store, item: Collected, folder: Path) -> None:
     """Write the data set: events as AEDAT4, and a table with what belongs to each trial."""
-    files = sliplab("export", store.folder, item.name, "--output", folder)["files"]
+    files = answer("export", store.folder, item.name, "--output", folder)["files"]
     (folder / "sliplab-export.json").unlink()
     rows = []
     for (trial, recording), file in zip(
@@ -85,18 +69,18 @@ def other_labs_folder(store: Store, item: Collected, folder: Path, sliplab: Any)
     pd.DataFrame(rows).to_csv(folder / "trials.csv", index=False)
 
 
-def test_slides_of_another_lab_go_through_every_step(tmp_path: Path, sliplab: Any) -> None:
+def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
     here = Store.open(older_store(tmp_path / "here"))
     (item,) = collected(here)
-    other_labs_folder(here, item, tmp_path / "theirs", sliplab)
+    other_labs_folder(here, item, tmp_path / "theirs")
     (tmp_path / "adapter.yaml").write_text(ADAPTER)
     there = tmp_path / "there"
-    taken = sliplab("import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs",
+    taken = answer("import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs",
                     "--store", there)  # fmt: skip
     assert len(taken["imported"]) == 4
     for step in ("label", "train", "evaluate", "report"):
-        assert sliplab(step, there)["done"] > 0
-        assert sliplab(step, there)["done"] == 0
+        assert answer(step, there)["done"] > 0
+        assert answer(step, there)["done"] == 0
 
     store = Store.open(there)
     (foreign,) = collected(store)
