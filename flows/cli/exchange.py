@@ -74,10 +74,11 @@ def import_(
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
     from sliplab.storage.formats.import_trials import import_trials
+    from sliplab.storage.formats.published_import import of_one_campaign
     from sliplab.storage.formats.recognition import KINDS, kind_of, skipped_in, trials_in
     from sliplab.storage.trials.store import Store, StoreError
 
-    where = Path(kind_or_path) if path is None else path
+    where = of_one_campaign(Path(kind_or_path) if path is None else path)
     kind = kind_of(where) if path is None else kind_or_path
     if path is not None and kind not in KINDS:
         raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")

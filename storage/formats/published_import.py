@@ -46,6 +46,29 @@ def publication_at(path: Path) -> Path | None:
     return folder if there and (folder / CAMPAIGNS).is_dir() else None
 
 
+def of_one_campaign(path: Path) -> Path:
+    """Return the folder of the one campaign of a publication of MCAP files; else the path itself.
+
+    Raises:
+        InputError: the publication has several campaigns or none.
+    """
+    if not (path / CARD).is_file() or (path / STORE).exists() or not (path / CAMPAIGNS).is_dir():
+        return path
+    found = sorted(each for each in (path / CAMPAIGNS).iterdir() if each.is_dir())
+    if len(found) != 1:
+        raise _several(path, found)
+    return found[0]
+
+
+def _several(path: Path, folders: list[Path]) -> InputError:
+    names = ", ".join(map(str, folders))
+    return InputError(
+        path, "", None,
+        f"must be of one campaign; name one of these folders: {names}" if names
+        else "holds no campaign",
+    )  # fmt: skip
+
+
 def read_publication(path: Path) -> Iterator[ForeignTrial]:
     """Yield the trials of a publication with one campaign, or of one campaign's folder in it.
 
@@ -59,12 +82,7 @@ def read_publication(path: Path) -> Iterator[ForeignTrial]:
         store = Store.open(folder)
         found = [item for item in store.campaigns() if path in (folder, item.folder)]
         if len(found) != 1:
-            names = ", ".join(str(item.folder) for item in store.campaigns())
-            raise InputError(
-                path, "", None,
-                f"must be of one campaign; name one of these folders: {names}" if names
-                else "holds no campaign",
-            )  # fmt: skip
+            raise _several(path, [item.folder for item in store.campaigns()])
         (where,) = found
         texts = _texts(where)
         for trial in trial_folders(where):

@@ -26,6 +26,7 @@ from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.mcap_trials import write_mcap
 from sliplab.storage.formats.publish import publish
+from sliplab.storage.formats.published_import import of_one_campaign
 from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Clocks, Provenance, SyncResult
@@ -320,8 +321,14 @@ def test_an_imported_campaign_and_one_without_frames_come_back(tmp_path: Path) -
     ours = Store.open(tmp_path / "store")
     publish(publication(ours), tmp_path / "out", "mcap")
     theirs = Store.create(tmp_path / "again")
-    take(theirs, tmp_path / "out" / "campaigns" / "c", "c")
+    only = of_one_campaign(tmp_path / "out")
+    assert only == tmp_path / "out" / "campaigns" / "c"
+    assert of_one_campaign(only) == only
+    take(theirs, only, "c")
     assert_equal(ours, theirs)
+    (tmp_path / "out" / "campaigns" / "d").mkdir()
+    with pytest.raises(InputError, match=r"must be of one campaign; name one of these folders: "):
+        of_one_campaign(tmp_path / "out")
 
 
 def test_trials_of_two_campaigns_are_not_mixed(
