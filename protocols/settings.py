@@ -170,12 +170,6 @@ class Training(StrictModel):
     mirror: bool = True
     """Each epoch shows each training window as it is, or mirrored along one side or both, drawn
     anew: a slide to the left is as good as one to the right."""
-    shift_steps: int = Field(default=0, ge=0, le=1000, exclude_if=lambda value: value == 0)
-    """Each epoch shows each training window up to so many steps earlier or later, drawn anew:
-    for recordings that do not all begin with the touch."""
-    drop_events: float = Field(default=0.0, ge=0, lt=1, exclude_if=lambda value: value == 0)
-    """Share of each training window's events that an epoch leaves out, drawn anew: for few
-    recordings, which a network would learn by heart."""
     patience: int = Field(default=5, ge=1, le=10_000)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[Seed, ...] = (0,)

@@ -353,11 +353,6 @@ def fit(
             seen = train
             if training.mirror:
                 seen = train.mirrored(rng.integers(0, 4, len(train), np.uint8))
-            if training.shift_steps:
-                most = training.shift_steps
-                seen = seen.shifted(rng.integers(-most, most + 1, len(train)))
-            if training.drop_events:
-                seen = seen.thinned(training.drop_events, rng)
             loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
             val_counts = Engine(run.trained, windows.cells).counts(val)
             record = epoch_record(

@@ -109,41 +109,6 @@ class SparseWindows:
         _mirror(how.astype(np.uint8), places, self.offsets, steps, cell, count)
         return SparseWindows(self.shape, self.offsets, cell, count)
 
-    def shifted(self, by: npt.NDArray[np.integer[Any]]) -> SparseWindows:
-        """Each sample some steps later, or earlier where `by` is below 0.
-
-        Steps that leave the window are lost, and those that come in are empty.
-
-        Args:
-            by: (n,), steps.
-
-        Raises:
-            ValueError: another number of samples.
-        """
-        if by.shape != (len(self),):
-            raise ValueError(f"{by.shape} shifts for {len(self)} samples")
-        steps = self.shape[0]
-        source = np.arange(steps) - by.astype(np.int64)[:, None]
-        there = (source >= 0) & (source < steps)
-        row = np.arange(len(self))[:, None] * steps + np.where(there, source, 0)
-        sizes = np.where(there, np.diff(self.offsets)[row], 0).ravel()
-        offsets = np.concatenate([[0], sizes.cumsum()]).astype(np.int64)
-        entries = np.arange(offsets[-1]) + np.repeat(
-            self.offsets[row].ravel() - offsets[:-1], sizes
-        )
-        return SparseWindows(self.shape, offsets, self.cell[entries], self.count[entries])
-
-    def thinned(self, share: float, rng: np.random.Generator) -> SparseWindows:
-        """The samples without a share of their events, each of which is dropped by itself.
-
-        Raises:
-            ValueError: a share outside 0 to 1.
-        """
-        count = rng.binomial(self.count, 1.0 - share).astype(np.uint8)
-        left = count > 0
-        offsets = np.concatenate([[0], left.cumsum()])[self.offsets].astype(np.int64)
-        return SparseWindows(self.shape, offsets, self.cell[left], count[left])
-
     @staticmethod
     def join(parts: list[SparseWindows], shape: tuple[int, int, int, int]) -> SparseWindows:
         """All parts' samples in order; works for none."""

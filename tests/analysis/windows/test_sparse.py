@@ -161,32 +161,3 @@ def test_a_damaged_file_of_samples_is_named(tmp_path: Path, kind: str) -> None:
     )
     with pytest.raises(ValueError, match=r"train\.arrays"):
         SampleSet.load(path)
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 7))
-def test_shifted_samples(seed: int, steps: int) -> None:
-    rng = np.random.default_rng(seed)
-    x = rng.poisson(0.4, (6, steps, 2, 1, 3)).astype(np.uint8)
-    by = rng.integers(-9, 10, 6)
-    expected = np.zeros_like(x)
-    for old, new, shift in zip(x, expected, by.tolist(), strict=True):
-        for t in range(steps):
-            if 0 <= t - shift < steps:
-                new[t] = old[t - shift]
-    np.testing.assert_array_equal(SparseWindows.of(x).shifted(by).dense(), expected)
-
-
-def test_thinned_samples() -> None:
-    x = np.random.default_rng(0).poisson(1.0, (50, 10, 2, 4, 4)).astype(np.uint8)
-    whole = SparseWindows.of(x)
-    np.testing.assert_array_equal(whole.thinned(0.0, np.random.default_rng(1)).dense(), x)
-    thin = whole.thinned(0.3, np.random.default_rng(1))
-    assert (thin.count > 0).all()
-    assert (thin.dense() <= x).all()
-    left, all_ = thin.totals.sum(), whole.totals.sum()
-    assert abs(left - 0.7 * all_) < 4 * (0.21 * all_) ** 0.5  # four deviations of the binomial
-    again = whole.thinned(0.3, np.random.default_rng(1))
-    np.testing.assert_array_equal(again.dense(), thin.dense())
-    with pytest.raises(ValueError, match="shifts for 50 samples"):
-        whole.shifted(np.zeros(3, int))
