@@ -480,11 +480,18 @@ def _key(loc: tuple[int | str, ...]) -> str:
     for part in loc:
         if isinstance(part, int):
             text += f"[{part}]"
-        elif not (text.endswith("]") and part in _TAGS) and part not in _TAGS_OF.get(before, ()):
+        elif not (
+            (text.endswith("]") and part in _TAGS)
+            or part in _TAGS_OF.get(before, ())
+            or _WAY_OF_UNION.fullmatch(part)
+        ):
             text += f".{part}" if text else part
         before = str(part)
     return text
 
+
+_WAY_OF_UNION = re.compile(r"constrained-\w+|(?:function-\w+|tuple|list)\[.*\]")
+"""A part that pydantic adds for one of several types that a value may have."""
 
 # pydantic puts the tag of a union into the location; a person does not write it there
 _TAGS: set[str] = set()

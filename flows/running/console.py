@@ -56,8 +56,8 @@ def results_width() -> int | None:
     return None if terminal or "COLUMNS" in os.environ else _LINE
 
 
-messages = Console(stderr=True, highlight=False, soft_wrap=True)
-results = Console(highlight=False, width=results_width())
+messages = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+results = Console(highlight=False, width=results_width(), emoji=False)
 
 
 def say(text: str) -> None:

@@ -30,7 +30,14 @@ from sliplab.storage.formats.adapted_trials import (
     AdaptedSet,
     AdaptedTrial,
 )
-from sliplab.storage.formats.foreign import ForeignTrial, FormatError, Seen, Whole, refusal
+from sliplab.storage.formats.foreign import (
+    Damage,
+    ForeignTrial,
+    FormatError,
+    Seen,
+    Whole,
+    refusal,
+)
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.process import now
 from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, Step
@@ -133,6 +140,19 @@ class AdaptedCampaign:
             )  # fmt: skip
 
 
+def _device(clock: StreamClock | None) -> DeviceRecord:
+    """Return what an adapter states of a clock."""
+    if clock is None:
+        return DeviceRecord(grade=UNKNOWN, map=IDENTITY)
+    offset_ns, drift = round(clock.offset_ms * 1e6), round(clock.drift_ppm * 1e12)
+    error = clock.uncertainty_ms
+    return DeviceRecord(
+        grade=GIVEN,
+        map=ClockMap((0,), (offset_ns,), (drift,)),
+        uncertainty_ns=None if error is None else error * 1e6,
+    )
+
+
 @dataclass
 class _Opening:
     """A trial while it is opened.
@@ -190,12 +210,25 @@ class _Opening:
 
     @contextmanager
     def _named(self, stream: str) -> Iterator[None]:
-        """Give a fault the stream's file."""
+        """Give a fault the stream's key and file."""
         try:
             yield
         except FormatError as error:
-            error.file = error.file or Path(self.found.folder.place(self._names(stream)[0]))
+            name = self._unpacked(stream, error.file) or self._names(stream)[0]
+            error.file = Path(self.found.folder.place(name))
+            error.key = "" if isinstance(error, Damage) else f"streams.{stream}"
             raise
+        except InputError as error:
+            known = self._unpacked(stream, Path(error.file))
+            if known is None:
+                raise
+            place = self.found.folder.place(known)
+            raise type(error)(place, error.key, error.value, error.expected) from None
+
+    def _unpacked(self, stream: str, file: Path | None) -> str | None:
+        """Return the path of a stream's file below the folder, which may have been unpacked."""
+        name = None if file is None else file.name
+        return next((each for each in self._names(stream) if each.rpartition("/")[2] == name), None)
 
     def _read(self, stream: str, read: Callable[[], T]) -> T:
         with self._named(stream):
@@ -263,12 +296,14 @@ class _Opening:
                 self.unknown.append(f"clock of {device}")
             self.clocks[device] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
             return
-        error = clock.uncertainty_ms
-        self.clocks[device] = DeviceRecord(
-            grade=GIVEN,
-            map=ClockMap.line(0, round(clock.offset_ms * 1e6), round(clock.drift_ppm * 1000)),
-            uncertainty_ns=None if error is None else error * 1e6,
-        )
+        self.clocks[device] = _device(clock)
+
+    def _label_clock(self, clock: str) -> DeviceRecord | None:
+        """Return what labels count on, also where its stream has no file; None: the time line."""
+        part = self.found.adapter.streams.frames
+        if clock != "frames" or part is None:
+            return None
+        return self.clocks.get("frames") or _device(part.clock)
 
     def _motion(self) -> tuple[int, int] | None:
         """Return begin and end of the slide on the clock that the adapter names."""
@@ -306,7 +341,7 @@ class _Opening:
     def _line_ns(self, ns: int, clock: str, span: tuple[int, int]) -> int:
         if clock == "start":
             return span[0] + ns
-        known = self.clocks.get(clock)
+        known = self._label_clock(clock)
         return ns if known is None else known.map.to_reference(ns)
 
     def _on_line(self, time: FoundTime, clock: str, span: tuple[int, int]) -> int:
@@ -342,9 +377,9 @@ class _Opening:
             None if time is None else self._on_line(time, label.clock, span)
             for time in (label.incipient, label.gross)
         )
-        known = self.clocks.get(label.clock)
+        known = self._label_clock(label.clock)
         error = label.uncertainty_ns
-        if error is not None and known is not None and label.clock != "events":
+        if error is not None and known is not None:
             clock_error = known.uncertainty_ns
             error = None if clock_error is None else error + clock_error
         return Given(

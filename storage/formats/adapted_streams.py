@@ -14,12 +14,20 @@ import numpy as np
 from sliplab.protocols.adapter_parts import (
     EventFiles,
     FrameFiles,
+    FrameTimes,
     PoseFiles,
     ScalarFiles,
     WrenchFiles,
 )
+from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.data_folder import DataFolder
-from sliplab.storage.formats.foreign import MOST_PX, ForeignTrial, FormatError, event_chunk
+from sliplab.storage.formats.foreign import (
+    MOST_PX,
+    ForeignTrial,
+    FormatError,
+    check_pixels,
+    event_chunk,
+)
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
 from sliplab.storage.formats.numpy_files import array_of
 from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
@@ -181,11 +189,11 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
 
     def chunks() -> Iterator[EventChunk]:
         found = read_columns(folder, name, part.format, columns)
-        t_us = times_ns(found["t"], unit)
-        t_us = (t_us + 500) // 1000 if unit != "us" else t_us // 1000
+        t_us = (times_ns(found["t"], unit) + 500) // 1000
         x = _places(found["x"], "x")
         y = _places(found["y"], "y") if "y" in found else np.zeros(len(x), np.int64)
         if "p" in found:
+            _check_numbers(found["p"], "p")
             p = np.isin(found["p"], positive) if positive else found["p"] > 0
         else:
             p = np.ones(len(x), bool)
@@ -194,7 +202,9 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
             t_us, x, y, p = t_us[order], x[order], y[order], p[order]
         for first in range(0, len(t_us), _BLOCK_EVENTS):
             cut = slice(first, first + _BLOCK_EVENTS)
-            yield event_chunk(x[cut], y[cut], p[cut], t_us[cut])
+            chunk = event_chunk(x[cut], y[cut], p[cut], t_us[cut])
+            check_pixels(chunk, size)
+            yield chunk
 
     return EventSource(chunks, lambda: size)
 
@@ -210,6 +220,12 @@ def _places(values: Any, name: str) -> Any:
     return whole
 
 
+def _check_numbers(values: Any, name: str | int) -> None:
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        at = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise FormatError(f"has {name} = {values[at]} in row {at + 1}")
+
+
 def read_frames(
     folder: DataFolder,
     names: Sequence[str],
@@ -221,22 +237,14 @@ def read_frames(
 
     Raises:
         FormatError: a file cannot be right, or has another number of frames than of times.
+        InputError: the file of times cannot be right.
     """  # fmt: skip
     images = _images(folder, names, part, paths)
     first = next(images(), None)
     if first is None:
         raise FormatError("holds no frame")
     size = (first.shape[1], first.shape[0])
-    stated: I64 | None = None
-    if part.times is not None:
-        form = "csv" if not times[0].lower().endswith((".npy", ".npz")) else "numpy"
-        if form == "numpy":
-            stated = times_ns(_one_column(folder, times[0], part.times.column), part.times.unit)
-        else:
-            found = read_columns(folder, times[0], form, {"t": part.times.column})
-            stated = times_ns(found["t"], part.times.unit)
-        if np.any(stated[1:] <= stated[:-1]):
-            raise FormatError("has times of frames that do not rise")
+    stated = None if part.times is None else _frame_times(folder, times[0], part.times)
 
     def chunks() -> Iterator[FrameChunk]:
         held: list[U8] = []
@@ -256,6 +264,21 @@ def read_frames(
             raise FormatError(f"holds {count} frames, and {len(stated)} times of frames")
 
     return size, chunks
+
+
+def _frame_times(folder: DataFolder, name: str, part: FrameTimes) -> I64:
+    is_numpy = name.lower().endswith((".npy", ".npz"))
+    try:
+        if is_numpy:
+            stated = times_ns(_one_column(folder, name, part.column), part.unit)
+        else:
+            stated = times_ns(read_columns(folder, name, "csv", {"t": part.column})["t"], part.unit)
+        if np.any(stated[1:] <= stated[:-1]):
+            raise FormatError("has times of frames that do not rise")
+    except FormatError as error:
+        where = "streams.frames.times"
+        raise InputError(folder.place(name), where, None, str(error)) from None
+    return stated
 
 
 def _one_column(folder: DataFolder, name: str, column: str | int) -> Any:
@@ -349,9 +372,7 @@ def _samples(
         at = int(np.flatnonzero(t_ns[1:] < t_ns[:-1])[0])
         raise FormatError(f"has times that run backwards after row {at + 1}")
     for key, values in found.items():
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            at = int(np.flatnonzero(~np.isfinite(values))[0])
-            raise FormatError(f"has {columns[key]} = {values[at]} in row {at + 1}")
+        _check_numbers(values, columns[key])
     return t_ns, found
 
 

@@ -135,8 +135,8 @@ class _Finding:
         for draft, files in zip(drafts, streams, strict=True):
             id_ = draft.built_in["id"]
             missing = tuple(key for key, names in files.items() if not names)
-            if self._needed in missing:
-                left_out[draft.source] = f"trial {id_} has no file of {self._needed}"
+            if lacking := next((key for key in self._needed if key in missing), None):
+                left_out[draft.source] = f"trial {id_} has no file of {lacking}"
                 continue
             for names in files.values():
                 self._used.update(names)
@@ -146,7 +146,7 @@ class _Finding:
                 id_, draft.source, draft.fields, self._condition(draft), there, label, missing
             ))  # fmt: skip
         if not trials:
-            self._none(f"streams.{self._needed}.files", None)
+            self._none(f"streams.{self._needed[0]}.files", None)
         trials.sort(key=lambda trial: natural(trial.id))
         self._warn_of_missing(trials)
         skipped = [
@@ -161,8 +161,8 @@ class _Finding:
         )  # fmt: skip
 
     @property
-    def _needed(self) -> str:
-        return EVENTS if self._adapter.streams.events is not None else FRAMES
+    def _needed(self) -> tuple[str, ...]:
+        return (FRAMES, FRAME_TIMES) if self._adapter.streams.events is None else (EVENTS,)
 
     def _error(self, key: str, value: object, expected: str) -> InputError:
         return InputError(self._file, key, value, expected)

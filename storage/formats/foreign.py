@@ -39,11 +39,13 @@ class FormatError(ValueError):
 
     Attributes:
         file: the file, where a trial has several.
+        key: of an adapter, which says how the file is read; empty without one.
     """
 
     def __init__(self, message: str, file: Path | None = None) -> None:
         """Make one whose `message` continues after the file's name, such as "is truncated"."""
         self.file = file
+        self.key = ""
         super().__init__(message)
 
 
@@ -183,7 +185,7 @@ class ForeignTrial:
 def refusal(file: Path, error: FormatError) -> InputError:
     """Return the error of a file that is not imported: bad data, or else wrong input."""
     kind = DamagedFile if isinstance(error, Damage) else InputError
-    return kind(file, "", None, str(error))
+    return kind(file, error.key, None, str(error))
 
 
 def before_damage(
@@ -211,11 +213,13 @@ def before_damage(
     except FormatError as fault:
         if fault is error:
             raise
-        raise Damage(str(fault if isinstance(fault, Damage) else error)) from None
+        worse = fault if isinstance(fault, Damage) else error
+        raise Damage(str(worse), error.file) from None
     if last_us is None:
-        raise Damage(f"{error}; no event stands before that")
+        raise Damage(f"{error}; no event stands before that", error.file)
     packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
-    raise Damage(f"{error}; --salvage imports {count:,} events up to {last_us} us{packets}")
+    offer = f"--salvage imports {count:,} events up to {last_us} us{packets}"
+    raise Damage(f"{error}; {offer}", error.file)
 
 
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -27,6 +28,7 @@ from sliplab.storage.streams import I64
 
 MOST_TABLE = 1 << 26
 _SEPARATORS = "\t;, "
+_QUOTED = re.compile('"[^"]*"')
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,7 @@ def _from_json(place: str, found: Any, what: str, first: int = 1) -> list[Row]:
 
 def _separator(line: str) -> str:
     """Return what separates the columns of a line of CSV."""
+    line = _QUOTED.sub("", line.strip())
     return next((each for each in _SEPARATORS[:3] if each in line), " " if " " in line else ",")
 
 
@@ -215,7 +218,11 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
     head = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace")
     first = head.partition("\n")[0].rstrip("\r")
     separator = _separator(first)
-    cells = [cell.strip().strip('"') for cell in first.split(separator)]
+    spaces = separator == " "  # any number of them
+    cells = [
+        cell.strip()
+        for cell in next(csv.reader([first.strip()], delimiter=separator, skipinitialspace=spaces))
+    ]
     # a heading has no number in a column that is read; others may hold words in every row
     used = [cells[c] for c in columns.values() if isinstance(c, int) and c < len(cells)]
     headed = len(used) < len(columns) or not all(map(_is_number, used))
@@ -227,10 +234,15 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
     for column in columns.values():
         if str(column) not in there:
             raise FormatError(f"has no column {column}; there are {', '.join(cells)}")
+        if isinstance(column, str) and cells.count(column) > 1:
+            raise FormatError(f"has the column {column} twice")
+    if headed:
+        _check_width(head, separator, len(cells))
     wanted = {key: int(there[str(column)]) for key, column in columns.items()}
     try:
         table = pd.read_csv(
-            io.BytesIO(data), sep=separator, header=None, skiprows=int(headed),
+            io.BytesIO(data), sep=r"\s+" if spaces else separator, header=None,
+            skiprows=int(headed),
             usecols=sorted(set(wanted.values())), low_memory=False, encoding="utf-8-sig",
         )  # fmt: skip
     except pd.errors.EmptyDataError:
@@ -241,6 +253,19 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
         key: _numbers(table[index].to_numpy(), columns[key], 1 + headed)
         for key, index in wanted.items()
     }
+
+
+def _check_width(head: str, separator: str, columns: int) -> None:
+    """Check that the first row has no more cells than the heading: whose they are is unknown."""
+    rows = csv.reader(
+        (line.strip() for line in head.splitlines()[1:] if line.strip()), delimiter=separator,
+        skipinitialspace=separator == " ",
+    )  # fmt: skip
+    first = next(rows, [])
+    while first and not first[-1].strip():
+        first.pop()
+    if len(first) > columns:
+        raise FormatError(f"has {len(first)} cells in row 2 below a heading of {columns} columns")
 
 
 def _numbers(column: Any, name: str | int, first_row: int) -> Any:

@@ -120,6 +120,15 @@ def test_data_are_neither_control_codes_nor_markup(capsys: pytest.CaptureFixture
         assert steers not in written
 
 
+def test_names_between_colons_are_no_pictures() -> None:
+    with console.messages.capture() as said, console.results.capture() as shown:
+        console.say("{a:b:}")
+        console.print_pairs("pairs", {"key": "{a:b:}"})
+        console.print_table("table", ["{a:b:}"], [["{a:b:}"]])
+    assert said.get().count("{a:b:}") == 1
+    assert shown.get().count("{a:b:}") == 3
+
+
 def test_typed_values_are_printed_by_their_fields(capsys: pytest.CaptureFixture[str]) -> None:
     @dataclass(frozen=True)
     class Inner:

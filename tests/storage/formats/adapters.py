@@ -8,6 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
+
+from sliplab.protocols.adapter import load_adapter
+from sliplab.storage.formats.adapted import import_adapted
+from sliplab.storage.formats.adapted_trials import find_trials
+from sliplab.storage.formats.data_folder import DataFolder
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
 
 COUNTS: dict[str, Any] = {
     "adapter": 1,
@@ -71,6 +79,18 @@ SLIDES: dict[str, Any] = {
     "motion": {"start": 0.1, "end": 0.9, "unit": "s"},
     "split": {"together": "person"},
 }
+
+
+def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = None) -> Campaign:
+    """Import `path` by an adapter into `store`, and return the campaign."""
+    file = store.parent / "adapter.yaml"
+    file.write_text(yaml.safe_dump(adapter) if text is None else text)
+    read = load_adapter(file)
+    found = find_trials(read, file, DataFolder(path))
+    opened = Store.create(store)
+    import_adapted(opened, read.name, found, file.read_text())
+    assert not verify(opened)
+    return opened.campaign(read.name)
 
 
 def touches(folder: Path, name: Callable[[int], str], classes: int = 3) -> dict[str, Any]:

@@ -23,24 +23,12 @@ from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.tables import read_columns
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
-from tests.storage.formats.adapters import COUNTS, SLIDES, slides, touches
+from tests.storage.formats.adapters import COUNTS, SLIDES, bring, slides, touches
 from tests.storage.formats.recordings import write_aedat4
-
-
-def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = None) -> Campaign:
-    """Import `path` by an adapter into `store`, and return the campaign."""
-    file = store.parent / "adapter.yaml"
-    file.write_text(yaml.safe_dump(adapter) if text is None else text)
-    read = load_adapter(file)
-    found = find_trials(read, file, DataFolder(path))
-    opened = Store.create(store)
-    import_adapted(opened, read.name, found, file.read_text())
-    assert not verify(opened)
-    return opened.campaign(read.name)
 
 
 def test_counts_become_events_that_bin_to_the_counts(tmp_path: Path) -> None:
@@ -198,10 +186,11 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a column that is none": (
         _with("streams", "events", "columns", "t", to="zeit"),
-        r"events.csv: has no column zeit; there are time, x",
+        r"events.csv: streams.events: has no column zeit; there are time, x",
     ),
     "a column of words": (
-        _with("streams", "events", "columns", "t", to="trial"), r"events.csv: has no column trial"
+        _with("streams", "events", "columns", "t", to="trial"),
+        r"events.csv: streams.events: has no column trial",
     ),
     "a label's column": (
         _with(*ONSETS, "gross", to="fall"), r"labels.onsets.gross = '?fall.*there are first"
