@@ -22,7 +22,7 @@ HOSTILE: tuple[Any, ...] = (
     "a/../b", "~", "\\", "C:\\x", "\u202e", [[]], {"a": {"b": {}}}, "outside.csv", "nan", "1 mm",
     2026, "2026-11-24", ["taxel", "taxel"], {"t": 0}, "!!python/object:os.system",
 )  # fmt: skip
-PLACE = r"(?:\S+|row \d+(?:, .+)?|line \d+, column \d+|byte \d+)"
+PLACE = r"(?:\S+(?:\\ufeff \S+)?|row \d+(?:, .+)?|line \d+, column \d+|byte \d+)"
 """A key, or what stands in its place in a table or a file that is no YAML."""
 TEXTS = (
     "adapter: 1\nadapter: 1\n", "a: &x [*x]\n", "a: !!python/object/apply:os.system [id]\n",
