@@ -31,7 +31,6 @@ from sliplab.storage.formats.adapted_trials import (
     AdaptedTrial,
 )
 from sliplab.storage.formats.foreign import (
-    Damage,
     ForeignTrial,
     FormatError,
     Seen,
@@ -187,7 +186,7 @@ class _Opening:
             read = partial(read_poses, self.found.folder, self._names(POSES)[0], parts.poses)
             made = replace(made, poses=self._read(POSES, read))
             self._clock(parts.poses.clock, "arm")
-        if made.salvage is not None:
+        if made.salvage is not None and parts.frames is not None:
             made = replace(made, salvage=partial(_salvaged, made.salvage, made))
         made = replace(made, streams=self._streams())
         motion = self._motion()
@@ -216,7 +215,7 @@ class _Opening:
         except FormatError as error:
             name = self._unpacked(stream, error.file) or self._names(stream)[0]
             error.file = Path(self.found.folder.place(name))
-            error.key = "" if isinstance(error, Damage) else f"streams.{stream}"
+            error.key = f"streams.{stream}"
             raise
         except InputError as error:
             known = self._unpacked(stream, Path(error.file))
@@ -256,10 +255,19 @@ class _Opening:
         if foreign is None:
             return made
         self.unknown += [what for what in foreign.unknown if what != "condition"]
-        return replace(
+        made = replace(
             made, triggers=foreign.triggers, lost=foreign.lost, packets=foreign.packets,
             salvage=foreign.salvage,
         )  # fmt: skip
+        # what the same file holds besides, unless the adapter names another file of it
+        parts = self.found.adapter.streams
+        if foreign.frames is not None and parts.frames is None:
+            made = replace(made, frames=foreign.frames, frame_px=foreign.frame_px)
+            self._clock(None, "frames")
+        if foreign.poses is not None and parts.poses is None:
+            made = replace(made, poses=foreign.poses)
+            self._clock(None, "arm")
+        return made
 
     def _timed(self) -> bool:
         part = self.found.adapter.streams.frames

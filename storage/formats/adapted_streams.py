@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
-import cv2
 import numpy as np
 
 from sliplab.protocols.adapter_parts import (
@@ -30,6 +28,7 @@ from sliplab.storage.formats.foreign import (
 )
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
 from sliplab.storage.formats.numpy_files import array_of
+from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
 from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
 from sliplab.storage.formats.tables import read_columns, times_ns
 from sliplab.storage.streams import (
@@ -308,14 +307,10 @@ def _images(
 
         def from_images() -> Iterator[U8]:
             for name in names:
-                data = np.frombuffer(folder.read(name), np.uint8)
                 try:
-                    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-                except cv2.error:
-                    image = None
-                if image is None:
-                    raise FormatError(f"holds no image that can be read: {name}")
-                yield np.asarray(image, np.uint8)
+                    yield decode_picture(folder.read(name))
+                except FormatError as error:
+                    raise type(error)(f"{error}: {name}") from None
 
         return from_images
     if part.format == "numpy":
@@ -328,12 +323,9 @@ def _images(
         return lambda: iter(array)
 
     def from_video() -> Iterator[U8]:
-        try:
-            with av.open(str(paths[0])) as video:
-                for frame in video.decode(video=0):
-                    yield frame.to_ndarray(format="gray")
-        except (av.FFmpegError, IndexError, ValueError) as error:
-            raise FormatError(f"is no video that can be read: {error}") from None
+        with opened_video(paths[0]) as (video, stream):
+            for frame in video.decode(stream):
+                yield levels_of(frame)
 
     return from_video
 

@@ -16,8 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import av
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -27,13 +25,12 @@ from sliplab.storage.errors import DamagedFile
 from sliplab.storage.files import read_json
 from sliplab.storage.formats.foreign import (
     LATEST_US,
-    MOST_PX,
     Damage,
     ForeignTrial,
     FormatError,
-    grey,
     rounded_us,
 )
+from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
 from sliplab.storage.streams import (
     EVENTS_KIND,
     F64,
@@ -61,8 +58,7 @@ _LENGTHS, _ANGLES = {"mm": 1.0, "m": 1000.0}, {"deg": 1.0, "rad": 180 / math.pi}
 _MOST_COMPONENTS, _MOST_ROWS, _MOST_GROUP, _MOST_NAME = 64, 1 << 24, 1 << 31, 32
 _FRAMES_AT_ONCE = 32
 _DAMAGES = (
-    pa.ArrowException, av.FFmpegError, cv2.error, OSError, ValueError, KeyError, TypeError,
-    OverflowError,
+    pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError,
 )  # fmt: skip
 
 
@@ -431,22 +427,13 @@ def _images(file: Path, key: str, episode: int) -> Iterator[U8]:
                 packed = item.get("bytes") if isinstance(item, dict) else item
                 if not isinstance(packed, bytes):
                     raise FormatError(f"keeps the images of {key} outside of its rows")
-                image = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_UNCHANGED)
-                if image is None:
-                    raise Damage(f"holds an image of {key} that cannot be read")
-                yield _levels(image)
+                yield decode_picture(packed)
 
 
 def _video(file: Path, wanted: F64, tolerance_s: float) -> Iterator[U8]:
     """Yield the frames at some times of a video, s."""
     at = 0
-    # of this container only: others may name files and addresses to be read
-    with _damage(file), av.open(str(file), format="mov") as container:
-        if not container.streams.video or container.streams.video[0].codec_context is None:
-            raise Damage("holds no video, or one of an unknown codec")
-        stream = container.streams.video[0]
-        if max(stream.width, stream.height) > MOST_PX:
-            raise FormatError(f"holds frames of {stream.width} x {stream.height}")
+    with _damage(file), opened_video(file) as (container, stream):
         container.seek(int(wanted[0] / float(stream.time_base or 1)), stream=stream)
         for frame in container.decode(stream):
             time = frame.time
@@ -454,17 +441,11 @@ def _video(file: Path, wanted: F64, tolerance_s: float) -> Iterator[U8]:
                 continue
             if time > wanted[at] + tolerance_s:
                 break
-            yield _levels(frame.to_ndarray(format="bgr24"))
+            yield levels_of(frame)
             at += 1
             if at == len(wanted):
                 return
         raise Damage(f"has no frame at {wanted[at]:.6f} s, of {len(wanted)} it has {at}")
-
-
-def _levels(image: Any) -> U8:
-    if image.dtype != np.uint8 or max(image.shape[:2]) > MOST_PX:
-        raise FormatError(f"holds images of {image.dtype} {image.shape}; read are those of 8 bits")
-    return grey(image)
 
 
 def _frames(pictures: Callable[[], Iterator[U8]], t_ns: I64) -> Callable[[], Iterator[FrameChunk]]:

@@ -180,12 +180,18 @@ def test_frames_that_are_none_are_refused_with_their_file(tmp_path: Path) -> Non
     assert cv2.imwrite(str(folder / "img" / "10.png"), other)
     refused(made, tmp_path, r"frames of \(12, 15\) and of \(12, 16\)")
     (folder / "img" / "10.png").write_bytes(b"\x89PNG")
-    refused(made, tmp_path, "no image that can be read: ann/img/10.png")
+    refused(made, tmp_path, "an image that cannot be read: ann/img/10.png")
     (folder / "img" / "10.png").write_bytes(b"")
-    refused(made, tmp_path, "no image that can be read: ann/img/10.png")
+    refused(made, tmp_path, "an image that cannot be read: ann/img/10.png")
     made = adapter({"frames": {**FRAMES["video"], "format": "video", "rate_hz": 30}})
     (folder / "film.mkv").write_bytes(b"\x1a\x45\xdf\xa3 and no video")
     refused(made, tmp_path, "film.mkv: streams.frames: is no video that can be read")
+    other = tmp_path / "elsewhere.mkv"
+    write_frames(tmp_path, "video", some_frames(2))
+    (tmp_path / "film.mkv").rename(other)
+    for text in (f"ffconcat version 1.0\nfile '{other}'\n", f"#EXTM3U\n#EXTINF:1,\n{other}\n"):
+        (folder / "film.mkv").write_text(text)  # a list of other files is no video
+        refused(made, tmp_path, "film.mkv: streams.frames: is no video that can be read")
     made = adapter({"frames": {**FRAMES["numpy"], "format": "numpy", "rate_hz": 30}})
     for wrong, message in (
         (np.zeros((2, 3, 4, 3), np.uint8), r"uint8 of shape \(2, 3, 4, 3\); frames are"),
@@ -428,6 +434,21 @@ def test_events_of_a_known_format_are_those_of_the_file(name: str, tmp_path: Pat
         with recording.open() as reader:
             pulses = reader.pulses("event_pulses")
         assert pulses.tolist() == (whole.t_us[::100] * 1000).tolist() * (form == "aedat4")
+
+
+def test_frames_in_the_file_of_the_events_come_with_them(tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    write_aedat4(tmp_path / "set" / "a.aedat4")
+    made = {
+        **BASE,
+        "trials": {"files": "{who}.aedat4"},
+        "streams": {"events": {"format": "aedat4"}},
+    }
+    recording = bring(made, tmp_path / "set", tmp_path / "store").recording("a")
+    assert recording.record.counts.frames == 3
+    assert recording.frame_px[:2] == (8, 6)
+    assert [int(recording.frame(k).mean()) for k in range(3)] == [0, 10, 20]
+    assert "clock of frames" in recording.record.imported.unknown
 
 
 @pytest.mark.usefixtures("small")

@@ -260,7 +260,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "info cut short": (_cut("meta/info.json"), "info.json"),
     "rows cut short": (_cut("data/chunk-000/file-000.parquet"), "file-000.parquet: is damaged"),
     "a video cut short": (_cut(f"{TOP}/chunk-000/file-000.mp4"), "file-000.mp4"),
-    "a playlist as video": (_playlist, "file-000.mp4: is damaged"),
+    "a playlist as video": (_playlist, "file-000.mp4: is no video that can be read"),
     "a link": (_link, "is missing or a link"),
     "a file of nowhere": (_episodes(**{"data/file_index": 7}), "file-007.parquet: is missing"),
     "a negative place": (_episodes(**{"data/file_index": -1}), "data/file_index = -1"),
