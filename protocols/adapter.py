@@ -19,6 +19,7 @@ from sliplab.protocols.adapter_parts import (
     FieldRule,
     GivenMotion,
     Labels,
+    Markers,
     TrialFiles,
 )
 from sliplab.protocols.settings import AnalysisSettings
@@ -84,6 +85,8 @@ class Adapter(StrictModel):
     labels: Labels = Labels()
     motion: GivenMotion | None = None
     """When the slide begins and ends, where that is known."""
+    markers: Markers | None = None
+    """Where the skin's markers are, for `analysis.labelling.rule` other than ``given``."""
     split: AdapterSplit = AdapterSplit()
     analysis: AnalysisSettings = AnalysisSettings()
 

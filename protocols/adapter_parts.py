@@ -395,6 +395,30 @@ class Labels(StrictModel):
 TimeText = Annotated[Template, WithJsonSchema({"type": ["string", "number"], "minLength": 1})]
 
 
+Place = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+class Markers(StrictModel):
+    """Layout of the skin's markers, without which our own rules find no onsets in frames."""
+
+    places_mm: tuple[tuple[Place, Place], ...] = Field(min_length=1, max_length=4096)
+    """Places of the markers at rest, to the right and up in the picture, from its middle."""
+    centre: Annotated[int, Field(ge=0)] = 0
+    """Index of the marker in the centre of contact, whose slip is gross slip."""
+    px_per_mm: Annotated[float, Field(gt=0, le=1e6)]
+    """Scale of the frames."""
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> Markers:
+        if self.centre >= len(self.places_mm):
+            raise KeyedError(
+                ".centre",
+                self.centre,
+                f"must be below the number of markers, {len(self.places_mm)}",
+            )
+        return self
+
+
 class GivenMotion(StrictModel):
     """Begin and end of the slide, which become the record's steps ``hold`` and ``slide``."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sliplab.protocols.adapter import load_adapter
-from sliplab.protocols.adapter_parts import StreamClock
+from sliplab.protocols.adapter_parts import Markers, StreamClock
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.formats.adapted_labels import FoundTime, find_motion
@@ -152,6 +152,14 @@ def _device(clock: StreamClock | None) -> DeviceRecord:
     )
 
 
+def _geometry(markers: Markers | None) -> Json:
+    if markers is None:
+        return {}
+    return {
+        "px_per_mm": markers.px_per_mm, "skin_mm": markers.places_mm, "centre": markers.centre
+    }  # fmt: skip
+
+
 @dataclass
 class _Opening:
     """A trial while it is opened.
@@ -198,6 +206,7 @@ class _Opening:
             about={"fields": trial.fields},
             unknown=(*self.unknown, *(f"{name} (no file)" for name in trial.missing)),
             clocks=self.clocks,
+            geometry=_geometry(adapter.markers),
             whole=lambda seen: self._whole(seen, motion),
         )
 

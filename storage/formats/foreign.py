@@ -152,6 +152,7 @@ class ForeignTrial:
             FormatError where that is nothing.
         campaign: the one that it is of; None for one of its own.
         clocks: those that are known, by device and stream. experiment: see the record.
+        geometry: further keys of the record's geometry.
         whole: what follows from all that was read; a trial with it may be without events. Raises
             InputError where that cannot be right.
     """
@@ -179,6 +180,7 @@ class ForeignTrial:
     campaign: ForeignCampaign | None = None
     clocks: Mapping[str, DeviceRecord] = field(default_factory=dict)
     experiment: str = "imported"
+    geometry: Json = field(default_factory=dict)
     whole: Callable[[Seen], Whole] | None = None
 
 

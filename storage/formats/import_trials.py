@@ -366,7 +366,9 @@ def _record(
         "clocks": _clocks(trial, counts, whole, streams),
         "quality": Quality(passed=True, gates={}),
         "steps": () if whole is None else whole.steps,
-        "geometry": Geometry(event_px=event_px, frame_px=trial.frame_px),
+        "geometry": Geometry.model_validate(
+            {"event_px": event_px, "frame_px": trial.frame_px, **trial.geometry}
+        ),
         "imported": origin,
     }
     if streams:

@@ -10,8 +10,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
+import yaml
 
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.labels.reviewed import Labels
@@ -19,9 +21,11 @@ from sliplab.analysis.metrics.classification import GROSS, NO_SLIP
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer
 from tests.flows.older import older_store
+from tests.flows.test_levels import kinematic, label, take
 
 ADAPTER = """adapter: 1
 name: slides
@@ -101,3 +105,59 @@ def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
     page = (there / "report" / "index.html").read_text()
     assert "onsets of the data set, within 2.0 ms" in page
     assert "sliplab holdout" not in page
+
+
+VIDEO = """adapter: 1
+name: filmed
+simulated: true
+experiment: kinematic
+trials: {files: "{who}/events.csv", id: "{who}"}
+streams:
+  events:
+    {format: csv, columns: {t: t_us, x: x, y: y, p: p}, unit: us, size_px: [640, 480]}
+  frames:
+    files: "{who}/frames/*.png"
+    format: images
+    times: {files: "{who}/times.csv", column: t_ns, unit: ns}
+    clock: {offset_ms: 0, uncertainty_ms: 0.1}
+"""
+
+
+def filmed(recording: Recording, folder: Path) -> dict[str, Any]:
+    """Write a trial as files of another lab, all times on one clock; return its adapter."""
+    (folder / "a" / "frames").mkdir(parents=True)
+    events = recording.events()
+    line_ns = np.asarray(recording.clock("events").to_reference(events.t_us * 1000))
+    table = {"t_us": line_ns // 1000, "x": events.x, "y": events.y, "p": events.p}
+    pd.DataFrame(table).to_csv(folder / "a" / "events.csv", index=False)
+    for number, image in enumerate(recording.frames()):
+        assert cv2.imwrite(str(folder / "a" / "frames" / f"{number}.png"), image)
+    pd.DataFrame({"t_ns": recording.frame_times()}).to_csv(folder / "a" / "times.csv", index=False)
+    geometry = recording.record.geometry
+    start, end = (str(time) for time in recording.motion_ns)
+    return {
+        **yaml.safe_load(VIDEO),
+        "markers": {
+            "places_mm": [list(place) for place in geometry.skin_mm], "centre": geometry.centre,
+            "px_per_mm": geometry.px_per_mm,
+        },
+        "motion": {"start": start, "end": end, "unit": "ns"},
+        "analysis": {"labelling": {"rule": "paper"}},
+    }  # fmt: skip
+
+
+def test_our_own_rules_label_the_frames_of_another_lab(tmp_path: Path) -> None:
+    data = kinematic()
+    recording, _ = take(tmp_path / "here", data, level="video")
+    mine = label(recording, data)
+    made = filmed(recording, tmp_path / "theirs")
+    (tmp_path / "adapter.yaml").write_text(yaml.safe_dump(made))
+    there = tmp_path / "there"
+    answer("import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs", "--store", there)
+    assert answer("label", there)["done"] == 1
+    (foreign,) = collected(Store.open(there))
+    found = Derived.of(Store.open(there), LABELS, foreign.name).load("a", TrialLabel)
+    assert (found.rule, found.source) == ("paper", "video")
+    assert found.incipient_ns == mine.onsets.incipient_ns
+    assert found.gross_ns == mine.onsets.gross_ns
+    assert found.incipient_ns is not None
