@@ -89,6 +89,11 @@ def configure_prefect(store: Path) -> None:
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)
     _ask_loopback_directly()
+    hide_cancelled_callbacks()
+
+
+def hide_cancelled_callbacks() -> None:
+    """Keep what `_is_fault` refuses off the terminal, in each process that runs a flow."""
     logging.getLogger("asyncio").addFilter(_is_fault)
 
 
