@@ -1,0 +1,135 @@
+"""The parameters of a simulated rig that a pilot may tell something about.
+
+None of them was measured when a rig file was written: they are assumed (`sliplab guesses`). Each is
+a number of the rig file's section `mock:`, positive, and is estimated as a logarithm, so that an
+interval is a factor either way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from sliplab.storage.streams import F64
+
+Stream = Literal["frames", "events", "force"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a simulated rig.
+
+    Attributes:
+        key: in the section `mock:` of a rig file, with dots; `LAYER_STEP` for the step between the
+            heights of neighbouring layers.
+        title: for people. unit: of its values.
+        streams: those without which nothing is learned of it.
+        most: largest value that a rig file may have.
+    """
+
+    key: str
+    title: str
+    unit: str
+    streams: tuple[Stream, ...]
+    most: float = np.inf
+
+
+LAYER_STEP = "scene.skin.layer_step_mm"
+"""Stands for `scene.skin.heights_mm`: all steps are changed by one factor, the centre stays."""
+
+CONTACT = (
+    Parameter("scene.friction.kinetic", "kinetic friction", "", ("frames", "force")),
+    Parameter("scene.friction.static_excess", "static over kinetic friction", "", ("frames",), 0.9),
+    Parameter("scene.friction.path_variation", "friction's variation along a path", "", ("frames",), 0.3),
+    Parameter("scene.friction.correlation_mm", "length of that variation", "mm", ("frames",)),
+    Parameter("scene.friction.papilla_scatter", "friction's scatter by papilla", "", ("frames",), 0.3),
+    Parameter("scene.skin.youngs_modulus_mpa", "Young's modulus of the skin", "MPa", ("force",)),
+    Parameter("scene.skin.base_normal_n_per_m", "stiffness of the base, along", "N/m", ("force",)),
+    Parameter("scene.skin.base_tangential_n_per_m", "stiffness of the base, across", "N/m", ("frames", "force")),
+    Parameter(LAYER_STEP, "step of height between layers", "mm", ("frames",)),
+    Parameter("scene.skin.height_scatter_mm", "scatter of heights, half the range", "mm", ("frames",)),
+    Parameter("scene.skin.position_scatter_mm", "scatter of places", "mm", ("frames",)),
+    Parameter("scene.skin.relaxation_share", "share of a force that relaxes", "", ("frames",), 0.9),
+    Parameter("scene.skin.relaxation_s", "time of relaxation", "s", ("frames",)),
+    Parameter("arm.vibration_um", "arm's vibration", "um", ("frames",)),
+    Parameter("arm.vibration_hz", "its frequency", "Hz", ("frames",)),
+)  # fmt: skip
+CAMERA = (
+    Parameter("event_camera.px_per_mm", "scale of the event camera", "px/mm", ("events",)),
+    Parameter("event_camera.radius_mm", "radius of the markers", "mm", ("events",)),
+    Parameter("event_camera.shift_mm_per_n", "image's shift by force", "mm/N", ("events", "force")),
+    Parameter("event_camera.growth_mm_per_n", "image's growth by force", "mm/N", ("events", "force")),
+    Parameter("event_camera.edge_px", "width of the markers' edge", "px", ("events",)),
+    Parameter("event_camera.contrast", "contrast of the markers", "", ("events",)),
+    Parameter("event_camera.threshold", "threshold of events", "", ("events",)),
+    Parameter("event_camera.threshold_sigma", "its mismatch", "", ("events",)),
+    Parameter("event_camera.cutoff_hz", "bandwidth of a pixel", "Hz", ("events",)),
+    Parameter("event_camera.refractory_us", "refractory time", "us", ("events",)),
+    Parameter("event_camera.noise_hz", "noise of a pixel", "Hz", ("events",)),
+    Parameter("event_camera.leak_share", "share of leakage in it", "", ("events",), 1.0),
+    Parameter("event_camera.hot_pixels", "hot pixels", "", ("events",)),
+    Parameter("event_camera.hot_hz", "rate of a hot pixel", "Hz", ("events",)),
+    Parameter("event_camera.readout_hz", "scans of the read-out", "Hz", ("events",)),
+    Parameter("event_camera.scan_us", "duration of a scan", "us", ("events",)),
+)  # fmt: skip
+PARAMETERS = (*CONTACT, *CAMERA)
+
+
+def value_of(mock: Any, parameter: Parameter) -> float:
+    """Return a parameter's value in a simulated rig's settings; 0 where it is switched off."""
+    if parameter.key == LAYER_STEP:
+        heights = mock.scene.skin.heights_mm
+        return float(heights[0] - heights[-1]) / max(len(heights) - 1, 1)
+    for name in parameter.key.split("."):
+        mock = getattr(mock, name)
+    return float(mock)
+
+
+def settings_of(mock: Any, values: Mapping[str, float]) -> dict[str, Any]:
+    """Return settings of `mock:` in which parameters have other values, as nested mappings.
+
+    Args:
+        mock: settings of a simulated rig that are changed.
+        values: by key.
+    """
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        changed: Any = float(value)
+        if key == LAYER_STEP:
+            heights = np.array(mock.scene.skin.heights_mm)
+            step = (heights[0] - heights[-1]) / max(len(heights) - 1, 1)
+            key = "scene.skin.heights_mm"
+            changed = tuple((heights[0] + (heights - heights[0]) * value / step).tolist())
+        elif key == "event_camera.hot_pixels":
+            changed = round(value)
+        *parents, last = key.split(".")
+        part = found
+        for name in parents:
+            part = part.setdefault(name, {})
+        part[last] = changed
+    return found
+
+
+def drawn(
+    mock: Any, parameters: Sequence[Parameter], spread: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Draw values around those of a rig, uniform in their logarithm.
+
+    Args:
+        spread: largest factor less 1, either way: 0.3 is from 1/1.3 to 1.3 times the value.
+    """
+    reach = np.log1p(spread)
+    found = {}
+    for parameter in parameters:
+        value = value_of(mock, parameter)
+        factor = np.exp(rng.uniform(-reach, reach))
+        found[parameter.key] = min(value * factor, parameter.most)
+    return found
+
+
+def logarithms(values: Mapping[str, float], parameters: Sequence[Parameter]) -> F64:
+    """Return the parameters' logarithms in order, (len(parameters),)."""
+    return np.log([values[parameter.key] for parameter in parameters])
