@@ -27,6 +27,16 @@ Triple = tuple[Finite, Finite, Finite]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
+class Papilla(StrictModel):
+    """One papilla as it came out."""
+
+    height_mm: Positive
+    friction: Positive = 1.0
+    """Its friction over the mean."""
+    offset_mm: tuple[Finite, Finite] = (0.0, 0.0)
+    """From its place in the layout."""
+
+
 class Skin(StrictModel):
     """The papillae: a centre and two rings, lower towards the outside."""
 
@@ -53,9 +63,18 @@ class Skin(StrictModel):
     relaxation_share: Share = 0.2
     """Share of a suddenly applied force that relaxes away (standard linear solid)."""
     relaxation_s: Positive = 1.0
+    papillae: tuple[Papilla, ...] | None = None
+    """Every papilla as measured, from the centre outwards and counterclockwise from +x; null: drawn
+    by the seed with the scatters above."""
 
     @model_validator(mode="after")
     def _layers(self) -> Skin:
+        if self.papillae is not None and len(self.papillae) != sum(self.ring_counts):
+            raise KeyedError(
+                "mock.scene.skin.papillae",
+                f"{len(self.papillae)} of them",
+                f"must be the {sum(self.ring_counts)} of ring_counts, or null",
+            )
         if len(self.ring_counts) != len(self.heights_mm):
             raise KeyedError(
                 "mock.scene.skin.heights_mm",
@@ -373,14 +392,22 @@ class MockSettings(StrictModel):
 
 def skin_of(settings: MockSettings) -> scene_skin.Skin:
     """Return the skin of a simulated rig."""
-    from sliplab.rigs.scene import skin as scene_skin  # numpy, which a rig file does without
+    # numpy, which a rig file does without
+    import numpy as np
+
+    from sliplab.rigs.scene import skin as scene_skin
 
     made = settings.scene.skin
     geometry = scene_skin.SkinGeometry(
-        **made.model_dump(exclude={"seed", "relaxation_share", "relaxation_s"}),
+        **made.model_dump(exclude={"seed", "relaxation_share", "relaxation_s", "papillae"}),
         friction_scatter=settings.scene.friction.papilla_scatter,
     )
-    return scene_skin.make_skin(geometry, settings.seed if made.seed is None else made.seed)
+    measured = None
+    if made.papillae is not None:
+        columns = zip(*((p.height_mm, p.friction, p.offset_mm) for p in made.papillae), strict=True)
+        measured = scene_skin.Made(*(np.array(column, np.float64) for column in columns))
+    seed = settings.seed if made.seed is None else made.seed
+    return scene_skin.make_skin(geometry, seed, measured)
 
 
 def check_timing(mock: MockSettings, timing: Timing, force_of_arm: bool = False) -> None:

@@ -73,8 +73,22 @@ class Skin:
         return 1.0 / (1.0 / self.bending_n_per_mm + self.compliance_mm_per_n)
 
 
-def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
-    """A skin with the fabrication scatter that belongs to `seed`.
+@dataclass(frozen=True)
+class Made:
+    """How n papillae came out, measured instead of drawn.
+
+    Attributes:
+        height_mm: (n,). friction_factor: over the mean, (n,). offset_mm: from the design's places,
+            (n, 2).
+    """
+
+    height_mm: F64
+    friction_factor: F64
+    offset_mm: F64
+
+
+def make_skin(geometry: SkinGeometry, seed: int, made: Made | None = None) -> Skin:
+    """A skin with the fabrication scatter that belongs to `seed`, or with a measured one.
 
     The skin without scatter is the same after a turn by 60 degrees if every ring's count can
     be divided by 6.
@@ -88,19 +102,24 @@ def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
             heights.append(geometry.heights_mm[layer])
             ring.append(layer)
     n = len(ring)
-    rng = generator(seed, "skin")
-    height = np.array(heights) + geometry.height_scatter_mm * rng.uniform(-1.0, 1.0, n)
-    wander = np.clip(rng.standard_normal((n, 2)), -2.0, 2.0)
-    grip = np.clip(rng.standard_normal(n), -2.0, 2.0)
+    if made is None:
+        rng = generator(seed, "skin")
+        height = np.array(heights) + geometry.height_scatter_mm * rng.uniform(-1.0, 1.0, n)
+        wander = np.clip(rng.standard_normal((n, 2)), -2.0, 2.0)
+        grip = np.clip(rng.standard_normal(n), -2.0, 2.0)
+        made = Made(
+            height, 1.0 + geometry.friction_scatter * grip, geometry.position_scatter_mm * wander
+        )
+    height = made.height_mm
     return Skin(
-        layout_mm=np.array(places) + geometry.position_scatter_mm * wander,
+        layout_mm=np.array(places) + made.offset_mm,
         gap_mm=height.max() - height,
         ring=np.array(ring, np.int64),
         normal_n_per_mm=normal_stiffness(geometry, height),
         height_mm=height,
         bending_n_per_mm=bending_stiffness(geometry, height),
         compliance_mm_per_n=series_compliance(geometry, height),
-        friction_factor=1.0 + geometry.friction_scatter * grip,
+        friction_factor=made.friction_factor,
     )
 
 

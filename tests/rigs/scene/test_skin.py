@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.skin import (
     SkinGeometry,
     bending_stiffness,
@@ -63,3 +65,28 @@ def test_scatter_belongs_to_its_seed_and_stays_small() -> None:
     assert np.abs(first.layout_mm - ideal.layout_mm).max() <= 0.1 + 1e-12
     assert first.gap_mm.min() == 0.0
     assert np.all(first.gap_mm[first.ring == 2] < 2.4)
+
+
+def test_a_skin_that_states_its_papillae_is_the_one_that_was_drawn() -> None:
+    drawn = skin_of(MockSettings(seed=7))
+    ideal = make_skin(SkinGeometry(), 1)
+    papillae = [
+        {
+            "height_mm": float(drawn.height_mm[k]),
+            "friction": float(drawn.friction_factor[k]),
+            "offset_mm": (drawn.layout_mm[k] - ideal.layout_mm[k]).tolist(),
+        }
+        for k in range(len(drawn))
+    ]
+    stated = skin_of(
+        MockSettings.model_validate({"seed": 8, "scene": {"skin": {"papillae": papillae}}})
+    )
+    for name in ("gap_mm", "height_mm", "normal_n_per_mm", "bending_n_per_mm", "friction_factor"):
+        assert np.array_equal(getattr(stated, name), getattr(drawn, name)), name
+    assert stated.layout_mm == pytest.approx(drawn.layout_mm, abs=1e-12)
+
+
+def test_a_skin_states_all_of_its_papillae_or_none() -> None:
+    papillae = [{"height_mm": 10.0}] * 18
+    with pytest.raises(ValidationError, match=r"must be the 19 of ring_counts, or null"):
+        MockSettings.model_validate({"scene": {"skin": {"papillae": papillae}}})
