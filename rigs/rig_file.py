@@ -46,6 +46,7 @@ from sliplab.rigs.stream_settings import (
     named_drivers,
     stream_drivers,
 )
+from sliplab.rigs.twin import TwinRecord
 
 CAMERAS = {"events": "event camera", "frames": "frame camera"}
 """Streams by name in rig files and protocols, and the devices that give them."""
@@ -148,6 +149,8 @@ class RigFile(StrictModel):
     """The simulated scene and devices; not for `devices`."""
     streams: Streams = Field(default={})
     """Further devices, each under the name of its stream: a second event camera, a thermometer."""
+    twin: TwinRecord | None = None
+    """How the simulated scene was fitted to a pilot; written by `sliplab calibrate scene`."""
 
     @field_validator("cameras")
     @classmethod
@@ -168,6 +171,8 @@ class RigFile(StrictModel):
                 raise KeyedError(name, None, f"is needed by driver: {self.driver}")
             if not needed and found is not None:
                 raise KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
+        if self.twin is not None and self.mock is None:
+            raise KeyedError("twin", "...", f"has no meaning with driver: {self.driver}")
         if self.driver == "devices" and self.devices is not None and self.devices.sync_box is None:
             raise KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
         if self.devices is not None:

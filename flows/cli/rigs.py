@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption
+from sliplab.flows.cli.common import JsonOption, RigOption, StoreArgument
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
 teach_app = typer.Typer(help="Teach plane, depth zero and tool of a rig.", **_SETTINGS)  # type: ignore[arg-type]
-calibrate_app = typer.Typer(help="Calibrate a rig's cameras.", **_SETTINGS)  # type: ignore[arg-type]
+calibrate_app = typer.Typer(help="Calibrate cameras, or a simulated scene.", **_SETTINGS)  # type: ignore[arg-type]
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")
 
@@ -385,6 +385,67 @@ def calibrate_crop(
         PlannedMove(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.CIRCLE_MM_S),
     ]
     command.run(moves, yes, dry_run, lambda session: steps.calibrate_crop(session, depth, radius))
+
+
+@calibrate_app.command("scene")
+def calibrate_scene(
+    folder: StoreArgument,
+    rig: RigOption,
+    out: Annotated[Path, typer.Option("--out", help="The twin's rig file to write (YAML).")],
+    campaign: Annotated[
+        str | None, typer.Option("--campaign", help="The pilot; may be left out if it is alone.")
+    ] = None,
+    worlds: Annotated[
+        int,
+        typer.Option("--worlds", min=100, max=100_000, help="Simulated worlds in each round."),
+    ] = 200,
+    spread: Annotated[
+        float,
+        typer.Option(
+            "--spread", min=0.05, max=5, help="Largest change of a parameter: 0.5 is by half."
+        ),
+    ] = 0.5,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=2**31, help="Seed of the simulated worlds.")
+    ] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit a simulated rig's scene to a labelled pilot: writes a rig file, a page and numbers."""
+    from sliplab.flows.steps import prepare_store
+    from sliplab.storage.remote.mirror import open_store
+
+    store = open_store(folder)
+    prepare_store(folder)
+    from sliplab.analysis.campaigns import collected
+    from sliplab.flows import twin
+
+    wanted = twin.request(rig, out, worlds, spread, seed)
+    found = collected(store, None if campaign is None else [campaign])
+    if len(found) != 1:
+        names = ", ".join(item.name for item in found)
+        raise InputError("--campaign", "", None, f"is needed: the store has {names}")
+    fit = twin.calibrate_scene(store, found[0], wanted)
+    if as_json:
+        console.print_json({"rig": str(out), **fit.to_json()})
+        return
+    rows = [
+        [
+            it.title, f"{it.assumed:.4g}", f"{it.value:.4g}" if it.identified else "-",
+            f"{it.low:.4g} to {it.high:.4g}", it.unit, "yes" if it.identified else "no",
+        ]
+        for it in fit.parameters
+    ]  # fmt: skip
+    pilot = "simulated pilot" if fit.simulated else "pilot"
+    console.print_table(
+        f"twin of the {pilot} '{fit.campaign}'",
+        ["parameter", "assumed", "fitted", "95 %", "unit", "identified"],
+        rows,
+    )
+    for check in fit.checks:
+        if check.found:
+            console.say(f"misfit in the {check.stream}: {check.title}")
+    console.say(f"{fit.worlds} worlds, {console.duration(fit.seconds)}; twin: {out}")
+    console.say(f"page: {out.with_suffix('.html')}")
 
 
 @calibrate_app.command("board")

@@ -89,12 +89,16 @@ def configure_prefect(store: Path) -> None:
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)
     _ask_loopback_directly()
-    hide_cancelled_callbacks()
+    hide_what_a_lost_server_leaves()
 
 
-def hide_cancelled_callbacks() -> None:
-    """Keep what `_is_fault` refuses off the terminal, in each process that runs a flow."""
+def hide_what_a_lost_server_leaves() -> None:
+    """Keep Prefect's own words of a lost server off the terminal, in each process with a flow.
+
+    The flow says it in one line, and what could not be sent is kept in the store.
+    """
     logging.getLogger("asyncio").addFilter(_is_fault)
+    logging.getLogger("prefect._internal.concurrency").setLevel(logging.CRITICAL)
 
 
 def _is_fault(record: logging.LogRecord) -> bool:

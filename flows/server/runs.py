@@ -163,7 +163,7 @@ def _carry_out_here(flow: Any, run: Any) -> None:
 def _carry_out(run_id: str, flow_name: str) -> None:
     """Execute one run in this process; its end is stored and reported to the server."""
     collect_garbage_seldom()
-    orchestration.hide_cancelled_callbacks()
+    orchestration.hide_what_a_lost_server_leaves()
     from prefect.exceptions import Abort, Pause
     from prefect.flow_engine import run_flow
     from prefect.settings import temporary_settings

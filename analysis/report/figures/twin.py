@@ -1,0 +1,150 @@
+"""Figures of a twin: its intervals, and a pilot's test trials beside simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from sliplab.analysis.report.figures.style import (
+    BLUE,
+    GREY,
+    ORANGE,
+    RED,
+    STYLE,
+    Array,
+    svg_text,
+)
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A parameter's interval over its assumed value.
+
+    Attributes:
+        low, middle, high: of the fit. least, most: of the worlds that were simulated.
+    """
+
+    title: str
+    low: float
+    middle: float
+    high: float
+    least: float
+    most: float
+    identified: bool
+
+
+def intervals(factors: Sequence[Factor], *, simulated: bool) -> str:
+    """Draw each parameter's 95 % interval as factors of what the rig file assumed."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(6.4, 0.6 + 0.2 * len(factors)))
+        for row, it in enumerate(factors):
+            axes.plot([it.least, it.most], [row, row], color="#dddddd", lw=6, solid_capstyle="butt")
+            colour = BLUE if it.identified else GREY
+            axes.plot([it.low, it.high], [row, row], color=colour, lw=2)
+            axes.plot(it.middle, row, "o", color=colour, ms=4)
+        axes.axvline(1.0, color="black", lw=0.8)
+        axes.set_yticks(range(len(factors)), [it.title for it in factors])
+        axes.set_ylim(len(factors) - 0.5, -0.5)
+        axes.set_xscale("log")
+        ticks = [0.5, 0.7, 1.0, 1.4, 2.0]
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+        axes.set_xlabel("factor of the rig file's value")
+        axes.plot([], [], color=BLUE, lw=2, label="identified, 95 %")
+        axes.plot([], [], color=GREY, lw=2, label="not identified")
+        axes.plot([], [], color="#dddddd", lw=6, label="simulated worlds")
+        handles, titles = axes.get_legend_handles_labels()
+        figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One quantity of one trial over time.
+
+    Attributes:
+        title: of the trial. t_s: (n,). pilot: (n,). twin, before: of several worlds, (k, n).
+    """
+
+    title: str
+    t_s: Array
+    pilot: Array
+    twin: Array
+    before: Array
+
+
+def over_time(panels: Sequence[Curves], label: str, *, simulated: bool) -> str:
+    """Draw a quantity of some trials over time: the pilot's on the middle 95 % of the worlds'."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            len(panels), 1, figsize=(6.4, 1.6 * len(panels) + 0.5), squeeze=False
+        )
+        for ax, it in zip(axes[:, 0], panels, strict=True):
+            for worlds, colour, name in (
+                (it.before, ORANGE, "rig file as it was"), (it.twin, BLUE, "twin"),
+            ):  # fmt: skip
+                low, middle, high = np.nanquantile(worlds, (0.025, 0.5, 0.975), axis=0)
+                ax.fill_between(it.t_s, low, high, color=colour, alpha=0.25, lw=0)
+                ax.plot(it.t_s, middle, color=colour, lw=1, label=f"{name}, middle 95 %")
+            ax.plot(it.t_s, it.pilot, color="black", lw=1, label="pilot")
+            ax.set_title(it.title)
+            ax.set_ylabel(label)
+            ax.set_ylim(bottom=0.0)
+        axes[-1, 0].set_xlabel("time since the slide began (s)")
+        handles, titles = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+def slip_order(
+    pilot_s: Array, twin_s: Array, before_s: Array, rings: Array, *, simulated: bool
+) -> str:
+    """Draw when each marker of each trial slipped: simulated against the pilot.
+
+    Args:
+        pilot_s, twin_s, before_s: seconds after the start, (trials, m); medians of the worlds.
+        rings: layer of each marker, (m,).
+    """
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, 2, figsize=(6.4, 3.1), sharex=True, sharey=True)
+        most = float(np.nanmax([np.nanmax(pilot_s), np.nanmax(twin_s), np.nanmax(before_s)]))
+        for ax, found, name in (
+            (axes[0], before_s, "rig file as it was"), (axes[1], twin_s, "twin"),
+        ):  # fmt: skip
+            ax.plot([0, most], [0, most], color="black", lw=0.8)
+            for ring, colour in zip(np.unique(rings), (RED, ORANGE, BLUE, GREY) * 15, strict=False):
+                of = rings == ring
+                title = "centre" if ring == 0 else f"ring {ring:.0f}"
+                ax.plot(
+                    pilot_s[:, of].ravel(), found[:, of].ravel(), ".", color=colour, ms=4,
+                    label=title,
+                )  # fmt: skip
+            ax.set_title(name)
+            ax.set_xlabel("slip of a marker, pilot (s)")
+        axes[0].set_ylabel("the same, simulated (s)")
+        handles, titles = axes[0].get_legend_handles_labels()
+        figure.legend(handles, titles, loc="outside lower center", ncols=4, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+def maps(pilot: Array, twin: Array, before: Array, *, simulated: bool) -> str:
+    """Draw positive events of the test trials' slides over the centre crop, events per cell.
+
+    Args:
+        pilot, twin, before: means over trials and worlds, (rows, columns).
+    """
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, 3, figsize=(6.4, 2.5))
+        most = max(float(found.max()) for found in (pilot, twin, before))
+        for ax, found, name in zip(
+            axes, (pilot, twin, before), ("pilot", "twin", "rig file as it was"), strict=True
+        ):
+            image = ax.imshow(found, cmap="viridis", vmin=0.0, vmax=most)
+            ax.set_title(name)
+            ax.set_xticks([])
+            ax.set_yticks([])
+        figure.colorbar(image, ax=axes, shrink=0.8, label="events per cell and trial")
+        return svg_text(figure, simulated)

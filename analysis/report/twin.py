@@ -1,0 +1,175 @@
+"""The page of a twin: what was fitted to a pilot, how well, and what the scene cannot show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sliplab.analysis.report.figures import twin as figures
+from sliplab.analysis.report.page import Figure, Table, render_page
+from sliplab.analysis.twin.parameters import PARAMETERS
+from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.analysis.twin.shown import event_map, rate_per_s, slips_s
+from sliplab.storage.schema.twin import TwinFit
+from sliplab.storage.streams import F64
+
+PANELS = 3
+"""Test trials that are drawn over time."""
+WOULD_IDENTIFY = {
+    "frames": "trials with the outside camera's frames",
+    "events": "trials with an event camera",
+    "force": "a force sensor at the pilot (docs/force.md)",
+}
+
+
+def render(
+    fit: TwinFit,
+    name: str,
+    pilot: Sequence[PilotTrial],
+    twin: Sequence[Sequence[PilotTrial]],
+    before: Sequence[Sequence[PilotTrial]],
+    rings: F64,
+    streams: frozenset[str],
+) -> str:
+    """Return the page as text.
+
+    Args:
+        name: of the twin. pilot: test trials. twin, before: worlds with the same trials.
+        rings: layer of each marker, (m,). streams: that the pilot has.
+    """
+    minutes = f"{fit.seconds / 60:.1f} min" if fit.seconds >= 60 else f"{fit.seconds:.0f} s"
+    misfits = [
+        [check.title, check.stream, f"{check.pilot:.3g} {check.unit}".strip(),
+         f"{check.limit:.3g} {check.unit}".strip()]
+        for check in fit.checks if check.found
+    ]  # fmt: skip
+    return render_page(
+        "twin.html",
+        simulated=fit.simulated,
+        fit=fit,
+        name=name,
+        rig=fit.rig,
+        minutes=minutes,
+        misfits=Table(("check", "stream", "pilot", "most that the scene shows"), misfits),
+        intervals=Figure(_intervals(fit)),
+        parameters=Table(
+            ("parameter", "key", "assumed", "fitted", "95 % interval", "unit", "identified"),
+            [
+                [
+                    it.title, it.key, _short(it.assumed),
+                    _short(it.value) if it.identified else "–",
+                    f"{_short(it.low)} to {_short(it.high)}", it.unit,
+                    "yes" if it.identified else "no",
+                ]
+                for it in fit.parameters
+            ],
+        ),
+        missing=_missing(fit, streams),
+        compared=Table(
+            ("quantity", "pilot", "twin differs by", "rig file by", "scatter"),
+            [
+                [it.title, *(_short(v) for v in (it.pilot, it.twin, it.before, it.scatter))]
+                for it in fit.compared
+            ],
+        ),
+        figures=_figures(pilot, twin, before, rings, fit.simulated) if pilot else [],
+        statistics=Table(
+            ("statistic", "pilot", "worlds from", "to"),
+            [
+                [key, *("–" if v is None else _short(v) for v in (it.pilot, it.low, it.high))]
+                for key, it in fit.statistics.items()
+            ],
+        ),
+    )  # fmt: skip
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _intervals(fit: TwinFit) -> str:
+    rows = [
+        figures.Factor(
+            it.title, it.low / it.assumed, it.value / it.assumed, it.high / it.assumed,
+            it.least / it.assumed, it.most / it.assumed, it.identified,
+        )
+        for it in fit.parameters
+    ]  # fmt: skip
+    return figures.intervals(rows, simulated=fit.simulated)
+
+
+def _missing(fit: TwinFit, streams: frozenset[str]) -> Table | None:
+    """Return what is not identified, and which trials would identify it."""
+    known = {parameter.key: parameter for parameter in PARAMETERS}
+    rows = []
+    for it in fit.parameters:
+        if it.identified:
+            continue
+        lacking = [name for name in known[it.key].streams if name not in streams]
+        needs = ", ".join(WOULD_IDENTIFY[name] for name in lacking)
+        rows.append([it.title, needs or "more trials; these leave it as likely as it was assumed"])
+    return Table(("parameter", "what would identify it"), rows) if rows else None
+
+
+def _figures(
+    pilot: Sequence[PilotTrial],
+    twin: Sequence[Sequence[PilotTrial]],
+    before: Sequence[Sequence[PilotTrial]],
+    rings: F64,
+    simulated: bool,
+) -> list[tuple[Figure, str]]:
+    """Return figures of the test trials, each with its caption."""
+    found = []
+    shown = range(min(PANELS, len(pilot)))
+    if all(trial.camera is not None for trial in pilot):
+        rates = [
+            figures.Curves(
+                pilot[k].trial, *rate_per_s(pilot[k]),
+                _aligned([rate_per_s(world[k]) for world in twin], rate_per_s(pilot[k])[0]),
+                _aligned([rate_per_s(world[k]) for world in before], rate_per_s(pilot[k])[0]),
+            )
+            for k in shown
+        ]  # fmt: skip
+        svg = figures.over_time(rates, "positive events/s", simulated=simulated)
+        found.append((Figure(svg), "Positive events per second, in bins of 0.1 s."))
+    moved = [
+        figures.Curves(
+            pilot[k].trial, *_moved(pilot[k]),
+            _aligned([_moved(world[k]) for world in twin], pilot[k].frame_s),
+            _aligned([_moved(world[k]) for world in before], pilot[k].frame_s),
+        )
+        for k in shown
+    ]  # fmt: skip
+    svg = figures.over_time(moved, "moved (mm)", simulated=simulated)
+    found.append((Figure(svg), "Mean displacement of the markers along the slide."))
+    of_pilot = np.stack([slips_s(trial) for trial in pilot])
+    order = [
+        np.nanmedian([[slips_s(trial) for trial in world] for world in worlds], axis=0)
+        for worlds in (twin, before)
+    ]
+    svg = figures.slip_order(of_pilot, order[0], order[1], rings, simulated=simulated)
+    found.append(
+        (
+            Figure(svg),
+            "Slip of each marker in each test trial: median of the worlds, over the pilot's.",
+        )
+    )
+    if all(trial.camera is not None for trial in pilot):
+        means = [
+            np.mean([event_map(trial) for world in worlds for trial in world], axis=0)
+            for worlds in ([pilot], twin, before)
+        ]
+        svg = figures.maps(means[0], means[1], means[2], simulated=simulated)
+        found.append((Figure(svg), "Where positive events came from during the slides."))
+    return found
+
+
+def _moved(trial: PilotTrial) -> tuple[F64, F64]:
+    along = trial.moved_mm @ trial.slide.direction
+    return trial.frame_s, np.nanmean(along, axis=1)
+
+
+def _aligned(curves: Sequence[tuple[F64, F64]], t_s: F64) -> F64:
+    """Return curves at the times of another one, (k, n)."""
+    return np.stack([np.interp(t_s, own_s, values) for own_s, values in curves])
