@@ -1,250 +1,357 @@
-"""Reader of Prophesee's raw and dat files and of `.es`, through faery if it is installed.
+"""Reader of Prophesee's `.raw` files (EVT 2.0, 2.1 and 3.0) and `.dat` files (versions 1 and 2).
 
-It is an extra, `pip install 'sliplab[formats]'`. A file that ends within an event is refused as cut
-short, which faery would not notice.
+A file is a header of lines that begin with `% `, and words. The header ends at `% end`, or where a
+line is none of text; the words are decoded in `evt`. Where this deviates from faery, which tests
+compare it with, it follows the maker's documentation and decoders: events before the first time
+are dropped; vectors stand at their own base, and one that reaches beyond the camera is damage; the
+clock begins anew after a gap, too; it is not taken for begun anew where it only fell; what follows
+`% end` is no header. Times are microseconds, with the header's `T0` added, which faery writes.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import replace
-from importlib import import_module, util
-from itertools import takewhile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
 
-from sliplab.protocols.errors import InputError
+from sliplab.storage.formats.evt import (
+    DAT,
+    EDGES,
+    EVT2,
+    EVT3,
+    EVT21,
+    FAULT,
+    FELL,
+    GOT,
+    HAD,
+    LAST_TURN_US,
+    OUTSIDE,
+    ROOM,
+    Encoding,
+    new_state,
+)
 from sliplab.storage.formats.foreign import (
+    RISING,
     Damage,
     ForeignTrial,
     FormatError,
-    check_pixels,
-    event_chunk,
+    Triggers,
+    as_damage,
     read_head,
 )
 from sliplab.storage.schema.trial import Lost
-from sliplab.storage.streams import EventChunk
+from sliplab.storage.streams import I64, EventChunk
 
-LIBRARY = "faery"
-EVENT_STREAM = b"Event Stream"
-"""First bytes of a `.es` file."""
-_RAW = re.compile(rb"(?mi)^% (?:evt \d|format EVT\d)")
-_DAT = re.compile(rb"(?mi)^% version \d")
-_RAW_HEADER = re.compile(rb"(?:%[^\n]*\n)*%[^\n]*")
-_VERSION = re.compile(rb"(?mi)^% (?:evt |format EVT)(\d)")
+_LINES = re.compile(rb"(?:% [^\n]*\n?)+")
+_FORMAT = re.compile(rb"(?mi)^% (?:evt \d|format EVT\d|version \d)")
+_HEADER = re.compile(rb"(?:%[^\n]*\n)*%[^\n]*")
 _HEADER_CUT = "is cut short in its header"
 _MOST_LINE = 1 << 20
-_ES_HEAD = len(EVENT_STREAM) + 4
-"""Name, version in three bytes, and kind of events; the size follows."""
-_ES_OVERFLOWS = {1: 0b1111_1110, 2: 0b1111_1100}
-"""Of change and ATIS events: the first byte from which on time passes without an event."""
-_NO_SIZE = (2048, 2048)
-"""faery returns this where a file gives no size; its events' 11 bits reach no further."""
-_BLOCK = 1 << 16
-"""Bytes that faery reads at once."""
-T = TypeVar("T")
+_NUMBER = re.compile(r"\d{1,20}", re.ASCII)
+_MOST_SIDE = 1 << 16
+_ENCODINGS = {"2": EVT2, "2.0": EVT2, "2.1": EVT21, "21": EVT21, "3": EVT3, "3.0": EVT3}
+"""By the version after `evt` or `format EVT`."""
+_DAT_BITS = {"1": (9, 8), "2": (14, 14), "2.0": (14, 14)}
+"""Bits of columns and rows by version."""
+_DAT_KINDS = (0x00, 0x0C)
+"""Pixels with a polarity; 0x0E are triggers."""
+_DAT_BYTES = 8
+_FALLING = 2
+"""A falling edge of the external input, as AEDAT4 numbers triggers."""
+_CHUNK = 1 << 16
+"""Events of a chunk."""
+_EDGES = 1 << 10
+_BLOCK = 1 << 18
+"""Bytes that are read at once."""
 
 
-def faery_type(head: bytes) -> str | None:
-    """Return faery's name for the format of a file by its first bytes; None for any other."""
-    if head.startswith(EVENT_STREAM):
-        return "es"
-    header = takewhile(lambda line: line.startswith(b"%"), head.split(b"\n"))
-    lines = b"\n".join(header)
-    if _RAW.search(lines):
-        return "evt"
-    return "dat" if _DAT.search(lines) else None
+@dataclass(frozen=True)
+class Header:
+    """What the beginning of a file says.
+
+    Attributes:
+        begin: byte of the first word; end: byte behind the last whole one.
+        size: columns and rows; None where it does not say.
+        t0_us: what times count from.
+        bits: of a column and a row, in DAT.
+        swapped: EVT 2.1 with the upper half of each word first.
+    """
+
+    encoding: Encoding
+    begin: int
+    end: int
+    size: tuple[int, int] | None
+    t0_us: int
+    bits: tuple[int, int] = (0, 0)
+    swapped: bool = False
 
 
-def read_by_faery(path: Path, name: str) -> ForeignTrial:
-    """Read a `.raw`, `.dat` or `.es` file as a trial called `name`.
+def is_prophesee(head: bytes) -> bool:
+    """Return whether the first bytes of a file are those of a `.raw` or `.dat` file."""
+    found = _LINES.match(head)
+    return found is not None and bool(_FORMAT.search(found[0]))
+
+
+def read_prophesee(path: Path, name: str) -> ForeignTrial:
+    """Read a `.raw` or `.dat` file as a trial called `name`.
 
     Raises:
-        InputError: faery is not installed.
-        FormatError: the file says no format, is cut short, or faery cannot read it.
+        FormatError: it says no format, or one that is not read.
+        Damage: it is cut short.
     """
-    form = _form(path)
-    begin = _begin(path, form)
-    if rest := _rest(path, form, begin):
-        raise Damage(_cut_short(rest))
-    return _trial(path, name, form, None)
+    header = read_header(path)
+    if lost := _rest(path, header):
+        raise Damage(lost.reason)
+    return _trial(path, name, header)
 
 
-def salvage_by_faery(path: Path, name: str) -> ForeignTrial:
+def salvage_prophesee(path: Path, name: str) -> ForeignTrial:
     """Read the events of a damaged file that stand before the damage.
 
-    faery reads blocks of 64 KiB, and returns nothing of the one in which it stops.
-
     Raises:
-        InputError: faery is not installed.
         FormatError: the file's header is damaged, or says no format.
     """
-    form = _form(path)
-    begin, size = _begin(path, form), path.stat().st_size
-    rest = _rest(path, form, begin)
-    reason = _cut_short(rest) if rest else None
-    trial = _trial(path, name, form, None)
-    packets: int | None = None
-    count, at = 0, size - rest
+    header = read_header(path)
+    lost = _rest(path, header)
     try:
-        for chunk in trial.events():
-            check_pixels(chunk, trial.event_px())
-            count += len(chunk)
-    except FormatError as error:
-        packets = _whole_blocks(path, form)
-        at, reason = begin + packets * _BLOCK, str(error)
-        if at >= size:  # faery reads on: nobody knows where that is
-            raise
-    if reason is None:
-        return trial
-    lost = Lost(at_byte=at, unread_bytes=size - at, reason=reason)
-    return replace(_trial(path, name, form, count), lost=lost, packets=packets)
+        for _ in _decoded(path, header):
+            pass
+    except DamagedWord as error:
+        unread = path.stat().st_size - error.at_byte
+        lost = Lost(at_byte=error.at_byte, unread_bytes=unread, reason=str(error))
+        header = replace(header, end=error.at_byte)
+    return replace(_trial(path, name, header), lost=lost)
 
 
-def check_faery(path: Path) -> None:
-    """Check that faery is there for a file. Raises InputError where it is not installed."""
-    if util.find_spec(LIBRARY) is None:
-        raise InputError(
-            path, "", None,
-            "needs the library faery, which is not installed; the extra 'formats' brings it: "
-            "pip install 'sliplab[formats]'",
-        )  # fmt: skip
+class DamagedWord(Damage):
+    """A word cannot be right.
+
+    Attributes:
+        at_byte: its place in the file.
+    """
+
+    def __init__(self, at_byte: int, reason: str) -> None:
+        """Make one whose `reason` continues after "is damaged at byte N: "."""
+        self.at_byte = at_byte
+        super().__init__(f"is damaged at byte {at_byte}: {reason}")
 
 
-def _form(path: Path) -> str:
-    """Return faery's name for the format of a file."""
-    check_faery(path)
+def read_header(path: Path) -> Header:
+    """Read the header of a `.raw` or `.dat` file.
+
+    Raises:
+        FormatError: it says no format, or one that is not read.
+        Damage: it is cut short.
+    """
     head = read_head(path)
-    form = faery_type(head)
-    if form is None:
-        if EVENT_STREAM.startswith(head) or _RAW_HEADER.fullmatch(head):
-            raise Damage(_HEADER_CUT)
-        raise FormatError(
-            "gives no format: a .raw file has a line `% evt 3.0` or `% format EVT3` in its header, "
-            "a .dat file `% Version 2`, a .es file begins with `Event Stream`"
-        )
-    return form
-
-
-def _begin(path: Path, form: str) -> int:
-    """Return the byte at which the events of a file begin."""
     size = path.stat().st_size
-    with path.open("rb") as file:
-        if form == "es":
-            kind = file.read(_ES_HEAD)[-1:]
-            begin = _ES_HEAD + (0 if kind == b"\0" else 4)
-        else:
-            begin = 0
-            while (line := file.readline(_MOST_LINE)).startswith(b"%") and _is_text(line):
-                begin += len(line)
-                if begin == size and not line.endswith(b"\n"):
-                    raise Damage(_HEADER_CUT)
-            begin += 2 if form == "dat" else 0  # kind and size of its events
-    if begin > size:
+    lines, begin = _lines(path, size)
+    said = {key: value for words in lines for key, value in _values(words)}
+    t0_us = int(said.get("t0", "0"))
+    if t0_us >= LAST_TURN_US:
+        raise FormatError(f"counts times from {t0_us} us, which is no time")
+    if "evt" in said:
+        encoding = _ENCODINGS.get(said["evt"])
+        if encoding is None:
+            raise FormatError(f"is of EVT {said['evt']}; read are EVT 2.0, 2.1 and 3.0")
+        if said.get("endianness") == "big":
+            raise FormatError("is big-endian; read are little-endian files")
+        end = size - (size - begin) % np.dtype(encoding.dtype).itemsize
+        swapped = encoding is EVT21 and said.get("endianness") == "legacy"
+        return Header(encoding, begin, end, _size(said), t0_us, swapped=swapped)
+    if "version" in said:
+        bits = _dat_bits(path, begin, said["version"])
+        begin += 2
+        return Header(DAT, begin, size - (size - begin) % _DAT_BYTES, _size(said), t0_us, bits)
+    if not head or _HEADER.fullmatch(head):
         raise Damage(_HEADER_CUT)
-    return begin
+    raise FormatError(
+        "gives no format: a .raw file has a line `% evt 3.0` or `% format EVT3` in its header, "
+        "a .dat file `% Version 2`"
+    )
+
+
+def _dat_bits(path: Path, begin: int, version: str) -> tuple[int, int]:
+    """Check version, kind and size of DAT's events, and return the bits of a column and a row."""
+    bits = _DAT_BITS.get(version)
+    if bits is None:
+        raise FormatError(f"is of DAT version {version}; read are 1 and 2")
+    with path.open("rb") as file:
+        file.seek(begin)
+        found = file.read(2)
+    if len(found) < 2:
+        raise Damage(_HEADER_CUT)
+    if found[0] not in _DAT_KINDS or found[1] != _DAT_BYTES:
+        raise FormatError(
+            f"holds DAT events of type {found[0]} with {found[1]} bytes; read are types 0 and 12 "
+            f"with {_DAT_BYTES}"
+        )
+    return bits
+
+
+def _lines(path: Path, size: int) -> tuple[list[list[str]], int]:
+    """Return the words of each line of a header, and the byte behind it."""
+    lines, begin = [], 0
+    with path.open("rb") as file:
+        while (line := file.readline(_MOST_LINE)).startswith(b"% ") and _is_text(line):
+            begin += len(line)
+            if not line.endswith(b"\n"):
+                if begin == size:
+                    raise Damage(_HEADER_CUT)
+                raise FormatError(f"has a line of more than {_MOST_LINE} bytes in its header")
+            words = re.split(r"[ ;]+", line[2:].decode().strip())
+            if words == ["end"]:
+                break
+            lines.append(words)
+    return lines, begin
 
 
 def _is_text(line: bytes) -> bool:
-    """Return whether faery takes a line for one of the header, not for events."""
+    """Return whether a line is one of a header, not of words that begin as one."""
     try:
-        line.decode()
+        return line.decode().rstrip("\r\n").replace("\t", " ").isprintable()
     except UnicodeDecodeError:
         return False
-    return True
 
 
-def _rest(path: Path, form: str, begin: int) -> int:
-    """Return the bytes at the end of a file that are too few for an event."""
-    size = path.stat().st_size
-    if form == "dat":
-        return (size - begin) % 8
-    if form == "evt":
-        found = _VERSION.findall(read_head(path)[:begin])
-        return (size - begin) % (4 if found and found[-1] == b"2" else 2)
-    if size == begin:
-        return 0
-    with path.open("rb") as file:
-        kind = file.read(_ES_HEAD)[-1]
-    if kind not in _ES_OVERFLOWS:
-        return 0
-    content = np.memmap(path, np.uint8, "r", begin)
-    return int(_es_rest(content, np.uint8(_ES_OVERFLOWS[kind])))
+def _values(words: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield what a line says, under names that are the same for all ways to say it.
+
+    What is no number where one belongs is left out, as faery does.
+    """
+    key, value = words[0].lower(), words[1] if len(words) > 1 else ""
+    number = _NUMBER.fullmatch(value)
+    if key in {"evt", "version"} or (number and key in {"t0", "width", "height"}):
+        yield key, value
+    elif key == "geometry":
+        width, _, height = value.partition("x")
+        if _NUMBER.fullmatch(width) and _NUMBER.fullmatch(height):
+            yield from (("width", width), ("height", height))
+    elif key == "format" and value.lower().startswith("evt"):
+        yield "evt", value[3:]
+        for word in words[2:]:
+            name, _, content = word.partition("=")
+            if name == "endianness" or (name in {"width", "height"} and _NUMBER.fullmatch(content)):
+                yield name, content
 
 
-@njit(cache=True, nogil=True)
-def _es_rest(content, overflow):  # type: ignore[no-untyped-def]
-    """Return the bytes behind the last whole event: 5 bytes each, or 1 that lets time pass."""
-    at = whole = 0
-    while at < len(content):
-        at += 1 if content[at] >= overflow else 5
-        if at <= len(content):
-            whole = at
-    return len(content) - whole
+def _size(said: dict[str, str]) -> tuple[int, int] | None:
+    width, height = int(said.get("width", "0")), int(said.get("height", "0"))
+    return (width, height) if 0 < width < _MOST_SIDE and 0 < height < _MOST_SIDE else None
 
 
-def _whole_blocks(path: Path, form: str) -> int:
-    """Return the number of blocks that faery reads before it stops."""
-    decoder = getattr(import_module(f"{LIBRARY}.extension"), form).Decoder
-    options = {"t0": 0} if form == "es" else {
-        "dimensions_fallback": _NO_SIZE, "version_fallback": f"{form}2"
-    }  # fmt: skip
-    count = 0
-    with suppress(FormatError), _guarded(lambda: decoder(path=path, **options), None, 0) as blocks:
-        while _guarded(lambda: next(blocks, None), None, 0) is not None:
-            count += 1
-    return count
+def _rest(path: Path, header: Header) -> Lost | None:
+    """Return the bytes at the end of a file that are too few for a word."""
+    rest = path.stat().st_size - header.end
+    if not rest:
+        return None
+    reason = f"is cut short: its last {rest} bytes, from byte {header.end} on, are no whole event"
+    return Lost(at_byte=header.end, unread_bytes=rest, reason=reason)
 
 
-def _cut_short(rest: int) -> str:
-    return f"is cut short: its last {rest} bytes are no whole event"
-
-
-def _trial(path: Path, name: str, form: str, most: int | None) -> ForeignTrial:
-    """Return a trial of the first `most` events of a file, of all by default."""
-
-    def stream() -> Any:
-        return import_module(LIBRARY).events_stream_from_file(
-            path, dimensions_fallback=_NO_SIZE, file_type=form
-        )
-
-    width, height = _guarded(lambda: stream().dimensions(), None, 0)
-    known = (int(width), int(height)) if (width, height) != _NO_SIZE else None
+def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
+    """Return a trial of the words that a header tells of."""
+    with as_damage():
+        triggers, left_out = _triggers(path, header)
 
     def all_events() -> Iterator[EventChunk]:
-        count = 0
-        packets = _guarded(lambda: iter(stream()), known, count)
-        while most is None or count < most:
-            rows = _guarded(lambda: next(packets, None), known, count)
-            if rows is None:
-                break
-            count += len(rows)
-            yield event_chunk(rows["x"], rows["y"], rows["on"].view("u1"), rows["t"])
+        for chunk, _ in _decoded(path, header):
+            yield chunk
 
+    unknown = ("sync grade", "poses", "motion", "condition", "frames")
     return ForeignTrial(
         name, path.name, all_events, "the camera's own clock, us, from the file's beginning",
-        lambda: known, about={"read_by": LIBRARY},
-        unknown=("sync grade", "poses", "motion", "condition", "frames", "triggers"),
+        lambda: header.size, triggers,
+        about={"encoding": header.encoding.name, "left_out": left_out},
+        unknown=unknown if triggers is not None else (*unknown, "triggers"),
     )  # fmt: skip
 
 
-def _guarded(step: Callable[[], T], size: tuple[int, int] | None, count: int) -> T:
-    """Run a step in faery; a panic of its Rust code is no `Exception`."""
-    try:
-        return step()
-    except (KeyboardInterrupt, SystemExit):
-        raise
-    except BaseException as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        text = re.sub(r'the stream "[^"]*"', "it", text)
-        if "overflow" in text and size is not None:
-            text += f": an event outside of the {size[0]} x {size[1]} pixels in its header"
-        raise FormatError(
-            "is damaged, truncated or not of the format in its header: after "
-            f"{count:,} events faery stops with: {text}"
-        ) from None
+def _triggers(path: Path, header: Header) -> tuple[Triggers | None, list[str]]:
+    """Return the edges of the first trigger input that has some, and the names of others."""
+    encoding = header.encoding
+    if encoding.type_bit is None or not any(
+        encoding.has_edges(words) for _, words in _blocks(path, header)
+    ):
+        return None, []
+    edges = np.concatenate([found for _, found in _decoded(path, header)])
+    inputs = np.unique(edges[:, 1])
+    if not len(inputs):  # all of them stand before the first time
+        return None, []
+    mine = edges[edges[:, 1] == inputs[0]]
+    kind = np.where(mine[:, 2] == 1, RISING, _FALLING).astype(np.uint8)
+    return Triggers(mine[:, 0].copy(), kind), [f"trigger input {one}" for one in inputs[1:]]
+
+
+def _decoded(path: Path, header: Header) -> Iterator[tuple[EventChunk, I64]]:
+    """Yield events, and the edges of trigger inputs among them: time (us), input, 1 if rising.
+
+    Raises:
+        DamagedWord: after what stands before it was yielded.
+    """
+    most = header.encoding.most_px
+    width, height = header.size or (most, most)
+    item = np.dtype(header.encoding.dtype).itemsize
+    state = new_state(header.t0_us, *header.bits)
+    edges = np.empty((_EDGES, 3), np.int64)
+    chunk, filled = _empty(), 0
+    for place, words in _blocks(path, header):
+        at = 0
+        while at < len(words):
+            at, filled = header.encoding.decode(
+                words, at, filled, state, width, height,
+                chunk.x, chunk.y, chunk.p, chunk.t_us, edges,
+            )  # fmt: skip
+            fault = int(state[FAULT])
+            if fault or filled > _CHUNK - ROOM or state[EDGES] == _EDGES:
+                yield _part(chunk, filled), edges[: state[EDGES]].copy()
+                chunk, filled, state[EDGES] = _empty(), 0, 0
+            if fault:
+                where = f"{width} x {height} pixels {'in its header' if header.size else 'of all'}"
+                raise DamagedWord(place + at * item, _reason(state, where))
+    yield _part(chunk, filled), edges[: state[EDGES]].copy()
+
+
+def _reason(state: I64, where: str) -> str:
+    fault, got, had = (int(state[index]) for index in (FAULT, GOT, HAD))
+    if fault == OUTSIDE:
+        return f"an event at column {got}, row {had}, outside of the {where}"
+    if fault == FELL:
+        return f"the high part of the time falls from {had} to {got}"
+    return "a time that is out of range"
+
+
+def _blocks(path: Path, header: Header) -> Iterator[tuple[int, npt.NDArray[Any]]]:
+    """Yield the words of a file, each block with its byte; one is valid until the next."""
+    buffer = bytearray(_BLOCK)
+    dtype = np.dtype(header.encoding.dtype)
+    with path.open("rb") as file:
+        file.seek(header.begin)
+        at = header.begin
+        while at < header.end:
+            count = min(_BLOCK, header.end - at)
+            if file.readinto(memoryview(buffer)[:count]) != count:
+                raise Damage(f"became shorter while it was read, at byte {at}")
+            words = np.frombuffer(buffer, dtype, count // dtype.itemsize)
+            if header.swapped:
+                words = words << np.uint64(32) | words >> np.uint64(32)
+            yield at, words
+            at += count
+
+
+def _empty() -> EventChunk:
+    return EventChunk(
+        np.empty(_CHUNK, np.uint16),
+        np.empty(_CHUNK, np.uint16),
+        np.empty(_CHUNK, np.uint8),
+        np.empty(_CHUNK, np.int64),
+    )
+
+
+def _part(chunk: EventChunk, count: int) -> EventChunk:
+    return EventChunk(chunk.x[:count], chunk.y[:count], chunk.p[:count], chunk.t_us[:count])

@@ -25,6 +25,12 @@ from sliplab.storage.formats.dsec import (
     salvage_dsec,
     salvage_lab_hdf5,
 )
+from sliplab.storage.formats.event_stream import (
+    EVENT_STREAM,
+    check_faery,
+    read_es,
+    salvage_es,
+)
 from sliplab.storage.formats.foreign import (
     EXPORT_FORMAT,
     EXPORT_MANIFEST,
@@ -40,10 +46,9 @@ from sliplab.storage.formats.lab_pickles import Pair, pairs, read_pair
 from sliplab.storage.formats.lerobot_import import is_lerobot, read_lerobot
 from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
 from sliplab.storage.formats.prophesee import (
-    check_faery,
-    faery_type,
-    read_by_faery,
-    salvage_by_faery,
+    is_prophesee,
+    read_prophesee,
+    salvage_prophesee,
 )
 from sliplab.storage.formats.published_import import publication_at, read_publication
 from sliplab.storage.streams import Json
@@ -53,16 +58,16 @@ READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
     "aedat4": ((".aedat4",), read_aedat4),
     "dsec": ((".h5", ".hdf5"), read_dsec),
     "lab-hdf5": ((".h5", ".hdf5"), read_lab_hdf5),
-    "raw": ((".raw", ".dat"), read_by_faery),
-    "es": ((".es",), read_by_faery),
+    "raw": ((".raw", ".dat"), read_prophesee),
+    "es": ((".es",), read_es),
     "mcap": ((".mcap",), read_mcap),
 }
 SALVAGE: dict[str, Reader] = {
     "aedat4": salvage_aedat4,
     "dsec": salvage_dsec,
     "lab-hdf5": salvage_lab_hdf5,
-    "raw": salvage_by_faery,
-    "es": salvage_by_faery,
+    "raw": salvage_prophesee,
+    "es": salvage_es,
     "mcap": salvage_mcap,
 }
 """Readers of what stands whole before the damage in a file, by format."""
@@ -227,7 +232,7 @@ def _check_names(path: Path, wanted: list[Wanted]) -> None:
                 f"holds two files for the trial {name}: {one} and {two}; keep one of them, rename "
                 "one, or import one format alone: sliplab import KIND PATH",
             )  # fmt: skip
-        if kind in {"raw", "es"} and isinstance(file, Path):
+        if kind == "es" and isinstance(file, Path):
             check_faery(file)
         if kind == "mcap" and util.find_spec("mcap") is None:
             raise ModuleNotFoundError("No module named 'mcap'", name="mcap")
@@ -288,8 +293,10 @@ def _possible(file: Path) -> tuple[str, ...]:
         return ("mcap",)
     if head.startswith(SIGNATURE):
         return ("dsec", "lab-hdf5")
-    if form := faery_type(head):
-        return ("es",) if form == "es" else ("raw",)
+    if head.startswith(EVENT_STREAM):
+        return ("es",)
+    if is_prophesee(head):
+        return ("raw",)
     suffix = file.suffix.lower()
     return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
 

@@ -137,6 +137,33 @@ def write_evt2(path: Path) -> None:
     )
 
 
+def write_evt3(path: Path) -> None:
+    """Words of 16 bits that say what changed; events one by one and as vectors of one pixel."""
+    whole = all_events()
+    words = []
+    high = low = row = -1
+    for x, y, p, t in zip(*(column.tolist() for column in vars(whole).values()), strict=True):
+        if t >> 12 != high:
+            high, low = t >> 12, 0
+            words.append(8 << 12 | high)
+        if t & 0xFFF != low:
+            low = t & 0xFFF
+            words.append(6 << 12 | low)
+        if y != row:
+            row = y
+            words.append(row)
+        if x % 2:
+            words.append(2 << 12 | p << 11 | x)
+        else:
+            words += [3 << 12 | p << 11 | x - x % 32, 4 << 12, 4 << 12, 5 << 12]
+            at = x % 32
+            words[-3 + at // 12] |= 1 << at % 12
+    path.write_bytes(
+        b"% evt 3.0\n% format EVT3;height=480;width=640\n% end\n"
+        + struct.pack(f"<{len(words)}H", *words)
+    )
+
+
 def write_dat(path: Path) -> None:
     """Words of 64 bits, one an event."""
     whole = all_events()
@@ -155,12 +182,13 @@ FILES: dict[str, tuple[str, Callable[[Path], None]]] = {
     "mcap": ("a.mcap", write_mcap),
     "es": ("a.es", write_es),
     "evt2": ("a.raw", write_evt2),
+    "evt3": ("a.raw", write_evt3),
     "dat": ("a.dat", write_dat),
 }
 CHECKED = {"dsec checked", "mcap"}
 """Formats whose packets have checksums, so that no damage goes by unseen."""
 HEADERS = {
     "aedat4": 1354, "dsec": 4096, "dsec newest": 2048, "dsec checked": 4096, "contiguous": 2048,
-    "lab": 2048, "mcap": 300, "es": 20, "evt2": 44, "dat": 40,
+    "lab": 2048, "mcap": 300, "es": 20, "evt2": 44, "evt3": 50, "dat": 40,
 }  # fmt: skip
 """Bytes at the beginning of each that describe it."""

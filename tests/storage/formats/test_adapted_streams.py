@@ -393,7 +393,7 @@ KNOWN: dict[str, tuple[str, str, Callable[[Path], None], tuple[int, int] | None]
     "dat": ("raw", "a.dat", write_dat, SIZE),
     "es": ("es", "a.es", write_es, SIZE),
 }
-LIBRARIES = {"mcap": "mcap", "raw": "faery", "es": "faery"}
+LIBRARIES = {"mcap": "mcap", "es": "faery"}
 
 
 def zipped(path: Path) -> Path:

@@ -557,10 +557,10 @@ def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> Non
 def test_without_faery_its_files_are_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sliplab.storage.formats.prophesee.LIBRARY", "no_such_library")
-    (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n")
+    monkeypatch.setattr("sliplab.storage.formats.event_stream.LIBRARY", "no_such_library")
+    (tmp_path / "a.es").write_bytes(b"Event Stream\2\0\0\1")
     with pytest.raises(InputError, match="pip install"):
-        _import(tmp_path / "store", tmp_path / "a.raw")
+        _import(tmp_path / "store", tmp_path / "a.es")
 
 
 def test_pairs_of_pickles(tmp_path: Path) -> None:

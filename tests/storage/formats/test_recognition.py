@@ -263,19 +263,26 @@ def test_a_bad_file_is_named_with_what_would_be_right(tmp_path: Path, name: str)
 @pytest.mark.parametrize(
     ("file", "write", "says"),
     [
-        ("a.es", _es, r"after 0 events faery stops with: y overflow .*outside of the 320 x 16"),
         ("a.raw", lambda path: _raw(path, f"% evt 2.0\n% {'x' * 47}\n"), "contains no events"),
         ("a.raw", lambda path: _raw(path, "% date today\n"), "gives no format: a .raw file"),
         ("a.dat", _text, "gives no format"),
     ],
 )
-def test_a_bad_file_of_faerys(tmp_path: Path, file: str, write: Any, says: str) -> None:
-    pytest.importorskip("faery")
+def test_a_bad_file_of_prophesees(tmp_path: Path, file: str, write: Any, says: str) -> None:
     write(tmp_path / file)
     with pytest.raises(InputError, match=says) as caught:
         _import(tmp_path / "store", tmp_path / file)
     assert caught.value.message.count(file) == 1
     assert Store.open(tmp_path / "store").campaigns() == []
+
+
+def test_a_bad_file_of_faerys(tmp_path: Path) -> None:
+    pytest.importorskip("faery")
+    _es(tmp_path / "a.es")
+    says = r"after 0 events faery stops with: y overflow .*outside of the 320 x 16"
+    with pytest.raises(InputError, match=says) as caught:
+        _import(tmp_path / "store", tmp_path / "a.es")
+    assert caught.value.message.count("a.es") == 1
 
 
 EVT2 = (0x80000001, 1 << 28 | 2 << 22 | 5 << 11 | 7, 3 << 22 | 1500 << 11 | 1400)
@@ -288,7 +295,6 @@ EVT2 = (0x80000001, 1 << 28 | 2 << 22 | 5 << 11 | 7, 3 << 22 | 1500 << 11 | 1400
 def test_a_size_that_no_header_gives_is_unknown(
     tmp_path: Path, header: str, size: list[int] | None
 ) -> None:
-    pytest.importorskip("faery")
     _raw(tmp_path / "a", f"% evt 2.0\n{header}", EVT2)
     (found,) = _import(tmp_path / "store", tmp_path / "a")
     assert found.record.geometry.event_px == (None if size is None else tuple(size))
@@ -350,14 +356,17 @@ def test_two_formats_of_one_name_are_refused_before_anything_is_written(tmp_path
 def test_a_missing_library_is_said_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sliplab.storage.formats.prophesee.LIBRARY", "no_such_library")
+    monkeypatch.setattr("sliplab.storage.formats.event_stream.LIBRARY", "no_such_library")
     folder = tmp_path / "theirs"
     folder.mkdir()
     _aedat4(folder / "a.aedat4", _events([3, 4]))
     _raw(folder / "b.raw", words=EVT2)
-    with pytest.raises(InputError, match=r"b\.raw: .*pip install 'sliplab\[formats\]'"):
+    _es(folder / "c.es")
+    with pytest.raises(InputError, match=r"c\.es: .*pip install 'sliplab\[formats\]'"):
         _import(tmp_path / "store", folder)
     assert Store.open(tmp_path / "store").campaigns() == []
+    (folder / "c.es").unlink()
+    assert [one.trial_id for one in _import(tmp_path / "other", folder)] == ["a", "b"]
 
 
 def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path) -> None:

@@ -136,7 +136,9 @@ def _cut(folder: Path, name: str, data: bytes, at: int) -> int:
         return 0
     assert saved.found is not None
     if plain.error is None:
-        assert name in {"aedat4", "es", "evt2", "dat"}, "formats that do not say where they end"
+        assert name in {"aedat4", "es", "evt2", "evt3", "dat"}, (
+            "formats that do not say where they end"
+        )
     return _is_prefix(saved.found)
 
 
@@ -159,7 +161,7 @@ def test_a_file_cut_short_gives_a_prefix(
 @pytest.mark.parametrize(
     ("name", "share"),
     [("aedat4", 0.9), ("dsec", 0.5), ("dsec newest", 0.5), ("mcap", 0.8), ("es", 0.9),
-     ("evt2", 0.9), ("dat", 0.9)],
+     ("evt2", 0.94), ("evt3", 0.94), ("dat", 0.94)],
 )  # fmt: skip
 def test_most_of_a_file_that_lost_its_end_is_salvaged(
     tmp_path: Path, name: str, share: float, whole: dict[str, bytes]

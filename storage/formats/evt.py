@@ -1,0 +1,329 @@
+"""Decoders of Prophesee's words: EVT 2.0, EVT 2.1, EVT 3.0 and DAT to events and trigger edges.
+
+Layouts: docs.prophesee.ai, Encoding Formats and DAT File Format. A decoder takes words and its
+state, fills columns, and stops in front of a word that cannot be right. Indices in its loop are
+unsigned, which spares numba a test for negative ones. The higher part of an EVT
+time is sent alone and only grows, until it begins anew; one that falls otherwise is a fault. The
+lower part may fall, because events come from several sources: such a time is raised to the latest
+one, and so is a time of DAT. Events before the first high part have no time, and are dropped, as
+the maker says for EVT 2.0; the row and the base of a vector, which EVT 3.0 sends alone, count from
+the first word on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from sliplab.storage.formats.foreign import LATEST_US
+from sliplab.storage.streams import I64
+
+OUTSIDE, FELL, LATE = 1, 2, 3
+"""Faults of a word: a pixel that the camera has not, a high part that fell, a time too late."""
+NOW, HIGH_US, HIGH, ROW, BASE, ON, EDGES, X_BITS, Y_BITS, FAULT, GOT, HAD = range(12)
+"""Places in a state (int64).
+
+NOW: time of the last word, us. HIGH_US: time of the last high part, with all turns of the clock
+before it; HIGH: its value, -1 before the first. ROW, BASE, ON: row, base column and polarity of the
+next vector. EDGES: rows filled in the table of edges. X_BITS, Y_BITS: bits of DAT's columns and
+rows. FAULT: of the word at which it stopped, or 0; GOT, HAD: its column and row, or its high part
+and the one before.
+"""
+ROOM = 32
+"""Rows that one word may fill."""
+LAST_TURN_US = LATEST_US - (1 << 35)
+"""Time at which no turn may begin any more; the longest turn has 2^34 us."""
+_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8 = 0x0, 0x2, 0x3, 0x4, 0x5
+_TIME_LOW, _TIME_HIGH, _EXT_TRIGGER = 0x6, 0x8, 0xA
+_TILE = 1 << 11
+"""Words of DAT that are decoded together, before one is looked at by itself."""
+_HIGHS_3, _HIGHS_2 = 1 << 12, 1 << 28
+"""Values of the high part before it begins anew: of 4096 us each in EVT 3.0, else of 64 us."""
+
+Decode = Callable[..., tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """An encoding of events.
+
+    Attributes:
+        dtype: of its words, little-endian. decode: see `decode_evt3`.
+        type_bit: the lowest of the four bits with a word's type; None if all words are events.
+        most_px: columns and rows that its words can tell.
+    """
+
+    name: str
+    dtype: str
+    decode: Decode
+    type_bit: int | None
+    most_px: int
+
+    def has_edges(self, words: npt.NDArray[Any]) -> bool:
+        """Return whether one of the words is an edge of a trigger input."""
+        return self.type_bit is not None and bool(_any_edge(words, self.type_bit))
+
+
+@njit(cache=True, nogil=True)
+def _any_edge(words, type_bit):  # type: ignore[no-untyped-def]
+    found = False
+    for i in range(len(words)):
+        found |= np.uint64(words[i]) >> np.uint64(type_bit) == _EXT_TRIGGER
+    return found
+
+
+def new_state(t0_us: int, x_bits: int = 0, y_bits: int = 0) -> I64:
+    """Return the state before the first word; times count from `t0_us`."""
+    state = np.zeros(12, np.int64)
+    state[[NOW, HIGH_US, HIGH, X_BITS, Y_BITS]] = t0_us, t0_us, -1, x_bits, y_bits
+    return state
+
+
+@njit(cache=True, nogil=True)
+def _turned(value, high, high_us, highs, unit_us):  # type: ignore[no-untyped-def]
+    """Return the time of a new high part, us, or a fault as a negative number.
+
+    It begins anew if it falls by half of its range or more. A step ahead by nearly all of it is a
+    fall, too, over the place where it begins anew.
+
+    Args:
+        high, high_us: the one before, -1 if there is none, and its time.
+        highs: values of it; unit_us: of one.
+    """
+    if high < 0:
+        return high_us + value * unit_us
+    step = value - high
+    if step <= -highs // 2:
+        step += highs
+        if high_us >= LAST_TURN_US:
+            return -LATE
+    if not 0 <= step < highs - 2:
+        return -FELL
+    return high_us + step * unit_us
+
+
+@njit(cache=True, nogil=True)
+def _last_bit(valid):  # type: ignore[no-untyped-def]
+    """Return the number of the highest bit that is set; there is one."""
+    bit = 0
+    while valid >> (bit + 1):
+        bit += 1
+    return bit
+
+
+@njit(cache=True, nogil=True)
+def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+    """Decode 16-bit words, which say what changed: time, row, and columns alone or as vectors.
+
+    A vector stands at the last base, which it moves on; a single event leaves that alone.
+
+    Args:
+        words: shape (n,). at: index of the first to decode.
+        filled: rows that the columns hold already.
+        state: see `new_state`. width, height: of the camera, pixels.
+        x, y, p, t: columns of events to fill; t in us. edges: time (us), input, and 1 for a rising
+            edge, shape (m, 3).
+
+    Returns:
+        Index of the first word not decoded, and rows filled. It stops at a fault, and where less
+        than `ROOM` rows or no row of edges is left.
+    """
+    now, high_us, high = state[NOW], state[HIGH_US], state[HIGH]
+    row, base, on, edge = state[ROW], state[BASE], state[ON], state[EDGES]
+    fault = 0
+    while at < len(words) and filled <= len(t) - ROOM and edge < len(edges):
+        word = np.int64(words[np.uintp(at)])
+        kind, value = word >> 12, word & 0xFFF
+        if kind == _ADDR_X:
+            column = value & 0x7FF
+            if high >= 0:
+                if column >= width or row >= height:
+                    fault, state[GOT], state[HAD] = OUTSIDE, column, row
+                    break
+                to = np.uintp(filled)
+                x[to], y[to], p[to], t[to] = column, row, value >> 11, now
+                filled += 1
+        elif kind == _ADDR_Y:
+            row = value & 0x7FF
+        elif kind == _TIME_LOW:
+            if high >= 0:
+                now = max(now, high_us + value)
+        elif kind in (_VECT_12, _VECT_8):
+            size = 12 if kind == _VECT_12 else 8
+            valid = value & ((1 << size) - 1)
+            if valid and high >= 0:
+                last = _last_bit(valid)
+                if base + last >= width or row >= height:
+                    fault, state[GOT], state[HAD] = OUTSIDE, base + last, row
+                    break
+                for bit in range(last + 1):  # without a branch: bits are hard to foresee
+                    to = np.uintp(filled)
+                    x[to], y[to], p[to], t[to] = base + bit, row, on, now
+                    filled += valid >> bit & 1
+            base += size
+        elif kind == _BASE_X:
+            base, on = value & 0x7FF, value >> 11
+        elif kind == _TIME_HIGH:
+            if value != high:
+                found = _turned(value, high, high_us, _HIGHS_3, 4096)
+                if found < 0:
+                    fault, state[GOT], state[HAD] = -found, value, high
+                    break
+                high, high_us = value, found
+                now = max(now, high_us)
+        elif kind == _EXT_TRIGGER and high >= 0:
+            edges[edge, 0], edges[edge, 1], edges[edge, 2] = now, value >> 8, value & 1
+            edge += 1
+        at += 1
+    state[NOW], state[HIGH_US], state[HIGH] = now, high_us, high
+    state[ROW], state[BASE], state[ON], state[EDGES] = row, base, on, edge
+    state[FAULT] = fault
+    return at, filled
+
+
+@njit(cache=True, nogil=True)
+def decode_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+    """Decode 32-bit words, each with a pixel and 6 bits of time; otherwise as `decode_evt3`."""
+    now, high_us, high, edge = state[NOW], state[HIGH_US], state[HIGH], state[EDGES]
+    fault = 0
+    while at < len(words) and filled <= len(t) - ROOM and edge < len(edges):
+        word = np.int64(words[np.uintp(at)])
+        kind, value = word >> 28, word & (_HIGHS_2 - 1)
+        if kind <= 1:
+            if high >= 0:
+                column, row = value >> 11 & 0x7FF, value & 0x7FF
+                if column >= width or row >= height:
+                    fault, state[GOT], state[HAD] = OUTSIDE, column, row
+                    break
+                now = max(now, high_us + (value >> 22))
+                to = np.uintp(filled)
+                x[to], y[to], p[to], t[to] = column, row, kind, now
+                filled += 1
+        elif kind == _TIME_HIGH:
+            found = _turned(value, high, high_us, _HIGHS_2, 64)
+            if found < 0:
+                fault, state[GOT], state[HAD] = -found, value, high
+                break
+            high, high_us = value, found
+        elif kind == _EXT_TRIGGER and high >= 0:
+            now = max(now, high_us + (value >> 22))
+            edges[edge, 0], edges[edge, 1], edges[edge, 2] = now, value >> 8 & 0x1F, value & 1
+            edge += 1
+        at += 1
+    state[NOW], state[HIGH_US], state[HIGH], state[EDGES] = now, high_us, high, edge
+    state[FAULT] = fault
+    return at, filled
+
+
+@njit(cache=True, nogil=True)
+def decode_evt21(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+    """Decode 64-bit words: one of EVT 2.0, and 32 bits that say which pixels from its column on."""
+    now, high_us, high, edge = state[NOW], state[HIGH_US], state[HIGH], state[EDGES]
+    fault = 0
+    while at < len(words) and filled <= len(t) - ROOM and edge < len(edges):
+        word = np.int64(words[np.uintp(at)] >> np.uint64(32))
+        valid = np.int64(words[np.uintp(at)] & np.uint64(0xFFFFFFFF))
+        kind, value = word >> 28, word & (_HIGHS_2 - 1)
+        if kind == _TIME_HIGH:
+            found = _turned(value, high, high_us, _HIGHS_2, 64)
+            if found < 0:
+                fault, state[GOT], state[HAD] = -found, value, high
+                break
+            high, high_us = value, found
+        elif kind <= 1 and valid and high >= 0:
+            base, row, last = value >> 11 & 0x7FF, value & 0x7FF, _last_bit(valid)
+            if base + last >= width or row >= height:
+                fault, state[GOT], state[HAD] = OUTSIDE, base + last, row
+                break
+            now = max(now, high_us + (value >> 22))
+            for bit in range(last + 1):
+                to = np.uintp(filled)
+                x[to], y[to], p[to], t[to] = base + bit, row, kind, now
+                filled += valid >> bit & 1
+        elif kind == _EXT_TRIGGER and high >= 0:
+            now = max(now, high_us + (value >> 22))
+            edges[edge, 0], edges[edge, 1], edges[edge, 2] = now, value >> 8 & 0x1F, value & 1
+            edge += 1
+        at += 1
+    state[NOW], state[HIGH_US], state[HIGH], state[EDGES] = now, high_us, high, edge
+    state[FAULT] = fault
+    return at, filled
+
+
+@njit(cache=True, nogil=True)
+def decode_dat(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+    """Decode 64-bit words: 32 bits of time, column, row, and 4 bits above, 0 of an OFF event.
+
+    A time that falls by more than half of its range has begun anew.
+    """
+    x_bits, y_bits = state[X_BITS], state[Y_BITS]
+    state[FAULT] = 0
+    while at < len(words) and filled < len(t):
+        count = min(_TILE, len(words) - at, len(t) - filled)
+        part = words[at : at + count]
+        xs, ys = x[filled : filled + count], y[filled : filled + count]
+        ps, ts = p[filled : filled + count], t[filled : filled + count]
+        most_x, most_y = _split_places(part, x_bits, y_bits, xs, ys)
+        falls = _split_times(part, x_bits + y_bits, state[HIGH_US], ps, ts)
+        done = count
+        if falls or ts[0] < state[NOW] or most_x >= width or most_y >= height:
+            done = _mend(xs, ys, ts, state, width, height)
+        if done:
+            state[NOW] = ts[done - 1]
+        at += done
+        filled += done
+        if state[FAULT]:
+            break
+    return at, filled
+
+
+@njit(cache=True, nogil=True)
+def _split_places(words, x_bits, y_bits, x, y):  # type: ignore[no-untyped-def]
+    """Fill columns and rows, without a branch in the loop; return the largest of each."""
+    most_x = most_y = np.uint16(0)
+    for i in range(len(words)):
+        x[i] = column = np.uint16(words[i] >> np.uint64(32) & np.uint64((1 << x_bits) - 1))
+        y[i] = row = np.uint16(words[i] >> np.uint64(32 + x_bits) & np.uint64((1 << y_bits) - 1))
+        most_x, most_y = max(most_x, column), max(most_y, row)
+    return most_x, most_y
+
+
+@njit(cache=True, nogil=True)
+def _split_times(words, place_bits, turns_us, p, t):  # type: ignore[no-untyped-def]
+    """Fill polarities and times, the latter after `turns_us`; return whether a time falls."""
+    for i in range(len(words)):
+        p[i] = words[i] >> np.uint64(32 + place_bits) & np.uint64(0xF) != 0
+        t[i] = turns_us + np.int64(words[i] & np.uint64(0xFFFFFFFF))
+    falls = False
+    for i in range(1, len(words)):
+        falls |= t[i] < t[i - 1]
+    return falls
+
+
+@njit(cache=True, nogil=True)
+def _mend(x, y, t, state, width, height):  # type: ignore[no-untyped-def]
+    """Raise times that fall, count turns of the clock, and stop at a fault; return rows before."""
+    now, turned_us = state[NOW], 0
+    for i in range(len(t)):
+        if x[i] >= width or y[i] >= height:
+            state[FAULT], state[GOT], state[HAD] = OUTSIDE, x[i], y[i]
+            return i
+        if now - (t[i] + turned_us) > 1 << 31:
+            if state[HIGH_US] >= LAST_TURN_US:
+                state[FAULT] = LATE
+                return i
+            turned_us += 1 << 32
+            state[HIGH_US] += 1 << 32
+        t[i] = now = max(now, t[i] + turned_us)
+    return len(t)
+
+
+EVT2 = Encoding("EVT 2.0", "<u4", decode_evt2, 28, 1 << 11)
+EVT21 = Encoding("EVT 2.1", "<u8", decode_evt21, 60, 1 << 11)
+EVT3 = Encoding("EVT 3.0", "<u2", decode_evt3, 12, 1 << 11)
+DAT = Encoding("DAT", "<u8", decode_dat, None, 1 << 14)
