@@ -41,7 +41,7 @@ LAST_TURN_US = LATEST_US - (1 << 35)
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8 = 0x0, 0x2, 0x3, 0x4, 0x5
 _TIME_LOW, _TIME_HIGH, _EXT_TRIGGER = 0x6, 0x8, 0xA
 _TILE = 1 << 11
-"""Words of DAT that are decoded together, before one is looked at by itself."""
+"""Words of EVT 2.0 and DAT that are decoded together, and singly if one is out of the ordinary."""
 _HIGHS_3, _HIGHS_2 = 1 << 12, 1 << 28
 """Values of the high part before it begins anew: of 4096 us each in EVT 3.0, else of 64 us."""
 
@@ -189,6 +189,60 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
 @njit(cache=True, nogil=True)
 def decode_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
     """Decode 32-bit words, each with a pixel and 6 bits of time; otherwise as `decode_evt3`."""
+    state[FAULT] = 0
+    while at < len(words) and filled <= len(t) - ROOM and state[EDGES] < len(edges):
+        end = at + min(_TILE, len(words) - at, len(t) - filled)
+        count = _plain_evt2(
+            words[at:end], state, width, height, x[filled:], y[filled:], p[filled:], t[filled:]
+        )
+        if count >= 0:
+            at, filled = end, filled + count
+            continue
+        at, filled = _each_evt2(words[:end], at, filled, state, width, height, x, y, p, t, edges)
+        if state[FAULT]:
+            break
+    return at, filled
+
+
+@njit(cache=True, nogil=True)
+def _plain_evt2(words, state, width, height, x, y, p, t):  # type: ignore[no-untyped-def]
+    """Decode events and high parts, without a branch: which comes next is hard to foresee.
+
+    Returns:
+        Rows filled; -1, and the state as it was, where a word is of another kind or a fault, a time
+        falls or the clock begins anew.
+    """
+    high_us, high = state[HIGH_US], state[HIGH]
+    odd = high < 0
+    filled: Any = 0
+    for i in range(len(words)):
+        word = np.int64(words[i])
+        kind, value = word >> 28, word & (_HIGHS_2 - 1)
+        seen = kind <= 1
+        step = value - high
+        odd |= (not seen) & ((kind != _TIME_HIGH) | (step < 0) | (step >= _HIGHS_2 - 2))
+        high_us = high_us if seen else high_us + (step << 6)
+        high = high if seen else value
+        to = np.uintp(filled)
+        x[to], y[to], p[to] = value >> 11 & 0x7FF, value & 0x7FF, kind
+        t[to] = high_us + (value >> 22)
+        filled += seen
+    most_x = most_y = np.uint16(0)
+    for i in range(filled):
+        most_x, most_y = max(most_x, x[i]), max(most_y, y[i])
+    for i in range(1, filled):
+        odd |= t[i] < t[i - 1]
+    if odd or most_x >= width or most_y >= height or (filled and t[0] < state[NOW]):
+        return -1
+    state[HIGH_US], state[HIGH] = high_us, high
+    if filled:
+        state[NOW] = t[filled - 1]
+    return filled
+
+
+@njit(cache=True, nogil=True)
+def _each_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+    """Decode words of EVT 2.0 of any kind, one by one."""
     now, high_us, high, edge = state[NOW], state[HIGH_US], state[HIGH], state[EDGES]
     fault = 0
     while at < len(words) and filled <= len(t) - ROOM and edge < len(edges):

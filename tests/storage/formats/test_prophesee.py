@@ -522,6 +522,29 @@ def test_files_that_faery_writes(tmp_path: Path, form: str, version: str) -> Non
     assert found == [tuple(row) for row in rows.tolist()]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_out_of_the_ordinary_in_a_long_file(tmp_path: Path, seed: int) -> None:
+    """Words that are decoded together, with a fall, a turn of the clock or an edge in some."""
+    rng = np.random.default_rng(seed)
+    count = 30_000
+    t = (1 << 32) - 100_000 + np.cumsum(rng.integers(0, 9, count))
+    t[rng.integers(0, count, 5)] -= 50
+    x, y, p = rng.integers(0, 640, count), rng.integers(0, 480, count), rng.integers(0, 2, count)
+    path = write(tmp_path, "dat", dat(*zip(*(c.tolist() for c in (t, x, y, p)), strict=True)))
+    assert events(path) == by_faery(path, "dat")
+    words, last = [], -1
+    for time, column, row, on in zip(*(c.tolist() for c in (np.sort(t), x, y, p)), strict=True):
+        if time >> 6 != last:
+            last = time >> 6
+            words.append(high(last % (1 << 28)))
+        words.append(cd(on, time & 63, column, row))
+    words[rng.integers(9_000)] = TRIGGER << 28 | 1
+    words[20_000:20_000] = [high((1 << 28) - 1), high(0), cd(1, 5, 3, 4), cd(1, 4, 3, 4)]
+    words[20_004:] = [word if word >> 28 != HIGH else high(7) for word in words[20_004:]]
+    path = write(tmp_path, "evt2", evt2(*words))
+    assert events(path) == by_faery(path, "evt2")
+
+
 def test_a_pause_longer_than_the_clock_as_faery_writes_it(tmp_path: Path) -> None:
     """faery writes it so that its own reader does not see the clock begin anew."""
     rows: Any = np.zeros(2, faery.EVENTS_DTYPE)
