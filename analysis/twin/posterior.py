@@ -11,6 +11,7 @@ al. 2005; Lei et al. 2018): a poor one only makes it wide.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,9 +64,7 @@ class Bank:
         k, p, q = len(self.theta), len(self.parameters), len(self.statistics)
         shapes = (self.theta.shape, self.s.shape, self.lower.shape, self.upper.shape)
         if shapes != ((k, p), (k, q), (p,), (p,)):
-            raise ValueError(
-                f"a bank's shapes {shapes} are not those of {p} parameters, {q} statistics"
-            )
+            raise ValueError(f"a bank of {p} parameters and {q} statistics has arrays {shapes}")
         if not (self.lower < self.upper).all():
             raise ValueError("a lower bound of the bank's prior is not below its upper bound")
         slack = 1e-9 * (self.upper - self.lower)
@@ -225,7 +224,8 @@ class Fitted:
     def _estimate(self, j: int, low: float, median: float, high: float, sd: float) -> Estimate:
         lower, upper = float(self.prior_lower[j]), float(self.prior_upper[j])
         tail = _LEVELS[0] * (upper - lower)
-        left = float(high - low) / (upper - lower - 2.0 * tail)
+        # where little is learned, the chance of the bank may make it wider than the prior's
+        left = min(float(high - low) / (upper - lower - 2.0 * tail), 1.0)
         carriers: tuple[tuple[str, float], ...] = ()
         if self.skilled[j]:
             power = self.regression.weights[:, j] ** 2
@@ -257,10 +257,9 @@ def fitted(bank: Bank, usable: Bools | None = None, prior: tuple[F64, F64] | Non
         used &= usable
     centre, scale = centre[used], scale[used]
     x, y = _standard(bank.s[:, used], centre, scale), bank.unit(bank.theta)
-    fold = np.arange(len(bank)) % _FOLDS
     predicted = np.empty_like(y)
-    for part in range(_FOLDS):
-        predicted[fold == part] = regression(x[fold != part], y[fold != part])(x[fold == part])
+    for own in _folds(len(bank)):
+        predicted[own] = regression(x[~own], y[~own])(x[own])
     skilled = ((y - predicted) ** 2).mean(axis=0) < (1.0 - _NOTHING) * y.var(axis=0)
     predicted = np.where(skilled, predicted, y.mean(axis=0))
     errors = y - predicted
@@ -326,7 +325,10 @@ def _scales(s: F64) -> tuple[F64, F64, Bools]:
     enough = np.isfinite(s).mean(axis=0) >= _SEEN
     filled = np.where(enough, finite, 0.0)
     lower, centre, upper = np.nanpercentile(filled, [25, 50, 75], axis=0)
-    deviation = np.nanstd(filled, axis=0)
+    # most values of a count may be the same: then the spread of the others counts
+    reach = np.nanmax(np.abs(filled - centre), axis=0)
+    part = np.where(reach > 0.0, reach, 1.0)
+    deviation = part * np.nanstd((filled - centre) / part, axis=0)
     scale = (upper - lower) / 1.349
     scale = np.where(scale > 1e-9 * deviation, scale, deviation)
     return centre, scale, enough & (scale > 1e-12 * np.maximum(1.0, np.abs(centre)))
@@ -342,9 +344,19 @@ def _spread(predicted: F64, errors: F64, skilled: Bools) -> _Spread:
     """Fit the size of errors (k, p) to what was predicted (k, p)."""
     # an error near 0 has no logarithm worth fitting
     size = np.log(np.abs(errors) + np.maximum(0.02 * errors.std(axis=0), 1e-9))
-    weights, constant = sparse_weights(_terms(predicted[:, skilled]), size)
-    at_worlds = np.exp(_terms(predicted[:, skilled]) @ weights + constant)
-    return _Spread(weights, constant, skilled, at_worlds)
+    terms = _terms(predicted[:, skilled])
+    # a world must not have part in the size that its own error is compared with
+    logarithms = np.empty_like(size)
+    for own in _folds(len(errors)):
+        weights, constant = sparse_weights(terms[~own], size[~own])
+        logarithms[own] = terms[own] @ weights + constant
+    return _Spread(*sparse_weights(terms, size), skilled, np.exp(logarithms))
+
+
+def _folds(k: int) -> Iterator[Bools]:
+    """Yield the worlds of each part of a bank, (k,)."""
+    for part in range(_FOLDS):
+        yield np.arange(k) % _FOLDS == part
 
 
 def _terms(unit: F64) -> F64:

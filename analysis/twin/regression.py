@@ -14,9 +14,9 @@ import numpy as np
 
 from sliplab.storage.streams import F64, I64
 
-MOST = 60
+MOST = 120
 """Statistics that one parameter is regressed on, those most correlated with it."""
-ROUNDS = 25
+ROUNDS = 12
 """Of the re-estimation of variances: more change predictions by less than they err."""
 _LEAST_NOISE = 1e-6
 """Smallest share of a parameter's variance that is taken for noise, so that copies of an exact
