@@ -63,6 +63,9 @@ SHORT_S = 0.1
 CLEAR = 0.75
 """Pixels so far from all discs at rest see none in a slide either; of the least distance between
 two discs."""
+FIRST_REACH, REACH = 1.8, 1.3
+"""Events of a disc are looked for up to here, in radii: from where it was at rest, and from its
+way."""
 FALSE_HOT = 0.01
 """Pixels that are called hot and are not, on average."""
 SCANNED, SCANNED_EVENTS = 3, 20_000
@@ -78,14 +81,14 @@ _FEWEST_FULL = 200
 def camera_estimates(trials: Sequence[PilotTrial]) -> dict[str, float]:
     """Return estimates by name, see `NAMES`; NaN for those that cannot be had.
 
-    Trials without an event camera, or with another one, are left out.
+    Trials without an event camera, or of another camera or skin than the first, are left out.
     """
     found = dict.fromkeys(NAMES, np.nan)
     seen = [trial for trial in trials if trial.camera is not None and len(trial.camera.events)]
     if not seen:
         return found
-    size_px = _size(seen[0])
-    seen = [trial for trial in seen if _size(trial) == size_px]
+    size_px, markers = _size(seen[0]), seen[0].tips_mm.shape[1]
+    seen = [t for t in seen if _size(t) == size_px and t.tips_mm.shape[1] == markers]
     rests = _rests(seen, size_px)
     noise = _noise(seen, rests, size_px)
     found.update(noise_hz=noise.rate_hz, leak_share=noise.leak_share)
@@ -110,16 +113,9 @@ def _events(trial: PilotTrial, begin_s: float, end_s: float) -> EventChunk:
     return EventChunk(events.x[part], events.y[part], events.p[part], events.t_us[part])
 
 
-def _way_mm(trial: PilotTrial) -> F64:
-    """Way of the sensor at each frame, 0 before the slide, (n,)."""
-    way: F64 = np.hypot(trial.base_mm[:, 0], trial.base_mm[:, 1])
-    return np.where(trial.frame_s > 0.0, way, 0.0)
-
-
 def _moved_s(trial: PilotTrial, way_mm: float) -> float:
     """Time at which the sensor has gone a way; the end of the slide if it never does."""
-    beyond = np.flatnonzero(_way_mm(trial) >= way_mm)
-    return float(trial.frame_s[beyond[0]]) if len(beyond) else trial.slide_s
+    return min(way_mm / trial.slide.speed_mm_s, trial.slide_s)
 
 
 def _tips(trial: PilotTrial) -> F64:
@@ -192,22 +188,23 @@ def _noise(trials: Sequence[PilotTrial], rests: F64 | None, size_px: tuple[int, 
         hold_s, slide_s = hold_s - min(trial.hold_s, 0.0), slide_s + trial.slide_s
     seen_s = np.where(clear, hold_s + slide_s, hold_s)
     total = counts.sum(axis=0)
-    quiet = clear if clear.any() else np.ones_like(clear)
-    # those that are hot count little at first, and not at all from then on
+    quiet = (clear if clear.any() else np.ones_like(clear)) & (seen_s > 0.0)
+    if not quiet.any():
+        return _Noise(np.nan, np.nan, np.zeros_like(clear), np.nan)
+    # those that are hot count a little at first, and not at all from then on
     for _ in range(10):
-        off, on = counts[:, quiet].sum(axis=1) / seen_s[quiet].sum() if hold_s + slide_s else (0, 0)
+        off, on = (counts[:, quiet].sum(axis=1) / seen_s[quiet].sum()).tolist()
         most = poisson.isf(
             FALSE_HOT / total.size, (on + off) * np.array([hold_s, hold_s + slide_s])
         )
         # a pixel near a rim may fire once in each hold, as its disc creeps
-        hot = total > np.where(clear, most[1], most[0] + len(trials))
+        hot = (total > np.where(clear, most[1], most[0] + len(trials))) & (seen_s > 0.0)
         if not (quiet & hot).any():
             break
         quiet &= ~hot
-    hot &= seen_s > 0.0
     hot_hz = total[hot].sum() / seen_s[hot].sum() if hot.any() else np.nan
     share = (on - off) / (on + off) if on + off > 0.0 else np.nan
-    return _Noise(float(on + off), float(share), hot, float(hot_hz))
+    return _Noise(on + off, share, hot, float(hot_hz))
 
 
 @njit(cache=True, nogil=True)
@@ -276,8 +273,7 @@ def _rates(trials: Sequence[PilotTrial]) -> dict[str, float]:
         events = _events(trial, trial.hold_s, 0.0)
         hold, hold_s = hold + int((events.p > 0).sum()), hold_s - min(trial.hold_s, 0.0)
         begun = _events(trial, 0.0, _moved_s(trial, PHASE_MM))
-        whole = float(_way_mm(trial).max(initial=0.0))
-        ended = _events(trial, _moved_s(trial, whole - PHASE_MM), trial.slide_s)
+        ended = _events(trial, trial.slide_s - _moved_s(trial, PHASE_MM), trial.slide_s)
         first, last = first + int((begun.p > 0).sum()), last + int((ended.p > 0).sum())
         if len(begun) > 1:
             gaps.append(float(np.mean(np.diff(begun.t_us)) * trial.slide.speed_mm_s))
@@ -318,9 +314,11 @@ def _discs(
     for k in (RIGHT, DOWN):
         discs[..., k] = np.where(np.isnan(discs[..., k]), np.array(starts)[..., k], discs[..., k])
     return {
-        "edge_px": edge_px, **_contrast(fits, noise_hz * seen_s, contrast), **_geometry(trials, discs),
+        "edge_px": edge_px,
+        **_contrast(fits, noise_hz * seen_s, contrast),
+        **_geometry(trials, discs),
         **_papillae(trials, discs),
-    }  # fmt: skip
+    }
 
 
 def _counts(trial: PilotTrial, noise: _Noise, size_px: tuple[int, int]) -> NDArray[np.int32]:
@@ -338,13 +336,14 @@ def _counts(trial: PilotTrial, noise: _Noise, size_px: tuple[int, int]) -> NDArr
 def _start(counts: NDArray[np.int32], rests: F64) -> F64:
     """Discs at rest with first guesses of the contrast, and of their displacements by moments."""
     start = rests.copy()
-    apart = float(pdist(rests[:, [COLUMN, ROW]]).min())
-    sums = first_moments(counts, start, 0.6 * apart)
-    # most pixels that fire see nearly all of the contrast
-    contrast = float(sums[:, 0].sum() / max(sums[:, 1].sum(), 1.0)) + 0.5
-    area = contrast * np.pi * start[:, RADIUS] ** 2
-    start[:, [RIGHT, DOWN]] = sums[:, 2:] / area[:, None]
-    start[:, CONTRAST] = max(contrast, 2.0)
+    # where a disc ends up is not known at first, and another one's pixels may be taken for its own
+    for reach in (FIRST_REACH, REACH):
+        sums = first_moments(counts, start, reach)
+        # most pixels that fire see nearly all of the contrast
+        contrast = max(float(sums[:, 0].sum() / max(sums[:, 1].sum(), 1.0)) + 0.5, 2.0)
+        area = contrast * np.pi * start[:, RADIUS] ** 2
+        start[:, [RIGHT, DOWN]] = sums[:, 2:] / area[:, None]
+    start[:, CONTRAST] = contrast
     return start
 
 
@@ -425,9 +424,13 @@ def _geometry(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
         found["image_shift_mm_per_n"] = float(
             shift[measured] @ pulled[measured] / (pulled[measured] @ pulled[measured]) / px_per_mm
         )
-        # together radii are those without force, of as many as are seen, and grow by all of it
+        # together radii are those without force, of as many as are seen, and grow by the force on
+        # these: friction is in proportion to it, and so is how far a disc moves
+        moved = np.hypot(discs[measured][..., RIGHT], discs[measured][..., DOWN])
+        unseen = np.where(seen[measured], 0.0, moved).sum(axis=1)
+        pressed = loads[measured, 0, 2] * (1.0 - unseen / np.maximum(moved.sum(axis=1), 1e-9))
         together = np.nansum(discs[measured][..., RADIUS], axis=1)
-        design = np.column_stack([seen[measured].sum(axis=1), loads[measured, 0, 2]])
+        design = np.column_stack([seen[measured].sum(axis=1), pressed])
         (radius_px, growth_px), _, rank, _ = np.linalg.lstsq(design, together, rcond=1e-6)
         if rank == 2:
             found["marker_radius_mm"] = float(radius_px) / px_per_mm
@@ -446,9 +449,10 @@ def _papillae(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
     radius = deep[..., RADIUS].mean(axis=0)
     moved = np.hypot(deep[..., RIGHT], deep[..., DOWN]).mean(axis=0)
     known = np.isfinite(radius)
-    layout = _tips(trials[0])
-    if known.sum() < 3 or not np.isfinite(layout).all():
+    layouts = [tips for tips in map(_tips, trials) if np.isfinite(tips).all()]
+    if known.sum() < 3 or not layouts:
         return {}
+    layout = layouts[0]
     away = np.hypot(*(layout - layout.mean(axis=0)).T)
     ring = np.rint(away / pdist(layout).min()).astype(np.int64)[known]
     radius, moved = radius[known], moved[known]

@@ -78,30 +78,41 @@ def fit_rims(counts: I32, background: float, start: F64, *, shape: bool) -> RimF
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_moments(counts: Any, discs: Any, reach_px: float) -> Any:
-    """Sums of the counts round each disc: of their squares, sizes, and moments, (m, 4).
+def first_moments(counts: Any, discs: Any, reach: float) -> Any:
+    """Sums of the counts of each disc: of their squares, sizes, and moments, (m, 4).
 
-    Moments are about the centre: columns to the right and rows downwards.
+    A pixel belongs to the disc whose way it is nearest to. Moments are about the centre before the
+    motion, columns to the right and rows downwards.
 
     Args:
-        discs: (m, 8). reach_px: distance from the centre up to which pixels are added.
+        discs: (m, 8), with the ways as far as they are known.
+        reach: in radii; pixels farther from all ways belong to none.
     """
     height, width = counts.shape
     sums = np.zeros((discs.shape[0], 4))
-    for i in range(discs.shape[0]):
-        column, row = discs[i, COLUMN], discs[i, ROW]
-        if not np.isfinite(column + row):
-            continue
-        for y in range(max(int(row - reach_px), 0), min(int(row + reach_px) + 2, height)):
-            for x in range(max(int(column - reach_px), 0), min(int(column + reach_px) + 2, width)):
-                n = counts[y, x]
-                dx, dy = x - column, y - row
-                if n == HIDDEN or n == 0 or dx * dx + dy * dy > reach_px * reach_px:
+    for y in range(height):
+        for x in range(width):
+            n = counts[y, x]
+            if n == 0 or n == HIDDEN:
+                continue
+            nearest, least = -1, np.inf
+            for i in range(discs.shape[0]):
+                dx, dy = x - discs[i, COLUMN], y - discs[i, ROW]
+                far = reach * discs[i, RADIUS]
+                u, v = discs[i, RIGHT], discs[i, DOWN]
+                square = u * u + v * v
+                if dx * dx + dy * dy > 2.0 * (far * far + square):
                     continue
-                sums[i, 0] += n * n
-                sums[i, 1] += abs(n)
-                sums[i, 2] += n * dx
-                sums[i, 3] += n * dy
+                along = min(max((dx * u + dy * v) / square, 0.0), 1.0) if square > 0.0 else 0.0
+                ex, ey = dx - along * u, dy - along * v
+                away = ex * ex + ey * ey
+                if away < least and away < far * far:
+                    nearest, least = i, away
+            if nearest >= 0:
+                sums[nearest, 0] += n * n
+                sums[nearest, 1] += abs(n)
+                sums[nearest, 2] += n * (x - discs[nearest, COLUMN])
+                sums[nearest, 3] += n * (y - discs[nearest, ROW])
     return sums
 
 

@@ -108,13 +108,13 @@ def swept(angle: float, depth: float, rng: np.random.Generator) -> PilotTrial:
     before = level(SIZE, centres(), radius)
     parts = []
     seen = np.zeros(SIZE[::-1], np.int32)
-    for step in range(1, 41):
-        moved = PX_PER_MM * SHIFT * pulled * step / 40 * way * [-1.0, 1.0]
+    for step in range(1, 13):
+        moved = PX_PER_MM * SHIFT * pulled * step / 12 * way * [-1.0, 1.0]
         now = counts(before, level(SIZE, centres() + moved, radius))
         y, x = np.nonzero(now - seen)
         more = (now - seen)[y, x]
         y, x, p = (np.repeat(a, np.abs(more)) for a in (y, x, more > 0))
-        parts.append((rng.uniform(step - 1, step, len(x)) * 5e4, x, y, p))
+        parts.append((rng.uniform(step - 1, step, len(x)) * 2e6 / 12, x, y, p))
         seen = now
     events = EventChunk.joined([chunk(*map(np.concatenate, zip(*parts, strict=True))), noise(rng)])
     made = trial(chunk(events.t_us, events.x, events.y, events.p), depth=depth, angle=angle)
@@ -279,6 +279,19 @@ def test_without_a_hold_noise_comes_from_the_slide() -> None:
     assert found["noise_hz"] == pytest.approx(NOISE_HZ, rel=0.02)
     assert np.isnan(found["hold_events_per_s"])
     assert found["px_per_mm"] == pytest.approx(PX_PER_MM, rel=0.002)
+
+
+def test_discs_that_are_not_found_and_no_hold_leave_nothing_to_measure_noise_by() -> None:
+    made = replace(trial(noise(np.random.default_rng(8))), hold_s=0.0)
+    found = camera_estimates([made])
+    assert np.isnan(
+        [found[name] for name in ("noise_hz", "leak_share", "hot_hz", "px_per_mm")]
+    ).all()
+
+
+def test_a_trial_of_another_camera_is_left_out() -> None:
+    other = trial(noise(np.random.default_rng(9), size=(346, 260)), (346, 260))
+    assert camera_estimates([*pilot()[:2], other]) == camera_estimates(pilot()[:2])
 
 
 def test_noise_alone_is_measured_in_the_hold() -> None:
