@@ -65,6 +65,7 @@ def simulate_pilot(
     assert size is not None
     rate_hz = plan.protocol.collection.recording.sync_rate
     built = build_rig(tracked)
+    built.force_poll_s = built.poll_s
     found = []
     try:
         built.connect()

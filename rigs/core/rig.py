@@ -127,6 +127,9 @@ class Rig:
     """The event camera while it is recorded."""
     _reading: tuple[FurtherStream, ...] = field(default=(), init=False)
     """The further devices while they are recorded."""
+    force_poll_s: float = field(default=force_watch.POLL_S, init=False)
+    """Interval at which forces are read and held against their limit, s. Runs in memory, where nothing
+    can break, need not look so often."""
     _forces: ForceWatch | None = field(default=None, init=False)
     """Forces while they are watched, whether or not they are recorded."""
     _reported: str = field(default="", init=False)
@@ -500,7 +503,7 @@ class Rig:
             return
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
-            self.clock.wait(min(force_watch.POLL_S, left / 1e9))
+            self.clock.wait(min(self.force_poll_s, left / 1e9))
             forces = self._forces.read()
             if sink is not None:
                 sink.add_stream(FORCE, forces)
