@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import least_squares, minimize_scalar
+from scipy.signal import lfilter
 
 from sliplab.analysis.twin.contact_slips import (
     AFTER_S,
@@ -24,6 +26,8 @@ from sliplab.analysis.twin.contact_slips import (
 from sliplab.analysis.twin.contact_springs import Fit, Guess, Lags, fit_springs
 from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.storage.streams import F64, I64
+
+C128 = npt.NDArray[np.complex128]
 
 NOT_LOGGED = ("depth_zero_mm", "static_drop", "static_drop_per_speed", "ratio_per_speed")
 """Estimates that may be negative; all others are positive, and their logarithm is taken."""
@@ -38,6 +42,8 @@ PATH_STEP_MM = 0.1
 BAND_HZ = (2.2, 10.0)
 """Where an arm's tremor is looked for: friction along a path varies more slowly."""
 TONES = 4
+STRENGTHENING, WEAK_MM_S = 0.01, 0.1
+"""Friction at the speed w is taken to grow by 0.01 ln(1 + w / 0.1 mm/s)."""
 SAME_HZ = 0.07
 """Tones that are closer are one: slides take a dozen seconds."""
 
@@ -83,26 +89,24 @@ def contact_estimates(trials: Sequence[PilotTrial], guess: Guess | None = None) 
     """
     guess = guess or Guess()
     slips = find_slips(trials)
-    found: dict[str, float] = {}
     if slips is None:
-        return found
+        return {}
     ring, place = rings_of(slips)
-    growth = fit_growth(slips)
-    table = steady_lags(slips, growth or Growth())
-    found |= {
+    fitted = fit_growth(slips)
+    growth = fitted or Growth()
+    table = steady_lags(slips, growth)
+    lags = lags_of(slips, ring, table, growth)
+    return {
         "position_scatter_mm": place_scatter(ring, place),
-        "relaxation_maxwell": growth.maxwell if growth else np.nan,
-        "relaxation_s": growth.relaxation_s if growth else np.nan,
-        "static_drop": growth.drop if growth else np.nan,
-        "static_drop_per_speed": growth.drop_per_speed if growth else np.nan,
+        "relaxation_maxwell": fitted.maxwell if fitted else np.nan,
+        "relaxation_s": fitted.relaxation_s if fitted else np.nan,
+        "static_drop": fitted.drop if fitted else np.nan,
+        "static_drop_per_speed": fitted.drop_per_speed if fitted else np.nan,
+        **path_estimates(slips, growth, table),
+        **force_estimates(slips, lags),
+        **spring_estimates(fit_springs(lags, guess), ring),
+        **tremor_estimates(slips),
     }
-    found |= path_estimates(slips, growth or Growth(), table)
-    forces = force_estimates(slips, growth or Growth())
-    found |= forces
-    fit = fit_springs(lags_of(slips, ring, table, growth or Growth()), guess)
-    found |= spring_estimates(fit, ring)
-    found |= tremor_estimates(slips)
-    return found
 
 
 # -- rest places -------------------------------------------------------------------------------
@@ -260,8 +264,11 @@ def lags_of(slips: Slips, ring: I64, table: SteadyLags, growth: Growth) -> Lags:
         independent = np.maximum(total[known] / (1.8 * CORRELATION_MM), 1.0)
         error[level, known] = np.hypot(1.2 * VARIATION * mean / np.sqrt(independent), 4e-3)
         normal[level], stiffness[level] = mean_seen(held[these]), mean_seen(slope[these])
-    ratio = float(mean_seen(gross_ratios(slips)))
-    return Lags(levels, ring, lag, error, normal, ratio, stiffness)
+    gross = gross_forces(slips)
+    ratio = float(mean_seen(gross[:, 0] / gross[:, 1]))
+    kept = np.array([mean_seen((gross[:, 1] / held)[which == k]) for k in range(len(levels))])
+    pull = ring_stiffness(slips, ring, growth)
+    return Lags(levels, ring, lag, error, normal, ratio, kept, stiffness, pull)
 
 
 def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:
@@ -350,7 +357,11 @@ def tremor_estimates(slips: Slips) -> dict[str, float]:
         series = [common_lag(slips, i) for i in np.flatnonzero(axis == side)]
         known = [one for one in series if one is not None]
         if len(known) >= 3:
-            found.append(_tones(known))
+            tones, amplitude = _tones([(t, lag) for t, lag, _ in known])
+            followed = np.array([follows for *_, follows in known])[:, None]
+            turning = 2 * np.pi * tones * followed * STRENGTHENING
+            averaged = np.sinc(tones * np.median(np.diff(known[0][0])))
+            found.append((tones, amplitude * np.hypot(1.0, turning) / averaged))
     along: list[float] = []
     power = weighted = 0.0
     for number, (tones, amplitude) in enumerate(found):
@@ -375,10 +386,13 @@ def _largest(values: Sequence[float]) -> float:
     return float(np.mean(np.sort(values)[-2:])) if len(values) else float("nan")
 
 
-def common_lag(slips: Slips, i: int) -> tuple[F64, F64] | None:
-    """Return times and mean lag of the tips that slide early in a slide, 25 a second, mm.
+def common_lag(slips: Slips, i: int) -> tuple[F64, F64, float] | None:
+    """Return times and mean lag of the tips that slide early in a slide, 25 a second, mm; and the
+    mean lag over the speed, s.
 
-    Small lags count more: friction of the tip itself has less part in them.
+    Small lags count more: friction of the tip itself has less part in them. Friction that rises
+    with speed, d mu / mu = s dw / (w + weak), keeps a tip with the lag l from following the tremor:
+    it follows by 1 / (1 + i omega s l / (w + weak)).
     """
     t, lag = slips.frame_s[i], slips.lag_mm[i]
     begins = np.sort(slips.slipped_s[i][np.isfinite(slips.slipped_s[i])])
@@ -393,14 +407,15 @@ def common_lag(slips: Slips, i: int) -> tuple[F64, F64] | None:
     seen = lag[rows][:four][:, use]
     weight = 1.0 / np.maximum(np.abs(seen.mean(axis=0)), LEAST_STRETCH_MM) ** 2
     common = (seen @ weight / weight.sum()).reshape(-1, 4).mean(axis=1)
-    return t[rows][:four].reshape(-1, 4).mean(axis=1), common
+    behind = float(np.mean(common)) / (slips.speed_mm_s[i] + WEAK_MM_S)
+    return t[rows][:four].reshape(-1, 4).mean(axis=1), common, behind
 
 
 def _tones(series: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
     """Return the frequencies of the tones that series have in common, and their amplitudes in each:
     (TONES,) and (len(series), TONES)."""
     grid = np.arange(*BAND_HZ, 0.03)
-    waves = [np.exp(-2j * np.pi * grid[:, None] * t) for t, _ in series]
+    waves = [_waves(t, grid) for t, _ in series]
     trends = [_legendre(t) for t, _ in series]
     tones: list[float] = []
     rest = [_without(values, trend)[0] for (_, values), trend in zip(series, trends, strict=True)]
@@ -415,6 +430,15 @@ def _tones(series: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
             pair = best[trend.shape[1] :].reshape(2, number + 1)
             amplitude[row, : number + 1] = np.hypot(*pair)
     return np.array(tones), amplitude
+
+
+def _waves(t_s: F64, grid_hz: F64) -> C128:
+    """exp(-2 pi i f t) on an even grid of frequencies, (len(grid), n): each from the one before."""
+    step = np.exp(-2j * np.pi * (grid_hz[1] - grid_hz[0]) * t_s)
+    rows = np.tile(step, (len(grid_hz), 1))
+    rows[0] = np.exp(-2j * np.pi * grid_hz[0] * t_s)
+    result: C128 = np.multiply.accumulate(rows, axis=0)
+    return result
 
 
 def _legendre(t_s: F64) -> F64:
@@ -463,9 +487,9 @@ def initial_slopes(slips: Slips, growth: Growth) -> F64:
     return result
 
 
-def gross_ratios(slips: Slips) -> F64:
-    """Tangential over normal force in gross slip, (k,); NaN without forces or without gross slip."""
-    result = np.full(len(slips.trials), np.nan)
+def gross_forces(slips: Slips) -> F64:
+    """Force along the slide and normal force in gross slip, N, (k, 2); NaN where there is none."""
+    result = np.full((len(slips.trials), 2), np.nan)
     for i, trial in enumerate(slips.trials):
         stuck = ~np.isfinite(slips.slipped_s[i]) & np.isfinite(slips.path_mm[i]).any(axis=0)
         if trial.forces is None or stuck.any() or not slips.slid[i].any():
@@ -475,28 +499,74 @@ def gross_ratios(slips: Slips) -> F64:
         rows = (t >= begin) & (t <= trial.slide_s)
         if rows.sum() < 50:
             continue
-        force = trial.forces.force_n[rows].mean(axis=0)
-        result[i] = float(force[:2] @ slips.way[i] / force[2]) if force[2] > 0.0 else np.nan
+        x, y, normal = trial.forces.force_n[rows].mean(axis=0)
+        if normal > 0.0:
+            result[i] = slips.way[i] @ [x, y], normal
     return result
 
 
-def force_estimates(slips: Slips, growth: Growth) -> dict[str, float]:
-    """Return estimates from the forces alone; NaN without a force sensor."""
-    ratio = gross_ratios(slips)
+def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
+    """Force over lag of each ring's tips at each depth, N/mm, (levels, rings); NaN where not known.
+
+    Stuck or sliding, a tip pulls with its spring, and its lag is seen: the measured force along
+    the slide is a sum of the rings' lags, with their stiffnesses as factors. What relaxes is
+    counted in as a lag of its own, q' = -q / tau + m lag'.
+    """
     levels, which = slips.depths
-    normal = np.array([normal_at_rest(trial) for trial in slips.trials])
-    slope = initial_slopes(slips, growth)
-    deepest = which == len(levels) - 1
+    rings = np.arange(ring.max(initial=0) + 1)
+    result = np.full((len(levels), len(rings)), np.nan)
+    square = np.zeros((len(levels), len(rings), len(rings)))
+    product = np.zeros((len(levels), len(rings)))
+    for i, trial in enumerate(slips.trials):
+        t = slips.frame_s[i]
+        if trial.forces is None or len(t) < 10:
+            continue
+        lag = np.column_stack([_filled(t, column) for column in slips.lag_mm[i].T])
+        step = (t[-1] - t[0]) / (len(t) - 1)
+        decay = np.exp(-step / growth.relaxation_s)
+        gain = growth.maxwell * growth.relaxation_s / step * (1.0 - decay)
+        steps = np.diff(lag, axis=0, prepend=0.0)
+        stretch = lag + lfilter([gain], [1.0, -decay], steps, axis=0)
+        total = np.column_stack([stretch[:, ring == r].sum(axis=1) for r in rings])
+        before = (trial.forces.t_s >= -0.2) & (trial.forces.t_s < 0.0)
+        pull = trial.forces.force_n[:, :2] @ slips.way[i]
+        # means over frames
+        edge = np.searchsorted(trial.forces.t_s, np.append(t, t[-1] + step) - step / 2)
+        whole = np.concatenate([[0.0], np.cumsum(pull)])
+        count = np.diff(edge)
+        seen = count > 0
+        mean = (whole[edge[1:]] - whole[edge[:-1]])[seen] / count[seen]
+        mean -= float(mean_seen(pull[before]))
+        square[which[i]] += total[seen].T @ total[seen]
+        product[which[i]] += mean @ total[seen]
+    for level in range(len(levels)):
+        touching = np.diag(square[level]) > 1.0
+        if touching.any() and np.isfinite(product[level]).all():
+            use = np.ix_(touching, touching)
+            best, *_ = np.linalg.lstsq(square[level][use], product[level][touching], rcond=1e-9)
+            result[level, touching] = np.where(best > 0.0, best, np.nan)
+    return result
+
+
+def _filled(t_s: F64, values: F64) -> F64:
+    """Values with lines through what is missing; zeros where there are none."""
+    seen = np.isfinite(values)
+    return np.interp(t_s, t_s[seen], values[seen]) if seen.any() else np.zeros(len(t_s))
+
+
+def force_estimates(slips: Slips, lags: Lags) -> dict[str, float]:
+    """Return estimates from the forces at the deepest level; NaN without a force sensor."""
+    gross = gross_forces(slips)
     share, time = hold_relaxation(slips)
-    found = {
-        "normal_deepest_n": float(mean_seen(normal[deepest])),
-        "tangential_n_per_mm": float(mean_seen(slope[deepest])),
-        "ratio": float(mean_seen(ratio)),
-        "ratio_per_speed": _slope(np.log(slips.speed_mm_s), ratio),
+    return {
+        "normal_n": float(lags.normal_n[-1]),
+        "normal_lost": 1.0 - float(lags.kept[-1]),
+        "ratio": lags.ratio,
+        "ratio_per_speed": _slope(np.log(slips.speed_mm_s), gross[:, 0] / gross[:, 1]),
+        "stiffness_n_per_mm": float(lags.stiffness_n_per_mm[-1]),
         "hold_relaxing_share": share,
         "hold_relaxation_s": time,
-    }
-    return found
+    } | {f"pull_ring{r}_n_per_mm": float(k) for r, k in enumerate(lags.pull_n_per_mm[-1])}
 
 
 def _slope(x: F64, y: F64) -> float:
@@ -584,5 +654,5 @@ def papillae(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Papill
     gap = fit.layer_step_mm * ring - fit.raised_mm
     gap -= gap[centre].mean()
     return Papillae(
-        ring, place, np.full(len(ring), np.nan), gap, fit.errors[1], fit.friction, fit.errors[0]
+        ring, place, error, gap, fit.errors[1], fit.friction / fit.friction.mean(), fit.errors[0]
     )

@@ -1,7 +1,7 @@
 """The papillae as springs that slide steadily, fitted to how far the tips lag behind their bases.
 
 A tip in steady slip pulls with T = mu N. Its papilla is a bent column: with the bend b,
-N = k_n (d - 0.6 b^2 / h) and T = b (k_b - 1.2 N / h), and the lag is b + c T with the compliance c of
+N = k_n (d - 0.6 b^2 / h) and T = b (k_b - 1.2 N / h), and the lag is b + c T, c the compliance of
 shear and base (the potential of `rigs.scene.slip`; a beam's shortening and softening). Lags have
 no scale of force: they tell friction, and the base's compliances over the skin's. Forces add it.
 """
@@ -59,7 +59,9 @@ class Lags:
         depth_mm: (l,). ring: (m,).
         lag_mm: NaN where not known, 0 where a papilla does not touch, (l, m). error_mm: (l, m).
         normal_n: normal force at rest, (l,); NaN without. ratio: of the forces in gross slip.
+        kept: normal force in gross slip over that at rest, (l,).
         stiffness_n_per_mm: of all tips together while they stick, (l,).
+        pull_n_per_mm: force over lag of each ring's tips, (l, rings).
     """
 
     depth_mm: F64
@@ -68,7 +70,9 @@ class Lags:
     error_mm: F64
     normal_n: F64
     ratio: float
+    kept: F64
     stiffness_n_per_mm: F64
+    pull_n_per_mm: F64
 
 
 @dataclass(frozen=True)
@@ -96,13 +100,14 @@ class Fit:
     misfit: float
 
 
-def lag_of(
+def steady(
     mu: F64, height_mm: F64, deep_mm: F64, base_normal: float, base_tangential: float, guess: Guess
-) -> F64:
-    """Steady lag of papillae, mm; forces over Young's modulus, so that compliances are in 1/mm.
+) -> tuple[F64, F64]:
+    """Return lag, mm, and normal force over Young's modulus, mm2, of papillae in steady slip.
 
     Args:
         mu, height_mm: (m,). deep_mm: indentation, (..., m).
+        base_normal, base_tangential: compliances of the base times Young's modulus, 1/mm.
     """
     area, inertia, nu = _section(guess)
     bending = guess.bending * inertia / height_mm**3
@@ -121,8 +126,7 @@ def lag_of(
         miss = bend * np.where(soft, least, spring) - mu * normal
         bend = np.maximum(bend - miss / slope, 0.0)
     normal = along * np.maximum(deep - shorter * bend**2, 0.0)
-    result: F64 = bend + compliance * mu * normal
-    return result
+    return bend + compliance * mu * normal, normal
 
 
 def _section(guess: Guess) -> tuple[float, float, float]:
@@ -137,56 +141,78 @@ def _shear(height_mm: F64, area: float, nu: float) -> F64:
 
 
 def fit_springs(lags: Lags, guess: Guess) -> Fit | None:
-    """Fit the springs to lags by least squares with weak priors; None without any lag."""
+    """Fit the springs to lags by least squares with weak priors; None without enough lags."""
     m = len(lags.ring)
-    known = np.isfinite(lags.lag_mm)
-    if known.sum() < 3:
+    if np.isfinite(lags.lag_mm).sum() < 3:
         return None
-    forces = bool(np.isfinite(lags.normal_n).any())
+    size = COMMON + 2 * m
+
+    def residuals(x: F64) -> F64:
+        return _residuals(x[None], lags, guess)[0]
+
+    def slopes(x: F64) -> F64:
+        moved = _residuals(np.vstack([x, x + _STEP * np.eye(size)]), lags, guess)
+        return ((moved[1:] - moved[0]) / _STEP).T
+
+    solved = least_squares(
+        residuals, np.zeros(size), slopes, method="trf", loss="soft_l1", f_scale=3.0, max_nfev=40
+    )
+    common, zero, friction, raised = _unpacked(solved.x[None], guess)
+    mu, normal, tangential, step, young = common[0].tolist()
+    spread = np.linalg.inv(solved.jac.T @ solved.jac)
+    return Fit(
+        mu, normal, tangential, step, float(zero[0]),
+        young if np.isfinite(lags.normal_n).any() else float("nan"), friction[0], raised[0],
+        SCATTER * np.sqrt(np.diag(spread)[COMMON:]).reshape(2, m),
+        float(np.sqrt(np.mean(solved.fun[: int(np.isfinite(lags.lag_mm).sum())] ** 2))),
+    )  # fmt: skip
+
+
+COMMON = 6
+"""Unknowns that all papillae have in common."""
+_STEP = 1e-5
+
+
+def _unpacked(x: F64, guess: Guess) -> tuple[F64, F64, F64, F64]:
+    """Return common quantities (b, 5), depth zero (b,), friction and raised heights (b, m)."""
     young = guess.youngs_modulus_mpa
     start = np.log([
         guess.kinetic, 1000 * young / guess.base_normal_n_per_m,
         1000 * young / guess.base_tangential_n_per_m, guess.layer_step_mm, young,
     ])  # fmt: skip
-    area, inertia, nu = _section(guess)
+    m = (x.shape[1] - COMMON) // 2
+    own = SCATTER * x[:, COMMON:]
+    return np.exp(start + LOOSE * x[:, :5]), LOOSE_ZERO_MM * x[:, 5], np.exp(own[:, :m]), own[:, m:]
 
-    def unpacked(x: F64) -> tuple[F64, float, F64, F64, F64, F64]:
-        common = np.exp(start + LOOSE * x[:5])
-        zero = LOOSE_ZERO_MM * x[5]
-        friction = np.exp(SCATTER * x[6 : 6 + m])
-        raised = SCATTER * x[6 + m :]
-        height = guess.height_mm - common[3] * lags.ring + raised
-        deep = lags.depth_mm[:, None] + zero - (guess.height_mm - height)
-        return common, zero, friction, raised, height, deep
 
-    def residuals(x: F64) -> F64:
-        common, _, friction, _, height, deep = unpacked(x)
-        found = lag_of(common[0] * friction, height, deep, common[1], common[2], guess)
-        parts = [((found - lags.lag_mm) / lags.error_mm)[known], x]
-        if forces:
-            young = common[4]
-            along = young / (height / area + common[1])
-            across = young / (
-                height**3 / (guess.bending * inertia) + _shear(height, area, nu) + common[2]
-            )
-            normal = (along * np.maximum(deep, 0.0)).sum(axis=1)
-            sticks = np.where(deep > 0.0, across, 0.0).sum(axis=1)
-            for model, seen in ((normal, lags.normal_n), (sticks, lags.stiffness_n_per_mm)):
-                there = np.isfinite(seen) & (seen > 0.0)
-                parts.append((model[there] / seen[there] - 1.0) / 0.01)
-            if np.isfinite(lags.ratio):
-                parts.append(np.array([(common[0] / lags.ratio - 1.0) / 0.005]))
-        return np.concatenate(parts)
-
-    size = 6 + 2 * m
-    solved = least_squares(residuals, np.zeros(size), method="trf", loss="soft_l1", f_scale=3.0,
-                           max_nfev=30, x_scale=1.0)  # fmt: skip
-    common, zero, friction, raised, _, _ = unpacked(solved.x)
-    spread = np.linalg.inv(solved.jac.T @ solved.jac)
-    error = SCATTER * np.sqrt(np.diag(spread)[6:]).reshape(2, m)
-    count = int(known.sum())
-    return Fit(
-        float(common[0]), float(common[1]), float(common[2]), float(common[3]), float(zero),
-        float(common[4]) if forces else float("nan"), friction, raised, error,
-        float(np.sqrt(np.mean(solved.fun[:count] ** 2))),
-    )  # fmt: skip
+def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
+    """Return misfits over their errors, the priors' too, for b sets of unknowns: (b, n)."""
+    common, zero, friction, raised = _unpacked(x, guess)
+    mu, normal, tangential, step, young = (column[:, None, None] for column in common.T)
+    height = guess.height_mm - step * lags.ring + raised[:, None]
+    deep = lags.depth_mm[:, None] + zero[:, None, None] - (guess.height_mm - height)
+    grip = mu * friction[:, None]
+    lag, pressed = steady(grip, height, deep, normal, tangential, guess)
+    known = np.isfinite(lags.lag_mm)
+    parts = [((lag - lags.lag_mm) / lags.error_mm)[:, known], x]
+    if np.isfinite(lags.normal_n).any():
+        area, inertia, nu = _section(guess)
+        along = 1.0 / (height / area + normal)
+        bending = height**3 / (guess.bending * inertia)
+        across = 1.0 / (bending + _shear(height, area, nu) + tangential)
+        resting = (along * np.maximum(deep, 0.0)).sum(axis=2)
+        sticks = np.where(deep > 0.0, across, 0.0).sum(axis=2)
+        in_ring = lags.ring[:, None] == np.arange(lags.ring.max() + 1)
+        pull = young * ((grip * pressed) @ in_ring) / np.maximum(lag @ in_ring, 1e-6)
+        kept = pressed.sum(axis=2) / resting
+        ratio = (grip * pressed).sum(axis=2) / pressed.sum(axis=2)
+        for model, seen, error in (
+            (young[:, 0] * resting, lags.normal_n, 0.003),
+            (kept, lags.kept, 0.002),
+            (young[:, 0] * sticks, lags.stiffness_n_per_mm, 0.02),
+            (pull.reshape(len(x), -1), lags.pull_n_per_mm.ravel(), 0.01),
+            (ratio, np.full(len(lags.depth_mm), lags.ratio), 0.003),
+        ):
+            there = np.isfinite(seen)
+            parts.append((model[:, there] / seen[there] - 1.0) / error)
+    return np.concatenate(parts, axis=1)
