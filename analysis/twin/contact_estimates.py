@@ -112,13 +112,26 @@ def contact_estimates(trials: Sequence[PilotTrial], guess: Guess | None = None) 
 # -- rest places -------------------------------------------------------------------------------
 
 
-def rings_of(slips: Slips) -> tuple[I64, F64]:
-    """Return each marker's ring, 0 for the centre, and its mean place in the holds, (m, 2)."""
+def rest_places(slips: Slips) -> F64:
+    """Return each marker's place in the last 0.5 s of each hold, mm, (k, m, 2), NaN where unseen.
+
+    Slides begin at different places of the plate: they are shifted onto those of
+    one slide.
+    """
     places = np.array([
         mean_seen(trial.tips_mm[(trial.frame_s < 0.0) & (trial.frame_s >= -0.5)])
         for trial in slips.trials
     ])  # fmt: skip
-    place = mean_seen(places)
+    here = places[int(np.argmax(np.isfinite(places[:, :, 0]).sum(axis=1)))]
+    for place in places:
+        shift = (place - here)[np.isfinite(place - here).all(axis=1)]
+        place -= np.median(shift, axis=0) if len(shift) else np.nan
+    return places
+
+
+def rings_of(slips: Slips) -> tuple[I64, F64]:
+    """Return each marker's ring, 0 for the centre, and its place, (m, 2): `rest_places`."""
+    place = mean_seen(rest_places(slips))
     seen = np.isfinite(place).all(axis=1)
     ring = np.zeros(len(place), np.int64)
     if not seen.any():
@@ -625,7 +638,7 @@ class Papillae:
 
     Attributes:
         ring: 0 is the centre, (m,).
-        place_mm: from the picture's centre, (m, 2); place_error_mm: (m,).
+        place_mm: from their mean, (m, 2); place_error_mm: along an axis, (m,).
         gap_mm: depth at which each touches over that of the centre one, (m,); its error.
         friction: of each over the mean, (m,); its error.
     """
@@ -646,13 +659,15 @@ def papillae(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Papill
     if slips is None:
         return None
     ring, place = rings_of(slips)
+    places = rest_places(slips)
+    apart = np.linalg.norm(places - place, axis=2)
+    seen = np.maximum(np.isfinite(apart).sum(axis=0), 2)
+    error = np.sqrt(mean_seen(apart**2) / 2 / (seen - 1))
     growth = fit_growth(slips) or Growth()
     fit = fit_springs(lags_of(slips, ring, steady_lags(slips, growth), growth), guess)
     if fit is None:
         return None
-    centre = ring == 0
-    gap = fit.layer_step_mm * ring - fit.raised_mm
-    gap -= gap[centre].mean()
     return Papillae(
-        ring, place, error, gap, fit.errors[1], fit.friction / fit.friction.mean(), fit.errors[0]
-    )
+        ring, place - mean_seen(place), error, fit.gap_mm, fit.gap_error_mm,
+        fit.friction / fit.friction.mean(), fit.friction_error,
+    )  # fmt: skip

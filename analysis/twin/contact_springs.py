@@ -84,7 +84,8 @@ class Fit:
             stiffnesses, 1/mm. layer_step_mm. zero_mm: depth beyond the reported one.
         youngs_modulus_mpa: NaN without forces.
         friction: of each papilla over the mean, (m,). raised_mm: height over its ring's, (m,).
-        errors: standard errors of `friction` and `raised_mm`, (2, m).
+        gap_mm: depth at which each touches over that of the centre, (m,).
+        friction_error, gap_error_mm: standard errors, (m,).
         misfit: root mean square of residuals over their errors.
     """
 
@@ -96,7 +97,9 @@ class Fit:
     youngs_modulus_mpa: float
     friction: F64
     raised_mm: F64
-    errors: F64
+    gap_mm: F64
+    friction_error: F64
+    gap_error_mm: F64
     misfit: float
 
 
@@ -160,16 +163,22 @@ def fit_springs(lags: Lags, guess: Guess) -> Fit | None:
     common, zero, friction, raised = _unpacked(solved.x[None], guess)
     mu, normal, tangential, step, young = common[0].tolist()
     spread = np.linalg.inv(solved.jac.T @ solved.jac)
+    centre = lags.ring == 0
+    gap = step * lags.ring - raised[0] + raised[0, centre].mean()
+    slope = np.zeros((m, size))
+    slope[:, _LAYER_STEP] = LOOSE * step * lags.ring
+    slope[:, COMMON + m :] = SCATTER * (centre / centre.sum() - np.eye(m))
     return Fit(
         mu, normal, tangential, step, float(zero[0]),
-        young if np.isfinite(lags.normal_n).any() else float("nan"), friction[0], raised[0],
-        SCATTER * np.sqrt(np.diag(spread)[COMMON:]).reshape(2, m),
+        young if np.isfinite(lags.normal_n).any() else float("nan"), friction[0], raised[0], gap,
+        SCATTER * np.sqrt(np.diag(spread)[COMMON : COMMON + m]),
+        np.sqrt(np.einsum("jp,pq,jq->j", slope, spread, slope)),
         float(np.sqrt(np.mean(solved.fun[: int(np.isfinite(lags.lag_mm).sum())] ** 2))),
     )  # fmt: skip
 
 
-COMMON = 6
-"""Unknowns that all papillae have in common."""
+COMMON, _LAYER_STEP = 6, 3
+"""Unknowns that all papillae have in common, and which of them is the layers' step."""
 _STEP = 1e-5
 
 
@@ -206,13 +215,17 @@ def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
         pull = young * ((grip * pressed) @ in_ring) / np.maximum(lag @ in_ring, 1e-6)
         kept = pressed.sum(axis=2) / resting
         ratio = (grip * pressed).sum(axis=2) / pressed.sum(axis=2)
+        # a ring of few papillae has a small part in the force
+        few = np.tile(0.1 / in_ring.sum(axis=0), len(lags.depth_mm))
         for model, seen, error in (
             (young[:, 0] * resting, lags.normal_n, 0.003),
             (kept, lags.kept, 0.002),
             (young[:, 0] * sticks, lags.stiffness_n_per_mm, 0.02),
-            (pull.reshape(len(x), -1), lags.pull_n_per_mm.ravel(), 0.01),
+            (pull.reshape(len(x), -1), lags.pull_n_per_mm.ravel(), few),
             (ratio, np.full(len(lags.depth_mm), lags.ratio), 0.003),
         ):
             there = np.isfinite(seen)
-            parts.append((model[:, there] / seen[there] - 1.0) / error)
+            parts.append(
+                (model[:, there] / seen[there] - 1.0) / np.broadcast_to(error, seen.shape)[there]
+            )
     return np.concatenate(parts, axis=1)
