@@ -130,14 +130,16 @@ def rest_places(slips: Slips) -> F64:
 
 
 def rings_of(slips: Slips) -> tuple[I64, F64]:
-    """Return each marker's ring, 0 for the centre, and its place, (m, 2): `rest_places`."""
+    """Return each marker's ring, 0 for the centre and -1 where it was never seen, and its place,
+    (m, 2): `rest_places`."""
     place = mean_seen(rest_places(slips))
     seen = np.isfinite(place).all(axis=1)
-    ring = np.zeros(len(place), np.int64)
+    ring = np.full(len(place), -1)
     if not seen.any():
         return ring, place
-    middle = np.median(place[seen], axis=0)
-    far = np.hypot(*(place[seen] - middle).T)
+    # the marker that is nearest to the middle of all is the centre
+    off = np.hypot(*(place[seen] - np.median(place[seen], axis=0)).T)
+    far = np.hypot(*(place[seen] - place[seen][np.argmin(off)]).T)
     order = np.argsort(far)
     steps = np.diff(far[order])
     jumps = steps > 0.5 * steps.max(initial=0.0)
@@ -151,9 +153,9 @@ def place_scatter(ring: I64, place: F64) -> float:
     """Standard deviation of places about a lattice of rings, mm: the best place, turn and scale."""
     lattice = np.full(place.shape, np.nan)
     seen = np.isfinite(place).all(axis=1)
-    if seen.sum() < 4:
+    if seen.sum() < 4 or not np.any(seen & (ring == 0)):
         return float("nan")
-    middle = np.median(place[seen], axis=0)
+    middle = place[seen & (ring == 0)].mean(axis=0)
     for r in np.unique(ring[seen]):
         these = np.flatnonzero(seen & (ring == r))
         angle = np.arctan2(*(place[these] - middle).T[::-1])

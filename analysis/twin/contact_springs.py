@@ -56,7 +56,7 @@ class Lags:
     """Steady lags of m papillae at l depths, and forces where there are any.
 
     Attributes:
-        depth_mm: (l,). ring: (m,).
+        depth_mm: (l,). ring: (m,), -1 for a papilla that is not there.
         lag_mm: NaN where not known, 0 where a papilla does not touch, (l, m). error_mm: (l, m).
         normal_n: normal force at rest, (l,); NaN without. ratio: of the forces in gross slip.
         kept: normal force in gross slip over that at rest, (l,).
@@ -206,9 +206,11 @@ def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
     parts = [((lag - lags.lag_mm) / lags.error_mm)[:, known], x]
     if np.isfinite(lags.normal_n).any():
         area, inertia, nu = _section(guess)
-        along = 1.0 / (height / area + normal)
+        there = lags.ring >= 0
+        pressed = pressed * there
+        along = there / (height / area + normal)
         bending = height**3 / (guess.bending * inertia)
-        across = 1.0 / (bending + _shear(height, area, nu) + tangential)
+        across = there / (bending + _shear(height, area, nu) + tangential)
         resting = (along * np.maximum(deep, 0.0)).sum(axis=2)
         sticks = np.where(deep > 0.0, across, 0.0).sum(axis=2)
         in_ring = lags.ring[:, None] == np.arange(lags.ring.max() + 1)
@@ -224,8 +226,8 @@ def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
             (pull.reshape(len(x), -1), lags.pull_n_per_mm.ravel(), few),
             (ratio, np.full(len(lags.depth_mm), lags.ratio), 0.003),
         ):
-            there = np.isfinite(seen)
+            told = np.isfinite(seen)
             parts.append(
-                (model[:, there] / seen[there] - 1.0) / np.broadcast_to(error, seen.shape)[there]
+                (model[:, told] / seen[told] - 1.0) / np.broadcast_to(error, seen.shape)[told]
             )
     return np.concatenate(parts, axis=1)
