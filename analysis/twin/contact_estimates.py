@@ -38,6 +38,8 @@ LEAST_STRETCH_MM = 0.15
 """Slips of springs that were stretched less tell more of the tremor than of friction."""
 LEAST_LAG_MM = 0.8
 """Lags that are smaller fluctuate by the tremor as much as by friction."""
+LEAST_PULLING_MM = 0.3
+"""Rings whose tips lag less pull too little for their stiffness to be told from forces."""
 PATH_STEP_MM = 0.1
 BAND_HZ = (2.2, 10.0)
 """Where an arm's tremor is looked for: friction along a path varies more slowly."""
@@ -283,6 +285,8 @@ def lags_of(slips: Slips, ring: I64, table: SteadyLags, growth: Growth) -> Lags:
     ratio = float(mean_seen(gross[:, 0] / gross[:, 1]))
     kept = np.array([mean_seen((gross[:, 1] / held)[which == k]) for k in range(len(levels))])
     pull = ring_stiffness(slips, ring, growth)
+    for r in range(pull.shape[1]):
+        pull[~(mean_seen(lag[:, ring == r], axis=1) >= LEAST_PULLING_MM), r] = np.nan
     return Lags(levels, ring, lag, error, normal, ratio, kept, stiffness, pull)
 
 

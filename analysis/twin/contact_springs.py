@@ -157,9 +157,13 @@ def fit_springs(lags: Lags, guess: Guess) -> Fit | None:
         moved = _residuals(np.vstack([x, x + _STEP * np.eye(size)]), lags, guess)
         return ((moved[1:] - moved[0]) / _STEP).T
 
-    solved = least_squares(
-        residuals, np.zeros(size), slopes, method="trf", loss="soft_l1", f_scale=3.0, max_nfev=40
-    )
+    x = np.zeros(size)
+    # far from the solution everything looks like an outlier
+    for outlier in (30.0, 3.0):
+        solved = least_squares(
+            residuals, x, slopes, method="trf", loss="soft_l1", f_scale=outlier, max_nfev=40
+        )
+        x = solved.x
     common, zero, friction, raised = _unpacked(solved.x[None], guess)
     mu, normal, tangential, step, young = common[0].tolist()
     spread = np.linalg.inv(solved.jac.T @ solved.jac)
