@@ -60,7 +60,7 @@ def pressed(springs: Springs, depth: float) -> Tips:
     advance(
         springs.table, springs.friction, springs.law, tips.state,
         np.array([0, 10**9, 6 * 10**9], np.int64), sensor, np.zeros(3),
-        np.empty((2, track_width(n))), np.empty((2, 0)),
+        np.empty((2, track_width(n))), np.empty((2, 0)), springs.spots,
     )  # fmt: skip
     return tips
 
@@ -75,7 +75,7 @@ def slide(springs: Springs, way: Callable[[F64], F64], h_ms: float) -> tuple[F64
     begun = time.process_time()
     advance(
         springs.table, springs.friction, springs.law, tips.state, t_ns, sensor,
-        np.zeros(len(t_ns)), track, load,
+        np.zeros(len(t_ns)), track, load, springs.spots,
     )  # fmt: skip
     taken = time.process_time() - begun
     stride = round(8.0 / h_ms)
@@ -95,6 +95,7 @@ def fall(springs: Springs, h_ms: float) -> tuple[F64, float]:
     done, _ = advance_free(
         springs.table, springs.friction, springs.law, tips.state, t_ns, sensor, motion, MASS_KG,
         np.minimum(t / 1.024, 1.0) * MASS_KG * 9.81, 0.001, -25.0, track, load,
+        springs.spots,
     )  # fmt: skip
     taken = time.process_time() - begun
     slips = track[:done, 3 * n : 4 * n]

@@ -18,7 +18,7 @@ BACKLOG_NS = 120_000_000_000
 
 
 class MockArm:
-    """A simulated arm without ramps: each segment has its full speed from the start.
+    """A simulated arm: each segment has its full speed from the start, but for `arm_ramp`.
 
     Args:
         wired: True if the sync line reaches its digital input.

@@ -133,7 +133,8 @@ class MockEventCamera:
         loads = self._loads = world.keep_loads(self._loads_of)
         self._next_ns = loads.end_ns
         row_ns, rows = loads.between(self._next_ns, self._next_ns)
-        self._sensor.reset(self._on_skin(row_ns, rows)[0], self._own.trial_seed(world))
+        flicker = world.faults.flicker() if self._own.first else None
+        self._sensor.reset(self._on_skin(row_ns, rows)[0], self._own.trial_seed(world), flicker)
         self._begun_ns, self._until_ns, self._running = world.now_ns, NEVER, True
         self._input.skip()
 

@@ -15,6 +15,8 @@ from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Papilla = Annotated[int, Field(ge=0, le=10_000)]
+Factor = Annotated[float, Field(gt=0, le=10)]
+PlateMm = Annotated[float, Field(ge=-1000, le=1000)]
 Device = Literal["arm", "event_camera", "frame_camera", "sync_box", "force_sensor"]
 RestartDevice = Literal["arm", "event_camera", "frame_camera"]
 PulseDevice = Literal["arm", "event_camera", "sync_box"]
@@ -180,6 +182,49 @@ class PlateStuck(_Fault):
     kind: Literal["plate_stuck"]
 
 
+class PapillaSticky(_Fault):
+    """One papilla grips more (or less) than the others of its layer."""
+
+    kind: Literal["papilla_sticky"]
+    papilla: Papilla
+    """Counted as for `papilla_torn`."""
+    factor: Factor = 1.6
+    """Its friction over what it would be without the fault."""
+
+
+class PlateSpot(_Fault):
+    """A round spot on the plate, on which friction differs; factors of several multiply."""
+
+    kind: Literal["plate_spot"]
+    centre_mm: tuple[PlateMm, PlateMm]
+    """On the plate, x and y; a sliding plate takes it with it."""
+    radius_mm: Annotated[float, Field(gt=0, le=1000)]
+    factor: Factor = 0.6
+    """Friction on it over friction beside it. A tip stands on it if its middle does."""
+
+
+class MainsLight(_Fault):
+    """Lamps on the mains flicker, which the event camera sees as if all of the image did.
+
+    Intensity is 1 + share sin(2 pi hz t + phase) times that of steady light; the phase belongs to
+    the trial. A further event camera and the outside camera do not see it.
+    """
+
+    kind: Literal["mains_light"]
+    share: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Amplitude over the mean of the intensity."""
+    hz: Annotated[float, Field(ge=10, le=1000)] = 100.0
+    """Of the light, which is twice that of the mains."""
+
+
+class ArmRamp(_Fault):
+    """The arm speeds up and brakes gently in every straight move that begins or ends in contact."""
+
+    kind: Literal["arm_ramp"]
+    mm_s2: Annotated[float, Field(ge=0.01, le=1e6)] = 1.0
+    """Its acceleration, and its deceleration."""
+
+
 class DiskFull(_TimedFault):
     """Writes of the recording fail (ENOSPC) for the rest of the trial."""
 
@@ -222,6 +267,10 @@ AnyFault = (
     | PapillaTorn
     | MarkerOccluded
     | PlateStuck
+    | PapillaSticky
+    | PlateSpot
+    | MainsLight
+    | ArmRamp
     | DiskFull
     | DeviceGone
     | StreamGone
@@ -247,4 +296,33 @@ def check_papillae(faults: tuple[AnyFault, ...], count: int) -> None:
                 f"mock.faults[{index}].papilla",
                 papilla,
                 f"the skin has {count} papillae, numbered from 0 (the centre) to {count - 1}",
+            )
+
+
+def check_single(faults: tuple[AnyFault, ...], cutoff_hz: float) -> None:
+    """Check the faults that a trial can have but one of, and what they need.
+
+    Args:
+        cutoff_hz: of the event camera's pixels; 0 if they have no low pass.
+
+    Raises:
+        KeyedError: two faults of one kind meet in a trial, or pixels with a low pass see a light.
+    """
+    seen: dict[type[AnyFault], list[int | None]] = {MainsLight: [], ArmRamp: []}
+    for index, fault in enumerate(faults):
+        trials = seen.get(type(fault))
+        if trials is None:
+            continue
+        if trials and (fault.trial in trials or None in trials or fault.trial is None):
+            raise KeyedError(
+                f"mock.faults[{index}].kind",
+                fault.kind,
+                "must be in the list once only for a trial",
+            )
+        trials.append(fault.trial)
+        if isinstance(fault, MainsLight) and cutoff_hz > 0:
+            raise KeyedError(
+                f"mock.faults[{index}].kind",
+                fault.kind,
+                "needs mock.event_camera.cutoff_hz = 0: flicker behind a low pass is not computed",
             )

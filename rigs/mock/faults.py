@@ -6,7 +6,9 @@ where it occurs: with the pulses, the clocks, the frames, the arm.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,12 +17,17 @@ import numpy.typing as npt
 from sliplab.rigs.mock.fault_settings import (
     AnyFault,
     ArmProtectiveStop,
+    ArmRamp,
     Device,
     DeviceGone,
     EventGap,
     EventStall,
+    MainsLight,
+    PapillaSticky,
     PapillaTorn,
+    PlateSpot,
 )
+from sliplab.rigs.scene.skin import Skin
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -129,6 +136,32 @@ class FaultBook:
         """Return the true time up to which the event camera has sent its data."""
         stalls = [begin for _, begin, end in self.spans(EventStall) if begin <= now_ns < end]
         return min(stalls, default=now_ns)
+
+    # -- whole trials ----------------------------------------------------------------------
+
+    def grips(self, skin: Skin) -> Skin:
+        """Return `skin` with the friction of the papillae that are sticky in this trial."""
+        sticky = self.of(PapillaSticky)
+        if not sticky:
+            return skin
+        friction = skin.friction_factor.copy()
+        for fault in sticky:
+            friction[fault.papilla] *= fault.factor
+        return replace(skin, friction_factor=friction)
+
+    def spots(self) -> F64:
+        """Return the spots on the plate: x, y and radius in mm, factor of friction, (k, 4)."""
+        rows = [[*spot.centre_mm, spot.radius_mm, spot.factor] for spot in self.of(PlateSpot)]
+        return np.array(rows, np.float64).reshape(-1, 4)
+
+    def flicker(self) -> tuple[float, float] | None:
+        """Return amplitude over mean and frequency (Hz) of the light; None if it is steady."""
+        lights = self.of(MainsLight)
+        return (lights[0].share, lights[0].hz) if lights else None
+
+    def ramp_mm_s2(self) -> float:
+        """Return the arm's acceleration in contact; infinite for an arm without ramps."""
+        return min((fault.mm_s2 for fault in self.of(ArmRamp)), default=math.inf)
 
     # -- the skin --------------------------------------------------------------------------
 

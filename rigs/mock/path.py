@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose, Segment
+from sliplab.rigs.core.fake_motion import Ramp
 from sliplab.rigs.mock.fault_settings import ArmOffPath
 from sliplab.rigs.mock.faults import NEVER, FaultBook
 from sliplab.rigs.mock.settings import Contact
@@ -100,8 +101,8 @@ class ContactPlane:
 I64 = npt.NDArray[np.int64]
 _LOOK_BACK_NS = 1_000_000
 _MOVING_MM = 1e-9
-_X, _Y = 6, 7
-"""Columns of an arm state: the sensor's position on the plate."""
+_X, _Y, _DEPTH = 6, 7, 8
+"""Columns of an arm state: the sensor's position on the plate, and its depth."""
 
 
 class Deviation:
@@ -167,12 +168,17 @@ class Leg:
     """Planned end time and state of a leg that was cut short."""
     turns: bool = False
     """A turn on the spot: orientations follow the shortest rotation, not a line."""
+    ramp: Ramp | None = None
+    """How it speeds up and brakes; None: full speed from the start to the end."""
 
     def at(self, t_ns: I64, columns: slice = EVERY) -> F64:
         """Return states at times within the leg, shape (n, 12) or those columns."""
         end_ns, end = self.planned or (self.end_ns, self.end)
         start = self.start[columns]
-        share = (t_ns - self.start_ns) / (end_ns - self.start_ns)
+        if self.ramp is None:
+            share = (t_ns - self.start_ns) / (end_ns - self.start_ns)
+        else:
+            share = self.ramp.shares((t_ns - self.start_ns) / 1e9)
         result: F64 = start + share[:, None] * (end[columns] - start)
         if self.turns and columns.start == 0:
             from scipy.spatial.transform import Rotation  # a plan is read without it
@@ -185,13 +191,18 @@ class Leg:
 
 
 class ArmPath:
-    """Legs in order of time; the arm is at rest between and after them."""
+    """Legs in order of time; the arm is at rest between and after them.
+
+    Attributes:
+        ramp_mm_s2: acceleration of legs that begin or end in contact; infinite without ramps.
+    """
 
     def __init__(self, plane: ContactPlane, pose: Pose) -> None:
         self._plane = plane
         self._rest = self._state(pose)
         self.legs: list[Leg] = []
         self.deviation: Deviation | None = None
+        self.ramp_mm_s2 = math.inf
 
     def restart(self, now_ns: int) -> None:
         """Discard the legs; the arm rests at its commanded position at `now_ns`."""
@@ -208,11 +219,21 @@ class ArmPath:
             if segment.turn_deg_s is not None:
                 turn = abs(math.degrees(_unwound(target, state) - state[TURN])) / segment.turn_deg_s
                 target[TURN] = _unwound(target, state)
-            end = begin + round(max(travel, turn) * 1e9)
-            legs.append(Leg(begin, end, state, target, turns=segment.turn_deg_s is not None))
+            ramp = self._ramp(state, target, segment.speed_mm_s) if travel > turn else None
+            seconds = max(travel, turn) if ramp is None else ramp.seconds
+            end = begin + round(seconds * 1e9)
+            turns = segment.turn_deg_s is not None
+            legs.append(Leg(begin, end, state, target, turns=turns, ramp=ramp))
             state, begin = target, end
         self.legs += legs
         return legs
+
+    def _ramp(self, state: F64, target: F64, speed_mm_s: float) -> Ramp | None:
+        """Return the ramp of a leg from one state to another; None if it has none."""
+        clear = max(state[_DEPTH], target[_DEPTH]) <= 0.0
+        if clear or math.isinf(self.ramp_mm_s2):
+            return None
+        return Ramp(math.dist(state[:3], target[:3]), speed_mm_s, self.ramp_mm_s2)
 
     def cut(self, now_ns: int) -> None:
         """Stop at `now_ns`."""

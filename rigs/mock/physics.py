@@ -55,17 +55,21 @@ class Physics:
         seed: int,
         sensor_at: Callable[[I64], F64],
         torn: Callable[[], Sequence[tuple[int, int]]] = tuple,
+        spots: F64 | None = None,
     ) -> None:
         """Put the skin at rest on the plate.
 
         Args:
             sensor_at: maps times (k,) to x, y, depth (mm) and slopes of depth, (k, 5).
             torn: papillae that tear off, with known true times, ns.
+            spots: of `rigs.scene.springs.Springs`; left out, the plate is clean.
         """
         self._settings, self._sensor_at, self._torn = settings, sensor_at, torn
         self._off: set[int] = set()
         self.step_ns = settings.scene.step_ms * 1_000_000
         self.springs = springs_of(settings, skin, seed)
+        if spots is not None:
+            self.springs = replace(self.springs, spots=spots)
         self.tips: Tips = new_tips(len(skin))
         self.track = History(track_width(len(skin)))
         self.loads: History | None = None
@@ -129,7 +133,7 @@ class Physics:
             height[1:] = self._prescribed(t_ns[1:])
             advance(
                 springs.table, springs.friction, springs.law, state, t_ns, sensor, height, track,
-                load,
+                load, springs.spots,
             )  # fmt: skip
             self._plate_motion[:] = height[-1], 0.0
             self._sum_up(t_ns[1:], track, load)
@@ -138,7 +142,7 @@ class Physics:
         done, landed = advance_free(
             springs.table, springs.friction, springs.law, state, t_ns, sensor,
             self._plate_motion, mass_kg, self._weight(t_ns), plate.stiction_n,
-            -plate.stroke_mm, track, load,
+            -plate.stroke_mm, track, load, springs.spots,
         )  # fmt: skip
         self._sum_up(t_ns[1:], track, load)
         if landed:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from sliplab.protocols.timing import Delay, ForceTiming, Timing
 from sliplab.protocols.yaml_file import KeyedError, StrictModel
-from sliplab.rigs.mock.fault_settings import Fault, check_papillae
+from sliplab.rigs.mock.fault_settings import Fault, check_papillae, check_single
 
 if TYPE_CHECKING:
     from sliplab.rigs.scene import skin as scene_skin
@@ -385,8 +385,9 @@ class MockSettings(StrictModel):
     """Faults to inject; docs/faults.md lists the kinds."""
 
     @model_validator(mode="after")
-    def _papillae(self) -> MockSettings:
+    def _faults(self) -> MockSettings:
         check_papillae(self.faults, sum(self.scene.skin.ring_counts))
+        check_single(self.faults, self.event_camera.cutoff_hz)
         return self
 
 

@@ -105,13 +105,17 @@ class World:
         if self._run_on:
             clocks = clocks.after(self.past_ns)
         self.clocks: TrialClocks = with_faults(clocks, self.faults)
+        self.path.ramp_mm_s2 = self.faults.ramp_mm_s2()
         self.path.deviation = Deviation(self.faults, self.plane, self.path.commanded)
         here = self.path.commanded(np.array([self.now_ns], np.int64), SENSOR)[0]
         self._straight_rad = float(here[5])
         self._vibration = Vibration(
             settings.arm.vibration_um, settings.arm.vibration_hz, settings.seed, seed
         )
-        self.physics = Physics(settings, self.skin, seed, self._sensor_at, self.faults.torn)
+        self.physics = Physics(
+            settings, self.faults.grips(self.skin), seed, self._sensor_at, self.faults.torn,
+            self.faults.spots(),
+        )  # fmt: skip
         self.plate_marked = False
 
     def _sensor_at(self, t_ns: I64) -> F64:

@@ -36,6 +36,7 @@ from sliplab.rigs.scene.friction import (
     leaves_cone_at,
     raised_cone,
     slip_direction,
+    spot_factor,
     tractrix,
     tractrix_end,
 )
@@ -149,6 +150,28 @@ def _take_knot(w, field, i, j, knot):  # type: ignore[no-untyped-def]
     """Let lane `j` hold the friction of tip `i` behind a knot."""
     w.knot[j] = knot
     w.c0[j], w.c1[j], w.c2[j], w.c3[j] = cubic_at(field, i, knot)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def feel_spots(blocks, n, clean, field, spots, factors):  # type: ignore[no-untyped-def]
+    """Let every tip feel the friction of the spots on which it stands when a step begins.
+
+    It keeps that friction for the step, so that it feels a spot's border a step late: a few
+    micrometres on the way.
+
+    Args:
+        clean: friction beside all spots, as `Springs.friction`.
+        field: friction as it is felt; rows of the tips that came to another place are written.
+        spots: of `Springs`, (k, 4).
+        factors: by which each row of `field` differs from `clean`, (n,), written.
+    """
+    for i in range(n):
+        w, j = blocks[i // LANES], i % LANES
+        factor = spot_factor(w.place_x[j], w.place_y[j], spots)
+        if factor != factors[i]:
+            factors[i] = factor
+            field[i] = clean[i] * factor
+            _take_knot(w, field, i, j, w.knot[j])
 
 
 # -- a step of a block -----------------------------------------------------------------------
@@ -712,19 +735,25 @@ def record(blocks, n, plate_y, track, load):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance(table, field, law, state, t_ns, sensor, plate_y, track, load):  # type: ignore[no-untyped-def]
+def advance(  # type: ignore[no-untyped-def]
+    table, friction, law, state, t_ns, sensor, plate_y, track, load, spots
+):
     """Advance tips from row to row with the plate where it is prescribed.
 
     Args:
-        table, field, law: of `Springs`; state: of `Tips`, written.
+        table, friction, law: of `Springs`; state: of `Tips`, written.
         t_ns: when the first step begins and when each ends, rising, int64, (m + 1,).
         sensor: x, y, depth (mm) and the two slopes of depth at the end of each step, (m, 5); and
             its angle about the plate's normal, rad, if it turns, (m, 6).
         plate_y: height of the plate, mm: before the first step, and after each, (m + 1,).
         track: filled with one row a step, (m, track_width(n)).
         load: tangential force x, y and normal force of each tip, N, (m, 3 n); or (m, 0).
+        spots: of `Springs`, (k, 4).
     """
-    n, blocks = state.shape[0], make_blocks(table, field, state)
+    n, blocks = state.shape[0], make_blocks(table, friction, state)
+    field, factors = friction, np.ones(n)
+    if spots.shape[0] > 0:
+        field = friction.copy()
     step_ns, step = np.int64(0), Step(0.0, 1.0, 1.0, 0.0)
     for k in range(sensor.shape[0]):
         if t_ns[k + 1] - t_ns[k] != step_ns:
@@ -732,6 +761,8 @@ def advance(table, field, law, state, t_ns, sensor, plate_y, track, load):  # ty
             h = step_ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
             step = Step(h, decay, gain, 0.0)
+        if spots.shape[0] > 0:
+            feel_spots(blocks, n, friction, field, spots, factors)
         move_tips(blocks, n, field, law, sensor[k], plate_y[k + 1], t_ns[k] * 1e-9, step)
         record(blocks, n, plate_y[k + 1], track[k], load[k])
     store_state(blocks, state)

@@ -19,6 +19,8 @@ import numpy.typing as npt
 from numba import njit
 
 from sliplab.rigs.scene.circuit import (
+    OFF,
+    ON,
     RATE_DECADES,
     Circuit,
     events_of_circuit,
@@ -28,6 +30,7 @@ from sliplab.rigs.scene.circuit import (
     start_cells,
 )
 from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, memorise_discs, widen
+from sliplab.rigs.scene.flicker import flicker_events, new_flicker, steady
 from sliplab.rigs.scene.marker_path import (
     SEGMENT,
     cut_block,
@@ -175,6 +178,8 @@ class MarkerSensor:
             hot_places(optics.width, optics.height, optics.hot_pixels, seed),
         )  # fmt: skip
         self._circuit = self._new_circuit(seed) if optics.has_circuit else no_circuit()
+        self._light = steady()
+        self._flicker: tuple[float, float] | None = None
         self._started = True
         middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
         self._projection = (
@@ -229,13 +234,16 @@ class MarkerSensor:
         )  # fmt: skip
         return result
 
-    def reset(self, load: F64, seed: int) -> None:
+    def reset(self, load: F64, seed: int, flicker: tuple[float, float] | None = None) -> None:
         """Every pixel takes the image under `load`, (3 n,), as its reference.
 
         Args:
-            seed: the trial's: noise, and when the read-out scans.
+            seed: the trial's: noise, when the read-out scans, and the phase of the light.
+            flicker: amplitude over mean and frequency (Hz) of a light that flickers, see
+                `rigs.scene.flicker`.
         """
         optics = self.optics
+        self._light, self._flicker = steady(), flicker
         self._trial, self._bins = seed, {}
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
         darken(self._pixels.seen, self._dark, self._pixels.state)
@@ -247,7 +255,7 @@ class MarkerSensor:
             # a camera that has run for long: each pixel is at a random point between two leaks
             phase = generator(seed, "leak phases").random(self.threshold.shape)
             memorise_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
-            self._started = False
+        self._started = False
         self._pixels.fired[:] = NEVER_NS
         self._pending = np.empty(0, np.int64)
         if optics.period_ns:
@@ -273,14 +281,23 @@ class MarkerSensor:
                 optics' `block_ns` between the first and the last one is among them.
         """
         if not self._started:
-            start_cells(self._circuit, int(t_ns[0]))
-            self._started = True
+            self._start(int(t_ns[0]))
         when, x, y, p, self._pending = trace(
             np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, self._camera,
             self._phase_ns, self._pixels, self._lists, self._circuit,
-            self._candidates(int(t_ns[0]), int(t_ns[-1])), self._pending,
+            self._candidates(int(t_ns[0]), int(t_ns[-1])), self._light, self._pending,
         )  # fmt: skip
         return when, x, y, p
+
+    def _start(self, t_ns: int) -> None:
+        """Let the pixels look from `t_ns` on."""
+        on = off = self.threshold
+        if self.optics.has_circuit:
+            start_cells(self._circuit, t_ns)
+            on, off = self._circuit.cells[..., ON], self._circuit.cells[..., OFF]
+        if self._flicker is not None:
+            self._light = new_flicker(*self._flicker, on, off, t_ns, self._trial)
+        self._started = True
 
     def _candidates(self, begin_ns: int, end_ns: int) -> Candidates:
         """Possible noise of the whole seconds of the trial that a span of true time touches."""
@@ -335,7 +352,7 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
     loads, layout_mm, projection, row_ns, camera, phase_ns, of_pixels, lists, circuit, noise,
-    pending,
+    light, pending,
 ):  # fmt: skip
     """Return signal and noise events under `loads`, as the camera delivers them.
 
@@ -350,6 +367,7 @@ def trace(  # type: ignore[no-untyped-def]
         of_pixels, lists: `Pixels` and `RimLists`, written.
         circuit: pixels of `circuit`, which do all signal events where there are any.
         noise: `noise.Candidates`, at least those of this time.
+        light: `flicker.Flicker`, written.
         pending: packed events of scans that were not complete, ns after `row_ns[0]`, less a period
             and the time to read all columns.
 
@@ -405,6 +423,15 @@ def trace(  # type: ignore[no-untyped-def]
                 noise, noise_at, row_ns[begin + first[block + 1]], base_ns, camera.leak_below,
                 contrast, edge, path[:, :, begin + first[block]], events, n,
             )  # fmt: skip
+        if light.share > 0.0:
+            for block in range(blocks):
+                begin_ns = row_ns[begin + first[block]]
+                events, n = flicker_events(
+                    light, begin_ns, row_ns[begin + first[block + 1]], base_ns, events, n
+                )
+            if capacity < events.shape[0]:
+                capacity = events.shape[0]
+                other = np.empty(capacity, np.int64)
         for block in range(blocks):
             a, b = first[block], first[block + 1]
             slope_weights(rows, a, b, block, inverse, weights)

@@ -135,6 +135,17 @@ def cubic_at(field, i, knot):  # type: ignore[no-untyped-def]
     return field[i, k, 0], field[i, k, 1], field[i, k, 2], field[i, k, 3]
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def spot_factor(x_mm, y_mm, spots):  # type: ignore[no-untyped-def]
+    """Factor of friction at a place of the plate; `spots` as in `rigs.scene.springs.Springs`."""
+    factor = 1.0
+    for k in range(spots.shape[0]):
+        dx, dy, radius = x_mm - spots[k, 0], y_mm - spots[k, 1], spots[k, 2]
+        if dx * dx + dy * dy <= radius * radius:
+            factor *= spots[k, 3]
+    return factor
+
+
 _BETWEEN = 1.0 - 1e-9
 
 

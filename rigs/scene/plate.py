@@ -19,6 +19,7 @@ from numba import njit
 from sliplab.rigs.scene.contact import (
     LANES,
     Step,
+    feel_spots,
     make_blocks,
     move_tips,
     record,
@@ -104,8 +105,9 @@ def _solve(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance_free(  # type: ignore[no-untyped-def]
-    table, field, law, state, t_ns, sensor, motion, mass, weight, stiction, stop, track, load
-):
+    table, friction, law, state, t_ns, sensor, motion, mass, weight, stiction, stop, track, load,
+    spots,
+):  # fmt: skip
     """Advance tips and plate together until the steps end or the plate meets its stop.
 
     Args:
@@ -117,12 +119,15 @@ def advance_free(  # type: ignore[no-untyped-def]
         weight: what the catch leaves of the plate's weight at those times, N, (m + 1,).
         stiction: dry friction of the slider, N.
         stop: height of the stop, mm.
-        track, load: as in `rigs.scene.contact.advance`.
+        table, friction, law, state, track, load, spots: as in `rigs.scene.contact.advance`.
 
     Returns:
         steps taken, and whether the plate came to rest on its stop in the last of them.
     """
-    n, blocks = state.shape[0], make_blocks(table, field, state)
+    n, blocks = state.shape[0], make_blocks(table, friction, state)
+    field, factors = friction, np.ones(n)
+    if spots.shape[0] > 0:
+        field = friction.copy()
     holding = Law(
         _NEVER, law.strengthening, law.weak_mm_s, law.maxwell, law.relaxation_s, law.damping_s,
         law.exact_turns,
@@ -133,6 +138,8 @@ def advance_free(  # type: ignore[no-untyped-def]
     for k in range(sensor.shape[0]):
         begin_ns, begin_weight = t_ns[k], weight[k]
         while True:
+            if spots.shape[0] > 0:
+                feel_spots(blocks, n, friction, field, spots, factors)
             if t_ns[k + 1] - begin_ns != step_ns:
                 step_ns = t_ns[k + 1] - begin_ns
                 h = step_ns * 1e-9

@@ -10,7 +10,7 @@ L3  and relaxation after pressing, static over kinetic friction, friction rising
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +63,9 @@ class Springs:
     friction: F64
     """Kinetic coefficient along each tip's path (`rigs.scene.friction`), shape (n, knots, 4)."""
     law: Law
+    spots: F64 = field(default_factory=lambda: np.empty((0, 4)))
+    """Round spots on the plate on which friction differs: x, y and radius in mm, and the factor
+    on it; (k, 4)."""
 
     @property
     def layout(self) -> F64:

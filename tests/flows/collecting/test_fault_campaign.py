@@ -48,6 +48,12 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "pulses_late", "count": 30, "device": "arm"},
     {"kind": "papilla_torn", "papilla": 0},
     {"kind": "marker_occluded", "papilla": 0},
+    {"kind": "papilla_sticky", "papilla": 3},
+    {"kind": "plate_spot", "centre_mm": [9, 4], "radius_mm": 4},
+    {"kind": "mains_light", "share": 0.08},
+    {"kind": "mains_light", "share": 0.15},
+    {"kind": "arm_ramp", "mm_s2": 20},
+    {"kind": "arm_ramp"},
     {"kind": "disk_full"},
     {"kind": "device_gone", "device": "arm"},
     {"kind": "device_gone", "device": "event_camera"},
@@ -55,6 +61,7 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "device_gone", "device": "sync_box"},
 ]
 """Each happens once, in the middle of a trial of its own; a plate sticks only where one falls."""
+WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "plate_spot", "mains_light", "arm_ramp"}
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,7 @@ def _suffer(
     folder: Path, data: dict[str, Any], fault: dict[str, Any]
 ) -> tuple[Row, Campaign, set[str]]:
     """The next trial of a campaign with a fault in it; the trials that it committed, too."""
-    at = {} if fault["kind"] == "plate_stuck" or "at_mm" in fault else {"at_s": 0.8}
+    at = {} if fault["kind"] in WHOLE_TRIALS or "at_mm" in fault else {"at_s": 0.8}
     work, campaign = session(
         folder, data, faults=[{**fault, "trial": 1, **at}], frame_camera={"level": "tracks"}
     )

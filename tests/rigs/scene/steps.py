@@ -38,7 +38,7 @@ def run(
     rows = times(steps, h) if t_ns is None else t_ns
     advance(
         springs.table, springs.friction, springs.law, tips.state, rows, full,
-        np.zeros(steps + 1), track, load,
+        np.zeros(steps + 1), track, load, springs.spots,
     )  # fmt: skip
     return track, load.reshape(steps, n, 3)
 
@@ -68,7 +68,7 @@ def fall(
     rows = times(steps, h) if t_ns is None else t_ns
     done, _ = advance_free(
         springs.table, springs.friction, springs.law, tips.state, rows, full, motion,
-        mass, pull, stiction, -25.0, track, load,
+        mass, pull, stiction, -25.0, track, load, springs.spots,
     )  # fmt: skip
     return track[:done], done
 

@@ -16,7 +16,7 @@ def turn(springs: Springs, tips: Tips, sensor: np.ndarray) -> tuple[np.ndarray, 
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     advance(
         springs.table, springs.friction, springs.law, tips.state, times(steps, 1e-3), sensor,
-        np.zeros(steps + 1), track, load,
+        np.zeros(steps + 1), track, load, springs.spots,
     )  # fmt: skip
     return track, load.reshape(steps, n, 3)
 
