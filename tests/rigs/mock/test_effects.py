@@ -23,7 +23,7 @@ EFFECTS: list[dict[str, Any]] = [
     {"kind": "papilla_torn", "papilla": 9, "since": "trial", "at_s": 0},
     {"kind": "plate_spot", "centre_mm": (9.0, 4.0), "radius_mm": 4.0},
     {"kind": "mains_light", "share": 0.08},
-    {"kind": "arm_ramp", "mm_s2": 5.0},
+    {"kind": "arm_ramp", "mm_s2": 20.0},
 ]
 MU, DEPTH, SPEED = 0.85, 2.6, 2.0
 

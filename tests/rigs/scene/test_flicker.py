@@ -61,6 +61,7 @@ def test_events_are_those_of_a_pixel_stepped_through_time(
     negative = on if off is None else sensor._circuit.cells[..., 4]
     light = new_flicker(share, hz, on, negative, 0, 5)
     assert len(light.place) > 3500
+    events = 0
     for k in range(0, len(light.place), 400):
         column, row = light.place[k] >> 12, light.place[k] & 4095
         expected = stepped(
@@ -68,12 +69,12 @@ def test_events_are_those_of_a_pixel_stepped_through_time(
         )
         assert light.on[k] == on[row, column]
         own = (x == column) & (y == row)
-        assert len(expected) > 0
+        events += len(expected)
         assert p[own].tolist() == [polarity for _, polarity in expected]
         late_us = np.array([t for t, _ in expected]) - t_ns[own] / 1e3
-        # events that a microsecond holds together are seen at its end
-        assert late_us.min() > -1e-3
-        assert late_us.max() <= 1.0 + 1e-3
+        # what happens within a microsecond is seen at its end
+        assert np.all((late_us > -1e-3) & (late_us <= 1.0 + 1e-3))
+    assert events > 60
 
 
 @pytest.mark.parametrize("hz", [100.0, 120.0])
@@ -132,7 +133,7 @@ def test_a_light_keeps_the_refractory_period_and_the_scans() -> None:
     assert len(set((t_ns - (x * optics.column_ns).astype(np.int64)) % 200_000)) == 1
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     first=st.integers(0, 100), readout=st.sampled_from([0.0, 5000.0]),
     hz=st.sampled_from([10.0, 100.0, 333.3]), off=st.sampled_from([None, 0.18]), data=st.data(),
