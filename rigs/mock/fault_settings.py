@@ -211,7 +211,7 @@ class MainsLight(_Fault):
     """
 
     kind: Literal["mains_light"]
-    share: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    share: Annotated[float, Field(gt=0, le=0.5)] = 0.06
     """Amplitude over the mean of the intensity."""
     hz: Annotated[float, Field(ge=10, le=1000)] = 100.0
     """Of the light, which is twice that of the mains."""
