@@ -46,6 +46,8 @@ BAND_HZ = (2.2, 10.0)
 TONES = 4
 STRENGTHENING, WEAK_MM_S = 0.01, 0.1
 """Friction at the speed w is taken to grow by 0.01 ln(1 + w / 0.1 mm/s)."""
+UNSURE = 0.4
+"""A tone whose error is a larger share of its mean strength is left out of that slide."""
 SAME_HZ = 0.07
 """Tones that are closer are one: slides take a dozen seconds."""
 
@@ -376,33 +378,41 @@ def tremor_estimates(slips: Slips) -> dict[str, float]:
         series = [common_lag(slips, i) for i in np.flatnonzero(axis == side)]
         known = [one for one in series if one is not None]
         if len(known) >= 3:
-            tones, amplitude = _tones([(t, lag) for t, lag, _ in known])
+            tones, amplitude, error = _tones([(t, lag) for t, lag, _ in known])
             followed = np.array([follows for *_, follows in known])[:, None]
             turning = 2 * np.pi * tones * followed * STRENGTHENING
             averaged = np.sinc(tones * np.median(np.diff(known[0][0])))
-            found.append((tones, amplitude * np.hypot(1.0, turning) / averaged))
+            followed_mm = amplitude * np.hypot(1.0, turning) / averaged
+            height = np.sqrt(np.mean(followed_mm**2, axis=0))
+            found.append((tones, height, followed_mm, error < UNSURE * height))
     along: list[float] = []
+    own_tones: list[float] = []
     power = weighted = 0.0
-    for number, (tones, amplitude) in enumerate(found):
-        height = np.sqrt(np.mean(amplitude**2, axis=0))
+    for number, (tones, height, amplitude, sure) in enumerate(found):
         power += float(np.sum(height**2))
         weighted += float(np.sum(height**2 * np.log(tones)))
         others = np.concatenate([found[k][0] for k in range(len(found)) if k != number] or [[]])
         own = [k for k in range(len(tones)) if not np.any(np.abs(others - tones[k]) < SAME_HZ)]
         if own:
-            along += amplitude[:, max(own, key=lambda k: height[k])].tolist()
-    strength = [float(np.sqrt(np.sum(row**2))) for _, amplitude in found for row in amplitude]
+            k = max(own, key=lambda k: height[k])
+            along += amplitude[sure[:, k], k].tolist()
+            own_tones.append(float(tones[k]))
+    strength = [float(np.sqrt(np.sum(row**2))) for *_, amplitude, _ in found for row in amplitude]
     return {
         "tremor_mm": _largest(along),
         "tremor_along_mean_mm": float(np.mean(along)) if along else float("nan"),
         "tremor_all_mm": _largest(strength),
         "tremor_hz": float(np.exp(weighted / power)) if power > 0.0 else float("nan"),
+        # one axis' tones alone are others than both axes'
+        "tremor_along_hz": float(np.sqrt(np.prod(own_tones)))
+        if len(own_tones) == 2
+        else float("nan"),
     }
 
 
 def _largest(values: Sequence[float]) -> float:
-    """Mean of the two largest values; NaN without."""
-    return float(np.mean(np.sort(values)[-2:])) if len(values) else float("nan")
+    """Mean of the four largest values; NaN without."""
+    return float(np.mean(np.sort(values)[-4:])) if len(values) else float("nan")
 
 
 def common_lag(slips: Slips, i: int) -> tuple[F64, F64, float] | None:
@@ -430,25 +440,39 @@ def common_lag(slips: Slips, i: int) -> tuple[F64, F64, float] | None:
     return t[rows][:four].reshape(-1, 4).mean(axis=1), common, behind
 
 
-def _tones(series: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
-    """Return the frequencies of the tones that series have in common, and their amplitudes in each:
-    (TONES,) and (len(series), TONES)."""
+def _tones(series: Sequence[tuple[F64, F64]]) -> tuple[F64, F64, F64]:
+    """Return the frequencies of the tones that series have in common, (TONES,), and their
+    amplitudes in each with standard errors, (len(series), TONES)."""
     grid = np.arange(*BAND_HZ, 0.03)
     waves = [_waves(t, grid) for t, _ in series]
     trends = [_legendre(t) for t, _ in series]
     tones: list[float] = []
     rest = [_without(values, trend)[0] for (_, values), trend in zip(series, trends, strict=True)]
-    amplitude = np.zeros((len(series), TONES))
+    amplitude, error = np.zeros((2, len(series), TONES))
     for number in range(TONES):
         power = sum(np.abs(wave @ r) ** 2 / len(r) for wave, r in zip(waves, rest, strict=True))
-        tones.append(float(grid[int(np.argmax(power))]))
+        tones.append(_peak(grid, power))
         for row, ((t, values), trend) in enumerate(zip(series, trends, strict=True)):
             phase = 2 * np.pi * np.array(tones) * t[:, None]
             design = np.column_stack([trend, np.cos(phase), np.sin(phase)])
             rest[row], best = _without(values, design)
             pair = best[trend.shape[1] :].reshape(2, number + 1)
             amplitude[row, : number + 1] = np.hypot(*pair)
-    return np.array(tones), amplitude
+            if number == TONES - 1:
+                spread = np.diag(np.linalg.pinv(design.T @ design))[trend.shape[1] :]
+                free = max(len(t) - design.shape[1], 1)
+                noise = np.sum(rest[row] ** 2) / free
+                error[row] = np.sqrt(noise * spread.reshape(2, TONES).mean(axis=0))
+    return np.array(tones), amplitude, error
+
+
+def _peak(grid_hz: F64, power: F64) -> float:
+    """Frequency of the largest power, by a parabola through it and its neighbours."""
+    k = int(np.clip(np.argmax(power), 1, len(grid_hz) - 2))
+    before, here, after = power[k - 1 : k + 2]
+    bend = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return float(grid_hz[k] + np.clip(shift, -0.5, 0.5) * (grid_hz[1] - grid_hz[0]))
 
 
 def _waves(t_s: F64, grid_hz: F64) -> C128:
