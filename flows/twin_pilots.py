@@ -23,6 +23,12 @@ from sliplab.storage.streams import (
     WrenchChunk,
 )
 
+POLL_S = 60.0
+"""Nothing waits for the streams, so that they are read once a step; the data are the same."""
+COARSE_MS = 4
+"""Step of the contact without events: slips are exact at any step, and marker places that are seen
+100 times a second change by less than their noise."""
+
 
 @dataclass
 class _Memory(NullSink):
@@ -61,11 +67,14 @@ def simulate_pilot(
         RigError: a trial cannot be run on this rig.
     """
     tracked = changed(with_true_times(rig), {"frame_camera": {"level": "tracks"}})
+    if not with_events:
+        step_ms = max(rig.scene.scene.step_ms, COARSE_MS)
+        tracked = changed(tracked, {"scene": {"step_ms": step_ms}})
     size = tracked.frame_px(plan)
     assert size is not None
     rate_hz = plan.protocol.collection.recording.sync_rate
     built = build_rig(tracked)
-    built.force_poll_s = built.poll_s
+    built.poll_s = built.force_poll_s = POLL_S
     found = []
     try:
         built.connect()

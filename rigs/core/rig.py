@@ -128,8 +128,8 @@ class Rig:
     _reading: tuple[FurtherStream, ...] = field(default=(), init=False)
     """The further devices while they are recorded."""
     force_poll_s: float = field(default=force_watch.POLL_S, init=False)
-    """Interval at which forces are read and held against their limit, s. Runs in memory, where nothing
-    can break, need not look so often."""
+    """Interval at which forces are read and held against their limit, s; a run in memory, where
+    nothing can break, need not look so often."""
     _forces: ForceWatch | None = field(default=None, init=False)
     """Forces while they are watched, whether or not they are recorded."""
     _reported: str = field(default="", init=False)
