@@ -34,6 +34,7 @@ from sliplab.analysis.twin.rims import (
     CONTRAST,
     DOWN,
     EDGE,
+    GROWN,
     HIDDEN,
     RADIUS,
     RIGHT,
@@ -140,7 +141,7 @@ def _rests(trials: Sequence[PilotTrial], size_px: tuple[int, int]) -> F64 | None
             continue
         alike = np.hypot(*(ways - ways[first]).T) < 0.1
         tried |= alike
-        together = [trials[k] for k in np.flatnonzero(alike)]
+        together = [t for t, same in zip(trials, alike, strict=True) if same]
         layout = np.mean([_tips(trial) for trial in together], axis=0)
         if len(layout) < 3 or not np.isfinite(layout).all():
             continue
@@ -424,18 +425,39 @@ def _geometry(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
         found["image_shift_mm_per_n"] = float(
             shift[measured] @ pulled[measured] / (pulled[measured] @ pulled[measured]) / px_per_mm
         )
-        # together radii are those without force, of as many as are seen, and grow by the force on
-        # these: friction is in proportion to it, and so is how far a disc moves
-        moved = np.hypot(discs[measured][..., RIGHT], discs[measured][..., DOWN])
-        unseen = np.where(seen[measured], 0.0, moved).sum(axis=1)
-        pressed = loads[measured, 0, 2] * (1.0 - unseen / np.maximum(moved.sum(axis=1), 1e-9))
-        together = np.nansum(discs[measured][..., RADIUS], axis=1)
-        design = np.column_stack([seen[measured].sum(axis=1), pressed])
-        (radius_px, growth_px), _, rank, _ = np.linalg.lstsq(design, together, rcond=1e-6)
-        if rank == 2:
-            found["marker_radius_mm"] = float(radius_px) / px_per_mm
-            found["image_growth_mm_per_n"] = float(growth_px) / px_per_mm
+        found.update(_growth(discs[measured], loads[measured, :, 2], px_per_mm))
     return found
+
+
+def _growth(discs: F64, normal_n: F64, px_per_mm: float) -> dict[str, float]:
+    """Radius of a marker without force, and its growth by force.
+
+    Together, radii are those without force, of as many as are seen, and grow by the force on them
+    all. Where the number seen goes with the force, that does not tell one from the other. But when
+    all tips slide, a disc's displacement is in proportion to the force on its papilla, but for what
+    friction differs by, so that big and small discs of one slide tell it too.
+
+    Args:
+        normal_n: of all papillae before and after each slide, N, (n, 2).
+    """
+    seen = np.isfinite(discs[..., RADIUS])
+    moved = np.hypot(discs[..., RIGHT], discs[..., DOWN])
+    share = moved / np.maximum(moved.sum(axis=1, keepdims=True), 1e-9)
+    pressed = normal_n[:, 0] * np.where(seen, share, 0.0).sum(axis=1)
+    together = np.column_stack([seen.sum(axis=1), pressed])
+    each = np.column_stack([np.ones(seen.sum()), (normal_n[:, [1]] * share)[seen]])
+    radius = np.concatenate(
+        [np.nansum(discs[..., RADIUS], axis=1), (discs[..., RADIUS] + discs[..., GROWN])[seen]]
+    )
+    (at_rest, grown), _, rank, _ = np.linalg.lstsq(
+        np.concatenate([together, each]), radius, rcond=1e-6
+    )
+    if rank < 2:
+        return {}
+    return {
+        "marker_radius_mm": float(at_rest) / px_per_mm,
+        "image_growth_mm_per_n": float(grown) / px_per_mm,
+    }
 
 
 def _papillae(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
