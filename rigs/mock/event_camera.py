@@ -133,8 +133,7 @@ class MockEventCamera:
         loads = self._loads = world.keep_loads(self._loads_of)
         self._next_ns = loads.end_ns
         row_ns, rows = loads.between(self._next_ns, self._next_ns)
-        flicker = world.faults.flicker() if self._own.first else None
-        self._sensor.reset(self._on_skin(row_ns, rows)[0], self._own.trial_seed(world), flicker)
+        self._sensor.reset(self._on_skin(row_ns, rows)[0], self._own.trial_seed(world))
         self._begun_ns, self._until_ns, self._running = world.now_ns, NEVER, True
         self._input.skip()
 
@@ -157,7 +156,8 @@ class MockEventCamera:
         if last_ns <= self._next_ns:
             return EventChunk.empty()
         row_ns, rows = loads.between(self._next_ns, last_ns)
-        t_ns, x, y, p = self._sensor.sense(self._on_skin(row_ns, rows), row_ns)
+        flicker = world.faults.flicker() if self._own.first else None
+        t_ns, x, y, p = self._sensor.sense(self._on_skin(row_ns, rows), row_ns, flicker)
         if self._bursts is not None:
             t_ns, x, y, p = self._bursts.into(
                 (t_ns, x, y, p), self._next_ns, last_ns, self._sensor.scans

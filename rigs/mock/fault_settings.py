@@ -203,7 +203,7 @@ class PlateSpot(_Fault):
     """Friction on it over friction beside it. A tip stands on it if its middle does."""
 
 
-class MainsLight(_Fault):
+class MainsLight(_TimedFault):
     """Lamps on the mains flicker, which the event camera sees as if all of the image did.
 
     Intensity is 1 + share sin(2 pi hz t + phase) times that of steady light; the phase belongs to
@@ -211,7 +211,9 @@ class MainsLight(_Fault):
     """
 
     kind: Literal["mains_light"]
-    share: Annotated[float, Field(gt=0, le=0.5)] = 0.06
+    at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """When it begins; it lasts to the trial's end."""
+    share: Annotated[float, Field(gt=0, le=0.5)] = 0.08
     """Amplitude over the mean of the intensity."""
     hz: Annotated[float, Field(ge=10, le=1000)] = 100.0
     """Of the light, which is twice that of the mains."""

@@ -126,6 +126,15 @@ class FaultBook:
 
     # -- the event camera ------------------------------------------------------------------
 
+    def flicker(self) -> tuple[float, float, int] | None:
+        """Return the light's amplitude over its mean, its frequency (Hz), and when it begins, ns.
+
+        None if it is steady, or while its recording has not begun.
+        """
+        for light, begin, _ in self.spans(MainsLight):
+            return light.share, light.hz, begin
+        return None
+
     def gaps_ns(self) -> list[tuple[int, int]]:
         """Return the true intervals in which the event camera loses its data."""
         gone = [span for span in self.spans(DeviceGone) if span[0].device == "event_camera"]
@@ -153,11 +162,6 @@ class FaultBook:
         """Return the spots on the plate: x, y and radius in mm, factor of friction, (k, 4)."""
         rows = [[*spot.centre_mm, spot.radius_mm, spot.factor] for spot in self.of(PlateSpot)]
         return np.array(rows, np.float64).reshape(-1, 4)
-
-    def flicker(self) -> tuple[float, float] | None:
-        """Return amplitude over mean and frequency (Hz) of the light; None if it is steady."""
-        lights = self.of(MainsLight)
-        return (lights[0].share, lights[0].hz) if lights else None
 
     def ramp_mm_s2(self) -> float:
         """Return the arm's acceleration in contact; infinite for an arm without ramps."""

@@ -30,7 +30,7 @@ from sliplab.rigs.scene.circuit import (
     start_cells,
 )
 from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, memorise_discs, widen
-from sliplab.rigs.scene.flicker import flicker_events, new_flicker, steady
+from sliplab.rigs.scene.flicker import Flicker, flicker_events, new_flicker, steady
 from sliplab.rigs.scene.marker_path import (
     SEGMENT,
     cut_block,
@@ -179,7 +179,6 @@ class MarkerSensor:
         )  # fmt: skip
         self._circuit = self._new_circuit(seed) if optics.has_circuit else no_circuit()
         self._light = steady()
-        self._flicker: tuple[float, float] | None = None
         self._started = True
         middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
         self._projection = (
@@ -234,16 +233,14 @@ class MarkerSensor:
         )  # fmt: skip
         return result
 
-    def reset(self, load: F64, seed: int, flicker: tuple[float, float] | None = None) -> None:
+    def reset(self, load: F64, seed: int) -> None:
         """Every pixel takes the image under `load`, (3 n,), as its reference.
 
         Args:
             seed: the trial's: noise, when the read-out scans, and the phase of the light.
-            flicker: amplitude over mean and frequency (Hz) of a light that flickers, see
-                `rigs.scene.flicker`.
         """
         optics = self.optics
-        self._light, self._flicker = steady(), flicker
+        self._light = steady()
         self._trial, self._bins = seed, {}
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
         darken(self._pixels.seen, self._dark, self._pixels.state)
@@ -255,7 +252,7 @@ class MarkerSensor:
             # a camera that has run for long: each pixel is at a random point between two leaks
             phase = generator(seed, "leak phases").random(self.threshold.shape)
             memorise_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
-        self._started = False
+            self._started = False
         self._pixels.fired[:] = NEVER_NS
         self._pending = np.empty(0, np.int64)
         if optics.period_ns:
@@ -267,7 +264,9 @@ class MarkerSensor:
             self._lists = no_lists(len(discs), slots)
         self._lists.origin[:] = 0.0
 
-    def sense(self, loads: F64, t_ns: I64) -> Events:
+    def sense(
+        self, loads: F64, t_ns: I64, flicker: tuple[float, float, int] | None = None
+    ) -> Events:
         """Events between the first and the last row of `loads`, in order of time.
 
         Between rows markers move on smooth curves, block by block of a global grid of true time,
@@ -279,9 +278,14 @@ class MarkerSensor:
             loads: as in `path`; the first row is the last one of the call before.
             t_ns: true time of each row, int64, (m,), strictly rising; every multiple of the
                 optics' `block_ns` between the first and the last one is among them.
+            flicker: of a light that is not steady (`rigs.scene.flicker`): amplitude over mean,
+                frequency (Hz), and true time (ns) from which it is so, in all later calls, too.
         """
         if not self._started:
-            self._start(int(t_ns[0]))
+            start_cells(self._circuit, int(t_ns[0]))
+            self._started = True
+        if flicker is not None and self._light.share == 0.0 and flicker[2] < t_ns[-1]:
+            self._light = self._flickering(*flicker[:2], max(flicker[2], int(t_ns[0])))
         when, x, y, p, self._pending = trace(
             np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, self._camera,
             self._phase_ns, self._pixels, self._lists, self._circuit,
@@ -289,15 +293,12 @@ class MarkerSensor:
         )  # fmt: skip
         return when, x, y, p
 
-    def _start(self, t_ns: int) -> None:
-        """Let the pixels look from `t_ns` on."""
+    def _flickering(self, share: float, hz: float, since_ns: int) -> Flicker:
+        """Return a light that flickers from a true time on."""
         on = off = self.threshold
         if self.optics.has_circuit:
-            start_cells(self._circuit, t_ns)
             on, off = self._circuit.cells[..., ON], self._circuit.cells[..., OFF]
-        if self._flicker is not None:
-            self._light = new_flicker(*self._flicker, on, off, t_ns, self._trial)
-        self._started = True
+        return new_flicker(share, hz, on, off, since_ns, self._trial)
 
     def _candidates(self, begin_ns: int, end_ns: int) -> Candidates:
         """Possible noise of the whole seconds of the trial that a span of true time touches."""

@@ -9,8 +9,8 @@ least theta; else none: its reference level comes to rest.
 
 A pixel has a reference level for the light besides the one for the markers. That is exact where the
 image stands still. At a rim that moves, the events of both are a superposition, in which neither
-advances or delays the other. A camera has run for long when it starts, so that the levels are at
-random between two events, and a leak does not move them.
+advances or delays the other. The levels are at random between two events when the light is first
+seen, as if it had long been so, and a leak does not move them.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ class Flicker(NamedTuple):
     hz: float
     origin_ns: float
     """A true time at which the intensity rises through its mean, ns."""
+    since_ns: int
+    """True time from which it flickers."""
     place: I64
     """Column << 12 | row, (n,)."""
     on: F64
@@ -49,16 +51,16 @@ class Flicker(NamedTuple):
 def steady() -> Flicker:
     """Return a light that does not flicker."""
     none = np.empty(0)
-    return Flicker(0.0, 1.0, 0.0, np.empty(0, np.int64), none, none, none.copy())
+    return Flicker(0.0, 1.0, 0.0, 0, np.empty(0, np.int64), none, none, none.copy())
 
 
-def new_flicker(share: float, hz: float, on: F64, off: F64, t_ns: int, seed: int) -> Flicker:
+def new_flicker(share: float, hz: float, on: F64, off: F64, since_ns: int, seed: int) -> Flicker:
     """Return the light of a trial, and all pixels that can fire by it for long.
 
     Args:
         share: amplitude over mean of the intensity, above 0 and below 1.
         on, off: thresholds of all pixels, (height, width).
-        t_ns: true time from which pixels look.
+        since_ns: true time from which it flickers, and pixels look.
         seed: the trial's: phase of the light, and reference levels.
     """
     rng = generator(seed, "mains light")
@@ -67,8 +69,9 @@ def new_flicker(share: float, hz: float, on: F64, off: F64, t_ns: int, seed: int
     lots = rng.random(on.shape)
     y, x = np.nonzero(np.maximum(on, off) <= swing)
     on, off, lots = on[y, x], off[y, x], lots[y, x]
-    level = _level_at(float(t_ns), share, hz, origin_ns) - on + lots * (on + off)
-    return Flicker(float(share), float(hz), origin_ns, x.astype(np.int64) << 12 | y, on, off, level)
+    level = _level_at(float(since_ns), share, hz, origin_ns) - on + lots * (on + off)
+    place = x.astype(np.int64) << 12 | y
+    return Flicker(float(share), float(hz), origin_ns, since_ns, place, on, off, level)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -88,7 +91,10 @@ def flicker_events(light, begin_ns, end_ns, base_ns, events, n):  # type: ignore
     Returns:
         the events, which may have moved, and how many there are.
     """
-    share, hz, origin_ns, place, on, off, levels = light
+    share, hz, origin_ns, since_ns, place, on, off, levels = light
+    begin_ns = max(begin_ns, since_ns)
+    if begin_ns >= end_ns:
+        return events, n
     half_ns, pace = 0.5e9 / hz, 2e-9 * np.pi * hz
     first = np.int64(np.floor((begin_ns - origin_ns) / half_ns + 0.5))
     last = np.int64(np.floor((end_ns - origin_ns) / half_ns + 0.5))

@@ -61,7 +61,7 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "device_gone", "device": "sync_box"},
 ]
 """Each happens once, in the middle of a trial of its own; a plate sticks only where one falls."""
-WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "plate_spot", "mains_light", "arm_ramp"}
+WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "plate_spot", "arm_ramp"}
 
 
 @dataclass(frozen=True)

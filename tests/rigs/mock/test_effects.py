@@ -170,6 +170,10 @@ def test_a_light_on_the_mains_is_seen_by_pixels_with_low_thresholds() -> None:
         for name, column in getattr(steady, stream).items():
             assert np.array_equal(getattr(trial, stream)[name], column)
     assert trial.truth == steady.truth
+    later = slide(with_faults({"kind": "mains_light", "share": share, "at_s": 1.0}), seed=11)
+    before = np.searchsorted(steady.events["t_us"], steady.events["t_us"][0] + 990_000)
+    assert np.array_equal(later.events["t_us"][:before], steady.events["t_us"][:before])
+    assert len(steady.events["t_us"]) + 0.4 * more < len(later.events["t_us"])
 
 
 # -- the arm -------------------------------------------------------------------------------
@@ -272,5 +276,12 @@ def test_an_impossible_effect_is_said_as_any_wrong_input(
 
 
 def test_effects_of_different_trials_may_differ() -> None:
-    lights = [{"kind": "mains_light", "trial": n, "share": 0.05 * n} for n in (1, 2)]
-    assert with_faults(*lights, {"kind": "arm_ramp"}).world.faults.flicker() is None
+    lights = [
+        {"kind": "mains_light", "trial": n, "share": 0.05 * n, "since": "trial"} for n in (1, 2)
+    ]
+    devices = with_faults(*lights, {"kind": "arm_ramp"})
+    assert devices.world.faults.flicker() is None
+    for n in (1, 2):
+        devices.begin_trial(5)
+        assert devices.world.faults.flicker() == (0.05 * n, 100.0, 0)
+        assert devices.world.path.ramp_mm_s2 == 1.0

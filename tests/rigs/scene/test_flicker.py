@@ -20,13 +20,11 @@ def swing(share: float) -> float:
     return math.log((1 + share) / (1 - share))
 
 
-def still(
-    optics: EventOptics, flicker: tuple[float, float] | None, rows: int = 321, first: int = 0
-) -> Events:
+def still(optics: EventOptics, flicker: tuple[float, float], rows: int = 321) -> Events:
     """Events of a sensor that sees one marker at rest."""
     sensor = MarkerSensor(optics, ONE, 1)
-    sensor.reset(np.zeros(3), 1, flicker)
-    return sensor.sense(np.zeros((rows, 3)), times(rows, first))
+    sensor.reset(np.zeros(3), 1)
+    return sensor.sense(np.zeros((rows, 3)), times(rows), (*flicker, 0))
 
 
 def stepped(
@@ -55,8 +53,8 @@ def test_events_are_those_of_a_pixel_stepped_through_time(
         **{**SMALL, "threshold": 0.12, "threshold_sigma": 0.02, "threshold_off": off}
     )
     sensor = MarkerSensor(optics, ONE, 1)
-    sensor.reset(np.zeros(3), 5, (share, hz))
-    t_ns, x, y, p = sensor.sense(np.zeros((97, 3)), times(97))
+    sensor.reset(np.zeros(3), 5)
+    t_ns, x, y, p = sensor.sense(np.zeros((97, 3)), times(97), (share, hz, 0))
     on = sensor.threshold
     negative = on if off is None else sensor._circuit.cells[..., 4]
     light = new_flicker(share, hz, on, negative, 0, 5)
@@ -110,8 +108,8 @@ def test_a_moving_marker_and_the_light_add_their_events() -> None:
     moving = sense(MarkerSensor(optics, ONE, 1), loads)
     light = still(optics, (0.1, 100.0))
     sensor = MarkerSensor(optics, ONE, 1)
-    sensor.reset(loads[0], 1, (0.1, 100.0))
-    both = sensor.sense(loads, times(321))
+    sensor.reset(loads[0], 1)
+    both = sensor.sense(loads, times(321), (0.1, 100.0, 0))
     assert min(len(moving[0]), len(light[0])) > 1000
     together = np.concatenate([np.stack(moving), np.stack(light)], axis=1)
     order, found = np.lexsort(together), np.stack(both)
@@ -135,26 +133,39 @@ def test_a_light_keeps_the_refractory_period_and_the_scans() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    first=st.integers(0, 100), readout=st.sampled_from([0.0, 5000.0]),
+    first=st.integers(0, 100), since=st.integers(0, 400), readout=st.sampled_from([0.0, 5000.0]),
     hz=st.sampled_from([10.0, 100.0, 333.3]), off=st.sampled_from([None, 0.18]), data=st.data(),
 )  # fmt: skip
 def test_chunks_do_not_matter(
-    first: int, readout: float, hz: float, off: float | None, data: st.DataObject
+    first: int, since: int, readout: float, hz: float, off: float | None, data: st.DataObject
 ) -> None:
     optics = EventOptics(
         width=64, height=64, noise_hz=1.0, readout_hz=readout, threshold_off=off, radius_mm=0.2
     )
     loads, t_ns = straight(optics, (30.0, 4.0), 600), times(601, first)
     sensor = MarkerSensor(optics, ONE, 7)
-    sensor.reset(loads[0], 3, (0.15, hz))
-    whole = sensor.sense(loads, t_ns)
-    sensor.reset(loads[0], 3, (0.15, hz))
+    light = (0.15, hz, since * 1_000_000 + 17)
+    sensor.reset(loads[0], 3)
+    whole = sensor.sense(loads, t_ns, light)
+    sensor.reset(loads[0], 3)
     ends = [k for k in range(1, 600) if t_ns[k] % optics.block_ns == 0]
     cuts = sorted({0, 600, *data.draw(st.sets(st.sampled_from(ends)))})
-    parts = [sensor.sense(loads[a : b + 1], t_ns[a : b + 1]) for a, b in itertools.pairwise(cuts)]
+    parts = [
+        sensor.sense(loads[a : b + 1], t_ns[a : b + 1], light) for a, b in itertools.pairwise(cuts)
+    ]
     assert len(whole[0]) > 1000
     for column, pieces in zip(whole, zip(*parts, strict=True), strict=True):
         assert np.array_equal(column, np.concatenate(pieces))
+
+
+def test_a_light_that_begins_later_is_steady_until_then() -> None:
+    optics = EventOptics(**SMALL)
+    sensor = MarkerSensor(optics, ONE, 1)
+    sensor.reset(np.zeros(3), 1)
+    t_ns, _, _, _ = sensor.sense(np.zeros((321, 3)), times(321), (0.2, 100.0, 123_456_789))
+    assert 123_456_789 <= t_ns[0] < 133_456_789
+    sensor.reset(np.zeros(3), 1)
+    assert len(sensor.sense(np.zeros((65, 3)), times(65), (0.2, 100.0, 123_456_789))[0]) == 0
 
 
 def test_a_steady_light_after_a_trial_with_flicker() -> None:
@@ -162,7 +173,7 @@ def test_a_steady_light_after_a_trial_with_flicker() -> None:
     sensor = MarkerSensor(optics, ONE, 1)
     loads = straight(optics, (30.0, 4.0), 320)
     fresh = sense(sensor, loads)
-    sensor.reset(loads[0], 2, (0.3, 100.0))
-    sensor.sense(loads, times(321))
+    sensor.reset(loads[0], 2)
+    sensor.sense(loads, times(321), (0.3, 100.0, 0))
     again = sense(sensor, loads)
     assert all(np.array_equal(a, b) for a, b in zip(fresh, again, strict=True))
