@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.twin.pilot import Camera, Forces, PilotTrial, base_at, slide_of
+from sliplab.analysis.twin.pilot import (
+    Camera,
+    Forces,
+    PilotTrial,
+    base_at,
+    seconds_after,
+    slide_of,
+)
 from sliplab.flows.scene_runs import changed, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import (
-    F64,
-    I64,
     EventChunk,
     FrameChunk,
     NullSink,
     PoseChunk,
-    StreamChunk,
     WrenchChunk,
 )
 
@@ -48,7 +53,7 @@ class _Memory(NullSink):
     def add_poses(self, chunk: PoseChunk) -> None:
         self.poses.append(chunk)
 
-    def add_stream(self, name: str, chunk: StreamChunk) -> None:  # type: ignore[override]
+    def add_stream(self, name: str, chunk: Any) -> None:
         if name == "force" and isinstance(chunk, WrenchChunk):
             self.forces.append(chunk)
 
@@ -89,10 +94,10 @@ def simulate_pilot(
             done = built.run_trial(program, sink, chance, size, rate_hz, with_events)
             steps = {step.phase: step for step, _ in done.steps}
             start_ns = steps["slide"].start_ns
-            frame_s = _since(np.concatenate([c.t_ns for c in sink.frames]), start_ns)
+            frame_s = seconds_after(start_ns, np.concatenate([c.t_ns for c in sink.frames]))
             xy_px = np.concatenate([c.markers_px for c in sink.frames if c.markers_px is not None])
             middle = (np.array(size) - 1) / 2
-            pose_s = _since(np.concatenate([c.t_ns for c in sink.poses]), start_ns)
+            pose_s = seconds_after(start_ns, np.concatenate([c.t_ns for c in sink.poses]))
             xyz, turn = (
                 np.concatenate([getattr(c, name) for c in sink.poses])
                 for name in ("xyz_mm", "rotvec_deg")
@@ -108,7 +113,7 @@ def simulate_pilot(
             if sink.forces:
                 t_ns = np.concatenate([c.t_ns for c in sink.forces])
                 forces = Forces(
-                    _since(t_ns, start_ns), np.concatenate([c.force_n for c in sink.forces])
+                    seconds_after(start_ns, t_ns), np.concatenate([c.force_n for c in sink.forces])
                 )
             found.append(
                 PilotTrial(
@@ -121,8 +126,3 @@ def simulate_pilot(
     finally:
         built.close()
     return found
-
-
-def _since(t_ns: I64, start_ns: int) -> F64:
-    result: F64 = (t_ns - start_ns) * 1e-9
-    return result

@@ -137,19 +137,25 @@ def pilot_trial(slide: Slide, recording: Recording, places: Mapping[str, Any]) -
         camera = Camera(EventChunk(found.x, found.y, found.p, t_us), recording.event_px)
     if has_forces(recording):
         plate = plate_forces(recording)
-        forces = Forces((plate.t_ns - start_ns) * 1e-9, plate.force_n)
+        forces = Forces(seconds_after(start_ns, plate.t_ns), plate.force_n)
+    frame_s = seconds_after(start_ns, frame_ns)
     return PilotTrial(
         recording.trial_id,
         slide,
         hold_s=(begin_ns - start_ns) * 1e-9,
         slide_s=(stop_ns - start_ns) * 1e-9,
-        frame_s=(frame_ns - start_ns) * 1e-9,
+        frame_s=frame_s,
         tips_mm=(xy_px - middle) * [1.0, -1.0] / scale,
-        base_mm=base_at((pose_ns - start_ns) * 1e-9, poses.xyz_mm, poses.rotvec_deg,
-                        (frame_ns - start_ns) * 1e-9),
+        base_mm=base_at(seconds_after(start_ns, pose_ns), poses.xyz_mm, poses.rotvec_deg, frame_s),
         camera=camera,
         forces=forces,
-    )  # fmt: skip
+    )
+
+
+def seconds_after(start_ns: int, t_ns: I64) -> F64:
+    """Return times in seconds after another one, which float64 holds to the nanosecond."""
+    result: F64 = (t_ns - start_ns).astype(np.float64) * 1e-9
+    return result
 
 
 def base_at(pose_s: F64, xyz_mm: F64, rotvec_deg: F64, t_s: F64) -> F64:
