@@ -309,12 +309,12 @@ def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:
             values[inside == r] -= values[inside == r].mean()
     free = max(len(inside) - len(np.unique(inside)), 1)
     reach = max((np.ptp(raised[inside == r]) / 2 for r in np.unique(inside)), default=np.nan)
-    values = (
+    told = (
         fit.kinetic, fit.normal_compliance, fit.tangential_compliance, fit.layer_step_mm,
         fit.zero_mm, fit.youngs_modulus_mpa, float(np.sqrt(np.sum(friction**2) / free)),
         float(np.sqrt(np.sum(raised**2) / free)), float(reach),
     )  # fmt: skip
-    return dict(zip(names, values, strict=True))
+    return dict(zip(names, told, strict=True))
 
 
 # -- along the path ----------------------------------------------------------------------------
@@ -375,7 +375,7 @@ def tremor_estimates(slips: Slips) -> dict[str, float]:
     axis = np.abs(slips.way[:, 0]) < np.abs(slips.way[:, 1])
     found = []
     for side in (False, True):
-        series = [common_lag(slips, i) for i in np.flatnonzero(axis == side)]
+        series = [common_lag(slips, i) for i in np.flatnonzero(axis == side).tolist()]
         known = [one for one in series if one is not None]
         if len(known) >= 3:
             tones, amplitude, error = _tones([(t, lag) for t, lag, _ in known])
@@ -391,8 +391,12 @@ def tremor_estimates(slips: Slips) -> dict[str, float]:
     for number, (tones, height, amplitude, sure) in enumerate(found):
         power += float(np.sum(height**2))
         weighted += float(np.sum(height**2 * np.log(tones)))
-        others = np.concatenate([found[k][0] for k in range(len(found)) if k != number] or [[]])
-        own = [k for k in range(len(tones)) if not np.any(np.abs(others - tones[k]) < SAME_HZ)]
+        others = [tone for k, one in enumerate(found) if k != number for tone in one[0].tolist()]
+        own = [
+            k
+            for k in range(len(tones))
+            if not any(abs(tones[k] - tone) < SAME_HZ for tone in others)
+        ]
         if own:
             k = max(own, key=lambda k: height[k])
             along += amplitude[sure[:, k], k].tolist()
@@ -450,7 +454,9 @@ def _tones(series: Sequence[tuple[F64, F64]]) -> tuple[F64, F64, F64]:
     rest = [_without(values, trend)[0] for (_, values), trend in zip(series, trends, strict=True)]
     amplitude, error = np.zeros((2, len(series), TONES))
     for number in range(TONES):
-        power = sum(np.abs(wave @ r) ** 2 / len(r) for wave, r in zip(waves, rest, strict=True))
+        power = np.zeros(len(grid))
+        for wave, r in zip(waves, rest, strict=True):
+            power += np.abs(wave @ r) ** 2 / len(r)
         tones.append(_peak(grid, power))
         for row, ((t, values), trend) in enumerate(zip(series, trends, strict=True)):
             phase = 2 * np.pi * np.array(tones) * t[:, None]
@@ -493,7 +499,7 @@ def _legendre(t_s: F64) -> F64:
 
 
 def _without(values: F64, design: F64) -> tuple[F64, F64]:
-    best, *_ = np.linalg.lstsq(design, values, rcond=1e-6)
+    best = np.asarray(np.linalg.lstsq(design, values, rcond=1e-6)[0], np.float64)
     return values - design @ best, best
 
 

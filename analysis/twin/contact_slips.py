@@ -88,13 +88,14 @@ def find_slips(trials: Sequence[PilotTrial]) -> Slips | None:
     usual = max(set(counts), key=counts.count)
     kept = tuple(trial for trial in trials if trial.tips_mm.shape[1] == usual)
     found = [_slips_of(trial) for trial in kept]
+    noise, free, slipped, stretch, after, lag, frame_s, path = zip(*found, strict=True)
     return Slips(
         kept,
         np.array([trial.slide.depth_mm for trial in kept]),
         np.array([trial.slide.speed_mm_s for trial in kept]),
         np.array([trial.slide.direction for trial in kept]),
-        *(np.array(column) for column in list(zip(*found, strict=True))[:5]),
-        *(list(column) for column in list(zip(*found, strict=True))[5:]),
+        np.array(noise), np.array(free), np.array(slipped), np.array(stretch), np.array(after),
+        list(lag), list(frame_s), list(path),
     )  # fmt: skip
 
 
