@@ -23,6 +23,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import twin as page
 from sliplab.analysis.twin.camera_estimates import camera_estimates
 from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, contact_estimates, papillae
+from sliplab.analysis.twin.contact_springs import Guess
 from sliplab.analysis.twin.parameters import (
     PARAMETERS,
     Parameter,
@@ -92,9 +93,10 @@ class Pilot:
         there = {"frames": True, "events": first.camera, "force": first.forces}
         return frozenset(name for name, found in there.items() if found is not None)
 
-    def statistics(self) -> dict[str, float]:
+    def statistics(self, guess: Guess) -> dict[str, float]:
         """Return what the fitted trials show."""
-        return statistics([self.slides[trial.id] for trial in self.fitted], self.with_events)
+        slides = [self.slides[trial.id] for trial in self.fitted]
+        return statistics(slides, self.with_events, guess)
 
 
 def read_pilot(store: Store, item: Collected) -> Pilot:
@@ -130,10 +132,16 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
     )  # fmt: skip
 
 
-def statistics(slides: Sequence[PilotTrial], with_events: frozenset[str]) -> dict[str, float]:
-    """Return what slides show of contact and event camera, by name."""
+def statistics(
+    slides: Sequence[PilotTrial], with_events: frozenset[str], guess: Guess
+) -> dict[str, float]:
+    """Return what slides show of contact and event camera, by name.
+
+    Args:
+        with_events: ids of those whose events are read. guess: see `contact_estimates`.
+    """
     seen = [slide for slide in slides if slide.trial in with_events and slide.camera is not None]
-    found = contact_estimates(slides)
+    found = contact_estimates(slides, guess)
     return found | camera_estimates(seen) if seen else found
 
 
@@ -143,6 +151,7 @@ class World:
 
     Attributes:
         with_events: ids of the trials whose events are simulated. seed: of the trials' chance.
+        guess: where estimates begin; of the rig that is fitted.
     """
 
     rig: RigFile
@@ -150,6 +159,7 @@ class World:
     trials: tuple[Trial, ...]
     with_events: frozenset[str]
     seed: int
+    guess: Guess
 
     def slides(self) -> list[PilotTrial]:
         """Take the trials, in their order."""
@@ -168,7 +178,7 @@ def slides_of_world(world: World) -> list[PilotTrial]:
 
 def statistics_of_world(world: World) -> dict[str, float]:
     """Return what a world's slides show."""
-    return statistics(world.slides(), world.with_events)
+    return statistics(world.slides(), world.with_events, world.guess)
 
 
 def other_rig(
@@ -184,7 +194,34 @@ def other_rig(
     scene = settings.setdefault("scene", {})
     scene["skin"] = {**scene.get("skin", {}), **skin}
     scene["contact"] = {"offset_mm": rig.scene.scene.contact.offset_mm + zero_mm}
-    return changed(rig, settings).model_copy(update={"poll": 1})
+    return changed(rig, settings)
+
+
+def other_specimen(rig: RigFile, values: Mapping[str, float], seed: int, zero_mm: float) -> RigFile:
+    """Return another specimen of a simulated rig: its skin, its pixels, its tremor are drawn anew.
+
+    Args:
+        values, zero_mm: as for `other_rig`.
+    """
+    made = other_rig(rig, values, {"seed": None, "papillae": None}, zero_mm)
+    return changed(made, {"seed": seed})
+
+
+def guess_of(rig: RigFile) -> Guess:
+    """Return the design of a rig's skin, and what it assumes of it."""
+    skin, friction = rig.scene.scene.skin, rig.scene.scene.friction
+    rigid = 1e9
+    return Guess(
+        height_mm=skin.heights_mm[0],
+        radius_mm=skin.radius_mm,
+        bending=skin.bending,
+        poisson_ratio=skin.poisson_ratio,
+        kinetic=friction.kinetic,
+        youngs_modulus_mpa=skin.youngs_modulus_mpa,
+        base_normal_n_per_m=skin.base_normal_n_per_m or rigid,
+        base_tangential_n_per_m=skin.base_tangential_n_per_m or rigid,
+        layer_step_mm=(skin.heights_mm[0] - skin.heights_mm[-1]) / max(len(skin.heights_mm) - 1, 1),
+    )
 
 
 def everywhere(title: str, work: Callable[[World], Any], worlds: Sequence[World]) -> list[Any]:
@@ -257,7 +294,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     began = monotonic()
     orchestration.configure_prefect(store.folder)
     pilot = read_pilot(store, item)
-    observed = pilot.statistics()
+    observed = pilot.statistics(guess_of(wanted.rig))
     parameters = wanted.parameters
     assumed = {it.key: value_of(wanted.rig.scene, it) for it in parameters}
     middle = logarithms(assumed, parameters)
@@ -353,8 +390,10 @@ def simulated_bank(
         values = {it.key: float(value) for it, value in zip(parameters, np.exp(row), strict=True)}
         seed, chance = (int(n) for n in rng.integers(2**31, size=2))
         zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
-        rig = other_rig(wanted.rig, values, {"seed": seed, "papillae": None}, zero_mm)
-        worlds.append(World(rig, pilot.plan, pilot.fitted, pilot.with_events, chance))
+        rig = other_specimen(wanted.rig, values, seed, zero_mm)
+        worlds.append(
+            World(rig, pilot.plan, pilot.fitted, pilot.with_events, chance, guess_of(wanted.rig))
+        )
     seen = everywhere(title, statistics_of_world, worlds)
     names = tuple(observed)
     s = np.stack([of_names(found, names) for found in seen])
@@ -363,7 +402,7 @@ def simulated_bank(
 
 def measured_papillae(rig: RigFile, pilot: Pilot) -> list[Json] | None:
     """Return the papillae as the pilot shows them, for `mock.scene.skin`; None if it does not."""
-    found = papillae([pilot.slides[trial.id] for trial in pilot.fitted])
+    found = papillae([pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig))
     design = np.array(rig.skin.layout_mm())
     if found is None or len(found.gap_mm) != len(design):
         return None
@@ -399,6 +438,7 @@ def predict(
     all_events = frozenset(trial.id for trial in pilot.judged)
     rows = rng.choice(len(found.samples), PREDICTED, replace=False)
     chance = [int(n) for n in rng.integers(2**31, size=PREDICTED)]
+    guess = guess_of(wanted.rig)
     worlds = []
     for row, seed in zip(rows, chance, strict=True):
         drawn = {
@@ -407,9 +447,11 @@ def predict(
             if it.key in values
         }
         rig = other_rig(wanted.rig, drawn, skin)
-        worlds.append(World(rig, pilot.plan, pilot.judged, all_events, seed))
+        worlds.append(World(rig, pilot.plan, pilot.judged, all_events, seed, guess))
     as_it_was = other_rig(wanted.rig, {}, {})
-    worlds += [World(as_it_was, pilot.plan, pilot.judged, all_events, seed) for seed in chance]
+    worlds += [
+        World(as_it_was, pilot.plan, pilot.judged, all_events, seed, guess) for seed in chance
+    ]
     taken = everywhere("test trials (worlds)", slides_of_world, worlds)
     return taken[:PREDICTED], taken[PREDICTED:]
 
