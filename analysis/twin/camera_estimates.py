@@ -119,21 +119,29 @@ def _moved_s(trial: PilotTrial, way_mm: float) -> float:
     return min(way_mm / trial.slide.speed_mm_s, trial.slide_s)
 
 
-def _tips(trial: PilotTrial) -> F64:
-    """Places of the markers when recording began, columns and rows, mm, (m, 2)."""
-    first = trial.frame_s < max(trial.hold_s, -trial.slide_s) + SHORT_S
-    tips = trial.tips_mm[first]
-    if not len(tips):
-        return np.full((trial.tips_mm.shape[1], 2), np.nan)
-    middle: F64 = np.mean(tips, axis=0) * [1.0, -1.0]
-    return middle
+def _tips(trials: Sequence[PilotTrial]) -> F64:
+    """Mean places of the markers when recording began, columns and rows, mm, (m, 2).
+
+    NaN for a marker that was not seen.
+    """
+    first = [t.tips_mm[t.frame_s < max(t.hold_s, -t.slide_s) + SHORT_S] for t in trials]
+    tips = np.concatenate(first) * [1.0, -1.0]
+    known = np.isfinite(tips)
+    middle: F64 = np.where(known, tips, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known.any(axis=0), middle, np.nan)
 
 
 def _rests(trials: Sequence[PilotTrial], size_px: tuple[int, int]) -> F64 | None:
     """Discs at rest, roughly: a table as of `rims`, (m, 8); None where they are not found.
 
-    They are looked for in the first motions of all trials of one direction together.
+    They are looked for in the first motions of all trials of one direction together. A row is NaN
+    where the tip was not seen.
     """
+    tips = _tips(trials)
+    known = np.isfinite(tips).all(axis=1)
+    if known.sum() < 3:
+        return None
+    layout = tips[known]
     ways = np.array([trial.slide.direction for trial in trials])
     tried = np.zeros(len(trials), np.bool_)
     for first in range(len(trials)):
@@ -142,9 +150,6 @@ def _rests(trials: Sequence[PilotTrial], size_px: tuple[int, int]) -> F64 | None
         alike = np.hypot(*(ways - ways[first]).T) < 0.1
         tried |= alike
         together = [t for t, same in zip(trials, alike, strict=True) if same]
-        layout = np.mean([_tips(trial) for trial in together], axis=0)
-        if len(layout) < 3 or not np.isfinite(layout).all():
-            continue
         events = EventChunk.joined(
             [_events(trial, 0.0, _moved_s(trial, FIRST_MM)) for trial in together]
         )
@@ -157,7 +162,9 @@ def _rests(trials: Sequence[PilotTrial], size_px: tuple[int, int]) -> F64 | None
         table[:, [COLUMN, ROW]] = np.where(discs.found[:, None], discs.xy, design @ fitted)
         table[:, RADIUS] = np.where(discs.found, discs.radius, np.nanmedian(discs.radius))
         table[:, EDGE], table[:, CONTRAST] = _EDGE_PX, _CONTRAST
-        return table
+        rests = np.full((len(tips), 8), np.nan)
+        rests[known] = table
+        return rests
     return None
 
 
@@ -225,10 +232,11 @@ def _clear(rests: F64 | None, size_px: tuple[int, int]) -> Mask:
     width, height = size_px
     if rests is None:
         return np.zeros((height, width), np.bool_)
-    reach = CLEAR * float(pdist(rests[:, [COLUMN, ROW]]).min())
+    places = rests[np.isfinite(rests[:, RADIUS])][:, [COLUMN, ROW]]
+    reach = CLEAR * float(pdist(places).min())
     clear = np.ones((height, width), np.bool_)
     column, row = np.arange(width), np.arange(height)[:, None]
-    for x, y in rests[:, [COLUMN, ROW]]:
+    for x, y in places:
         left, top = int(max(x - reach, 0)), int(max(y - reach, 0))
         box = np.s_[top : int(max(y + reach, 0)) + 2, left : int(max(x + reach, 0)) + 2]
         away = np.hypot(column[box[1]] - x, row[box[0]] - y)
@@ -313,11 +321,12 @@ def _discs(
     discs = np.array([fit.discs for fit in fits])
     # what does not press does not move, and shows no rim
     for k in (RIGHT, DOWN):
-        discs[..., k] = np.where(np.isnan(discs[..., k]), np.array(starts)[..., k], discs[..., k])
+        guessed = np.nan_to_num(np.array(starts)[..., k])
+        discs[..., k] = np.where(np.isnan(discs[..., k]), guessed, discs[..., k])
     return {
         "edge_px": edge_px,
         **_contrast(fits, noise_hz * seen_s, contrast),
-        **_geometry(trials, discs),
+        **_geometry(trials, discs, bool(np.isfinite(rests).all())),
         **_papillae(trials, discs),
     }
 
@@ -393,13 +402,14 @@ def _contrast(fits: Sequence[RimFit], variances: F64, fitted: float) -> dict[str
     return found
 
 
-def _geometry(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
+def _geometry(trials: Sequence[PilotTrial], discs: F64, complete: bool) -> dict[str, float]:
     """Scale, radius, and what forces do to the image.
 
     Args:
         discs: of each trial, (n, m, 8), see `rims`; displaced also where the rest is unknown.
+        complete: these are the discs of all papillae.
     """
-    tips = np.array([_tips(trial) for trial in trials])
+    tips = np.array([_tips([trial]) for trial in trials])
     seen = np.isfinite(discs[..., RADIUS])
     both = seen & np.isfinite(tips[..., 0])
     known = both.any(axis=0)
@@ -421,7 +431,8 @@ def _geometry(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
     loads = np.array([_loads(trial) for trial in trials])
     pulled = np.hypot(*(loads[:, 1, :2] - loads[:, 0, :2]).T)
     measured = np.isfinite(pulled)
-    if measured.sum() >= 3:
+    # a force on all papillae goes with all discs
+    if complete and measured.sum() >= 3:
         found["image_shift_mm_per_n"] = float(
             shift[measured] @ pulled[measured] / (pulled[measured] @ pulled[measured]) / px_per_mm
         )
@@ -471,12 +482,12 @@ def _papillae(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
     radius = deep[..., RADIUS].mean(axis=0)
     moved = np.hypot(deep[..., RIGHT], deep[..., DOWN]).mean(axis=0)
     known = np.isfinite(radius)
-    layouts = [tips for tips in map(_tips, trials) if np.isfinite(tips).all()]
-    if known.sum() < 3 or not layouts:
+    if known.sum() < 3:
         return {}
-    layout = layouts[0]
-    away = np.hypot(*(layout - layout.mean(axis=0)).T)
-    ring = np.rint(away / pdist(layout).min()).astype(np.int64)[known]
+    layout = _tips(trials)
+    seen = layout[np.isfinite(layout[:, 0])]
+    away = np.hypot(*(layout[known] - seen.mean(axis=0)).T)
+    ring = np.rint(away / pdist(seen).min()).astype(np.int64)
     radius, moved = radius[known], moved[known]
     found = {"radius_step_px": -_slope(ring.astype(np.float64), radius)}
     apart, relative = [], []

@@ -316,6 +316,28 @@ def test_without_forces_only_products_are_known() -> None:
     assert found["image_growth_px_per_mm"] == pytest.approx(PX_PER_MM * GROWTH * 0.1, rel=0.1)
 
 
+def test_a_marker_that_was_never_seen_is_left_out() -> None:
+    """The force on all papillae says nothing of the other discs' motion then."""
+    hidden = np.array([0, 0, 0, 1, 0, 0, 0], np.bool_)[:, None]
+    trials = [replace(made, tips_mm=np.where(hidden, np.nan, made.tips_mm)) for made in pilot()]
+    found = camera_estimates(trials)
+    assert found["px_per_mm"] == pytest.approx(PX_PER_MM, rel=0.002)
+    assert found["edge_px"] == pytest.approx(EDGE_PX, rel=0.05)
+    assert found["noise_hz"] == pytest.approx(NOISE_HZ, rel=0.03)
+    assert np.isnan(found["image_shift_mm_per_n"])
+    assert np.isnan(found["image_growth_mm_per_n"])
+
+
+def test_markers_that_are_seen_in_some_frames_only_are_enough() -> None:
+    trials = []
+    for index, made in enumerate(pilot()):
+        tips = made.tips_mm.copy()
+        tips[: 3 + index, index % 7] = np.nan
+        trials.append(replace(made, tips_mm=tips))
+    whole, found = camera_estimates(pilot()), camera_estimates(trials)
+    assert found == pytest.approx(whole, nan_ok=True)
+
+
 def test_estimates_of_a_simulated_rig(root: Path) -> None:
     """Four slides of each depth, one world, the numbers of its rig file."""
     rig, _ = load_rig_file(root / "rigs" / "mock_force.yaml")
