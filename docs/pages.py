@@ -43,6 +43,10 @@ _DOCUMENTS = {
         "`report/summary.json` of recordings of classes "
         "([The report's numbers](../summary.md#recordings-of-classes)).",
     ),
+    "twin": (
+        "The numbers of a twin",
+        "`TWIN.json` beside `TWIN.yaml`: a fit of a simulated rig to a pilot ([Twins](../twin.md)).",
+    ),
 }
 """Title and place of each document in a store."""
 _ITEM = re.compile(r"(- |1\. )\S")

@@ -18,6 +18,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import twin as page
@@ -46,22 +47,23 @@ from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin_pilots import simulate_pilot
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
 from sliplab.rigs.twin import FittedValue, Range, TwinRecord
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.schema.twin import ParameterFit, QuantityCompared, StatisticSeen, TwinFit
-from sliplab.storage.streams import F64, Json
+from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
 
-WORLDS = 200
+WORLDS = 150
 """Worlds of each of the two rounds."""
 SPREAD = 0.5
 """The first round draws between 1/1.5 and 1.5 times the rig file's values."""
 PREDICTED = 12
 """Worlds of the twin in which the test trials are taken."""
-EVENT_TRIALS = 8
+EVENT_TRIALS = 12
 """Slides whose events are simulated and read: events take most of the time, and their statistics
 need few trials."""
 ZERO_MM = 0.1
@@ -177,8 +179,9 @@ def slides_of_world(world: World) -> list[PilotTrial]:
 
 
 def statistics_of_world(world: World) -> dict[str, float]:
-    """Return what a world's slides show."""
-    return statistics(world.slides(), world.with_events, world.guess)
+    """Return what a world's slides show; the matrices are too small for threads of their own."""
+    with threadpool_limits(1):
+        return statistics(world.slides(), world.with_events, world.guess)
 
 
 def other_rig(
@@ -400,7 +403,7 @@ def simulated_bank(
     return Bank(tuple(it.key for it in parameters), names, theta, s, lower, upper)
 
 
-def measured_papillae(rig: RigFile, pilot: Pilot) -> list[Json] | None:
+def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
     """Return the papillae as the pilot shows them, for `mock.scene.skin`; None if it does not."""
     found = papillae([pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig))
     design = np.array(rig.skin.layout_mm())
@@ -410,14 +413,14 @@ def measured_papillae(rig: RigFile, pilot: Pilot) -> list[Json] | None:
     height = rig.scene.scene.skin.heights_mm[0] - found.gap_mm
     if not np.isfinite([*height, *found.friction, *place.ravel()]).all():
         return None
-    return [
-        {
-            "height_mm": round(float(height[k]), 4),
-            "friction": round(float(found.friction[k]), 4),
-            "offset_mm": np.round(place[k] - design[k], 4).tolist(),
-        }
+    return tuple(
+        Papilla(
+            height_mm=round(float(height[k]), 4),
+            friction=round(float(found.friction[k]), 4),
+            offset_mm=tuple(np.round(place[k] - design[k], 4).tolist()),
+        )
         for k in range(len(design))
-    ]
+    )
 
 
 def predict(
@@ -508,7 +511,8 @@ def write_twin(
     """Write the twin's rig file, which extends the one that was fitted."""
     mock = settings_of(wanted.rig.scene, {key: _rounded(value) for key, value in values.items()})
     if skin:
-        mock.setdefault("scene", {}).setdefault("skin", {}).update(skin)
+        papillae = [papilla.model_dump(mode="json") for papilla in skin["papillae"]]
+        mock.setdefault("scene", {}).setdefault("skin", {})["papillae"] = papillae
     path = rig_path(wanted.rig_path)
     shipped = path in shipped_rigs().values()
     extends = path.stem if shipped else os.path.relpath(path.resolve(), wanted.out.parent.resolve())

@@ -2,7 +2,8 @@
 
 None of them was measured when a rig file was written: they are assumed (`sliplab guesses`). Each is
 a number of the rig file's section `mock:`, positive, and is estimated as a logarithm, so that an
-interval is a factor either way.
+interval is a factor either way. The threshold of events is none of them: contrast, threshold and
+its mismatch scale together without changing an event, so the threshold keeps the rig's value.
 """
 
 from __future__ import annotations
@@ -76,9 +77,10 @@ CAMERA = (
         "event_camera.growth_mm_per_n", "image's growth by force", "mm/N", ("events", "force")
     ),
     Parameter("event_camera.edge_px", "width of the markers' edge", "px", ("events",)),
-    Parameter("event_camera.contrast", "contrast of the markers", "", ("events",)),
-    Parameter("event_camera.threshold", "threshold of events", "", ("events",)),
-    Parameter("event_camera.threshold_sigma", "its mismatch", "", ("events",)),
+    Parameter(
+        "event_camera.contrast", "contrast of the markers, at this threshold", "", ("events",)
+    ),
+    Parameter("event_camera.threshold_sigma", "mismatch of the threshold", "", ("events",)),
     Parameter("event_camera.cutoff_hz", "bandwidth of a pixel", "Hz", ("events",)),
     Parameter("event_camera.refractory_us", "refractory time", "us", ("events",)),
     Parameter("event_camera.noise_hz", "noise of a pixel", "Hz", ("events",)),

@@ -398,7 +398,7 @@ def calibrate_scene(
     worlds: Annotated[
         int,
         typer.Option("--worlds", min=100, max=100_000, help="Simulated worlds in each round."),
-    ] = 200,
+    ] = 150,
     spread: Annotated[
         float,
         typer.Option(

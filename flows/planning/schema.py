@@ -29,10 +29,11 @@ from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
+from sliplab.storage.schema.twin import TwinFit
 
 Kind = Literal[
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary",
+    "classes-summary", "twin",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
@@ -43,6 +44,7 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "summary": Summary,
     "classes": ClassEvaluation,
     "classes-summary": ClassSummary,
+    "twin": TwinFit,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
@@ -51,6 +53,7 @@ TITLES: dict[Kind, str] = {
     "summary": "The summary of a report of SlipLab",
     "classes": "An evaluation of SlipLab on recordings of classes",
     "classes-summary": "The summary of a report of SlipLab on recordings of classes",
+    "twin": "A fit of a simulated rig to a pilot, by SlipLab",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

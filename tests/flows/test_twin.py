@@ -1,0 +1,198 @@
+"""`sliplab calibrate scene` from a labelled store to a rig file, a page and its numbers.
+
+Where the method's own figures matter, worlds are simulated (long); the rest replaces a world's
+statistics by simple functions of its parameters, whose answer is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jsonschema import Draft7Validator
+from typer.testing import CliRunner
+
+import sliplab
+from sliplab.analysis.campaigns import collected
+from sliplab.analysis.twin.parameters import PARAMETERS, value_of
+from sliplab.analysis.twin.pilot import pilot_trial, slide_of
+from sliplab.flows import twin
+from sliplab.flows.cli.app import app
+from sliplab.flows.planning.preflight import check
+from sliplab.flows.planning.schema import file_schema
+from sliplab.flows.twin_pilots import simulate_pilot
+from sliplab.protocols import InputError
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.files import read_json
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
+
+TRIALS = 12
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Some slides of the pilot, labelled."""
+    folder = tmp_path_factory.mktemp("twin") / "store"
+    sliplab.collect("pilot", rig="rehearsal", store=folder, trials=TRIALS).label()
+    return Store(folder)
+
+
+def requested(tmp_path: Path, **changes: Any) -> twin.Calibration:
+    wanted = {"worlds": 100, "spread": 0.5, "seed": 1} | changes
+    return twin.request(Path("rehearsal"), tmp_path / "twin.yaml", **wanted)
+
+
+def answering(
+    wanted: twin.Calibration, observed: dict[str, float]
+) -> Callable[[str, Callable[[Any], Any], Sequence[twin.World]], list[Any]]:
+    """Stand in for `everywhere`: each statistic is the pilot's times one parameter's factor."""
+    real, parameters = twin.everywhere, wanted.parameters
+
+    def fake(world: twin.World) -> dict[str, float]:
+        factors = [
+            value_of(world.rig.scene, it) / value_of(wanted.rig.scene, it) for it in parameters
+        ]
+        return {
+            name: value * factors[k % len(factors)]
+            for k, (name, value) in enumerate(observed.items())
+        }
+
+    def everywhere(
+        title: str, work: Callable[[Any], Any], worlds: Sequence[twin.World]
+    ) -> list[Any]:
+        if work is twin.statistics_of_world:
+            return [fake(world) for world in worlds]
+        return real(title, work, worlds)
+
+    return everywhere
+
+
+def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: Store) -> None:
+    (item,) = collected(store, None)
+    trial, recording = item.trials[0]
+    slide = slide_of(item.plan.program(trial))
+    assert slide is not None
+    places = Derived.of(store, "labels", item.name).arrays(trial.id)
+    seen = pilot_trial(slide, recording, places)
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
+    made = simulate_pilot(rig, item.plan, [trial], 1)[0]
+    assert seen.slide.depth_mm == made.slide.depth_mm == float(dict(trial.condition)["depth"])
+    assert seen.hold_s == pytest.approx(made.hold_s, abs=2e-3)
+    assert seen.slide_s == pytest.approx(made.slide_s, abs=2e-3)
+    assert seen.tips_mm.shape[1:] == made.tips_mm.shape[1:] == (19, 2)
+    held = [found.tips_mm[found.frame_s < 0.0].mean(axis=0) for found in (seen, made)]
+    assert held[0] == pytest.approx(held[1], abs=0.01)
+    ends = [found.base_mm[-1] @ slide.direction for found in (seen, made)]
+    assert ends == pytest.approx([9.0, 9.0], abs=0.05)
+    assert seen.camera is not None
+    assert made.camera is not None
+    assert len(seen.camera.events) == pytest.approx(len(made.camera.events), rel=0.2)
+
+
+def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (item,) = collected(store, None)
+    wanted = requested(tmp_path)
+    pilot = twin.read_pilot(store, item)
+    assert len(pilot.fitted) + len(pilot.judged) == TRIALS
+    assert all(trial.split == "test" for trial in pilot.judged)
+    observed = pilot.statistics(twin.guess_of(wanted.rig))
+    finite = {name: value for name, value in observed.items() if value > 0.0}
+    monkeypatch.setattr(twin, "everywhere", answering(wanted, finite))
+    monkeypatch.setattr(twin, "PREDICTED", 2)
+    fit = twin.calibrate_scene(store, item, wanted)
+    known = [it for it in fit.parameters if it.identified]
+    assert len(known) == len(wanted.parameters)
+    for it in known:
+        assert it.low < it.assumed < it.high, it.key
+        assert it.value == pytest.approx(it.assumed, rel=0.05), it.key
+
+    Draft7Validator(file_schema("twin")).validate(read_json(tmp_path / "twin.json"))
+    page = (tmp_path / "twin.html").read_text()
+    assert "of a simulated pilot" in page
+    assert "kinetic friction" in page
+    rig, _ = load_rig_file(tmp_path / "twin.yaml")
+    assert rig.twin is not None
+    assert rig.twin.checksum == fit.checksum
+    assert rig.twin.trials == len(pilot.fitted)
+    papillae = rig.scene.scene.skin.papillae
+    assert papillae is not None
+    assert len(papillae) == 19
+    heights = np.array([it.height_mm for it in papillae])
+    assert heights[0] == pytest.approx(10.1, abs=0.2)
+    assert heights[1:7].mean() == pytest.approx(9.0, abs=0.1)
+    friction = next(it for it in fit.parameters if it.key == "scene.friction.kinetic")
+    assert rig.scene.scene.friction.kinetic == pytest.approx(friction.value, rel=1e-4)
+    said = {it.name: it.finding for it in check(Path("kinematic"), tmp_path / "twin.yaml",
+                                                tmp_path / "other", ())}  # fmt: skip
+    assert "the twin was fitted on" in said["twin"] or "within what" in said["twin"]
+
+
+def test_what_is_not_told_keeps_the_rigs_value(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (item,) = collected(store, None)
+    wanted = requested(tmp_path)
+    # one statistic, of the first parameter alone
+    monkeypatch.setattr(twin, "statistics", lambda *_: {"only": 2.0})
+    monkeypatch.setattr(twin, "everywhere", answering(wanted, {"only": 2.0}))
+    monkeypatch.setattr(twin, "PREDICTED", 2)
+    fit = twin.calibrate_scene(store, item, wanted)
+    assert [it.key for it in fit.parameters if it.identified] == [PARAMETERS[0].key]
+    for it in fit.parameters[1:]:
+        assert it.value == it.assumed
+        assert it.low < it.assumed < it.high
+    rig, _ = load_rig_file(tmp_path / "twin.yaml")
+    assert rig.scene.event_camera == wanted.rig.scene.event_camera
+    assert "a force sensor" in (tmp_path / "twin.html").read_text()
+
+
+def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
+    store: Store, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="must be a simulated rig with driver: mock"):
+        twin.request(Path("ur5"), tmp_path / "twin.yaml", 100, 0.5, 1)
+    with pytest.raises(InputError, match=r"must end in \.yaml"):
+        twin.request(Path("rehearsal"), tmp_path / "twin.txt", 100, 0.5, 1)
+    with pytest.raises(InputError, match="its folder does not exist"):
+        twin.request(Path("rehearsal"), tmp_path / "no" / "twin.yaml", 100, 0.5, 1)
+    other = tmp_path / "mine.yaml"
+    other.write_text("extends: rehearsal\nname: mine\n")
+    with pytest.raises(InputError, match="exists and is no twin"):
+        twin.request(Path("rehearsal"), other, 100, 0.5, 1)
+    empty = tmp_path / "unlabelled"
+    sliplab.collect("pilot", rig="rehearsal", store=empty, trials=1)
+    said = CliRunner().invoke(
+        app, ["calibrate", "scene", str(empty), "--rig", "rehearsal",
+              "--out", str(tmp_path / "twin.yaml")],
+    )  # fmt: skip
+    assert said.exit_code == 1
+    assert not (tmp_path / "twin.yaml").exists()
+
+
+@pytest.mark.long
+def test_a_hidden_rig_is_found(tmp_path: Path) -> None:
+    """Worlds are simulated: friction, relaxation and noise lie within their intervals."""
+    hidden = tmp_path / "hidden.yaml"
+    values = {
+        "scene.friction.path_variation": 0.06, "scene.skin.relaxation_share": 0.24,
+        "event_camera.noise_hz": 0.013, "event_camera.readout_hz": 4500.0,
+    }  # fmt: skip
+    hidden.write_text(
+        "extends: rehearsal\nname: hidden\nmock:\n  seed: 77\n"
+        "  scene: {friction: {path_variation: 0.06}, skin: {relaxation_share: 0.24}}\n"
+        "  event_camera: {noise_hz: 0.013, readout_hz: 4500}\n"
+    )
+    sliplab.collect("pilot", rig=hidden, store=tmp_path / "store").label()
+    store = Store(tmp_path / "store")
+    (item,) = collected(store, None)
+    fit = twin.calibrate_scene(store, item, requested(tmp_path))
+    found = {it.key: it for it in fit.parameters}
+    for key, value in values.items():
+        assert found[key].identified, key
+        assert found[key].low * 0.98 < value < found[key].high * 1.02, key
