@@ -61,6 +61,8 @@ WORLDS = 150
 """Worlds of each of the two rounds."""
 SPREAD = 0.5
 """The first round draws between 1/1.5 and 1.5 times the rig file's values."""
+LEVEL = "L3"
+"""All physics: what a scene may leave out is not known before it was fitted."""
 PREDICTED = 12
 """Worlds of the twin in which the test trials are taken."""
 EVENT_TRIALS = 12
@@ -114,6 +116,12 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
         slide = slide_of(item.plan.program(trial))
         if slide is None:
             continue
+        truth = recording.simulation_truth()
+        if truth is not None and truth.get("level", LEVEL) not in (LEVEL, "auto"):
+            raise StoreError(
+                f"campaign '{item.name}': was simulated at level {truth['level']}, without all "
+                f"physics that is fitted; collect it on a rig with mock.scene.level: {LEVEL}"
+            )
         try:
             places = labels.arrays(trial.id)
         except FileNotFoundError:
@@ -195,6 +203,7 @@ def other_rig(
     """
     settings = settings_of(rig.scene, values)
     scene = settings.setdefault("scene", {})
+    scene["level"] = LEVEL
     scene["skin"] = {**scene.get("skin", {}), **skin}
     scene["contact"] = {"offset_mm": rig.scene.scene.contact.offset_mm + zero_mm}
     return changed(rig, settings)
@@ -510,6 +519,7 @@ def write_twin(
 ) -> None:
     """Write the twin's rig file, which extends the one that was fitted."""
     mock = settings_of(wanted.rig.scene, {key: _rounded(value) for key, value in values.items()})
+    mock.setdefault("scene", {})["level"] = LEVEL
     if skin:
         papillae = [papilla.model_dump(mode="json") for papilla in skin["papillae"]]
         mock.setdefault("scene", {}).setdefault("skin", {})["papillae"] = papillae

@@ -37,7 +37,9 @@ TRIALS = 12
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Some slides of the pilot, labelled."""
     folder = tmp_path_factory.mktemp("twin") / "store"
-    sliplab.collect("pilot", rig="rehearsal", store=folder, trials=TRIALS).label()
+    rig = folder.with_name("rig.yaml")
+    rig.write_text("extends: rehearsal\nname: full\nmock: {scene: {level: L3}}\n")
+    sliplab.collect("pilot", rig=rig, store=folder, trials=TRIALS).label()
     return Store(folder)
 
 
@@ -173,6 +175,7 @@ def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
               "--out", str(tmp_path / "twin.yaml")],
     )  # fmt: skip
     assert said.exit_code == 1
+    assert "simulated at level L1" in said.stderr
     assert not (tmp_path / "twin.yaml").exists()
 
 
@@ -186,7 +189,7 @@ def test_a_hidden_rig_is_found(tmp_path: Path) -> None:
     }  # fmt: skip
     hidden.write_text(
         "extends: rehearsal\nname: hidden\nmock:\n  seed: 77\n"
-        "  scene: {friction: {path_variation: 0.06}, skin: {relaxation_share: 0.24}}\n"
+        "  scene: {level: L3, friction: {path_variation: 0.06}, skin: {relaxation_share: 0.24}}\n"
         "  event_camera: {noise_hz: 0.013, readout_hz: 4500}\n"
     )
     sliplab.collect("pilot", rig=hidden, store=tmp_path / "store").label()
