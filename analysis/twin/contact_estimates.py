@@ -234,7 +234,7 @@ class SteadyLags:
     path_mm: F64
 
 
-def _settled(slips: Slips, i: int, growth: Growth) -> tuple[F64, F64]:
+def settled_lags(slips: Slips, i: int, growth: Growth) -> tuple[F64, F64]:
     """Lag of one slide's tips while they slide, as if the springs had relaxed, (n, m), else NaN;
     and the frames' times."""
     t, lag = slips.frame_s[i], slips.lag_mm[i]
@@ -254,7 +254,7 @@ def steady_lags(slips: Slips, growth: Growth) -> SteadyLags:
     shape = slips.slipped_s.shape
     lag, path = np.full(shape, np.nan), np.zeros(shape)
     for i in range(shape[0]):
-        settled, _ = _settled(slips, i, growth)
+        settled, _ = settled_lags(slips, i, growth)
         seen = np.isfinite(settled)
         way = np.where(seen, slips.path_mm[i], np.nan)
         for j in np.flatnonzero(seen.any(axis=0)):
@@ -325,7 +325,7 @@ def path_estimates(slips: Slips, growth: Growth, table: SteadyLags) -> dict[str,
     steps = 16
     total, count = np.zeros(steps), np.zeros(steps)
     for i in range(len(slips.trials)):
-        settled, _ = _settled(slips, i, growth)
+        settled, _ = settled_lags(slips, i, growth)
         rows = []
         for j in np.flatnonzero(table.lag_mm[i] >= LEAST_LAG_MM):
             seen = np.isfinite(settled[:, j])

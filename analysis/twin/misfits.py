@@ -1,0 +1,426 @@
+"""Checks that say where a pilot shows an effect that the simulated scene lacks.
+
+Each is a number that one kind of effect makes large. The same number of simulated worlds says how
+large it becomes without the effect, and a number beyond that is a misfit. Further checks compare
+all statistics of a stream with those of the worlds: they find what no other check was made for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from scipy.ndimage import median_filter
+
+from sliplab.analysis.twin import camera_estimates
+from sliplab.analysis.twin.contact_estimates import (
+    Growth,
+    fit_growth,
+    lags_of,
+    rest_places,
+    rings_of,
+    settled_lags,
+    steady_lags,
+)
+from sliplab.analysis.twin.contact_slips import Slips, find_slips, mean_seen
+from sliplab.analysis.twin.contact_springs import Fit, Guess, fit_springs
+from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.storage.schema.twin import MisfitCheck
+from sliplab.storage.streams import F64, I64
+
+Bools = npt.NDArray[np.bool_]
+Stream = Literal["frames", "events", "poses", "force"]
+
+LEVEL = 0.05
+"""Share of pilots without any such effect that show a misfit, of all checks together."""
+TAIL = 0.2
+"""Share of the worlds that the tail of a number is taken from."""
+FEWEST = 20
+"""Worlds that a check takes."""
+
+TILT, STICKY, BROKEN, LIGHT, RAMP, SPOT = (
+    "tilt_mm_per_mm", "odd_friction", "missing_share", "line_over_noise", "ramp_mm", "spot",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Check:
+    """A number that one kind of effect makes large.
+
+    Attributes:
+        key: of the number. title: of the effect, for people.
+        stream: that shows it. unit: of the number.
+        floor: values that differ by less than this are alike.
+    """
+
+    key: str
+    title: str
+    stream: Stream
+    unit: str
+    floor: float
+
+
+CHECKS = (
+    Check(TILT, "plate tilted against the arm's", "frames", "mm/mm", 5e-4),
+    Check(STICKY, "friction of one papilla unlike that of the others", "frames", "sigma", 0.5),
+    Check(BROKEN, "slides in which a papilla is missing", "frames", "share", 0.25),
+    Check(LIGHT, "light that flickers", "events", "times noise", 0.2),
+    Check(RAMP, "slides that begin and end gently", "poses", "mm", 2e-3),
+    Check(SPOT, "friction of one place of the plate unlike that of others", "frames", "sigma", 0.5),
+)
+GENERAL: Mapping[Stream, str] = {
+    "frames": "all that frames show",
+    "force": "all that forces show",
+    "events": "all that events show",
+}
+"""Titles of the checks that compare all statistics of a stream."""
+
+
+def misfit_numbers(trials: Sequence[PilotTrial], guess: Guess | None = None) -> dict[str, float]:
+    """Return the number of every check by key, NaN where the slides do not tell it."""
+    found = dict.fromkeys((it.key for it in CHECKS), float("nan"))
+    found[RAMP] = ramp_mm(trials)
+    found[LIGHT] = line_over_noise(trials)
+    slips = find_slips(trials)
+    if slips is None:
+        return found
+    ring, _ = rings_of(slips)
+    found[BROKEN] = missing_share(slips, ring)
+    growth = fit_growth(slips) or Growth()
+    lags = lags_of(slips, ring, steady_lags(slips, growth), growth)
+    fit = fit_springs(lags, guess or Guess())
+    if fit is not None:
+        known = ring >= 0
+        places = mean_seen(rest_places(slips))
+        found[TILT] = gap_slope(places[known], fit.raised_mm[known], ring[known])
+        found[STICKY] = odd_friction(fit, ring)
+    found[SPOT] = largest_spot(slips, growth)
+    return found
+
+
+# -- frames ------------------------------------------------------------------------------------
+
+
+def gap_slope(place_mm: F64, raised_mm: F64, ring: I64) -> float:
+    """Slope of a plane through papillae's heights over their rings', mm/mm; NaN with too few.
+
+    Args:
+        place_mm: (m, 2). raised_mm, ring: (m,).
+    """
+    rings = (ring[:, None] == np.unique(ring)).astype(np.float64)
+    design = np.column_stack([place_mm - place_mm.mean(axis=0), rings])
+    best, _, rank, _ = np.linalg.lstsq(design, raised_mm, rcond=1e-6)
+    if rank < design.shape[1] or len(design) < design.shape[1] + 2:
+        return float("nan")
+    return float(np.hypot(*best[:2]))
+
+
+def odd_friction(fit: Fit, ring: I64) -> float:
+    """Largest deviation of a papilla's friction from all others', over its scatter and error."""
+    known = ring >= 0
+    if known.sum() < 5:
+        return float("nan")
+    friction, error = np.log(fit.friction[known]), fit.friction_error[known]
+    off = np.abs(friction - np.median(friction))
+    scatter = 1.4826 * float(np.median(off))
+    return float(np.max(off / np.hypot(scatter, error)))
+
+
+LOADED_MM = 0.3
+"""A ring whose tips are stretched so far before they slip does touch."""
+
+
+def missing_share(slips: Slips, ring: I64) -> float:
+    """Largest share of the slides in which a papilla is not seen, or does not hold while its ring
+    does, of one papilla."""
+    seen = np.array([np.isfinite(lag).any(axis=0) for lag in slips.lag_mm])
+    missing = ~seen
+    stretch = np.where(slips.slid, slips.stretch_mm, np.nan)
+    for r in np.unique(ring[ring >= 0]):
+        these = ring == r
+        for i in range(len(seen)):
+            own = stretch[i, these]
+            held = np.isfinite(own).sum() >= max(these.sum() / 2, 2)
+            if held and np.nanmedian(own) >= LOADED_MM:
+                missing[i, these] |= slips.free[i, these]
+    return float(missing.mean(axis=0).max())
+
+
+CELL_MM = 2.0
+LEAST_IN_CELL_MM = 0.5
+"""A tip's path in a cell counts from this length on."""
+FEWEST_IN_CELL = 3
+
+
+def largest_spot(slips: Slips, growth: Growth) -> float:
+    """Largest deviation of the lags in a cell of the plate from each papilla's own, over its error.
+
+    A papilla's lag in a cell is compared with its median over all cells at that depth. The error
+    is that of a mean of paths through the cell, by their scatter.
+    """
+    levels, which = slips.depths
+    m = slips.slipped_s.shape[1]
+    # sums by slide, papilla and cell would be large: one row a path through a cell
+    rows: list[tuple[int, int, complex, float]] = []
+    for i, trial in enumerate(slips.trials):
+        lag, _ = settled_lags(slips, i, growth)
+        moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
+        cell = np.floor(trial.tips_mm[moving] / CELL_MM)
+        step = np.abs(np.diff(slips.path_mm[i], axis=0, prepend=np.nan))
+        for j in range(m):
+            seen = np.flatnonzero(np.isfinite(lag[:, j]) & np.isfinite(step[:, j]))
+            if not len(seen):
+                continue
+            at = cell[seen, j, 0] + 1j * cell[seen, j, 1]
+            places, index = np.unique(at, return_inverse=True)
+            way = np.bincount(index, step[seen, j])
+            count = np.bincount(index)
+            mean = np.bincount(index, lag[seen, j]) / count
+            long = way >= LEAST_IN_CELL_MM
+            group = int(which[i]) * m + j
+            rows += [(group, j, p, float(v)) for p, v in
+                     zip(places[long], mean[long], strict=True)]  # fmt: skip
+    if not rows:
+        return float("nan")
+    group = np.array([row[0] for row in rows])
+    place = np.array([row[2] for row in rows])
+    value = np.array([row[3] for row in rows])
+    off = np.full(len(rows), np.nan)
+    for g in np.unique(group):
+        own = group == g
+        middle = np.median(value[own])
+        if own.sum() >= FEWEST_IN_CELL and middle >= LOADED_MM:
+            off[own] = value[own] / middle - 1.0
+    known = np.isfinite(off)
+    if known.sum() < 10:
+        return float("nan")
+    _, cell_of = np.unique(place[known], return_inverse=True)
+    off = off[known] - np.median(off[known])
+    count = np.bincount(cell_of)
+    scatter = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
+    mean = np.bincount(cell_of, off) / count
+    full = count >= FEWEST_IN_CELL
+    if not full.any():
+        return float("nan")
+    return float(np.max(np.abs(mean[full]) * np.sqrt(count[full])) / scatter)
+
+
+# -- poses -------------------------------------------------------------------------------------
+
+
+def ramp_mm(trials: Sequence[PilotTrial]) -> float:
+    """Way by which the reported motion stays behind constant speed at either end of a slide, mean,
+    mm.
+
+    The constant speed is that of the middle half. An acceleration a costs v^2 / 2a at either end.
+    """
+    found = []
+    for trial in trials:
+        t, way = trial.frame_s, trial.base_mm @ trial.slide.direction
+        middle = (t > 0.25 * trial.slide_s) & (t < 0.75 * trial.slide_s)
+        before, after = t <= 0.0, t >= trial.slide_s
+        moving = (t >= 0.0) & (t <= trial.slide_s)
+        if middle.sum() < 10 or not before.any():
+            continue
+        speed, begin = np.polynomial.Polynomial.fit(t[middle], way[middle], 1).convert().coef[::-1]
+        behind = way[before].mean() - begin
+        end = way[after].mean() if after.any() else way[moving][-1]
+        ahead = begin + speed * trial.slide_s - end
+        found.append(0.5 * (behind + ahead))
+    return abs(float(np.mean(found))) if found else float("nan")
+
+
+# -- events ------------------------------------------------------------------------------------
+
+BAND_HZ = (20.0, 500.0)
+SPAN_S = 1.0
+"""Events are looked at for so long at a time, which sets the width of a line."""
+BAND = np.arange(round(BAND_HZ[0] * SPAN_S), round(BAND_HZ[1] * SPAN_S) + 1)
+STEP_US = 20
+"""Events are counted by so many microseconds: short against the scans of a read-out, whose aliases
+would be lines."""
+ROUND_HZ = 20.0
+"""The noise at a frequency is the median so far on either side."""
+FEWEST_EVENTS = 100
+
+
+def line_over_noise(trials: Sequence[PilotTrial]) -> float:
+    """Power of the strongest line in the rate of events over the noise about it, in the hold.
+
+    Spectra of seconds, of each polarity by itself, are divided by their own noise and then
+    averaged, as the phase of a light differs from slide to slide. The mean is that of log(1 + x), so
+    that a single second does not make a line. Without one 0.8 of the noise is expected, and 1.2 or
+    so of the largest of many frequencies. NaN without events.
+    """
+    total, spans = np.zeros(len(BAND)), 0
+    span_us = round(SPAN_S * 1e6)
+    count = span_us // STEP_US
+    around = 2 * round(ROUND_HZ * SPAN_S) + 1
+    for trial in trials:
+        if trial.camera is None:
+            continue
+        events = trial.camera.events
+        for start in range(-span_us, round(trial.hold_s * 1e6) - 1, -span_us):
+            part = slice(*np.searchsorted(events.t_us, (start, start + span_us)).tolist())
+            step = (events.t_us[part] - start) // STEP_US
+            for positive in (True, False):
+                own = step[(events.p[part] > 0) == positive]
+                if len(own) < FEWEST_EVENTS:
+                    continue
+                rate = np.bincount(own, minlength=count)
+                power = np.abs(np.fft.rfft(rate)[BAND]) ** 2
+                noise = median_filter(power, around, mode="nearest") / np.log(2.0)
+                total += np.log1p(power / np.maximum(noise, 1e-12))
+                spans += 1
+    return float(np.expm1(total.max() / spans)) if spans else float("nan")
+
+
+# -- all statistics ----------------------------------------------------------------------------
+
+FOLDS = 5
+FAR = 5.0
+"""Statistics are cut off so many spreads from their median; one that the pilot lacks counts as so
+far off."""
+SEEN = 0.95
+"""Share of worlds that must have a statistic."""
+RIDGE = 0.01
+"""Added to variances, of statistics of unit spread."""
+FORCE_NAMES = (
+    "normal_n", "normal_lost", "ratio", "ratio_per_speed", "stiffness_n_per_mm",
+    "hold_relaxing_share", "hold_relaxation_s", "youngs_modulus_mpa",
+)  # fmt: skip
+
+
+def stream_of(statistic: str) -> Stream:
+    """Return the stream that shows a statistic of contact or camera."""
+    if statistic in camera_estimates.NAMES:
+        return "events"
+    force = statistic in FORCE_NAMES or statistic.startswith("pull_ring")
+    return "force" if force else "frames"
+
+
+def distances(s: F64, observed: F64) -> tuple[F64, float]:
+    """Return how far each world's statistics are from the other worlds', and the pilot's from them.
+
+    Mahalanobis distances over the root of the number of statistics. Each world is compared with
+    the mean and covariance of worlds that it is not among, and the pilot with all of these.
+
+    Args:
+        s: (k, q), some NaN. observed: (q,), some NaN.
+    """
+    finite = np.isfinite(s)
+    s, observed, finite = (a[..., finite.mean(axis=0) >= SEEN] for a in (s, observed, finite))
+    lower, centre, upper = np.nanpercentile(np.where(finite, s, np.nan), [25, 50, 75], axis=0)
+    moving = upper > lower
+    s, observed, centre = s[:, moving], observed[moving], centre[moving]
+    scale = (upper - lower)[moving] / 1.349
+    q = len(scale)
+    if q == 0:
+        return np.full(len(s), np.nan), float("nan")
+    x = np.clip(np.where(np.isfinite(s), (s - centre) / scale, 0.0), -FAR, FAR)
+    y = np.clip(np.where(np.isfinite(observed), (observed - centre) / scale, FAR), -FAR, FAR)
+    found, own = np.empty(len(x)), np.empty(FOLDS)
+    part = np.arange(len(x)) % FOLDS
+    for fold in range(FOLDS):
+        others = x[part != fold]
+        inverse = np.linalg.inv(np.atleast_2d(np.cov(others.T)) + RIDGE * np.eye(q))
+        off, off_y = x[part == fold] - others.mean(axis=0), y - others.mean(axis=0)
+        found[part == fold] = np.einsum("ij,jk,ik->i", off, inverse, off)
+        own[fold] = off_y @ inverse @ off_y
+    return np.sqrt(found / q), float(np.sqrt(own.mean() / q))
+
+
+# -- the verdict -------------------------------------------------------------------------------
+
+_LEAST_TAIL = 0.1
+"""Numbers of the worlds are taken to scatter in their tail by at least so much, relative."""
+
+
+@dataclass(frozen=True)
+class Tail:
+    """The largest values of a number in the worlds: log(value + floor) has an exponential tail.
+
+    A posterior predictive distribution (prior 1 / mean): with few worlds it is wider. It is longer
+    than that of a normal or log-normal number.
+
+    Attributes:
+        values: of the worlds, sorted logarithms, (n,). floor: see `Check`.
+    """
+
+    values: F64
+    floor: float
+
+    @classmethod
+    def of(cls, values: F64, floor: float) -> Tail:
+        """Return the tail of some worlds' values."""
+        return cls(np.sort(np.log(np.maximum(values, 0.0) + floor)), floor)
+
+    @property
+    def _shape(self) -> tuple[int, float, float]:
+        """Return how many worlds make the tail, where it begins and the sum of their excesses."""
+        k = max(round(TAIL * len(self.values)), 2)
+        begin = float(self.values[-k - 1])
+        return k, begin, max(float((self.values[-k:] - begin).sum()), k * _LEAST_TAIL)
+
+    def share(self, value: float) -> float:
+        """Return the probability of at least this value."""
+        k, begin, total = self._shape
+        x = float(np.log(max(value, 0.0) + self.floor))
+        if x <= begin:
+            return float((self.values >= x).mean())
+        return float(k / len(self.values) * (1.0 + (x - begin) / total) ** -k)
+
+    def limit(self, share: float) -> float:
+        """Return the value that is reached with a probability, which is less than `TAIL`."""
+        k, begin, total = self._shape
+        x = begin + total * ((k / len(self.values) / share) ** (1.0 / k) - 1.0)
+        return float(np.exp(x) - self.floor)
+
+
+def misfits(
+    numbers: Mapping[str, float],
+    worlds: Sequence[Mapping[str, float]],
+    names: Sequence[str],
+    observed: F64,
+    s: F64,
+) -> tuple[MisfitCheck, ...]:
+    """Return the checks of a pilot, misfits first; the first one says which stream shows it.
+
+    A check for one kind of effect comes before those of all statistics: it says more. Left out is
+    what the pilot does not tell, or fewer than `FEWEST` worlds.
+
+    Args:
+        numbers: of the pilot, see `misfit_numbers`. worlds: those of k simulated worlds.
+        names: of q statistics. observed: of the pilot, (q,). s: of the worlds, (k, q); logarithms
+            where they are positive.
+    """
+    tried: list[tuple[Check, float, F64]] = []
+    for check in CHECKS:
+        values = np.array([world[check.key] for world in worlds], np.float64)
+        tried.append((check, numbers[check.key], values[np.isfinite(values)]))
+    streams = np.array([stream_of(name) for name in names])
+    for stream, title in GENERAL.items():
+        own = streams == stream
+        if len(s) >= FEWEST and np.isfinite(observed[own]).any():
+            values, value = distances(s[:, own], observed[own])
+            check = Check("", title, stream, "distance", 0.1)
+            tried.append((check, value, values[np.isfinite(values)]))
+    tried = [it for it in tried if np.isfinite(it[1]) and len(it[2]) >= FEWEST]
+    found = []
+    for check, value, values in tried:
+        level = LEVEL / len(tried)
+        tail = Tail.of(values, check.floor)
+        share = tail.share(value)
+        general = check.key == ""
+        found.append((
+            (share >= level, general, share),
+            MisfitCheck(
+                title=check.title, stream=check.stream, unit=check.unit, pilot=value,
+                limit=tail.limit(level), share=share, found=share < level,
+            ),
+        ))  # fmt: skip
+    return tuple(check for _, check in sorted(found, key=lambda it: it[0]))
