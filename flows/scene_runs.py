@@ -56,9 +56,9 @@ def _changed(model: Any, values: Mapping[str, Any]) -> Any:
     return model.model_copy(update=update)
 
 
-def with_true_times(rig: RigFile) -> RigFile:
-    """Return the rig with perfect clocks and no faults; its camera as it is."""
-    return changed(rig, {"clocks": PERFECT, "faults": ()})
+def with_true_times(rig: RigFile, with_faults: bool = False) -> RigFile:
+    """Return the rig with perfect clocks and, if not said otherwise, no faults."""
+    return changed(rig, {"clocks": PERFECT, "faults": rig.scene.faults if with_faults else ()})
 
 
 def ideal(rig: RigFile) -> RigFile:

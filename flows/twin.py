@@ -25,6 +25,7 @@ from sliplab.analysis.report import twin as page
 from sliplab.analysis.twin.camera_estimates import camera_estimates
 from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, contact_estimates, papillae
 from sliplab.analysis.twin.contact_springs import Guess
+from sliplab.analysis.twin.misfits import misfit_numbers, misfits
 from sliplab.analysis.twin.parameters import (
     PARAMETERS,
     Parameter,
@@ -102,6 +103,11 @@ class Pilot:
         slides = [self.slides[trial.id] for trial in self.fitted]
         return statistics(slides, self.with_events, guess)
 
+    def misfit_numbers(self, guess: Guess) -> dict[str, float]:
+        """Return what the fitted trials show of effects that the scene lacks."""
+        slides = [self.slides[trial.id] for trial in self.fitted]
+        return misfit_numbers(slides, events_of(slides, self.with_events), guess)
+
 
 def read_pilot(store: Store, item: Collected) -> Pilot:
     """Read the labelled slides of a campaign.
@@ -150,9 +156,14 @@ def statistics(
     Args:
         with_events: ids of those whose events are read. guess: see `contact_estimates`.
     """
-    seen = [slide for slide in slides if slide.trial in with_events and slide.camera is not None]
+    seen = events_of(slides, with_events)
     found = contact_estimates(slides, guess)
     return found | camera_estimates(seen) if seen else found
+
+
+def events_of(slides: Sequence[PilotTrial], with_events: frozenset[str]) -> list[PilotTrial]:
+    """Return the slides whose events are read."""
+    return [slide for slide in slides if slide.trial in with_events and slide.camera is not None]
 
 
 @dataclass(frozen=True)
@@ -162,6 +173,7 @@ class World:
     Attributes:
         with_events: ids of the trials whose events are simulated. seed: of the trials' chance.
         guess: where estimates begin; of the rig that is fitted.
+        with_faults: keep the rig's faults.
     """
 
     rig: RigFile
@@ -170,13 +182,16 @@ class World:
     with_events: frozenset[str]
     seed: int
     guess: Guess
+    with_faults: bool = False
 
     def slides(self) -> list[PilotTrial]:
         """Take the trials, in their order."""
         found = {}
         for with_events in (True, False):
             trials = [t for t in self.trials if (t.id in self.with_events) == with_events]
-            for slide in simulate_pilot(self.rig, self.plan, trials, self.seed, with_events):
+            for slide in simulate_pilot(
+                self.rig, self.plan, trials, self.seed, with_events, self.with_faults
+            ):
                 found[slide.trial] = slide
         return [found[trial.id] for trial in self.trials]
 
@@ -186,10 +201,17 @@ def slides_of_world(world: World) -> list[PilotTrial]:
     return world.slides()
 
 
-def statistics_of_world(world: World) -> dict[str, float]:
-    """Return what a world's slides show; the matrices are too small for threads of their own."""
+def statistics_of_world(world: World) -> tuple[dict[str, float], dict[str, float]]:
+    """Return what a world's slides show: statistics, and the numbers of the checks for misfits.
+
+    The matrices are too small for threads of their own.
+    """
     with threadpool_limits(1):
-        return statistics(world.slides(), world.with_events, world.guess)
+        slides = world.slides()
+        return (
+            statistics(slides, world.with_events, world.guess),
+            misfit_numbers(slides, events_of(slides, world.with_events), world.guess),
+        )
 
 
 def other_rig(
@@ -313,9 +335,11 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     reach = np.log1p(wanted.spread)
     most = np.log([it.most for it in parameters])
     prior = middle - reach, np.minimum(middle + reach, most)
-    first = simulated_bank("first round (worlds)", wanted, pilot, observed, prior, 1)
+    first, _ = simulated_bank("first round (worlds)", wanted, pilot, observed, prior, 1)
     found = posterior(first, of_names(observed, first.statistics))
-    second = simulated_bank("second round (worlds)", wanted, pilot, observed, narrowed(found), 2)
+    second, numbers = simulated_bank(
+        "second round (worlds)", wanted, pilot, observed, narrowed(found), 2
+    )
     bank = pooled(first, second)
     found = posterior(bank, of_names(observed, bank.statistics), prior)
     values = {
@@ -341,6 +365,10 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
             for it, estimate in zip(parameters, found.estimates, strict=True)
         ),
         statistics=seen_statistics(bank, observed),
+        checks=misfits(
+            pilot.misfit_numbers(guess_of(wanted.rig)), numbers, second.statistics,
+            of_names(observed, second.statistics), second.s,
+        ),
         compared=compared(pilot, *predicted),
     )
     record = TwinRecord(
@@ -388,11 +416,14 @@ def simulated_bank(
     observed: Mapping[str, float],
     bounds: tuple[F64, F64],
     number: int,
-) -> Bank:
+) -> tuple[Bank, list[dict[str, float]]]:
     """Simulate the pilot in worlds drawn between bounds of the parameters' logarithms.
 
     Args:
         number: of the round, which has worlds of its own.
+
+    Returns:
+        The bank, and each world's numbers of the checks for misfits.
     """
     parameters, (lower, upper) = wanted.parameters, bounds
     rng = np.random.default_rng([wanted.seed, number])
@@ -408,8 +439,9 @@ def simulated_bank(
         )
     seen = everywhere(title, statistics_of_world, worlds)
     names = tuple(observed)
-    s = np.stack([of_names(found, names) for found in seen])
-    return Bank(tuple(it.key for it in parameters), names, theta, s, lower, upper)
+    s = np.stack([of_names(found, names) for found, _ in seen])
+    bank = Bank(tuple(it.key for it in parameters), names, theta, s, lower, upper)
+    return bank, [numbers for _, numbers in seen]
 
 
 def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:

@@ -59,19 +59,25 @@ class _Memory(NullSink):
 
 
 def simulate_pilot(
-    rig: RigFile, plan: Plan, trials: Sequence[Trial], seed: int, with_events: bool = True
+    rig: RigFile,
+    plan: Plan,
+    trials: Sequence[Trial],
+    seed: int,
+    with_events: bool = True,
+    with_faults: bool = False,
 ) -> list[PilotTrial]:
-    """Return the slides among `trials` as a simulated rig records them, without faults.
+    """Return the slides among `trials` as a simulated rig records them.
 
     Args:
         seed: of the trials' own chance: friction along the paths, vibration, noise. That of
             fabrication is the rig's.
         with_events: simulate the event camera too, which takes most of the time.
+        with_faults: keep the rig's faults; none of them may end a trial.
 
     Raises:
         RigError: a trial cannot be run on this rig.
     """
-    tracked = changed(with_true_times(rig), {"frame_camera": {"level": "tracks"}})
+    tracked = changed(with_true_times(rig, with_faults), {"frame_camera": {"level": "tracks"}})
     if not with_events:
         step_ms = max(rig.scene.scene.step_ms, COARSE_MS)
         tracked = changed(tracked, {"scene": {"step_ms": step_ms}})

@@ -80,11 +80,18 @@ GENERAL: Mapping[Stream, str] = {
 """Titles of the checks that compare all statistics of a stream."""
 
 
-def misfit_numbers(trials: Sequence[PilotTrial], guess: Guess | None = None) -> dict[str, float]:
-    """Return the number of every check by key, NaN where the slides do not tell it."""
+def misfit_numbers(
+    trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], guess: Guess | None = None
+) -> dict[str, float]:
+    """Return the number of every check by key, NaN where the slides do not tell it.
+
+    Args:
+        with_events: those of the trials whose events are read.
+        guess: design of the skin, and where the fit of its springs begins.
+    """
     found = dict.fromkeys((it.key for it in CHECKS), float("nan"))
     found[RAMP] = ramp_mm(trials)
-    found[LIGHT] = line_over_noise(trials)
+    found[LIGHT] = line_over_noise(with_events)
     slips = find_slips(trials)
     if slips is None:
         return found

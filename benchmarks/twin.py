@@ -1,0 +1,198 @@
+"""A scene fitted to pilots of hidden worlds: worlds with an effect that the scene lacks.
+
+    python -m benchmarks.twin misfits [--worlds 10] [--clean 40] [--bank 150] [--seed 1]
+                                      [--file WORLDS.jsonl] [--cores 2]
+
+A hidden world is a simulated rig with a force sensor, its parameters drawn 30 % around the
+defaults, with another skin and other pixels, and depth zero off by up to 0.1 mm. Its pilot has 36
+slides; test trials are left out. The bank's worlds are drawn as in the first round of a fit, 50 %
+around the defaults. Every world is looked at twice: with its forces, and without.
+
+Effects have the sizes that docs/faults.md names. The light is as bright as makes a pixel of 2.7
+standard deviations below the mean threshold fire, as light of the default share does on the default
+pixels: what is brighter fails a campaign's gates, and of what is less bright these have no events.
+
+`--file` keeps what was simulated: a run that was stopped goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliplab.analysis.twin.misfits import misfit_numbers, misfits
+from sliplab.analysis.twin.parameters import PARAMETERS, drawn, value_of
+from sliplab.flows.scene_runs import changed
+from sliplab.flows.twin import (
+    EVENT_TRIALS,
+    SPREAD,
+    ZERO_MM,
+    World,
+    events_of,
+    guess_of,
+    of_names,
+    other_specimen,
+    statistics,
+)
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.mock import fault_settings as faults
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_inheritance import shipped_rigs
+from sliplab.storage.schema.twin import MisfitCheck
+
+ROOT = Path(__file__).parents[1]
+HIDDEN_SPREAD = 0.3
+TILT_DEG = 1.0
+FAINT = 2.67
+"""A light is seen by pixels whose threshold is so many standard deviations below the mean."""
+STREAMS = {
+    "a tilted plate": "frames", "a sticky papilla": "frames", "a broken papilla": "frames",
+    "a light on the mains": "events", "a slow ramp": "poses", "a dirty spot": "frames",
+}  # fmt: skip
+CLEAN, BANK = "clean", "bank"
+KINDS = (BANK, CLEAN, *STREAMS)
+FORCES = ("without forces", "with forces")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One world to simulate: its kind, one of `KINDS`, and its number among these."""
+
+    kind: str
+    number: int
+    seed: int
+
+
+def world_of(job: Job) -> World:
+    """Return a world of a kind."""
+    rng = np.random.default_rng([job.seed, KINDS.index(job.kind), job.number])
+    rig, _ = load_rig_file(shipped_rigs()["mock_force"])
+    plan = load_plan(ROOT / "protocols/pilot.yaml")
+    fitted = tuple(trial for trial in plan.trials if trial.split != "test")
+    chosen = np.unique(np.linspace(0, len(fitted) - 1, EVENT_TRIALS).round().astype(int))
+    there = [it for it in PARAMETERS if value_of(rig.scene, it) > 0.0]
+    values = drawn(rig.scene, there, SPREAD if job.kind == BANK else HIDDEN_SPREAD, rng)
+    zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
+    specimen, chance = (int(n) for n in rng.integers(2**31, size=2))
+    made = other_specimen(rig, values, specimen, zero_mm)
+    if job.kind == "a tilted plate":
+        tilt_deg = rig.scene.scene.contact.tilt_deg + TILT_DEG
+        made = changed(made, {"scene": {"contact": {"tilt_deg": tilt_deg}}})
+    else:
+        made = changed(made, {"faults": tuple(faults_of(job.kind, values, rng))})
+    events = frozenset(fitted[k].id for k in chosen)
+    return World(made, plan, fitted, events, chance, guess_of(rig), with_faults=True)
+
+
+def faults_of(
+    kind: str, values: Mapping[str, float], rng: np.random.Generator
+) -> Iterator[faults.AnyFault]:
+    """Yield the fault that makes an effect; none for a clean world or a tilted plate."""
+    papilla = int(rng.integers(19))
+    if kind == "a sticky papilla":
+        yield faults.PapillaSticky(kind="papilla_sticky", papilla=papilla)
+    elif kind == "a broken papilla":
+        yield faults.PapillaTorn(kind="papilla_torn", papilla=papilla, since="trial", at_s=0.0)
+    elif kind == "a light on the mains":
+        threshold, sigma = (values[f"event_camera.{k}"] for k in ("threshold", "threshold_sigma"))
+        share = math.tanh((threshold - FAINT * sigma) / 2.0)
+        yield faults.MainsLight(kind="mains_light", share=share)
+    elif kind == "a slow ramp":
+        yield faults.ArmRamp(kind="arm_ramp", mm_s2=5.0)
+    elif kind == "a dirty spot":
+        angle, far = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 10.0)
+        centre = (float(far * np.cos(angle)), float(far * np.sin(angle)))
+        yield faults.PlateSpot(kind="plate_spot", centre_mm=centre, radius_mm=4.0)
+
+
+def shown_by(job: Job) -> dict[str, Any]:
+    """Return statistics and numbers of a world, with and without its forces."""
+    world = world_of(job)
+    slides = world.slides()
+    found: dict[str, Any] = {"kind": job.kind, "number": job.number, "seed": job.seed}
+    for name in FORCES:
+        if name == "without forces":
+            seen = [replace(slide, forces=None) for slide in slides]
+        else:
+            seen = slides
+        found[name] = (
+            statistics(seen, world.with_events, world.guess),
+            misfit_numbers(seen, events_of(seen, world.with_events), world.guess),
+        )
+    return found
+
+
+def taken(jobs: Sequence[Job], file: Path | None, cores: int) -> dict[str, list[dict[str, Any]]]:
+    """Return what worlds show by kind; those that the file has are not simulated again."""
+    kept: dict[Job, dict[str, Any]] = {}
+    if file is not None and file.exists():
+        for line in file.read_text().splitlines():
+            row = json.loads(line)
+            kept[Job(row["kind"], row["number"], row["seed"])] = row
+    missing = sorted((job for job in jobs if job not in kept), key=lambda job: job.number)
+    with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
+        for job, row in zip(missing, pool.map(shown_by, missing), strict=True):
+            kept[job] = row
+            if file is not None:
+                with file.open("a") as lines:
+                    lines.write(json.dumps(row) + "\n")
+    found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
+    for job in jobs:
+        found[job.kind].append(kept[job])
+    return found
+
+
+def checks_of(row: Mapping[str, Any], bank: Sequence[Mapping[str, Any]], name: str) -> tuple[
+    MisfitCheck, ...
+]:  # fmt: skip
+    """Return the checks of a hidden world against a bank."""
+    names = tuple(bank[0][name][0])
+    s = np.stack([of_names(world[name][0], names) for world in bank])
+    numbers = [world[name][1] for world in bank]
+    return misfits(row[name][1], numbers, names, of_names(row[name][0], names), s)
+
+
+def run_misfits(asked: argparse.Namespace) -> None:
+    """Print how many effects are found, by which stream, and false alarms."""
+    counts = {BANK: asked.bank, CLEAN: asked.clean} | dict.fromkeys(STREAMS, asked.worlds)
+    jobs = [Job(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
+    found = taken(jobs, asked.file, asked.cores)
+    print("| world | forces | found | by the right stream | first check (worlds) |")
+    print("| --- | --- | --- | --- | --- |")
+    for name in FORCES:
+        for kind in (*STREAMS, CLEAN):
+            called = [checks_of(row, found[BANK], name)[0] for row in found[kind]]
+            misfit = [check for check in called if check.found]
+            right = sum(check.stream == STREAMS.get(kind) for check in misfit)
+            titles = [f"{check.title} [{check.stream}]" for check in misfit]
+            first = "; ".join(f"{t} ({titles.count(t)})" for t in dict.fromkeys(titles))
+            told = "-" if kind == CLEAN else f"{right} of {len(called)}"
+            print(f"| {kind} | {name} | {len(misfit)} of {len(called)} | {told} | {first} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parts = parser.add_subparsers(required=True)
+    part = parts.add_parser("misfits", help="worlds with an effect that the scene lacks")
+    part.set_defaults(run=run_misfits)
+    part.add_argument("--worlds", type=int, default=10, help="of each effect")
+    part.add_argument("--clean", type=int, default=40, help="without any effect")
+    part.add_argument("--bank", type=int, default=150)
+    part.add_argument("--seed", type=int, default=1)
+    part.add_argument("--file", type=Path, help="keeps what was simulated")
+    part.add_argument("--cores", type=int, default=2)
+    asked = parser.parse_args()
+    asked.run(asked)
+
+
+if __name__ == "__main__":
+    main()
