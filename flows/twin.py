@@ -366,8 +366,11 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
         ),
         statistics=seen_statistics(bank, observed),
         checks=misfits(
-            pilot.misfit_numbers(guess_of(wanted.rig)), numbers, second.statistics,
-            of_names(observed, second.statistics), second.s,
+            pilot.misfit_numbers(guess_of(wanted.rig)),
+            numbers,
+            second.statistics,
+            of_names(observed, second.statistics),
+            second.s,
         ),
         compared=compared(pilot, *predicted),
     )

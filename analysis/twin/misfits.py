@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-
 from scipy.ndimage import median_filter
 
 from sliplab.analysis.twin import camera_estimates
@@ -127,18 +126,25 @@ def gap_slope(place_mm: F64, raised_mm: F64, ring: I64) -> float:
 
 
 def odd_friction(fit: Fit, ring: I64) -> float:
-    """Largest deviation of a papilla's friction from all others', over its scatter and error."""
+    """Largest deviation of one papilla's friction from all others', over the scatter of these.
+
+    Each is compared with the mean and scatter of the others (an externally studentised residual;
+    Cook and Weisberg 1982), its own standard error added.
+    """
     known = ring >= 0
-    if known.sum() < 5:
+    n = int(known.sum())
+    if n < 5:
         return float("nan")
     friction, error = np.log(fit.friction[known]), fit.friction_error[known]
-    off = np.abs(friction - np.median(friction))
-    scatter = 1.4826 * float(np.median(off))
-    return float(np.max(off / np.hypot(scatter, error)))
+    mean = (friction.sum() - friction) / (n - 1)
+    square = ((friction**2).sum() - friction**2) / (n - 1) - mean**2
+    variance = np.maximum(square, 0.0) * n / (n - 2)
+    return float(np.max(np.abs(friction - mean) / np.sqrt(variance + error**2)))
 
 
-LOADED_MM = 0.3
-"""A ring whose tips are stretched so far before they slip does touch."""
+LOADED_MM = 0.8
+"""Papillae of a ring whose tips are stretched so far before they slip all hold: their heights
+differ by less."""
 
 
 def missing_share(slips: Slips, ring: I64) -> float:
@@ -161,6 +167,10 @@ CELL_MM = 2.0
 LEAST_IN_CELL_MM = 0.5
 """A tip's path in a cell counts from this length on."""
 FEWEST_IN_CELL = 3
+LEAST_LAG_MM = 0.3
+"""Lags that are smaller tell more of heights and of the arm's tremor than of friction."""
+_CELLS = 10_000
+"""More than there are along an axis of the plate."""
 
 
 def largest_spot(slips: Slips, growth: Growth) -> float:
@@ -169,51 +179,45 @@ def largest_spot(slips: Slips, growth: Growth) -> float:
     A papilla's lag in a cell is compared with its median over all cells at that depth. The error
     is that of a mean of paths through the cell, by their scatter.
     """
-    levels, which = slips.depths
-    m = slips.slipped_s.shape[1]
-    # sums by slide, papilla and cell would be large: one row a path through a cell
-    rows: list[tuple[int, int, complex, float]] = []
-    for i, trial in enumerate(slips.trials):
-        lag, _ = settled_lags(slips, i, growth)
-        moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
-        cell = np.floor(trial.tips_mm[moving] / CELL_MM)
-        step = np.abs(np.diff(slips.path_mm[i], axis=0, prepend=np.nan))
-        for j in range(m):
-            seen = np.flatnonzero(np.isfinite(lag[:, j]) & np.isfinite(step[:, j]))
-            if not len(seen):
-                continue
-            at = cell[seen, j, 0] + 1j * cell[seen, j, 1]
-            places, index = np.unique(at, return_inverse=True)
-            way = np.bincount(index, step[seen, j])
-            count = np.bincount(index)
-            mean = np.bincount(index, lag[seen, j]) / count
-            long = way >= LEAST_IN_CELL_MM
-            group = int(which[i]) * m + j
-            rows += [(group, j, p, float(v)) for p, v in
-                     zip(places[long], mean[long], strict=True)]  # fmt: skip
-    if not rows:
-        return float("nan")
-    group = np.array([row[0] for row in rows])
-    place = np.array([row[2] for row in rows])
-    value = np.array([row[3] for row in rows])
-    off = np.full(len(rows), np.nan)
-    for g in np.unique(group):
-        own = group == g
-        middle = np.median(value[own])
-        if own.sum() >= FEWEST_IN_CELL and middle >= LOADED_MM:
-            off[own] = value[own] / middle - 1.0
+    parts = [_lags_in_cells(slips, i, growth) for i in range(len(slips.trials))]
+    own, cell, lag = (np.concatenate(column) for column in zip(*parts, strict=True))
+    off = np.full(len(lag), np.nan)
+    for one in np.unique(own):
+        these = own == one
+        middle = np.median(lag[these])
+        if these.sum() >= FEWEST_IN_CELL and middle >= LEAST_LAG_MM:
+            off[these] = lag[these] / middle - 1.0
     known = np.isfinite(off)
     if known.sum() < 10:
         return float("nan")
-    _, cell_of = np.unique(place[known], return_inverse=True)
     off = off[known] - np.median(off[known])
-    count = np.bincount(cell_of)
     scatter = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
-    mean = np.bincount(cell_of, off) / count
+    _, index = np.unique(cell[known], return_inverse=True)
+    count = np.bincount(index)
+    total = np.abs(np.bincount(index, off))
     full = count >= FEWEST_IN_CELL
-    if not full.any():
-        return float("nan")
-    return float(np.max(np.abs(mean[full]) * np.sqrt(count[full])) / scatter)
+    return float(np.max(total[full] / np.sqrt(count[full])) / scatter) if full.any() else np.nan
+
+
+def _lags_in_cells(slips: Slips, i: int, growth: Growth) -> tuple[I64, I64, F64]:
+    """Return the mean lag of each path of a sliding tip through a cell, mm, in one slide.
+
+    Returns:
+        Three arrays (paths,): a number for papilla and depth, one for the cell, and the lag.
+    """
+    trial, which = slips.trials[i], slips.depths[1]
+    m = slips.slipped_s.shape[1]
+    lag, _ = settled_lags(slips, i, growth)
+    moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
+    step = np.abs(np.diff(slips.path_mm[i], axis=0, prepend=np.nan))
+    seen = np.isfinite(lag) & np.isfinite(step)
+    j = np.nonzero(seen)[1]
+    across, up = np.floor(trial.tips_mm[moving][seen] / CELL_MM).astype(np.int64).T
+    place = (across + _CELLS // 2) * _CELLS + up + _CELLS // 2
+    path, index, count = np.unique(place * m + j, return_inverse=True, return_counts=True)
+    long = np.bincount(index, step[seen]) >= LEAST_IN_CELL_MM
+    mean = np.bincount(index, lag[seen]) / np.maximum(count, 1)
+    return which[i] * m + path[long] % m, path[long] // m, mean[long]
 
 
 # -- poses -------------------------------------------------------------------------------------
@@ -234,10 +238,13 @@ def ramp_mm(trials: Sequence[PilotTrial]) -> float:
         if middle.sum() < 10 or not before.any():
             continue
         speed, begin = np.polynomial.Polynomial.fit(t[middle], way[middle], 1).convert().coef[::-1]
-        behind = way[before].mean() - begin
-        end = way[after].mean() if after.any() else way[moving][-1]
-        ahead = begin + speed * trial.slide_s - end
-        found.append(0.5 * (behind + ahead))
+        first = way[before].mean() - begin
+        # recordings may end with the slide
+        if after.any():
+            last = begin + speed * trial.slide_s - way[after].mean()
+        else:
+            last = begin + speed * t[moving][-1] - way[moving][-1]
+        found.append(0.5 * (first + last))
     return abs(float(np.mean(found))) if found else float("nan")
 
 
@@ -259,9 +266,9 @@ def line_over_noise(trials: Sequence[PilotTrial]) -> float:
     """Power of the strongest line in the rate of events over the noise about it, in the hold.
 
     Spectra of seconds, of each polarity by itself, are divided by their own noise and then
-    averaged, as the phase of a light differs from slide to slide. The mean is that of log(1 + x), so
-    that a single second does not make a line. Without one 0.8 of the noise is expected, and 1.2 or
-    so of the largest of many frequencies. NaN without events.
+    averaged, as the phase of a light differs from slide to slide. The mean is that of log(1 + x):
+    a single second does not make a line. Without a light 0.8 of the noise is expected, and of the
+    largest of many frequencies some 1.5. NaN without events.
     """
     total, spans = np.zeros(len(BAND)), 0
     span_us = round(SPAN_S * 1e6)
