@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,8 +32,15 @@ from sliplab.analysis.twin.misfits import (
     stream_of,
 )
 from sliplab.analysis.twin.pilot import Camera, PilotTrial, Slide
+from sliplab.flows.scene_runs import changed
+from sliplab.flows.twin_pilots import simulate_pilot
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.mock.fault_settings import PapillaTorn
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import F64, EventChunk
 
+ROOT = Path(__file__).parents[3]
 RING = np.repeat([0, 1, 2], [1, 6, 12])
 ANGLE = np.concatenate([np.arange(n) * 2 * np.pi / n for n in (1, 6, 12)])
 LATTICE = 5.6 * RING[:, None] * np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])
@@ -119,7 +127,7 @@ def test_a_pilot_without_effects_has_small_numbers(clean: dict[str, float]) -> N
     assert clean[STICKY] < 4.0
     assert clean[BROKEN] == 0.0
     assert clean[RAMP] < 1e-9
-    assert clean[SPOT] < 5.0
+    assert clean[SPOT] < 8.0
     assert np.isnan(clean[LIGHT])
 
 
@@ -138,7 +146,7 @@ def test_a_sticky_papilla_stands_out(clean: dict[str, float], papilla: int) -> N
     found = numbers(pilot(friction=friction))
     assert found[STICKY] > 2.0 * clean[STICKY]
     assert found[TILT] < 2e-3
-    assert found[SPOT] < 5.0
+    assert found[SPOT] < 8.0
 
 
 def test_a_papilla_without_a_marker_or_a_hold_is_missing() -> None:
@@ -215,6 +223,20 @@ def test_without_slides_nothing_is_known() -> None:
     found = numbers(dark)
     assert np.isfinite(found[RAMP])
     assert np.isnan([found[TILT], found[STICKY], found[SPOT]]).all()
+
+
+def test_a_simulated_pilot_keeps_faults_where_they_are_asked_for() -> None:
+    rig, _ = load_rig_file(shipped_rigs()["rehearsal"])
+    plan = load_plan(ROOT / "protocols/pilot.yaml")
+    torn = PapillaTorn(kind="papilla_torn", papilla=5, since="trial", at_s=0.0)
+    broken = changed(rig, {"faults": (torn,)})
+
+    def tips(rig: RigFile, with_faults: bool) -> F64:
+        return simulate_pilot(rig, plan, plan.trials[:1], 3, False, with_faults)[0].tips_mm
+
+    seen = tips(broken, True)
+    assert np.isnan(seen).all(axis=(0, 2)).tolist() == [papilla == 5 for papilla in range(19)]
+    np.testing.assert_array_equal(tips(broken, False), tips(rig, True))
 
 
 # -- the verdict -------------------------------------------------------------------------------
