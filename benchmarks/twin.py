@@ -6,7 +6,8 @@
 A hidden world is a simulated rig with a force sensor, its parameters drawn 30 % around the
 defaults, with another skin and other pixels, and depth zero off by up to 0.1 mm. Its pilot has 36
 slides; test trials are left out. The bank's worlds are drawn as in the first round of a fit, 50 %
-around the defaults. Every world is looked at twice: with its forces, and without.
+around the defaults; each of them is compared with the others, too, as a clean world. Every world is
+looked at twice: with its forces, and without.
 
 Effects have the sizes that docs/faults.md names. The light is as bright as makes a pixel of 2.7
 standard deviations below the mean threshold fire, as light of the default share does on the default
@@ -151,9 +152,9 @@ def taken(jobs: Sequence[Job], file: Path | None, cores: int) -> dict[str, list[
     return found
 
 
-def checks_of(row: Mapping[str, Any], bank: Sequence[Mapping[str, Any]], name: str) -> tuple[
-    MisfitCheck, ...
-]:  # fmt: skip
+def checks_of(
+    row: Mapping[str, Any], bank: Sequence[Mapping[str, Any]], name: str
+) -> tuple[MisfitCheck, ...]:
     """Return the checks of a hidden world against a bank."""
     names = tuple(bank[0][name][0])
     s = np.stack([of_names(world[name][0], names) for world in bank])
@@ -169,13 +170,17 @@ def run_misfits(asked: argparse.Namespace) -> None:
     print("| world | forces | found | by the right stream | first check (worlds) |")
     print("| --- | --- | --- | --- | --- |")
     for name in FORCES:
-        for kind in (*STREAMS, CLEAN):
-            called = [checks_of(row, found[BANK], name)[0] for row in found[kind]]
+        for kind in (*STREAMS, CLEAN, BANK):
+            bank = found[BANK]
+            called = []
+            for row in found[kind]:
+                others = [world for world in bank if world is not row]
+                called += checks_of(row, others, name)[:1]
             misfit = [check for check in called if check.found]
             right = sum(check.stream == STREAMS.get(kind) for check in misfit)
             titles = [f"{check.title} [{check.stream}]" for check in misfit]
             first = "; ".join(f"{t} ({titles.count(t)})" for t in dict.fromkeys(titles))
-            told = "-" if kind == CLEAN else f"{right} of {len(called)}"
+            told = f"{right} of {len(called)}" if kind in STREAMS else "-"
             print(f"| {kind} | {name} | {len(misfit)} of {len(called)} | {told} | {first} |")
 
 
@@ -186,7 +191,7 @@ def main() -> None:
     part.set_defaults(run=run_misfits)
     part.add_argument("--worlds", type=int, default=10, help="of each effect")
     part.add_argument("--clean", type=int, default=40, help="without any effect")
-    part.add_argument("--bank", type=int, default=150)
+    part.add_argument("--bank", type=int, default=150, help="at least 21")
     part.add_argument("--seed", type=int, default=1)
     part.add_argument("--file", type=Path, help="keeps what was simulated")
     part.add_argument("--cores", type=int, default=2)

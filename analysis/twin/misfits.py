@@ -129,13 +129,16 @@ def odd_friction(fit: Fit, ring: I64) -> float:
     """Largest deviation of one papilla's friction from all others', over the scatter of these.
 
     Each is compared with the mean and scatter of the others (an externally studentised residual;
-    Cook and Weisberg 1982), its own standard error added.
+    Cook and Weisberg 1982), with the usual standard error of its ring: its own is large where it
+    is odd.
     """
     known = ring >= 0
     n = int(known.sum())
     if n < 5:
         return float("nan")
-    friction, error = np.log(fit.friction[known]), fit.friction_error[known]
+    friction, inside = np.log(fit.friction[known]), ring[known]
+    errors = {r: np.median(fit.friction_error[ring == r]) for r in np.unique(inside).tolist()}
+    error = np.array([errors[r] for r in inside.tolist()])
     mean = (friction.sum() - friction) / (n - 1)
     square = ((friction**2).sum() - friction**2) / (n - 1) - mean**2
     variance = np.maximum(square, 0.0) * n / (n - 2)
@@ -286,9 +289,11 @@ def line_over_noise(trials: Sequence[PilotTrial]) -> float:
                 if len(own) < FEWEST_EVENTS:
                     continue
                 rate = np.bincount(own, minlength=count)
-                power = np.abs(np.fft.rfft(rate)[BAND]) ** 2
-                noise = median_filter(power, around, mode="nearest") / np.log(2.0)
-                total += np.log1p(power / np.maximum(noise, 1e-12))
+                power = np.abs(np.fft.rfft(rate - rate.mean())) ** 2
+                # the median needs frequencies beyond the band, too
+                power = power[: BAND[-1] + around]
+                noise = median_filter(power, around)[BAND] / np.log(2.0)
+                total += np.log1p(power[BAND] / np.maximum(noise, 1e-12))
                 spans += 1
     return float(np.expm1(total.max() / spans)) if spans else float("nan")
 
