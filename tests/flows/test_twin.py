@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import sliplab
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.twin.misfits import CHECKS
 from sliplab.analysis.twin.parameters import PARAMETERS, value_of
 from sliplab.analysis.twin.pilot import pilot_trial, slide_of
 from sliplab.flows import twin
@@ -51,17 +52,21 @@ def requested(tmp_path: Path, **changes: Any) -> twin.Calibration:
 def answering(
     wanted: twin.Calibration, observed: dict[str, float]
 ) -> Callable[[str, Callable[[Any], Any], Sequence[twin.World]], list[Any]]:
-    """Stand in for `everywhere`: each statistic is the pilot's times one parameter's factor."""
+    """Stand in for `everywhere`: each statistic is the pilot's times one parameter's factor.
+
+    The number of each check for misfits is 100, which no pilot of a clean rig reaches.
+    """
     real, parameters = twin.everywhere, wanted.parameters
 
-    def fake(world: twin.World) -> dict[str, float]:
+    def fake(world: twin.World) -> tuple[dict[str, float], dict[str, float]]:
         factors = [
             value_of(world.rig.scene, it) / value_of(wanted.rig.scene, it) for it in parameters
         ]
-        return {
+        found = {
             name: value * factors[k % len(factors)]
             for k, (name, value) in enumerate(observed.items())
         }
+        return found, dict.fromkeys((check.key for check in CHECKS), 100.0)
 
     def everywhere(
         title: str, work: Callable[[Any], Any], worlds: Sequence[twin.World]
@@ -114,6 +119,10 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
         # where a statistic is the parameter itself, the interval has no width
         assert it.low * 0.999 < it.assumed < it.high * 1.001, it.key
         assert it.value == pytest.approx(it.assumed, rel=0.05), it.key
+
+    assert {check.stream for check in fit.checks} == {"frames", "events", "poses"}
+    assert len(fit.checks) == len(CHECKS) + 2  # and all that frames and events show
+    assert not any(check.found for check in fit.checks)
 
     Draft7Validator(file_schema("twin")).validate(read_json(tmp_path / "twin.json"))
     page = (tmp_path / "twin.html").read_text()
