@@ -1,7 +1,8 @@
-"""A scene fitted to pilots of hidden worlds: worlds with an effect that the scene lacks.
+"""A scene fitted to pilots of hidden worlds: intervals that hold, and effects that it lacks.
 
-    python -m benchmarks.twin misfits [--worlds 10] [--clean 40] [--bank 150] [--seed 1]
-                                      [--file WORLDS.jsonl] [--cores 2]
+    python -m benchmarks.twin coverage [--clean 40] [--bank 150] [--seed 1]
+                                       [--file WORLDS.jsonl] [--cores 2]
+    python -m benchmarks.twin misfits [--worlds 10] and the same
 
 A hidden world is a simulated rig with a force sensor, its parameters drawn 30 % around the
 defaults, with another skin and other pixels, and depth zero off by up to 0.1 mm. Its pilot has 36
@@ -32,6 +33,7 @@ import numpy as np
 
 from sliplab.analysis.twin.misfits import misfit_numbers, misfits
 from sliplab.analysis.twin.parameters import PARAMETERS, drawn, value_of
+from sliplab.analysis.twin.posterior import Bank, posterior
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin import (
     EVENT_TRIALS,
@@ -46,7 +48,7 @@ from sliplab.flows.twin import (
 )
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock import fault_settings as faults
-from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.schema.twin import MisfitCheck
 
@@ -73,15 +75,21 @@ class Job:
     seed: int
 
 
-def world_of(job: Job) -> World:
-    """Return a world of a kind."""
+def drawn_of(job: Job) -> tuple[RigFile, dict[str, float], np.random.Generator]:
+    """Return the rig that is fitted, a world's parameters, and what else is drawn for it."""
     rng = np.random.default_rng([job.seed, KINDS.index(job.kind), job.number])
     rig, _ = load_rig_file(shipped_rigs()["mock_force"])
+    there = [it for it in PARAMETERS if value_of(rig.scene, it) > 0.0]
+    spread = SPREAD if job.kind == BANK else HIDDEN_SPREAD
+    return rig, drawn(rig.scene, there, spread, rng), rng
+
+
+def world_of(job: Job) -> World:
+    """Return a world of a kind."""
+    rig, values, rng = drawn_of(job)
     plan = load_plan(ROOT / "protocols/pilot.yaml")
     fitted = tuple(trial for trial in plan.trials if trial.split != "test")
     chosen = np.unique(np.linspace(0, len(fitted) - 1, EVENT_TRIALS).round().astype(int))
-    there = [it for it in PARAMETERS if value_of(rig.scene, it) > 0.0]
-    values = drawn(rig.scene, there, SPREAD if job.kind == BANK else HIDDEN_SPREAD, rng)
     zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
     specimen, chance = (int(n) for n in rng.integers(2**31, size=2))
     made = other_specimen(rig, values, specimen, zero_mm)
@@ -182,6 +190,53 @@ def run_misfits(asked: argparse.Namespace) -> None:
             first = "; ".join(f"{t} ({titles.count(t)})" for t in dict.fromkeys(titles))
             told = f"{right} of {len(called)}" if kind in STREAMS else "-"
             print(f"| {kind} | {name} | {len(misfit)} of {len(called)} | {told} | {first} |")
+
+
+def run_coverage(asked: argparse.Namespace) -> None:
+    """Print how often the intervals of one round hold the truth, and how far medians are off."""
+    counts = {BANK: asked.bank, CLEAN: asked.clean}
+    jobs = [Job(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
+    found = taken(jobs, asked.file, asked.cores)
+    print("| parameter | forces | identified | interval holds | median error |")
+    print("| --- | --- | --- | --- | --- |")
+    for name in FORCES:
+        bank = bank_of(found[BANK], name)
+        rows = []
+        for hidden in found[CLEAN]:
+            job = Job(CLEAN, hidden["number"], hidden["seed"])
+            _, values, _ = drawn_of(job)
+            estimates = posterior(bank, of_names(hidden[name][0], bank.statistics)).estimates
+            rows.append(
+                [(it, np.log(values[key])) for it, key in zip(estimates, values, strict=True)]
+            )
+        known, held, errors = 0, 0, []
+        for column in zip(*rows, strict=True):
+            told = [(it, truth) for it, truth in column if it.identified]
+            holds = sum(it.low <= truth <= it.high for it, truth in told)
+            off = [abs(np.expm1(it.median - truth)) for it, truth in told]
+            known, held, errors = known + len(told), held + holds, errors + off
+            error = f"{100 * np.median(off):.1f} %" if off else "-"
+            told_of = f"{len(told)} of {len(column)}"
+            print(
+                f"| {column[0][0].parameter} | {name} | {told_of} | {holds} of {len(told)} | {error} |"
+            )
+        print(
+            f"| all | {name} | {known} of {sum(map(len, rows))} | {held} of {known} "
+            f"({100 * held / max(known, 1):.1f} %) | {100 * np.median(errors):.1f} % |"
+        )
+
+
+def bank_of(worlds: Sequence[Mapping[str, Any]], name: str) -> Bank:
+    """Return simulated worlds as a bank."""
+    names = tuple(worlds[0][name][0])
+    s = np.stack([of_names(world[name][0], names) for world in worlds])
+    theta = []
+    for world in worlds:
+        rig, values, _ = drawn_of(Job(BANK, world["number"], world["seed"]))
+        theta.append(np.log(list(values.values())))
+    middle = np.log([value_of(rig.scene, it) for it in PARAMETERS if it.key in values])
+    reach = np.log1p(SPREAD)
+    return Bank(tuple(values), names, np.stack(theta), s, middle - reach, middle + reach)
 
 
 def main() -> None:

@@ -45,7 +45,7 @@ _DOCUMENTS = {
     ),
     "twin": (
         "The numbers of a twin",
-        "`TWIN.json` beside `TWIN.yaml`: a fit of a simulated rig to a pilot ([Twins](../twin.md)).",
+        "`TWIN.json` beside `TWIN.yaml`: a simulated rig's fit to a pilot ([Twins](../twin.md)).",
     ),
 }
 """Title and place of each document in a store."""
