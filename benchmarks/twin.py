@@ -216,10 +216,8 @@ def run_coverage(asked: argparse.Namespace) -> None:
             off = [abs(np.expm1(it.median - truth)) for it, truth in told]
             known, held, errors = known + len(told), held + holds, errors + off
             error = f"{100 * np.median(off):.1f} %" if off else "-"
-            told_of = f"{len(told)} of {len(column)}"
-            print(
-                f"| {column[0][0].parameter} | {name} | {told_of} | {holds} of {len(told)} | {error} |"
-            )
+            cells = (f"{len(told)} of {len(column)}", f"{holds} of {len(told)}", error)
+            print(f"| {column[0][0].parameter} | {name} | {' | '.join(cells)} |")
         print(
             f"| all | {name} | {known} of {sum(map(len, rows))} | {held} of {known} "
             f"({100 * held / max(known, 1):.1f} %) | {100 * np.median(errors):.1f} % |"

@@ -48,6 +48,7 @@ from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin_pilots import simulate_pilot
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.levels import choose_level
 from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
@@ -115,6 +116,13 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
     Raises:
         StoreError: it has no slides, or they are not labelled.
     """
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
+    choice = choose_level(rig, item.plan)
+    if choice is not None and choice.name != LEVEL:
+        raise StoreError(
+            f"campaign '{item.name}': was simulated at level {choice.name}, without all physics "
+            f"that is fitted; collect it on a rig with mock.scene.level: {LEVEL}"
+        )
     labels = Derived.of(store, "labels", item.name)
     parts: dict[bool, list[Trial]] = {True: [], False: []}
     slides, sums = {}, hashlib.sha256()
@@ -122,12 +130,6 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
         slide = slide_of(item.plan.program(trial))
         if slide is None:
             continue
-        truth = recording.simulation_truth()
-        if truth is not None and truth.get("level", LEVEL) not in (LEVEL, "auto"):
-            raise StoreError(
-                f"campaign '{item.name}': was simulated at level {truth['level']}, without all "
-                f"physics that is fitted; collect it on a rig with mock.scene.level: {LEVEL}"
-            )
         try:
             places = labels.arrays(trial.id)
         except FileNotFoundError:

@@ -19,7 +19,7 @@ SHORTENING = 0.6
 """A guided column of height h bent by b is shorter by 0.6 b^2 / h: the integral of half the squared
 slope of its cubic shape."""
 _LEAST_STIFFNESS = 0.05
-_NEWTON = 15
+_NEWTON = 20
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,9 @@ def steady(
     along = 1.0 / (height_mm / area + base_normal)
     shorter = SHORTENING / height_mm
     deep = np.maximum(deep_mm, 0.0)
-    bend = mu * along * deep / bending
+    # between no bend, whose spring does not pull, and the one that lifts the tip off the plate
+    low, high = np.zeros(np.broadcast_shapes(deep.shape, shorter.shape)), np.sqrt(deep / shorter)
+    bend = np.minimum(mu * along * deep / bending, high)
     for _ in range(_NEWTON):
         normal = along * np.maximum(deep - shorter * bend**2, 0.0)
         falls = np.where(normal > 0.0, -2.0 * along * shorter * bend, 0.0)
@@ -127,7 +129,10 @@ def steady(
         soft = spring < least
         slope = np.where(soft, least, spring - 2.0 * shorter * bend * falls) - mu * falls
         miss = bend * np.where(soft, least, spring) - mu * normal
-        bend = np.maximum(bend - miss / slope, 0.0)
+        low, high = np.where(miss < 0.0, bend, low), np.where(miss < 0.0, high, bend)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = bend - miss / slope
+        bend = np.where((found >= low) & (found <= high), found, 0.5 * (low + high))
     normal = along * np.maximum(deep - shorter * bend**2, 0.0)
     return bend + compliance * mu * normal, normal
 

@@ -177,14 +177,17 @@ def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
     other.write_text("extends: rehearsal\nname: mine\n")
     with pytest.raises(InputError, match="exists and is no twin"):
         twin.request(Path("rehearsal"), other, 100, 0.5, 1)
-    empty = tmp_path / "unlabelled"
-    sliplab.collect("pilot", rig="rehearsal", store=empty, trials=1)
-    said = CliRunner().invoke(
-        app, ["calibrate", "scene", str(empty), "--rig", "rehearsal",
-              "--out", str(tmp_path / "twin.yaml")],
-    )  # fmt: skip
-    assert said.exit_code == 1
-    assert "simulated at level L1" in said.stderr
+    for level, reason in (("L3", "has no label yet"), ("L1", "was simulated at level L1")):
+        rig = tmp_path / f"{level}.yaml"
+        rig.write_text(f"extends: rehearsal\nname: some\nmock: {{scene: {{level: {level}}}}}\n")
+        folder = tmp_path / level
+        sliplab.collect("pilot", rig=rig, store=folder, trials=1)
+        said = CliRunner().invoke(
+            app, ["calibrate", "scene", str(folder), "--rig", "rehearsal",
+                  "--out", str(tmp_path / "twin.yaml")],
+        )  # fmt: skip
+        assert said.exit_code == 1
+        assert reason in str(said.exception)
     assert not (tmp_path / "twin.yaml").exists()
 
 
