@@ -48,6 +48,7 @@ from sliplab.flows.twin import (
 )
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock import fault_settings as faults
+from sliplab.rigs.mock.settings import EventCamera
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.schema.twin import MisfitCheck
@@ -55,6 +56,7 @@ from sliplab.storage.schema.twin import MisfitCheck
 ROOT = Path(__file__).parents[1]
 HIDDEN_SPREAD = 0.3
 TILT_DEG = 1.0
+THRESHOLD = EventCamera().threshold
 FAINT = 2.67
 """A light is seen by pixels whose threshold is so many standard deviations below the mean."""
 STREAMS = {
@@ -112,8 +114,8 @@ def faults_of(
     elif kind == "a broken papilla":
         yield faults.PapillaTorn(kind="papilla_torn", papilla=papilla, since="trial", at_s=0.0)
     elif kind == "a light on the mains":
-        threshold, sigma = (values[f"event_camera.{k}"] for k in ("threshold", "threshold_sigma"))
-        share = math.tanh((threshold - FAINT * sigma) / 2.0)
+        sigma = values["event_camera.threshold_sigma"]
+        share = math.tanh((THRESHOLD - FAINT * sigma) / 2.0)
         yield faults.MainsLight(kind="mains_light", share=share)
     elif kind == "a slow ramp":
         yield faults.ArmRamp(kind="arm_ramp", mm_s2=5.0)
