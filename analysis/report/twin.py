@@ -85,7 +85,7 @@ def render(
 
 
 def _short(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
 def _intervals(fit: TwinFit) -> str:
