@@ -145,6 +145,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     assert "the twin was fitted on" in said["twin"] or "within what" in said["twin"]
 
 
+@pytest.mark.long
 def test_what_is_not_told_keeps_the_rigs_value(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,9 +39,8 @@ def final(page: Page, run: str) -> str:
     return found if found in FINAL else ""
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(signal.SIGSTOP, marks=pytest.mark.long), signal.SIGKILL]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
 def test_a_served_campaign_goes_on_without_its_server(
     number: signal.Signals, tmp_path: Path
 ) -> None:
