@@ -12,7 +12,7 @@ from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move
 from sliplab.protocols.yaml_file import StrictModel
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
 class FittedValue(StrictModel):
@@ -42,7 +42,7 @@ class TwinRecord(StrictModel):
     """The pilot's name."""
     checksum: str
     """Of the trials that were fitted."""
-    trials: Annotated[int, Field(ge=1)]
+    trials: Annotated[int, Field(ge=1, le=10_000_000)]
     """Their number."""
     simulated: bool
     """The pilot itself was simulated."""

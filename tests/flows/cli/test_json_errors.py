@@ -58,6 +58,9 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
         ("teach plane", "teach zero", "teach tool", "calibrate lens", "calibrate crop"),
         (("--rig", "ROOM/nowhere"), "ROOM/nowhere", None, None),
     ),
+    "calibrate scene": (
+        ("ROOM/nowhere", "--rig", "mock", "--out", "ROOM/t.yaml"), "ROOM/nowhere", None, None,
+    ),
     "calibrate board": (("--out", "ROOM/x.doc"), None, "--out", "ROOM/x.doc"),
 }  # fmt: skip
 
