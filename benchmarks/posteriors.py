@@ -2,7 +2,6 @@
 
     python -m benchmarks.posteriors [--worlds 300] [--hidden 100] [--banks 2] [--toys NAME ...]
     python -m benchmarks.posteriors --bank FILE.npz        # simulated worlds instead of toys
-    python -m benchmarks.posteriors --toys curved --twice  # a second bank, narrowed
 
 Every method gets the same simulated worlds and gives 95 % intervals of hidden worlds drawn from the
 same prior. The rivals: plain rejection (the nearest twentieth of the worlds in standardised
@@ -22,20 +21,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import chdir
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.measure import SEED
-from sliplab.analysis.twin.posterior import (
-    IDENTIFIED,
-    Bank,
-    fitted,
-    narrowed,
-    pooled,
-    posterior,
-)
+from sliplab.analysis.twin.posterior import IDENTIFIED, Bank, fitted
 from sliplab.storage.streams import F64
 
 HALF = float(np.log(1.3))
@@ -195,32 +186,6 @@ def compared(name: str, pairs: list[tuple[Bank, Bank]]) -> None:
         )
 
 
-def twice(name: str, k: int, hidden: int) -> None:
-    """Print what a second bank of k worlds gives, beside twice as many worlds in one."""
-    rows: dict[str, list[F64]] = {f"{2 * k} at once": [], f"{k}, then {k}": []}
-    rng = np.random.default_rng(SEED)
-    first, both, worlds = drawn(name, k, 0), drawn(name, 2 * k, 1), drawn(name, hidden, 2)
-    fit, fit_both = fitted(first), fitted(both)
-    for theta, s in zip(worlds.theta, worlds.s, strict=True):
-        observed = np.where(np.isfinite(s), s, np.nanmedian(first.s, axis=0))
-        lower, upper = narrowed(fit.at(observed))
-        unit = first.unit(rng.uniform(lower, upper, (k, len(theta))))
-        second = replace(first, theta=first.scaled(unit), s=TOYS[name][0](unit, rng),
-                         lower=lower, upper=upper)  # fmt: skip
-        found = posterior(pooled(first, second), observed, (first.lower, first.upper))
-        for kept, estimates in zip(
-            rows.values(), (fit_both.at(observed).estimates, found.estimates), strict=True
-        ):
-            kept.append(np.array([(e.low <= t <= e.high, abs(np.expm1(e.median - t)), e.left)
-                                  for e, t in zip(estimates, theta, strict=True)]))  # fmt: skip
-    for label, kept in rows.items():
-        held, error, left = np.array(kept).transpose(2, 0, 1)
-        called = left <= IDENTIFIED
-        print(f"| {name} | {label} | {100 * held.mean():.1f} % | {100 * called.mean():.0f} % "
-              f"| {100 * held[called].mean():.1f} % | {100 * np.median(error[called]):.2f} % "
-              f"| {100 * np.median(left[called]):.0f} % |", flush=True)  # fmt: skip
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--worlds", type=int, default=300)
@@ -228,15 +193,7 @@ def main() -> None:
     parser.add_argument("--banks", type=int, default=2)
     parser.add_argument("--bank", type=Path, help="simulated worlds instead of the toys")
     parser.add_argument("--toys", nargs="*", default=list(TOYS))
-    parser.add_argument("--twice", action="store_true", help="what a second bank gives")
     asked = parser.parse_args()
-    if asked.twice:
-        print("| worlds | drawn | held | called identified | held of these "
-              "| median error of these | median width of these |")  # fmt: skip
-        print("|" + " --- |" * 7)
-        for name in asked.toys:
-            twice(name, asked.worlds, asked.hidden)
-        return
     print(HEAD)
     print("|" + " --- |" * 9)
     if asked.bank:

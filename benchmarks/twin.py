@@ -6,8 +6,8 @@
 
 A hidden world is a simulated rig with a force sensor, its parameters drawn 30 % around the
 defaults, with another skin and other pixels, and depth zero off by up to 0.1 mm. Its pilot has 36
-slides; test trials are left out. The bank's worlds are drawn as in the first round of a fit, 50 %
-around the defaults; each of them is compared with the others, too, as a clean world. Every world is
+slides; test trials are left out. The bank's worlds are drawn as in a fit, 50 % around the
+defaults; each of them is compared with the others, too, as a clean world. Every world is
 looked at twice: with its forces, and without.
 
 Effects have the sizes that docs/faults.md names. The light is as bright as makes a pixel of 2.7
@@ -30,31 +30,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from sliplab.analysis.twin.misfits import misfit_numbers, misfits
-from sliplab.analysis.twin.parameters import PARAMETERS, drawn, value_of
-from sliplab.analysis.twin.posterior import Bank, posterior
+from sliplab.analysis.twin.misfits import misfits
+from sliplab.analysis.twin.posterior import posterior
+from sliplab.analysis.twin.statistics import Statistics, of_names, statistics
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin import (
-    EVENT_TRIALS,
-    SPREAD,
-    ZERO_MM,
-    World,
-    events_of,
-    guess_of,
-    of_names,
-    other_specimen,
-    statistics,
-)
+from sliplab.flows.twin.pilots import event_trials
+from sliplab.flows.twin.worlds import Prior, Slides, World
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock import fault_settings as faults
 from sliplab.rigs.mock.settings import EventCamera
-from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.schema.twin import MisfitCheck
 
 ROOT = Path(__file__).parents[1]
-HIDDEN_SPREAD = 0.3
+SPREAD, HIDDEN_SPREAD = 0.5, 0.3
 TILT_DEG = 1.0
 THRESHOLD = EventCamera().threshold
 FAINT = 2.67
@@ -77,31 +69,33 @@ class Job:
     seed: int
 
 
-def drawn_of(job: Job) -> tuple[RigFile, dict[str, float], np.random.Generator]:
-    """Return the rig that is fitted, a world's parameters, and what else is drawn for it."""
-    rng = np.random.default_rng([job.seed, KINDS.index(job.kind), job.number])
+def prior_of(kind: str, seed: int) -> Prior:
+    """Return what worlds of a kind are drawn from."""
     rig, _ = load_rig_file(shipped_rigs()["mock_force"])
-    there = [it for it in PARAMETERS if value_of(rig.scene, it) > 0.0]
-    spread = SPREAD if job.kind == BANK else HIDDEN_SPREAD
-    return rig, drawn(rig.scene, there, spread, rng), rng
+    spread = SPREAD if kind == BANK else HIDDEN_SPREAD
+    return Prior(rig, spread, seed * len(KINDS) + KINDS.index(kind))
+
+
+def pilot_slides() -> Slides:
+    """Return the pilot's trials without its test trials."""
+    plan = load_plan(ROOT / "protocols/pilot.yaml")
+    fitted = tuple(trial for trial in plan.trials if trial.split != "test")
+    return Slides(plan, fitted, event_trials(fitted))
 
 
 def world_of(job: Job) -> World:
     """Return a world of a kind."""
-    rig, values, rng = drawn_of(job)
-    plan = load_plan(ROOT / "protocols/pilot.yaml")
-    fitted = tuple(trial for trial in plan.trials if trial.split != "test")
-    chosen = np.unique(np.linspace(0, len(fitted) - 1, EVENT_TRIALS).round().astype(int))
-    zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
-    specimen, chance = (int(n) for n in rng.integers(2**31, size=2))
-    made = other_specimen(rig, values, specimen, zero_mm)
+    prior = prior_of(job.kind, job.seed)
+    world = prior.world(job.number, pilot_slides())
     if job.kind == "a tilted plate":
-        tilt_deg = rig.scene.scene.contact.tilt_deg + TILT_DEG
-        made = changed(made, {"scene": {"contact": {"tilt_deg": tilt_deg}}})
+        tilt_deg = prior.rig.scene.scene.contact.tilt_deg + TILT_DEG
+        made = changed(world.rig, {"scene": {"contact": {"tilt_deg": tilt_deg}}})
     else:
-        made = changed(made, {"faults": tuple(faults_of(job.kind, values, rng))})
-    events = frozenset(fitted[k].id for k in chosen)
-    return World(made, plan, fitted, events, chance, guess_of(rig), with_faults=True)
+        rng = np.random.default_rng([prior.seed, job.number, 1])
+        made = changed(
+            world.rig, {"faults": tuple(faults_of(job.kind, prior.values(job.number), rng))}
+        )
+    return replace(world, rig=made, with_faults=True)
 
 
 def faults_of(
@@ -126,19 +120,14 @@ def faults_of(
 
 
 def shown_by(job: Job) -> dict[str, Any]:
-    """Return statistics and numbers of a world, with and without its forces."""
+    """Return what a world shows, with and without its forces."""
     world = world_of(job)
-    slides = world.slides()
-    found: dict[str, Any] = {"kind": job.kind, "number": job.number, "seed": job.seed}
-    for name in FORCES:
-        if name == "without forces":
-            seen = [replace(slide, forces=None) for slide in slides]
-        else:
-            seen = slides
-        found[name] = (
-            statistics(seen, world.with_events, world.guess),
-            misfit_numbers(seen, events_of(seen, world.with_events), world.guess),
-        )
+    found: dict[str, Any] = vars(job).copy()
+    with threadpool_limits(1):
+        slides = world.take()
+        for name in FORCES:
+            seen = slides if name == "with forces" else [replace(s, forces=None) for s in slides]
+            found[name] = vars(statistics(seen, world.slides.with_events, world.guess))
     return found
 
 
@@ -162,14 +151,20 @@ def taken(jobs: Sequence[Job], file: Path | None, cores: int) -> dict[str, list[
     return found
 
 
+def seen_in(row: Mapping[str, Any], name: str) -> Statistics:
+    """Return what a world showed, with or without forces."""
+    return Statistics(**row[name])
+
+
 def checks_of(
     row: Mapping[str, Any], bank: Sequence[Mapping[str, Any]], name: str
 ) -> tuple[MisfitCheck, ...]:
     """Return the checks of a hidden world against a bank."""
-    names = tuple(bank[0][name][0])
-    s = np.stack([of_names(world[name][0], names) for world in bank])
-    numbers = [world[name][1] for world in bank]
-    return misfits(row[name][1], numbers, names, of_names(row[name][0], names), s)
+    own, worlds = seen_in(row, name), [seen_in(world, name) for world in bank]
+    names = tuple(worlds[0].fitted)
+    s = np.stack([of_names(world.fitted, names) for world in worlds])
+    effects = [world.effects for world in worlds]
+    return misfits(own.effects, effects, names, of_names(own.fitted, names), s)
 
 
 def run_misfits(asked: argparse.Namespace) -> None:
@@ -195,48 +190,34 @@ def run_misfits(asked: argparse.Namespace) -> None:
 
 
 def run_coverage(asked: argparse.Namespace) -> None:
-    """Print how often the intervals of one round hold the truth, and how far medians are off."""
+    """Print how often intervals hold the truth, and how far medians are off."""
     counts = {BANK: asked.bank, CLEAN: asked.clean}
     jobs = [Job(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
     found = taken(jobs, asked.file, asked.cores)
     print("| parameter | forces | identified | interval holds | median error |")
     print("| --- | --- | --- | --- | --- |")
+    prior, hidden = prior_of(BANK, asked.seed), prior_of(CLEAN, asked.seed)
     for name in FORCES:
-        bank = bank_of(found[BANK], name)
-        rows = []
-        for hidden in found[CLEAN]:
-            job = Job(CLEAN, hidden["number"], hidden["seed"])
-            _, values, _ = drawn_of(job)
-            estimates = posterior(bank, of_names(hidden[name][0], bank.statistics)).estimates
-            rows.append(
-                [(it, np.log(values[key])) for it, key in zip(estimates, values, strict=True)]
-            )
+        bank = prior.bank([seen_in(row, name) for row in found[BANK]])
         known, held, errors = 0, 0, []
-        for column in zip(*rows, strict=True):
-            told = [(it, truth) for it, truth in column if it.identified]
-            holds = sum(it.low <= truth <= it.high for it, truth in told)
-            off = [abs(np.expm1(it.median - truth)) for it, truth in told]
-            known, held, errors = known + len(told), held + holds, errors + off
+        pairs = []
+        for row in found[CLEAN]:
+            observed = of_names(seen_in(row, name).fitted, bank.statistics)
+            truth = hidden.values(row["number"])
+            estimates = posterior(bank, observed).estimates
+            pairs.append([(it, np.log(truth[it.parameter])) for it in estimates])
+        for column in zip(*pairs, strict=True):
+            called = [(it, truth) for it, truth in column if it.identified]
+            holds = sum(it.low <= truth <= it.high for it, truth in called)
+            off = [abs(np.expm1(it.median - truth)) for it, truth in called]
+            known, held, errors = known + len(called), held + holds, errors + off
             error = f"{100 * np.median(off):.1f} %" if off else "-"
-            cells = (f"{len(told)} of {len(column)}", f"{holds} of {len(told)}", error)
+            cells = (f"{len(called)} of {len(column)}", f"{holds} of {len(called)}", error)
             print(f"| {column[0][0].parameter} | {name} | {' | '.join(cells)} |")
         print(
-            f"| all | {name} | {known} of {sum(map(len, rows))} | {held} of {known} "
+            f"| all | {name} | {known} of {sum(map(len, pairs))} | {held} of {known} "
             f"({100 * held / max(known, 1):.1f} %) | {100 * np.median(errors):.1f} % |"
         )
-
-
-def bank_of(worlds: Sequence[Mapping[str, Any]], name: str) -> Bank:
-    """Return simulated worlds as a bank."""
-    names = tuple(worlds[0][name][0])
-    s = np.stack([of_names(world[name][0], names) for world in worlds])
-    theta = []
-    for world in worlds:
-        rig, values, _ = drawn_of(Job(BANK, world["number"], world["seed"]))
-        theta.append(np.log(list(values.values())))
-    middle = np.log([value_of(rig.scene, it) for it in PARAMETERS if it.key in values])
-    reach = np.log1p(SPREAD)
-    return Bank(tuple(values), names, np.stack(theta), s, middle - reach, middle + reach)
 
 
 def main() -> None:

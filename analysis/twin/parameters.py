@@ -128,23 +128,19 @@ def settings_of(mock: Any, values: Mapping[str, float]) -> dict[str, Any]:
     return found
 
 
-def drawn(
-    mock: Any, parameters: Sequence[Parameter], spread: float, rng: np.random.Generator
-) -> dict[str, float]:
-    """Draw values around those of a rig, uniform in their logarithm.
+def prior_bounds(mock: Any, parameters: Sequence[Parameter], spread: float) -> tuple[F64, F64]:
+    """Return least and largest logarithm of each parameter around a rig's values, both (p,).
 
     Args:
         spread: largest factor less 1, either way: 0.3 is from 1/1.3 to 1.3 times the value.
     """
-    reach = np.log1p(spread)
-    found = {}
-    for parameter in parameters:
-        value = value_of(mock, parameter)
-        factor = np.exp(rng.uniform(-reach, reach))
-        found[parameter.key] = min(value * factor, parameter.most)
-    return found
+    middle, reach = np.log([value_of(mock, it) for it in parameters]), np.log1p(spread)
+    return middle - reach, np.minimum(middle + reach, np.log([it.most for it in parameters]))
 
 
-def logarithms(values: Mapping[str, float], parameters: Sequence[Parameter]) -> F64:
-    """Return the parameters' logarithms in order, (len(parameters),)."""
-    return np.log([values[parameter.key] for parameter in parameters])
+def drawn(
+    mock: Any, parameters: Sequence[Parameter], spread: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Draw values around those of a rig, uniform in their logarithms within `prior_bounds`."""
+    logarithms = rng.uniform(*prior_bounds(mock, parameters, spread))
+    return {it.key: float(v) for it, v in zip(parameters, np.exp(logarithms), strict=True)}

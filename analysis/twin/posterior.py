@@ -118,13 +118,10 @@ class Posterior:
     Attributes:
         estimates: one a parameter, in the bank's order.
         samples: (k, p), one a world of the bank; their marginals are those of the estimates.
-        lower, upper: bounds of the bank, (p,).
     """
 
     estimates: tuple[Estimate, ...]
     samples: F64
-    lower: F64
-    upper: F64
 
 
 @dataclass(frozen=True)
@@ -155,7 +152,7 @@ class Fitted:
     """A bank with its regression: gives the posterior of any observation with these statistics.
 
     Attributes:
-        bank: of the worlds. prior_lower, prior_upper: of the first bank, (p,).
+        bank: of the worlds.
         used: statistics that the regression uses, (q,). centre, scale: of these.
         regression: on all worlds.
         predicted: of each world without it, (k, p), unit. errors: truth less that.
@@ -164,8 +161,6 @@ class Fitted:
     """
 
     bank: Bank
-    prior_lower: F64
-    prior_upper: F64
     used: Bools
     centre: F64
     scale: F64
@@ -212,8 +207,8 @@ class Fitted:
                 self._estimate(j, low[j], median[j], high[j], float(samples[:, j].std()))
                 for j in range(len(unit))
             ),
-            samples, self.bank.lower, self.bank.upper,
-        )  # fmt: skip
+            samples,
+        )
 
     def _near(self, j: int, unit: float) -> npt.NDArray[np.intp]:
         """Return the worlds that give parameter j its shape where `unit` is predicted."""
@@ -222,7 +217,7 @@ class Fitted:
         return np.argsort(distance, kind="stable")[:count]
 
     def _estimate(self, j: int, low: float, median: float, high: float, sd: float) -> Estimate:
-        lower, upper = float(self.prior_lower[j]), float(self.prior_upper[j])
+        lower, upper = float(self.bank.lower[j]), float(self.bank.upper[j])
         tail = _LEVELS[0] * (upper - lower)
         # where little is learned, the chance of the bank may make it wider than the prior's
         left = min(float(high - low) / (upper - lower - 2.0 * tail), 1.0)
@@ -239,13 +234,11 @@ class Fitted:
         )  # fmt: skip
 
 
-def fitted(bank: Bank, usable: Bools | None = None, prior: tuple[F64, F64] | None = None) -> Fitted:
+def fitted(bank: Bank, usable: Bools | None = None) -> Fitted:
     """Return a bank with its regression.
 
     Args:
         usable: statistics that may be used, (q,); all by default.
-        prior: bounds (p,) of the first bank, which intervals are compared with; default: the
-            bank's.
 
     Raises:
         ValueError: fewer than `FEWEST` worlds.
@@ -264,48 +257,19 @@ def fitted(bank: Bank, usable: Bools | None = None, prior: tuple[F64, F64] | Non
     predicted = np.where(skilled, predicted, y.mean(axis=0))
     errors = y - predicted
     axes = np.linalg.eigh(np.atleast_2d(np.cov(errors.T)))[1]
-    lower, upper = prior or (bank.lower, bank.upper)
     return Fitted(
-        bank, lower, upper, used, centre, scale, regression(x, y), predicted, errors, skilled,
+        bank, used, centre, scale, regression(x, y), predicted, errors, skilled,
         _spread(predicted, errors, skilled), axes, _spread(predicted, errors @ axes, skilled),
     )  # fmt: skip
 
 
-def posterior(bank: Bank, observed: F64, prior: tuple[F64, F64] | None = None) -> Posterior:
+def posterior(bank: Bank, observed: F64) -> Posterior:
     """Return the posterior of a bank's parameters given observed statistics (q,), some NaN.
-
-    Args:
-        prior: as for `fitted`.
 
     Raises:
         ValueError: fewer than `FEWEST` worlds, or another number of statistics.
     """
-    return fitted(bank, np.isfinite(_checked(bank, observed)), prior).at(observed)
-
-
-def narrowed(found: Posterior) -> tuple[F64, F64]:
-    """Return bounds (p,) for a second bank: all that the posterior reaches, and a quarter more.
-
-    The range of the samples holds 99 to 99.9 % of the posterior; widened it holds, of a normal
-    distribution, all but some 1e-4.
-    """
-    low, high = found.samples.min(axis=0), found.samples.max(axis=0)
-    more = 0.25 * (high - low)
-    return np.maximum(low - more, found.lower), np.minimum(high + more, found.upper)
-
-
-def pooled(first: Bank, second: Bank) -> Bank:
-    """Return a second bank with those worlds of a first one that lie within its bounds.
-
-    Both were drawn uniformly, so within the bounds of the second all of them have the same weight
-    and outside of them the worlds of the first have none.
-    """
-    theta = first.theta
-    inside = ((theta >= second.lower) & (theta <= second.upper)).all(axis=1)
-    return Bank(
-        second.parameters, second.statistics, np.concatenate([second.theta, theta[inside]]),
-        np.concatenate([second.s, first.s[inside]]), second.lower, second.upper,
-    )  # fmt: skip
+    return fitted(bank, np.isfinite(_checked(bank, observed))).at(observed)
 
 
 def _checked(bank: Bank, observed: F64) -> F64:

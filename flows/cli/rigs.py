@@ -397,8 +397,8 @@ def calibrate_scene(
     ] = None,
     worlds: Annotated[
         int,
-        typer.Option("--worlds", min=100, max=100_000, help="Simulated worlds in each round."),
-    ] = 150,
+        typer.Option("--worlds", min=100, max=100_000, help="Worlds to simulate."),
+    ] = 300,
     spread: Annotated[
         float,
         typer.Option(
@@ -417,14 +417,15 @@ def calibrate_scene(
     store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
-    from sliplab.flows import twin
+    from sliplab.flows.twin.calibrate import calibrate_scene as fit_to
+    from sliplab.flows.twin.calibrate import request
 
-    wanted = twin.request(rig, out, worlds, spread, seed)
+    wanted = request(rig, out, worlds, spread, seed)
     found = collected(store, None if campaign is None else [campaign])
     if len(found) != 1:
         names = ", ".join(item.name for item in found)
         raise InputError("--campaign", "", None, f"is needed: the store has {names}")
-    fit = twin.calibrate_scene(store, found[0], wanted)
+    fit = fit_to(store, found[0], wanted)
     if as_json:
         console.print_json({"rig": str(out), **fit.to_json()})
         return

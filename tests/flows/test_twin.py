@@ -20,11 +20,12 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.twin.misfits import CHECKS
 from sliplab.analysis.twin.parameters import PARAMETERS, value_of
 from sliplab.analysis.twin.pilot import pilot_trial, slide_of
-from sliplab.flows import twin
+from sliplab.analysis.twin.statistics import Statistics
 from sliplab.flows.cli.app import app
 from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.schema import file_schema
-from sliplab.flows.twin_pilots import simulate_pilot
+from sliplab.flows.twin import calibrate, worlds
+from sliplab.flows.twin.pilots import Pilot, read_pilot, simulate_pilot
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
@@ -32,6 +33,7 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 TRIALS = 12
+EFFECTS = [check.key for check in CHECKS]
 
 
 @pytest.fixture(scope="module")
@@ -44,38 +46,47 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return Store(folder)
 
 
-def requested(tmp_path: Path, **changes: Any) -> twin.Calibration:
+def requested(tmp_path: Path, **changes: Any) -> calibrate.Calibration:
     wanted = {"worlds": 100, "spread": 0.5, "seed": 1} | changes
-    return twin.request(Path("rehearsal"), tmp_path / "twin.yaml", **wanted)
+    return calibrate.request(Path("rehearsal"), tmp_path / "twin.yaml", **wanted)
 
 
 def answering(
-    wanted: twin.Calibration, observed: dict[str, float]
-) -> Callable[[str, Callable[[Any], Any], Sequence[twin.World]], list[Any]]:
-    """Stand in for `everywhere`: each statistic is the pilot's times one parameter's factor.
+    wanted: calibrate.Calibration, observed: dict[str, float]
+) -> Callable[[worlds.World], Statistics]:
+    """Stand in for what a world shows: each statistic is the pilot's times one parameter's factor.
 
     The number of each check for misfits is 100, which no pilot of a clean rig reaches.
     """
-    real, parameters = twin.everywhere, wanted.parameters
 
-    def fake(world: twin.World) -> tuple[dict[str, float], dict[str, float]]:
+    def shown(world: worlds.World) -> Statistics:
         factors = [
-            value_of(world.rig.scene, it) / value_of(wanted.rig.scene, it) for it in parameters
+            value_of(world.rig.scene, it) / value_of(wanted.rig.scene, it)
+            for it in wanted.prior.parameters
         ]
         found = {
             name: value * factors[k % len(factors)]
             for k, (name, value) in enumerate(observed.items())
         }
-        return found, dict.fromkeys((check.key for check in CHECKS), 100.0)
+        return Statistics(found, dict.fromkeys(EFFECTS, 100.0))
 
-    def everywhere(
-        title: str, work: Callable[[Any], Any], worlds: Sequence[twin.World]
-    ) -> list[Any]:
-        if work is twin.statistics_of_world:
-            return [fake(world) for world in worlds]
-        return real(title, work, worlds)
+    return shown
 
-    return everywhere
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds are made in this process."""
+
+    def everywhere(title: str, work: Any, jobs: Sequence[Any], done: Any = None) -> list[Any]:
+        found = [work(job) for job in jobs]
+        for number, one in enumerate(found):
+            if done is not None:
+                done(number, one)
+        return found
+
+    monkeypatch.setattr(worlds, "everywhere", everywhere)
+    monkeypatch.setattr(calibrate, "everywhere", everywhere)
+    monkeypatch.setattr(calibrate, "PREDICTED", 2)
 
 
 def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: Store) -> None:
@@ -101,20 +112,19 @@ def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: Store) 
 
 
 def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (item,) = collected(store, None)
     wanted = requested(tmp_path)
-    pilot = twin.read_pilot(store, item)
+    pilot = read_pilot(store, item)
     assert len(pilot.fitted) + len(pilot.judged) == TRIALS
     assert all(trial.split == "test" for trial in pilot.judged)
-    observed = pilot.statistics(twin.guess_of(wanted.rig))
+    observed = pilot.statistics(worlds.guess_of(wanted.rig)).fitted
     finite = {name: value for name, value in observed.items() if value > 0.0}
-    monkeypatch.setattr(twin, "everywhere", answering(wanted, finite))
-    monkeypatch.setattr(twin, "PREDICTED", 2)
-    fit = twin.calibrate_scene(store, item, wanted)
+    monkeypatch.setattr(worlds.World, "statistics", answering(wanted, finite))
+    fit = calibrate.calibrate_scene(store, item, wanted)
     known = [it for it in fit.parameters if it.identified]
-    assert len(known) == len(wanted.parameters)
+    assert len(known) == len(wanted.prior.parameters)
     for it in known:
         # where a statistic is the parameter itself, the interval has no width
         assert it.low * 0.999 < it.assumed < it.high * 1.001, it.key
@@ -147,15 +157,17 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
 
 @pytest.mark.long
 def test_what_is_not_told_keeps_the_rigs_value(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (item,) = collected(store, None)
     wanted = requested(tmp_path)
     # one statistic, of the first parameter alone
-    monkeypatch.setattr(twin, "statistics", lambda *_: {"only": 2.0})
-    monkeypatch.setattr(twin, "everywhere", answering(wanted, {"only": 2.0}))
-    monkeypatch.setattr(twin, "PREDICTED", 2)
-    fit = twin.calibrate_scene(store, item, wanted)
+    shown = answering(wanted, {"only": 2.0})
+    monkeypatch.setattr(worlds.World, "statistics", shown)
+    monkeypatch.setattr(
+        Pilot, "statistics", lambda *_: Statistics({"only": 2.0}, dict.fromkeys(EFFECTS, 1.0))
+    )
+    fit = calibrate.calibrate_scene(store, item, wanted)
     assert [it.key for it in fit.parameters if it.identified] == [PARAMETERS[0].key]
     for it in fit.parameters[1:]:
         assert it.value == it.assumed
@@ -169,15 +181,15 @@ def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
     store: Store, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="must be a simulated rig with driver: mock"):
-        twin.request(Path("ur5"), tmp_path / "twin.yaml", 100, 0.5, 1)
+        calibrate.request(Path("ur5"), tmp_path / "twin.yaml", 100, 0.5, 1)
     with pytest.raises(InputError, match=r"must end in \.yaml"):
-        twin.request(Path("rehearsal"), tmp_path / "twin.txt", 100, 0.5, 1)
+        calibrate.request(Path("rehearsal"), tmp_path / "twin.txt", 100, 0.5, 1)
     with pytest.raises(InputError, match="its folder does not exist"):
-        twin.request(Path("rehearsal"), tmp_path / "no" / "twin.yaml", 100, 0.5, 1)
+        calibrate.request(Path("rehearsal"), tmp_path / "no" / "twin.yaml", 100, 0.5, 1)
     other = tmp_path / "mine.yaml"
     other.write_text("extends: rehearsal\nname: mine\n")
     with pytest.raises(InputError, match="exists and is no twin"):
-        twin.request(Path("rehearsal"), other, 100, 0.5, 1)
+        calibrate.request(Path("rehearsal"), other, 100, 0.5, 1)
     for level, reason in (("L3", "has no label yet"), ("L1", "was simulated at level L1")):
         rig = tmp_path / f"{level}.yaml"
         rig.write_text(f"extends: rehearsal\nname: some\nmock: {{scene: {{level: {level}}}}}\n")
@@ -208,7 +220,7 @@ def test_a_hidden_rig_is_found(tmp_path: Path) -> None:
     sliplab.collect("pilot", rig=hidden, store=tmp_path / "store").label()
     store = Store(tmp_path / "store")
     (item,) = collected(store, None)
-    fit = twin.calibrate_scene(store, item, requested(tmp_path))
+    fit = calibrate.calibrate_scene(store, item, requested(tmp_path))
     found = {it.key: it for it in fit.parameters}
     for key, value in values.items():
         assert found[key].identified, key

@@ -19,7 +19,7 @@ from sliplab.analysis.twin.event_times import (
 from sliplab.analysis.twin.pilot import Camera, Forces, PilotTrial, Slide
 from sliplab.analysis.twin.rims import CONTRAST, EDGE, HIDDEN, fit_rims
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin_pilots import simulate_pilot
+from sliplab.flows.twin.pilots import simulate_pilot
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import EventChunk

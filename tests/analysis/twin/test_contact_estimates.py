@@ -33,7 +33,7 @@ from sliplab.analysis.twin.contact_springs import (
     steady,
 )
 from sliplab.analysis.twin.pilot import Forces, PilotTrial, Slide
-from sliplab.flows.twin_pilots import simulate_pilot
+from sliplab.flows.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 

@@ -33,7 +33,7 @@ from sliplab.analysis.twin.misfits import (
 )
 from sliplab.analysis.twin.pilot import Camera, PilotTrial, Slide
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin_pilots import simulate_pilot
+from sliplab.flows.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock.fault_settings import PapillaTorn
 from sliplab.rigs.rig_file import RigFile, load_rig_file

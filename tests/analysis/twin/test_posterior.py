@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.twin.calibration_checks import ranks, uniformity
-from sliplab.analysis.twin.posterior import (
-    FEWEST,
-    Bank,
-    Posterior,
-    fitted,
-    narrowed,
-    pooled,
-    posterior,
-)
+from sliplab.analysis.twin.posterior import FEWEST, Bank, Posterior, fitted, posterior
 from sliplab.storage.streams import F64
 
 HALF = float(np.log(1.3))
@@ -219,48 +211,6 @@ def test_the_same_bank_gives_the_same_bytes() -> None:
     first, second = (posterior(worlds(curved, 200, 3, seed=10), np.full(10, 0.1)) for _ in range(2))
     assert first.samples.tobytes() == second.samples.tobytes()
     assert first.estimates == second.estimates
-
-
-def test_a_second_bank_sharpens_what_is_curved() -> None:
-    rng = np.random.default_rng(11)
-    first = worlds(curved, 300, 3, seed=12)
-    lefts, held = [], []
-    for _ in range(6):
-        truth = rng.uniform(-0.9, 0.9, (1, 3))
-        observed = curved(truth, rng)[0]
-        before = posterior(first, observed)
-        lower, upper = narrowed(before)
-        assert ((lower >= -HALF) & (upper <= HALF)).all()
-        assert ((lower <= truth[0] * HALF) & (truth[0] * HALF <= upper)).all()
-        theta = rng.uniform(lower, upper, (300, 3))
-        second = replace(first, theta=theta, s=curved(theta / HALF, rng), lower=lower, upper=upper)
-        both = pooled(first, second)
-        after = posterior(both, observed, prior=(first.lower, first.upper))
-        assert read(after, "prior_low") == pytest.approx(-0.95 * HALF)
-        lefts.append(read(after, "left") / read(before, "left"))
-        held.append((read(after, "low") <= truth * HALF) & (truth * HALF <= read(after, "high")))
-    assert np.median(np.array(lefts)[:, 0]) < 0.9
-    assert np.mean(held) > 0.8
-
-
-def test_pooling_keeps_the_worlds_within_the_second_bounds() -> None:
-    first = worlds(linear, 400, 3, seed=13)
-    lower, upper = np.full(3, -0.5 * HALF), np.full(3, 0.25 * HALF)
-    theta = np.random.default_rng(14).uniform(lower, upper, (100, 3))
-    second = replace(
-        first,
-        theta=theta,
-        s=linear(theta / HALF, np.random.default_rng(15)),
-        lower=lower,
-        upper=upper,
-    )
-    both = pooled(first, second)
-    inside = ((first.theta >= lower) & (first.theta <= upper)).all(axis=1)
-    assert len(both) == 100 + inside.sum()
-    assert both.theta[100:].tolist() == first.theta[inside].tolist()
-    assert both.s[:100].tolist() == second.s.tolist()
-    # uniform in the first, so also in the part of it
-    assert 10 < inside.sum() < 40
 
 
 def test_what_cannot_be_is_refused_in_one_line() -> None:

@@ -1,25 +1,31 @@
-"""Pilots of simulated worlds, in memory: what a rig with other parameters would have recorded."""
+"""Pilots: the slides of a collected campaign, or those that a simulated rig would have recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.twin.contact_springs import Guess
 from sliplab.analysis.twin.pilot import (
     Camera,
     Forces,
     PilotTrial,
     base_at,
+    pilot_trial,
     seconds_after,
     slide_of,
 )
+from sliplab.analysis.twin.statistics import Statistics, statistics
 from sliplab.flows.scene_runs import changed, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.levels import choose_level
+from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import (
     EventChunk,
     FrameChunk,
@@ -27,12 +33,94 @@ from sliplab.storage.streams import (
     PoseChunk,
     WrenchChunk,
 )
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
 
+LEVEL = "L3"
+"""All physics: what a scene may leave out is not known before it was fitted."""
+EVENT_TRIALS = 12
+"""Slides whose events are simulated and read: events take most of the time, and their statistics
+need few trials."""
 POLL_S = 60.0
 """Nothing waits for the streams, so that they are read once a step; the data are the same."""
 COARSE_MS = 4
 """Step of the contact without events: slips are exact at any step, and marker places that are seen
 100 times a second change by less than their noise."""
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """The slides of a campaign.
+
+    Attributes:
+        fitted: trials for the fit. judged: test trials, which judge it.
+        slides: all of them as arrays, by id.
+        with_events: ids of the fitted trials whose events are read.
+        checksum: of the fitted trials' files.
+    """
+
+    plan: Plan
+    fitted: tuple[Trial, ...]
+    judged: tuple[Trial, ...]
+    slides: Mapping[str, PilotTrial]
+    with_events: frozenset[str]
+    checksum: str
+
+    @property
+    def streams(self) -> frozenset[str]:
+        """Streams that the fitted trials have."""
+        first = self.slides[self.fitted[0].id]
+        there = {"frames": True, "events": first.camera, "force": first.forces}
+        return frozenset(name for name, found in there.items() if found is not None)
+
+    def statistics(self, guess: Guess) -> Statistics:
+        """Return what the fitted trials show."""
+        slides = [self.slides[trial.id] for trial in self.fitted]
+        return statistics(slides, self.with_events, guess)
+
+
+def read_pilot(store: Store, item: Collected) -> Pilot:
+    """Read the labelled slides of a campaign.
+
+    Raises:
+        StoreError: it has no slides, or they are not labelled.
+    """
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
+    choice = choose_level(rig, item.plan)
+    if choice is not None and choice.name != LEVEL:
+        raise StoreError(
+            f"campaign '{item.name}': was simulated at level {choice.name}, without all physics "
+            f"that is fitted; collect it on a rig with mock.scene.level: {LEVEL}"
+        )
+    labels = Derived.of(store, "labels", item.name)
+    parts: dict[bool, list[Trial]] = {True: [], False: []}
+    slides, sums = {}, hashlib.sha256()
+    for trial, recording in item.trials:
+        slide = slide_of(item.plan.program(trial))
+        if slide is None:
+            continue
+        try:
+            places = labels.arrays(trial.id)
+        except FileNotFoundError:
+            raise StoreError(
+                f"{item.name}/{trial.id}: has no label yet; run `sliplab label` first"
+            ) from None
+        slides[trial.id] = pilot_trial(slide, recording, places)
+        parts[trial.split == "test"].append(trial)
+        if trial.split != "test":
+            sums.update(recording.checksum.encode())
+    if not parts[False]:
+        raise StoreError(f"campaign '{item.name}': has no straight slides to fit a scene to")
+    fitted = tuple(parts[False])
+    return Pilot(
+        item.plan, fitted, tuple(parts[True]), slides, event_trials(fitted), sums.hexdigest()
+    )
+
+
+def event_trials(fitted: Sequence[Trial]) -> frozenset[str]:
+    """Return ids of trials, spread over all, whose events are read."""
+    chosen = np.unique(np.linspace(0, len(fitted) - 1, EVENT_TRIALS).round().astype(int))
+    return frozenset(fitted[k].id for k in chosen)
 
 
 @dataclass

@@ -1,0 +1,333 @@
+"""`sliplab calibrate scene`: fit a simulated rig's scene to the slides of a pilot.
+
+What the pilot shows is reduced to a few dozen statistics. The same pilot is then simulated in many
+worlds, whose parameters are drawn round the rig file's, and the statistics of these worlds say
+which parameters lead to those of the pilot. Test trials are not fitted: they judge the result.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.report import twin as page
+from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, papillae
+from sliplab.analysis.twin.misfits import misfits
+from sliplab.analysis.twin.parameters import Parameter, settings_of, value_of
+from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
+from sliplab.analysis.twin.shown import QUANTITIES, compare
+from sliplab.analysis.twin.statistics import Statistics, of_names
+from sliplab.flows.running import orchestration
+from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
+from sliplab.flows.twin.worlds import (
+    Prior,
+    Slides,
+    World,
+    everywhere,
+    guess_of,
+    other_rig,
+    simulated,
+)
+from sliplab.protocols.errors import InputError
+from sliplab.rigs.mock.settings import Papilla
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
+from sliplab.rigs.twin import FittedValue, Range, TwinRecord
+from sliplab.storage.files import write_json, write_text
+from sliplab.storage.schema.twin import ParameterFit, QuantityCompared, StatisticSeen, TwinFit
+from sliplab.storage.streams import F64
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
+
+PREDICTED = 12
+"""Worlds of the twin in which the test trials are taken."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a fit is asked for.
+
+    Attributes:
+        prior: worlds around the simulated rig to start from. rig_path: the rig's file.
+        out: rig file to write. worlds: to simulate.
+    """
+
+    prior: Prior
+    rig_path: Path
+    out: Path
+    worlds: int
+
+    @property
+    def rig(self) -> RigFile:
+        """The simulated rig to start from."""
+        return self.prior.rig
+
+
+def request(rig_path: Path, out: Path, worlds: int, spread: float, seed: int) -> Calibration:
+    """Check what is asked for before anything is simulated.
+
+    Raises:
+        InputError: the rig is not a simulated one in virtual time, or the new file cannot be made.
+    """
+    rig, _ = load_rig_file(rig_path)
+    if not rig.in_virtual_time:
+        raise InputError(
+            "--rig", "", str(rig_path),
+            "must be a simulated rig with driver: mock, whose scene is fitted; such as rehearsal, "
+            "or a file that extends it with your skin and cameras",
+        )  # fmt: skip
+    if out.suffix not in {".yaml", ".yml"}:
+        raise InputError("--out", "", str(out), "must end in .yaml")
+    if not out.parent.is_dir():
+        raise InputError("--out", "", str(out), "its folder does not exist")
+    if out.exists() and load_rig_file(out)[0].twin is None:
+        raise InputError("--out", "", str(out), "exists and is no twin: use another name")
+    return Calibration(Prior(rig, spread, seed), rig_path, out, worlds)
+
+
+@dataclass(frozen=True)
+class SceneFit:
+    """A pilot, the worlds that it was compared with, and what follows for the scene.
+
+    Attributes:
+        observed: what the pilot shows. seen: what each world shows. bank: of these worlds.
+        found: posterior of the prior's parameters.
+        skin: settings of the twin's skin, beside those among the parameters.
+    """
+
+    prior: Prior
+    pilot: Pilot
+    observed: Statistics
+    seen: Sequence[Statistics]
+    bank: Bank
+    found: Posterior
+    skin: Mapping[str, Any]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The identified parameters' medians, by key."""
+        return {
+            it.parameter: float(np.exp(it.median)) for it in self.found.estimates if it.identified
+        }
+
+    def drawn(self, rng: np.random.Generator, count: int) -> list[dict[str, float]]:
+        """Draw the identified parameters within what the pilot leaves open."""
+        rows = rng.choice(len(self.found.samples), count, replace=False)
+        return [
+            {
+                it.parameter: float(np.exp(self.found.samples[row, k]))
+                for k, it in enumerate(self.found.estimates)
+                if it.identified
+            }
+            for row in rows
+        ]
+
+
+def fit_scene(store: Store, pilot: Pilot, prior: Prior, worlds: int) -> SceneFit:
+    """Compare a pilot with simulated worlds."""
+    observed = pilot.statistics(guess_of(prior.rig))
+    slides = Slides(pilot.plan, pilot.fitted, pilot.with_events)
+    kept = Derived.of(store, "scene-worlds")
+    seen = simulated("pilot's trials (worlds)", prior, slides, worlds, kept)
+    bank = prior.bank(seen)
+    found = posterior(bank, of_names(observed.fitted, bank.statistics))
+    made = measured_papillae(prior.rig, pilot)
+    skin = {} if made is None else {"papillae": made}
+    return SceneFit(prior, pilot, observed, seen, bank, found, skin)
+
+
+def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinFit:
+    """Fit a rig's scene to a campaign's slides; write the twin's rig file, page and numbers.
+
+    Raises:
+        StoreError: the campaign has no slides, or they are not labelled.
+    """
+    began = monotonic()
+    orchestration.configure_prefect(store.folder)
+    pilot = read_pilot(store, item)
+    scene = fit_scene(store, pilot, wanted.prior, wanted.worlds)
+    predicted = predict(scene)
+    fit = TwinFit(
+        simulated=bool(item.info.get("simulated")),
+        campaign=item.name,
+        rig=wanted.rig.name,
+        checksum=pilot.checksum,
+        trials=len(pilot.fitted),
+        judged=len(pilot.judged),
+        worlds=len(scene.bank),
+        predicted=len(predicted[0]),
+        seconds=round(monotonic() - began, 1),
+        parameters=tuple(
+            parameter_fit(it, value_of(wanted.rig.scene, it), estimate)
+            for it, estimate in zip(wanted.prior.parameters, scene.found.estimates, strict=True)
+        ),
+        statistics=seen_statistics(scene),
+        checks=misfits(
+            scene.observed.effects,
+            [one.effects for one in scene.seen],
+            scene.bank.statistics,
+            of_names(scene.observed.fitted, scene.bank.statistics),
+            scene.bank.s,
+        ),
+        compared=compared(pilot, *predicted),
+    )
+    record = TwinRecord(
+        campaign=fit.campaign,
+        checksum=fit.checksum,
+        trials=fit.trials,
+        simulated=fit.simulated,
+        fitted=date.today(),
+        method=f"regression on {fit.worlds} simulated worlds",
+        depth_mm=_range([pilot.slides[t.id].slide.depth_mm for t in pilot.fitted]),
+        speed_mm_s=_range([pilot.slides[t.id].slide.speed_mm_s for t in pilot.fitted]),
+        parameters={
+            it.key: FittedValue(
+                value=it.value, low=it.low, high=it.high, unit=it.unit, identified=it.identified
+            )
+            for it in fit.parameters
+        },
+    )
+    write_twin(wanted, scene, record)
+    write_json(wanted.out.with_suffix(".json"), fit.to_json())
+    rings = ring_of(wanted.rig)
+    judged = [pilot.slides[trial.id] for trial in pilot.judged]
+    text = page.render(fit, wanted.out.stem, judged, *predicted, rings, pilot.streams)
+    write_text(wanted.out.with_suffix(".html"), text)
+    return fit
+
+
+def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
+    """Return the papillae as the pilot shows them, for `mock.scene.skin`; None if it does not."""
+    found = papillae([pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig))
+    design = np.array(rig.skin.layout_mm())
+    if found is None or len(found.gap_mm) != len(design):
+        return None
+    place = found.place_mm - np.median(found.place_mm - design, axis=0)
+    height = rig.scene.scene.skin.heights_mm[0] - found.gap_mm
+    if not np.isfinite([*height, *found.friction, *place.ravel()]).all():
+        return None
+    return tuple(
+        Papilla(
+            height_mm=round(float(height[k]), 4),
+            friction=round(float(found.friction[k]), 4),
+            offset_mm=tuple(np.round(place[k] - design[k], 4).tolist()),
+        )
+        for k in range(len(design))
+    )
+
+
+def predict(scene: SceneFit) -> tuple[list[list[PilotTrial]], list[list[PilotTrial]]]:
+    """Take the test trials in worlds of the twin and in worlds of the rig file as it was.
+
+    Worlds of the twin differ in what the pilot leaves open of the identified parameters.
+    """
+    pilot, rig = scene.pilot, scene.prior.rig
+    if not pilot.judged:
+        return [], []
+    rng = np.random.default_rng([scene.prior.seed, 3])
+    slides = Slides(pilot.plan, pilot.judged, frozenset(trial.id for trial in pilot.judged))
+    values = scene.drawn(rng, PREDICTED)
+    chance = [int(n) for n in rng.integers(2**31, size=PREDICTED)]
+    rigs = [other_rig(rig, one, scene.skin) for one in values]
+    rigs += [other_rig(rig, {}, {})] * PREDICTED
+    worlds = [
+        World(one, slides, seed, guess_of(rig)) for one, seed in zip(rigs, chance * 2, strict=True)
+    ]
+    taken = everywhere("test trials (worlds)", World.take, worlds)
+    return taken[:PREDICTED], taken[PREDICTED:]
+
+
+def parameter_fit(it: Parameter, assumed: float, estimate: Estimate) -> ParameterFit:
+    """Return what is kept of a parameter's posterior."""
+    low, high, least, most = np.exp(
+        [estimate.low, estimate.high, estimate.prior_low, estimate.prior_high]
+    )
+    value = float(np.exp(estimate.median)) if estimate.identified else assumed
+    return ParameterFit(
+        key=it.key, title=it.title, unit=it.unit, assumed=assumed, value=value,
+        low=float(low), high=float(high), least=float(least), most=float(most),
+        identified=estimate.identified,
+    )  # fmt: skip
+
+
+def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
+    """Return what was read of the pilot, beside the middle 95 % of the worlds."""
+    bank, observed = scene.bank, scene.observed.fitted
+    found = {}
+    for k, name in enumerate(bank.statistics):
+        there = bank.s[np.isfinite(bank.s[:, k]), k]
+        if name not in NOT_LOGGED:
+            there = np.exp(there)
+        low, high = np.quantile(there, (0.025, 0.975)) if len(there) else (None, None)
+        own = observed.get(name, np.nan)
+        found[name] = StatisticSeen(
+            pilot=float(own) if np.isfinite(own) else None,
+            low=None if low is None else float(low),
+            high=None if high is None else float(high),
+        )
+    return found
+
+
+def compared(
+    pilot: Pilot, twin: list[list[PilotTrial]], before: list[list[PilotTrial]]
+) -> tuple[QuantityCompared, ...]:
+    """Return the test trials' quantities beside those of simulated worlds."""
+    if not pilot.judged:
+        return ()
+    judged = [pilot.slides[trial.id] for trial in pilot.judged]
+    return tuple(
+        QuantityCompared(
+            title=QUANTITIES[it.name], pilot=it.pilot, twin=it.twin, before=it.before,
+            scatter=it.scatter,
+        )
+        for it in compare(judged, twin, before)
+    )  # fmt: skip
+
+
+def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None:
+    """Write the twin's rig file, which extends the one that was fitted."""
+    rounded = {key: _rounded(value) for key, value in scene.values.items()}
+    mock = settings_of(wanted.rig.scene, rounded)
+    mock.setdefault("scene", {})["level"] = LEVEL
+    if scene.skin:
+        papillae = [papilla.model_dump(mode="json") for papilla in scene.skin["papillae"]]
+        mock.setdefault("scene", {}).setdefault("skin", {})["papillae"] = papillae
+    path = rig_path(wanted.rig_path)
+    shipped = path in shipped_rigs().values()
+    extends = path.stem if shipped else os.path.relpath(path.resolve(), wanted.out.parent.resolve())
+    data = {
+        "extends": extends,
+        "name": wanted.out.stem.replace("_", "-"),
+        "mock": _plain(mock),
+        "twin": record.model_dump(mode="json"),
+    }
+    text = f"# Written by `sliplab calibrate scene`: {extends}, fitted to '{record.campaign}'.\n"
+    write_text(wanted.out, text + rig_yaml(data))
+
+
+def ring_of(rig: RigFile) -> F64:
+    """Return each papilla's ring, 0 for the centre, (m,)."""
+    return np.repeat(np.arange(len(rig.skin.ring_counts)), rig.skin.ring_counts).astype(np.float64)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.5g}")
+
+
+def _range(values: Sequence[float]) -> Range:
+    return Range(least=float(min(values)), most=float(max(values)))
