@@ -185,8 +185,8 @@ def run_misfits(asked: argparse.Namespace) -> None:
             right = sum(check.stream == STREAMS.get(kind) for check in misfit)
             titles = [f"{check.title} [{check.stream}]" for check in misfit]
             first = "; ".join(f"{t} ({titles.count(t)})" for t in dict.fromkeys(titles))
-            told = f"{right} of {len(called)}" if kind in STREAMS else "-"
-            print(f"| {kind} | {name} | {len(misfit)} of {len(called)} | {told} | {first} |")
+            counted = f"{right} of {len(called)}" if kind in STREAMS else "-"
+            print(f"| {kind} | {name} | {len(misfit)} of {len(called)} | {counted} | {first} |")
 
 
 def run_coverage(asked: argparse.Namespace) -> None:

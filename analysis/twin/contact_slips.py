@@ -37,10 +37,10 @@ class Slips:
 
     Attributes:
         trials: the slides, all with m markers.
-        depth_mm, speed_mm_s: (k,). way: directions, (k, 2).
+        depth_mm, speed_mm_s: (k,). direction: (k, 2).
         noise_mm: of a marker's place, (k,).
         free: never stuck, (k, m). slipped_s: time of the first slip, NaN: never, (k, m).
-        stretch_mm: base's way until then, which is what the spring was stretched, (k, m).
+        stretch_mm: base's path until then, which is what the spring was stretched, (k, m).
         after_mm: lag at `AFTER_S` after the slip, NaN beyond the slide, (k, m, AFTER_S).
         lag_mm: lag along the slide in its frames, one array (n, m) a slide, with their times
             `frame_s` (n,) and the tips' paths `path_mm` (n, m).
@@ -49,7 +49,7 @@ class Slips:
     trials: tuple[PilotTrial, ...]
     depth_mm: F64
     speed_mm_s: F64
-    way: F64
+    direction: F64
     noise_mm: F64
     free: Mask
     slipped_s: F64
@@ -103,11 +103,11 @@ def _slips_of(trial: PilotTrial) -> tuple[float, Mask, F64, F64, F64, F64, F64, 
     """Return the columns of `Slips` from `noise_mm` on."""
     held = (trial.frame_s < 0.0) & (trial.frame_s >= -0.5)
     moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
-    way = trial.slide.direction
+    along = trial.slide.direction
     rest = mean_seen(trial.tips_mm[held])
-    t, base = trial.frame_s[moving], trial.base_mm[moving] @ way
-    path = (trial.tips_mm[moving] - rest) @ way
-    noise = _noise((trial.tips_mm[held] @ way)[:, :])
+    t, base = trial.frame_s[moving], trial.base_mm[moving] @ along
+    path = (trial.tips_mm[moving] - rest) @ along
+    noise = _noise((trial.tips_mm[held] @ along)[:, :])
     m = path.shape[1]
     slipped, stretch = np.full(m, np.nan), np.full(m, np.nan)
     after = np.full((m, len(AFTER_S)), np.nan)

@@ -235,8 +235,8 @@ def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
             (pull.reshape(len(x), -1), lags.pull_n_per_mm.ravel(), few),
             (ratio, np.full(len(lags.depth_mm), lags.ratio), 0.003),
         ):
-            told = np.isfinite(seen)
+            known = np.isfinite(seen)
             parts.append(
-                (model[:, told] / seen[told] - 1.0) / np.broadcast_to(error, seen.shape)[told]
+                (model[:, known] / seen[known] - 1.0) / np.broadcast_to(error, seen.shape)[known]
             )
     return np.concatenate(parts, axis=1)

@@ -16,15 +16,9 @@ import numpy.typing as npt
 from scipy.ndimage import median_filter
 
 from sliplab.analysis.twin import camera_estimates
-from sliplab.analysis.twin.contact_estimates import (
-    Growth,
-    fit_growth,
-    lags_of,
-    rest_places,
-    rings_of,
-    settled_lags,
-    steady_lags,
-)
+from sliplab.analysis.twin.contact_estimates import lags_of
+from sliplab.analysis.twin.contact_lags import Growth, fit_growth, settled_lags, steady_lags
+from sliplab.analysis.twin.contact_places import rest_places, rings_of
 from sliplab.analysis.twin.contact_slips import Slips, find_slips, mean_seen
 from sliplab.analysis.twin.contact_springs import Fit, Guess, fit_springs
 from sliplab.analysis.twin.pilot import PilotTrial
@@ -227,26 +221,25 @@ def _lags_in_cells(slips: Slips, i: int, growth: Growth) -> tuple[I64, I64, F64]
 
 
 def ramp_mm(trials: Sequence[PilotTrial]) -> float:
-    """Way by which the reported motion stays behind constant speed at either end of a slide, mean,
-    mm.
+    """Mean distance by which the reported motion stays behind constant speed at a slide's ends, mm.
 
     The constant speed is that of the middle half. An acceleration a costs v^2 / 2a at either end.
     """
     found = []
     for trial in trials:
-        t, way = trial.frame_s, trial.base_mm @ trial.slide.direction
+        t, path = trial.frame_s, trial.base_mm @ trial.slide.direction
         middle = (t > 0.25 * trial.slide_s) & (t < 0.75 * trial.slide_s)
         before, after = t <= 0.0, t >= trial.slide_s
         moving = (t >= 0.0) & (t <= trial.slide_s)
         if middle.sum() < 10 or not before.any():
             continue
-        speed, begin = np.polynomial.Polynomial.fit(t[middle], way[middle], 1).convert().coef[::-1]
-        first = way[before].mean() - begin
+        speed, begin = np.polynomial.Polynomial.fit(t[middle], path[middle], 1).convert().coef[::-1]
+        first = path[before].mean() - begin
         # recordings may end with the slide
         if after.any():
-            last = begin + speed * trial.slide_s - way[after].mean()
+            last = begin + speed * trial.slide_s - path[after].mean()
         else:
-            last = begin + speed * t[moving][-1] - way[moving][-1]
+            last = begin + speed * t[moving][-1] - path[moving][-1]
         found.append(0.5 * (first + last))
     return abs(float(np.mean(found))) if found else float("nan")
 

@@ -101,9 +101,9 @@ def slide_of(program: Program) -> Slide | None:
     moves = [step for step in program.steps if isinstance(step, Move)]
     for before, step in pairwise(moves):
         if step.phase == "slide" and step.to.depth_mm == before.to.depth_mm:
-            way = np.array([step.to.x_mm - before.to.x_mm, step.to.y_mm - before.to.y_mm])
-            if np.hypot(*way) > 0.0:
-                return Slide(step.to.depth_mm, step.speed_mm_s, way / np.hypot(*way))
+            path = np.array([step.to.x_mm - before.to.x_mm, step.to.y_mm - before.to.y_mm])
+            if np.hypot(*path) > 0.0:
+                return Slide(step.to.depth_mm, step.speed_mm_s, path / np.hypot(*path))
     return None
 
 

@@ -11,19 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.twin.contact_estimates import (
-    NOT_LOGGED,
-    Growth,
-    contact_estimates,
-    fit_growth,
-    gross_forces,
-    hold_relaxation,
-    papillae,
-    place_scatter,
-    ring_stiffness,
-    rings_of,
-    steady_lags,
-)
+from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, contact_estimates, papillae
+from sliplab.analysis.twin.contact_forces import gross_forces, hold_relaxation, ring_stiffness
+from sliplab.analysis.twin.contact_lags import Growth, fit_growth, steady_lags
+from sliplab.analysis.twin.contact_places import place_scatter, rings_of
 from sliplab.analysis.twin.contact_slips import find_slips
 from sliplab.analysis.twin.contact_springs import (
     SHORTENING,
