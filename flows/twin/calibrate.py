@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 from time import monotonic
@@ -20,6 +20,7 @@ import numpy as np
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import twin as page
 from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, papillae
+from sliplab.analysis.twin.contact_slips import find_slips
 from sliplab.analysis.twin.misfits import misfits
 from sliplab.analysis.twin.parameters import Parameter, settings_of, value_of
 from sliplab.analysis.twin.pilot import PilotTrial
@@ -27,6 +28,7 @@ from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
 from sliplab.analysis.twin.shown import QUANTITIES, compare
 from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import orchestration
+from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
 from sliplab.flows.twin.worlds import (
     Prior,
@@ -48,6 +50,8 @@ from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
+LIKE = 1.25
+"""Noise of tracking that differs by less than this factor from the rig file's is the rig file's."""
 PREDICTED = 12
 """Worlds of the twin in which the test trials are taken."""
 
@@ -132,8 +136,24 @@ class SceneFit:
         ]
 
 
+def with_tracking_noise(rig: RigFile, pilot: Pilot) -> RigFile:
+    """Return the rig with the noise of marker places that the pilot's holds show.
+
+    It is measured, not fitted: a marker that sticks moves by nothing else.
+    """
+    slips = find_slips([pilot.slides[trial.id] for trial in pilot.fitted])
+    camera = rig.scene.frame_camera
+    if slips is None:
+        return rig
+    noise_px = float(np.median(slips.noise_mm)) * camera.px_per_mm
+    if camera.centroid_noise_px / LIKE < noise_px < camera.centroid_noise_px * LIKE:
+        return rig
+    return changed(rig, {"frame_camera": {"centroid_noise_px": float(f"{noise_px:.2g}")}})
+
+
 def fit_scene(store: Store, pilot: Pilot, prior: Prior, worlds: int) -> SceneFit:
     """Compare a pilot with simulated worlds."""
+    prior = replace(prior, rig=with_tracking_noise(prior.rig, pilot))
     observed = pilot.statistics(guess_of(prior.rig))
     slides = Slides(pilot.plan, pilot.fitted, pilot.with_events)
     kept = Derived.of(store, "scene-worlds")
@@ -298,6 +318,9 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     rounded = {key: _rounded(value) for key, value in scene.values.items()}
     mock = settings_of(wanted.rig.scene, rounded)
     mock.setdefault("scene", {})["level"] = LEVEL
+    noise_px = scene.prior.rig.scene.frame_camera.centroid_noise_px
+    if noise_px != wanted.rig.scene.frame_camera.centroid_noise_px:
+        mock["frame_camera"] = {"centroid_noise_px": noise_px}
     if scene.skin:
         papillae = [papilla.model_dump(mode="json") for papilla in scene.skin["papillae"]]
         mock.setdefault("scene", {}).setdefault("skin", {})["papillae"] = papillae

@@ -24,6 +24,7 @@ from sliplab.analysis.twin.statistics import Statistics
 from sliplab.flows.cli.app import app
 from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.schema import file_schema
+from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin import calibrate, worlds
 from sliplab.flows.twin.pilots import Pilot, read_pilot, simulate_pilot
 from sliplab.protocols import InputError
@@ -175,6 +176,16 @@ def test_what_is_not_told_keeps_the_rigs_value(
     rig, _ = load_rig_file(tmp_path / "twin.yaml")
     assert rig.scene.event_camera == wanted.rig.scene.event_camera
     assert "a force sensor" in (tmp_path / "twin.html").read_text()
+
+
+def test_noise_of_tracking_is_the_pilots_own(store: Store) -> None:
+    (item,) = collected(store, None)
+    pilot = read_pilot(store, item)
+    own, _ = load_rig_file(Path("rehearsal"))
+    assert calibrate.with_tracking_noise(own, pilot) == own
+    quieter = changed(own, {"frame_camera": {"centroid_noise_px": 0.001}})
+    found = calibrate.with_tracking_noise(quieter, pilot).scene.frame_camera.centroid_noise_px
+    assert found == pytest.approx(own.scene.frame_camera.centroid_noise_px, rel=0.15)
 
 
 def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
