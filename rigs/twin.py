@@ -53,11 +53,11 @@ class TwinRecord(StrictModel):
     parameters: dict[str, FittedValue]
     """By key in the section `mock:`."""
     misfits: tuple[str, ...] = ()
-    """What the pilot shows and the scene lacks."""
+    """What the pilot shows and the scene lacks, each after the stream that shows it."""
 
 
-def outside(twin: TwinRecord, plan: Plan) -> Iterator[str]:
-    """Say in which way a plan leaves the conditions that a twin was fitted on.
+def warnings(twin: TwinRecord, plan: Plan) -> Iterator[str]:
+    """Say where a plan leaves the conditions that a twin was fitted on, and what the twin lacks.
 
     A slide that is pressed deeper or driven faster than any of the pilot's is simulated by numbers
     that no trial has tested.
@@ -78,3 +78,5 @@ def outside(twin: TwinRecord, plan: Plan) -> Iterator[str]:
                 f"{name} {low:g} to {high:g} {unit} in contact; the twin was fitted on "
                 f"{fitted.least:g} to {fitted.most:g} {unit}"
             )
+    for misfit in twin.misfits:
+        yield f"the pilot shows what this scene lacks ({misfit})"

@@ -410,7 +410,10 @@ def calibrate_scene(
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit a simulated rig's scene to a labelled pilot: writes a rig file, a page and numbers."""
+    """Fit a simulated rig's scene to a labelled pilot: writes a rig file, a page and numbers.
+
+    Ends with exit code 1 where the pilot shows an effect that the scene lacks.
+    """
     from sliplab.flows.steps import prepare_store
     from sliplab.storage.remote.mirror import open_store
 
@@ -426,8 +429,11 @@ def calibrate_scene(
         names = ", ".join(item.name for item in found)
         raise InputError("--campaign", "", None, f"is needed: the store has {names}")
     fit = fit_to(store, found[0], wanted)
+    misfits = [check for check in fit.checks if check.found]
     if as_json:
         console.print_json({"rig": str(out), **fit.to_json()})
+        if misfits:
+            raise typer.Exit(console.FAILED)
         return
     rows = [
         [
@@ -442,11 +448,12 @@ def calibrate_scene(
         ["parameter", "assumed", "fitted", "95 %", "unit", "identified"],
         rows,
     )
-    for check in fit.checks:
-        if check.found:
-            console.say(f"misfit in the {check.stream}: {check.title}")
     console.say(f"{fit.worlds} worlds, {console.duration(fit.seconds)}; twin: {out}")
     console.say(f"page: {out.with_suffix('.html')}")
+    for check in misfits:
+        console.say(f"misfit: the pilot's {check.stream} show what this scene lacks: {check.title}")
+    if misfits:
+        raise typer.Exit(console.FAILED)
 
 
 @calibrate_app.command("board")

@@ -21,7 +21,7 @@ from sliplab.protocols.program import Move
 from sliplab.rigs.core.calibration import COMMANDS, find_faults, measured_on
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth, RigError
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.twin import outside
+from sliplab.rigs.twin import warnings
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
 
@@ -57,9 +57,9 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     found += check_region(run_request)
     found += [Check("hint", True, text) for text in run_request.plan.warnings()]
     if (twin := run_request.rig.twin) is not None:
-        beyond = list(outside(twin, run_request.plan))
+        cautions = list(warnings(twin, run_request.plan))
         within = f"within what it was fitted on: {twin.trials} trials of '{twin.campaign}'"
-        found += [Check("twin", True, text) for text in beyond or [within]]
+        found += [Check("twin", True, text) for text in cautions or [within]]
     try:
         free = check_disk([run_request])
         needed = size(missing_bytes(run_request))

@@ -215,6 +215,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
             )
             for it in fit.parameters
         },
+        misfits=tuple(f"{it.stream}: {it.title}" for it in fit.checks if it.found),
     )
     write_twin(wanted, scene, record)
     write_json(wanted.out.with_suffix(".json"), fit.to_json())

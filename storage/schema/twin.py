@@ -29,7 +29,7 @@ class ParameterFit(Part):
 
 
 class StatisticSeen(Part):
-    """What was read of the fitted trials, and the middle 95 % of the worlds of the last round."""
+    """What was read of the fitted trials, and the middle 95 % of the worlds."""
 
     pilot: Number | None
     low: Number | None

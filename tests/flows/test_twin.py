@@ -30,6 +30,7 @@ from sliplab.flows.twin.pilots import Pilot, read_pilot, simulate_pilot
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
+from sliplab.storage.schema.twin import MisfitCheck, TwinFit
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -186,6 +187,26 @@ def test_noise_of_tracking_is_the_pilots_own(store: Store) -> None:
     quieter = changed(own, {"frame_camera": {"centroid_noise_px": 0.001}})
     found = calibrate.with_tracking_noise(quieter, pilot).scene.frame_camera.centroid_noise_px
     assert found == pytest.approx(own.scene.frame_camera.centroid_noise_px, rel=0.15)
+
+
+def test_a_misfit_ends_with_exit_code_1(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = MisfitCheck(
+        title="light that flickers", stream="events", unit="times noise", pilot=40.0, limit=2.0,
+        share=1e-6, found=True,
+    )  # fmt: skip
+    fit = TwinFit(
+        simulated=True, campaign="pilot", rig="rehearsal", checksum="00", trials=9, judged=3,
+        worlds=100, predicted=2, seconds=1.0, parameters=(), statistics={}, checks=(line,),
+    )  # fmt: skip
+    monkeypatch.setattr(calibrate, "calibrate_scene", lambda *_: fit)
+    asked = ["calibrate", "scene", str(store.folder), "--rig", "rehearsal"]
+    asked += ["--out", str(tmp_path / "twin.yaml")]
+    for json in ([], ["--json"]):
+        done = CliRunner().invoke(app, [*asked, *json])
+        assert done.exit_code == 1
+        assert "light that flickers" in done.stdout + done.stderr
 
 
 def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(

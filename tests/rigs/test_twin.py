@@ -9,7 +9,7 @@ import pytest
 
 from sliplab.protocols import InputError, load_plan
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.rigs.twin import TwinRecord, outside
+from sliplab.rigs.twin import TwinRecord, warnings
 
 RECORD: dict[str, Any] = {
     "campaign": "pilot",
@@ -28,17 +28,24 @@ RECORD: dict[str, Any] = {
 
 def test_a_plan_within_the_pilot_leaves_nothing() -> None:
     twin = TwinRecord.model_validate(RECORD)
-    assert list(outside(twin, load_plan(Path("pilot")))) == []
+    assert list(warnings(twin, load_plan(Path("pilot")))) == []
 
 
-def test_a_plan_that_goes_deeper_or_faster_is_told_by_how_much() -> None:
+def test_a_plan_that_goes_deeper_or_faster_says_by_how_much() -> None:
     less = RECORD | {
         "depth_mm": {"least": 2.4, "most": 3.0}, "speed_mm_s": {"least": 1.0, "most": 1.6}
     }  # fmt: skip
     twin = TwinRecord.model_validate(less)
-    assert list(outside(twin, load_plan(Path("pilot")))) == [
+    assert list(warnings(twin, load_plan(Path("pilot")))) == [
         "depth 2.4 to 3.4 mm in contact; the twin was fitted on 2.4 to 3 mm",
         "speed 0.6 to 1.6 mm/s in contact; the twin was fitted on 1 to 1.6 mm/s",
+    ]
+
+
+def test_what_the_scene_lacks_is_said_of_every_plan() -> None:
+    twin = TwinRecord.model_validate(RECORD | {"misfits": ["events: light that flickers"]})
+    assert list(warnings(twin, load_plan(Path("pilot")))) == [
+        "the pilot shows what this scene lacks (events: light that flickers)"
     ]
 
 
