@@ -45,31 +45,58 @@ LEAST_PULLING_MM = 0.3
 PATH_STEP_MM = 0.1
 
 
-def contact_estimates(trials: Sequence[PilotTrial], guess: Guess | None = None) -> dict[str, float]:
-    """Return the estimates by name, NaN where these slides do not tell.
+@dataclass(frozen=True)
+class Contact:
+    """Slides as every estimate of the contact needs them.
+
+    Attributes:
+        ring: of each marker, 0 for the centre and -1 where it was never seen, (m,).
+        place_mm: of each at rest, (m, 2).
+        growth: of lags after a slip; `fitted` where the slides show it, else assumed.
+        steady: lags in steady slip. lags: the same by depth, with forces. springs: fitted to these.
+    """
+
+    slips: Slips
+    ring: I64
+    place_mm: F64
+    growth: Growth
+    fitted: bool
+    steady: SteadyLags
+    lags: Lags
+    springs: Fit | None
+
+
+def read_contact(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Contact | None:
+    """Return what slides show of the contact; None without markers.
 
     Args:
         guess: design of the skin, and where the fit of its springs begins.
     """
-    guess = guess or Guess()
     slips = find_slips(trials)
     if slips is None:
-        return {}
+        return None
     ring, place = rings_of(slips)
     fitted = fit_growth(slips)
     growth = fitted or Growth()
-    table = steady_lags(slips, growth)
-    lags = lags_of(slips, ring, table, growth)
+    steady = steady_lags(slips, growth)
+    lags = lags_of(slips, ring, steady, growth)
+    springs = fit_springs(lags, guess or Guess())
+    return Contact(slips, ring, place, growth, fitted is not None, steady, lags, springs)
+
+
+def contact_estimates(contact: Contact) -> dict[str, float]:
+    """Return the estimates by name, NaN where these slides do not tell."""
+    growth = contact.growth if contact.fitted else Growth(*[float("nan")] * 4)
     return {
-        "position_scatter_mm": place_scatter(ring, place),
-        "relaxation_maxwell": fitted.maxwell if fitted else np.nan,
-        "relaxation_s": fitted.relaxation_s if fitted else np.nan,
-        "static_drop": fitted.drop if fitted else np.nan,
-        "static_drop_per_speed": fitted.drop_per_speed if fitted else np.nan,
-        **path_estimates(slips, growth, table),
-        **force_estimates(slips, lags),
-        **spring_estimates(fit_springs(lags, guess), ring),
-        **tremor_estimates(slips),
+        "position_scatter_mm": place_scatter(contact.ring, contact.place_mm),
+        "relaxation_maxwell": growth.maxwell,
+        "relaxation_s": growth.relaxation_s,
+        "static_drop": growth.drop,
+        "static_drop_per_speed": growth.drop_per_speed,
+        **path_estimates(contact.slips, contact.growth, contact.steady),
+        **force_estimates(contact.slips, contact.lags),
+        **spring_estimates(contact.springs, contact.ring),
+        **tremor_estimates(contact.slips),
     }
 
 
@@ -193,21 +220,14 @@ class Papillae:
     friction_error: F64
 
 
-def papillae(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Papillae | None:
+def papillae(contact: Contact) -> Papillae | None:
     """Return what a pilot tells of each papilla; None where it tells nothing."""
-    guess = guess or Guess()
-    slips = find_slips(trials)
-    if slips is None:
-        return None
-    ring, place = rings_of(slips)
-    places = rest_places(slips)
-    apart = np.linalg.norm(places - place, axis=2)
-    seen = np.maximum(np.isfinite(apart).sum(axis=0), 2)
-    error = np.sqrt(mean_seen(apart**2) / 2 / (seen - 1))
-    growth = fit_growth(slips) or Growth()
-    fit = fit_springs(lags_of(slips, ring, steady_lags(slips, growth), growth), guess)
+    fit, ring, place = contact.springs, contact.ring, contact.place_mm
     if fit is None:
         return None
+    apart = np.linalg.norm(rest_places(contact.slips) - place, axis=2)
+    seen = np.maximum(np.isfinite(apart).sum(axis=0), 2)
+    error = np.sqrt(mean_seen(apart**2) / 2 / (seen - 1))
     return Papillae(
         ring, place - mean_seen(place), error, fit.gap_mm, fit.gap_error_mm,
         fit.friction / fit.friction.mean(), fit.friction_error,

@@ -16,11 +16,10 @@ import numpy.typing as npt
 from scipy.ndimage import median_filter
 
 from sliplab.analysis.twin import camera_estimates
-from sliplab.analysis.twin.contact_estimates import lags_of
-from sliplab.analysis.twin.contact_lags import Growth, fit_growth, settled_lags, steady_lags
-from sliplab.analysis.twin.contact_places import rest_places, rings_of
-from sliplab.analysis.twin.contact_slips import Slips, find_slips, mean_seen
-from sliplab.analysis.twin.contact_springs import Fit, Guess, fit_springs
+from sliplab.analysis.twin.contact_estimates import Contact
+from sliplab.analysis.twin.contact_lags import Growth, settled_lags
+from sliplab.analysis.twin.contact_slips import Slips
+from sliplab.analysis.twin.contact_springs import Fit
 from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.storage.schema.twin import MisfitCheck
 from sliplab.storage.streams import F64, I64
@@ -74,31 +73,27 @@ GENERAL: Mapping[Stream, str] = {
 
 
 def misfit_numbers(
-    trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], guess: Guess | None = None
+    trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], contact: Contact | None
 ) -> dict[str, float]:
     """Return the number of every check by key, NaN where the slides do not tell it.
 
     Args:
         with_events: those of the trials whose events are read.
-        guess: design of the skin, and where the fit of its springs begins.
+        contact: of the trials, see `read_contact`.
     """
     found = dict.fromkeys((it.key for it in CHECKS), float("nan"))
     found[RAMP] = ramp_mm(trials)
     found[LIGHT] = line_over_noise(with_events)
-    slips = find_slips(trials)
-    if slips is None:
+    if contact is None:
         return found
-    ring, _ = rings_of(slips)
-    found[BROKEN] = missing_share(slips, ring)
-    growth = fit_growth(slips) or Growth()
-    lags = lags_of(slips, ring, steady_lags(slips, growth), growth)
-    fit = fit_springs(lags, guess or Guess())
-    if fit is not None:
+    ring = contact.ring
+    found[BROKEN] = missing_share(contact.slips, ring)
+    if contact.springs is not None:
         known = ring >= 0
-        places = mean_seen(rest_places(slips))
-        found[TILT] = gap_slope(places[known], fit.raised_mm[known], ring[known])
-        found[STICKY] = odd_friction(fit, ring)
-    found[SPOT] = largest_spot(slips, growth)
+        raised_mm = contact.springs.raised_mm[known]
+        found[TILT] = gap_slope(contact.place_mm[known], raised_mm, ring[known])
+        found[STICKY] = odd_friction(contact.springs, ring)
+    found[SPOT] = largest_spot(contact.slips, contact.growth)
     return found
 
 

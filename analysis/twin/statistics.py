@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sliplab.analysis.twin.camera_estimates import camera_estimates
-from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, contact_estimates
+from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, contact_estimates, read_contact
 from sliplab.analysis.twin.contact_springs import Guess
 from sliplab.analysis.twin.misfits import misfit_numbers
 from sliplab.analysis.twin.pilot import PilotTrial
@@ -47,11 +47,14 @@ def statistics(
     """Return what slides show.
 
     Args:
-        with_events: ids of those whose events are read. guess: see `contact_estimates`.
+        with_events: ids of those whose events are read. guess: see `read_contact`.
     """
     seen = events_of(slides, with_events)
-    found = contact_estimates(slides, guess) | (camera_estimates(seen) if seen else {})
-    return Statistics(found, misfit_numbers(slides, seen, guess))
+    contact = read_contact(slides, guess)
+    found = contact_estimates(contact) if contact else {}
+    if seen:
+        found |= camera_estimates(seen)
+    return Statistics(found, misfit_numbers(slides, seen, contact))
 
 
 def of_names(values: Mapping[str, float], names: Sequence[str]) -> F64:

@@ -19,7 +19,7 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import twin as page
-from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, papillae
+from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, papillae, read_contact
 from sliplab.analysis.twin.contact_slips import find_slips
 from sliplab.analysis.twin.misfits import misfits
 from sliplab.analysis.twin.parameters import Parameter, settings_of, value_of
@@ -228,7 +228,8 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
 
 def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
     """Return the papillae as the pilot shows them, for `mock.scene.skin`; None if it does not."""
-    found = papillae([pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig))
+    contact = read_contact([pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig))
+    found = None if contact is None else papillae(contact)
     design = np.array(rig.skin.layout_mm())
     if found is None or len(found.gap_mm) != len(design):
         return None

@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import lomax
 
 from sliplab.analysis.twin.camera_estimates import NAMES
+from sliplab.analysis.twin.contact_estimates import read_contact
 from sliplab.analysis.twin.contact_springs import Guess, steady
 from sliplab.analysis.twin.misfits import (
     BROKEN,
@@ -114,7 +115,8 @@ def _slide(
 
 
 def numbers(trials: Sequence[PilotTrial]) -> dict[str, float]:
-    return misfit_numbers(trials, [trial for trial in trials if trial.camera is not None])
+    seen = [trial for trial in trials if trial.camera is not None]
+    return misfit_numbers(trials, seen, read_contact(trials))
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +218,7 @@ def test_scans_of_a_read_out_make_no_line() -> None:
 
 
 def test_without_slides_nothing_is_known() -> None:
-    found = misfit_numbers([], [])
+    found = misfit_numbers([], [], None)
     assert set(found) == {check.key for check in CHECKS}
     assert np.isnan(list(found.values())).all()
     dark = [replace(t, tips_mm=np.full_like(t.tips_mm, np.nan)) for t in pilot()[:3]]
