@@ -12,9 +12,12 @@ from sliplab.flows.running import console
 from sliplab.flows.steps import run_step
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
-StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
+StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="A store's folder.")]
 PlaceArgument = Annotated[
-    str, typer.Argument(help="A store's folder, or the URL of a pushed one (s3://..., file://...).")
+    str,
+    typer.Argument(
+        metavar="STORE", help="A store's folder, or the URL of a pushed one (s3://..., file://...)."
+    ),
 ]
 DaskOption = Annotated[
     str | None,
