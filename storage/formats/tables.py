@@ -29,6 +29,7 @@ from sliplab.storage.streams import I64
 MOST_TABLE = 1 << 26
 _SEPARATORS = "\t;, "
 _QUOTED = re.compile('"[^"]*"')
+_TOO_WIDE = re.compile(r"Expected \d+ fields in line (\d+), saw (\d+)")
 
 
 @dataclass(frozen=True)
@@ -215,14 +216,14 @@ def _column(there: Mapping[str, Any], column: str | int) -> Any:
 
 
 def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
-    head = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace")
-    first = head.partition("\n")[0].rstrip("\r")
-    separator = _separator(first)
+    lines = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace").split("\n")
+    separator = _separator(lines[0])
     spaces = separator == " "  # any number of them
-    cells = [
-        cell.strip()
-        for cell in next(csv.reader([first.strip()], delimiter=separator, skipinitialspace=spaces))
-    ]
+    # the first row of numbers may have more cells than the heading
+    cells, second = (
+        _cells([line for line in rows if line.strip()], separator)
+        for rows in (lines[:1], lines[1:])
+    )
     # a heading has no number in a column that is read; others may hold words in every row
     used = [cells[c] for c in columns.values() if isinstance(c, int) and c < len(cells)]
     headed = len(used) < len(columns) or not all(map(_is_number, used))
@@ -236,36 +237,51 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
             raise FormatError(f"has no column {column}; there are {', '.join(cells)}")
         if isinstance(column, str) and cells.count(column) > 1:
             raise FormatError(f"has the column {column} twice")
-    if headed:
-        _check_width(head, separator, len(cells))
     wanted = {key: int(there[str(column)]) for key, column in columns.items()}
+    below = f"{'heading' if headed else 'first row'} of {len(cells)} columns"
     try:
+        # all columns: with some of them alone pandas drops the cells that a row has too many
         table = pd.read_csv(
             io.BytesIO(data), sep=r"\s+" if spaces else separator, header=None,
-            skiprows=int(headed),
-            usecols=sorted(set(wanted.values())), low_memory=False, encoding="utf-8-sig",
+            names=range(max(len(cells), len(second)) if headed else len(cells)), index_col=False,
+            skiprows=int(headed), low_memory=False, encoding="utf-8-sig",
         )  # fmt: skip
-    except pd.errors.EmptyDataError:
-        return {key: np.empty(0, np.int64) for key in wanted}
     except (ValueError, OverflowError) as error:  # also pandas' own errors of parsing
-        raise FormatError(f"is not CSV: {' '.join(str(error).split())}") from None
+        text = " ".join(str(error).split())
+        if wide := _TOO_WIDE.search(text):
+            raise _too_wide(int(wide[2]), int(wide[1]), below) from None
+        raise FormatError(f"is not CSV: {text}") from None
+    if table.empty:
+        return {key: np.empty(0, np.int64) for key in wanted}
+    beyond = table.iloc[:, len(cells) :].notna()  # separators at the ends of rows make empty ones
+    if beyond.to_numpy().any():
+        at = int(beyond.any(axis=1).to_numpy().argmax())
+        last = int(np.flatnonzero(beyond.to_numpy()[at])[-1])
+        raise _too_wide(len(cells) + last + 1, 1 + headed + at, below)
     return {
         key: _numbers(table[index].to_numpy(), columns[key], 1 + headed)
         for key, index in wanted.items()
     }
 
 
-def _check_width(head: str, separator: str, columns: int) -> None:
-    """Check that the first row has no more cells than the heading: whose they are is unknown."""
+def _cells(lines: list[str], separator: str) -> list[str]:
+    """Return the cells of the first row; none where there is no row."""
+    spaces = separator == " "
     rows = csv.reader(
-        (line.strip() for line in head.splitlines()[1:] if line.strip()), delimiter=separator,
-        skipinitialspace=separator == " ",
+        (line.strip() if spaces else line.rstrip("\r") for line in lines), delimiter=separator,
+        skipinitialspace=spaces,
     )  # fmt: skip
-    first = next(rows, [])
-    while first and not first[-1].strip():
-        first.pop()
-    if len(first) > columns:
-        raise FormatError(f"has {len(first)} cells in row 2 below a heading of {columns} columns")
+    try:
+        return [cell.strip() for cell in next(rows, [])]
+    except csv.Error as error:
+        raise FormatError(f"is not CSV: {error}") from None
+
+
+def _too_wide(cells: int, row: int, below: str) -> FormatError:
+    return FormatError(
+        f"has {cells} cells in row {row} below a {below}; name every column, and quote a cell that "
+        "contains the separator"
+    )
 
 
 def _numbers(column: Any, name: str | int, first_row: int) -> Any:

@@ -602,6 +602,11 @@ def test_rows_out_of_order_are_sorted_and_polarities_are_those_named(tmp_path: P
         # R names its rows without a heading; a decimal comma makes two cells of one
         ("time,x,y,p\n1,1,2,3,1\n2,1,2,3,1\n", "5 cells in row 2 below a heading of 4 columns"),
         ("time,x,y,p\n\n1,5,2,3,1\n", "5 cells in row 2 below a heading of 4 columns"),
+        # the time 1,5 in a later row, also where every row ends with a separator
+        ("time,x,y,p\n1,2,3,1\n1,5,2,3,1\n", "5 cells in row 3 below a heading of 4 columns"),
+        ("time,x,y,p\n1,2,3,1,\n1,5,2,3,1\n", "5 cells in row 3 below a heading of 4 columns"),
+        ("time x y p\n1 2 3 1\n\n1 5 2 3 1\n", "5 cells in row 4 below a heading of 4 columns"),
+        ("time,x,y,p\r1,2,3,1\r", "is not CSV"),
         ("time,x,y,p\n1,2,3,1\n1,2\n", "no number in column y: row 3"),
         ("time,x,y,p\n1,2.5,3,1\n", "x = 2.5 in row 1"),
         ("time,x,y,p\n1,2,-3,1\n", "row is -3"),
