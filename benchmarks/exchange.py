@@ -1,7 +1,7 @@
-"""`python -m benchmarks.exchange [FORMAT ...]`: files of other programs, by us and by others.
+"""`python -m benchmarks.exchange [FORMAT ...] [--events N] [--runs N]`: files of other programs.
 
-All read the same files, on one core, fully into arrays, in turn. Times are of the processor, which
-other programs on the machine hardly change. Ours are the readers and the
+All read the same files, on one core, fully into arrays, in turn, ours and those of others. Times
+are of the processor, which other programs on the machine change less. Ours are the readers and the
 writer of `sliplab import` and `export`. faery and dv-processing come with the extras; expelliarmus
 (`pip install expelliarmus`) takes part where it is installed. A ratio above 1 says that ours is the
 faster one.
@@ -9,8 +9,8 @@ faster one.
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -157,4 +157,10 @@ def _check(file: Path, form: str, data: EventChunk) -> None:
 
 
 if __name__ == "__main__":
-    print(json.dumps({"figures": measure(*sys.argv[1:]), "machine": machine()}, indent=1))
+    parser = argparse.ArgumentParser(description="Time readers and writers of other formats.")
+    parser.add_argument("forms", nargs="*", metavar="FORMAT", help=", ".join(VERSIONS))
+    parser.add_argument("--events", type=int, default=3_000_000)
+    parser.add_argument("--runs", type=int, default=3)
+    given = parser.parse_args()
+    figures = measure(*given.forms, events=given.events, runs=given.runs)
+    print(json.dumps({"figures": figures, "machine": machine()}, indent=1))
