@@ -70,6 +70,7 @@ def import_(
     if name is None:
         raise InputError("--name", "", None, "is missing: the name of the new campaign")
     from dataclasses import replace
+    from itertools import chain, islice
 
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
@@ -87,8 +88,10 @@ def import_(
     except StoreError as error:
         raise InputError("--name", "", name, str(error)) from None
     skipped = skipped_in(where, kind)
-    opened = Store.create(store)
     found = trials_in(where, kind, salvage=salvage)
+    first = list(islice(found, 1))  # where its header is refused, no store is made
+    opened = Store.create(store)
+    found = chain(first, found)
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
     with store_lock(opened):
