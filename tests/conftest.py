@@ -22,6 +22,14 @@ os.environ["SLIPLAB_RUNTIME"] = tempfile.mkdtemp(prefix="sliplab-rigs-")
 SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import files without the mark that ``-m 'MARK and ...'`` requires."""
+    mark = config.option.markexpr.split(" and ")[0]
+    if mark not in {"realtime", "programs"} or collection_path.suffix != ".py":
+        return None
+    return f"mark.{mark}" not in collection_path.read_text() or None
+
+
 @pytest.fixture
 def root() -> Path:
     """The checkout."""
