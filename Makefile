@@ -1,9 +1,13 @@
 # Every target sets up .venv once and is quick the next time.
 PYTHON ?= python3
 BIN := .venv/bin
-PYTEST := $(BIN)/python -m pytest
+# several workers share the cores: threads of one would wait for those of the others
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 DONE := .venv/.installed
 LINKS := build/lint
+
+# what one worker or program has compiled, the others need not
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup demo test test-programs test-realtime test-long lint types imports links docs bench clean
 .DEFAULT_GOAL := setup
@@ -25,9 +29,9 @@ test: $(DONE)
 test-programs: $(DONE)
 	$(PYTEST) -n 3 --dist worksteal -m 'programs and not realtime and not long'
 
-# fakes in real time; they wait more than they compute
+# fakes in real time: whole scenes, which compute, one after another; beside them what waits
 test-realtime: $(DONE)
-	$(PYTEST) -n 4 --dist worksteal -m 'realtime and not long'
+	$(PYTEST) -n 3 --dist loadgroup -m 'realtime and not long'
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)

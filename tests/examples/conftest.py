@@ -36,6 +36,10 @@ class Lab:
         """Run a command of SlipLab; what it prints as JSON."""
         return json.loads(self._call(sys.executable, "-m", "sliplab", *words, "--json"))
 
+    def python(self, code: str) -> str:
+        """Run Python there; what it prints."""
+        return self._call(sys.executable, "-c", code)
+
     def _call(self, *words: object) -> str:
         done = subprocess.run(
             [str(word) for word in words], cwd=self.folder, env=self._environment,

@@ -9,7 +9,16 @@ import pytest
 from tests.examples.conftest import Lab, checkout
 
 # the rig is a stand-in in real time: beside programs that compute it would be late
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
+
+ANALYSE = """
+import sliplab
+store = sliplab.open_store("store")
+print(store.label()["done"])
+for step in (store.train, store.evaluate, store.report):
+    step()
+print(store.summary()["simulated"])
+"""
 
 
 def test_a_package_outside_the_checkout_runs_a_campaign(tmp_path: Path) -> None:
@@ -38,9 +47,7 @@ def test_a_package_outside_the_checkout_runs_a_campaign(tmp_path: Path) -> None:
     assert len(trials) == 2
     assert all("depth=2.3876mm" in trial["trial"] for trial in trials)  # 94 mil
 
-    assert sliplab("label", "store")["done"] == 4
-    for step in ("train", "evaluate", "report"):
-        sliplab(step, "store")
+    assert sliplab.python(ANALYSE).splitlines() == ["4", "True"]
     page = sliplab.folder / "store" / "report" / "index.html"
     assert "simulated" in page.read_text()
     assert checkout() == before

@@ -314,6 +314,7 @@ def test_a_camera_that_is_absent_is_a_fault(
 
 
 @realtime
+@pytest.mark.xdist_group("scene")
 def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
     before = checkout()
     sliplab = Lab(tmp_path, "prophesee")
@@ -323,13 +324,11 @@ def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
     on = ("protocol.yaml", "--rig", "rig.yaml", "--store", "store")
     checks = sliplab("check", *on)["checks"]
     assert all(check["passed"] for check in checks), checks
-    taken = sliplab("collect", *on)
-    assert (taken["planned"], taken["committed"]) == (4, 4)
+    taken = sliplab("collect", *on, "--trials", "1")
+    assert (taken["planned"], taken["committed"]) == (4, 1)
     assert taken["simulated"] is True
     sliplab("sync", "store")
-    assert sliplab("label", "store")["done"] == 4
-    for step in ("train", "evaluate", "report"):
-        sliplab(step, "store")
+    assert sliplab("label", "store")["done"] == 1
     store = Store.open(sliplab.folder / "store")
     assert verify(store) == []
     for recording in store.campaign("prophesee").recordings():
@@ -338,5 +337,4 @@ def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
             sent = len(reader.pulses("sync_pulses"))
         assert pulses == sent > 50
         assert recording.record.counts.events > 10_000
-    assert "simulated" in (store.folder / "report" / "index.html").read_text()
     assert checkout() == before

@@ -28,7 +28,7 @@ from tests.flows.live import (
 )
 from tests.rigs.waiting import own_address
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
 LABELS_AGREE_MS = 20.0
 """Tolerance between the onsets of one trial through real drivers and in the mock rig."""

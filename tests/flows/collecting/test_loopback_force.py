@@ -23,7 +23,7 @@ from tests.flows.conftest import write
 from tests.flows.live import at_work, quick, request_in, stage_of, take_all
 from tests.rigs.waiting import own_address
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
 LONGEST_US = 400_000
 """What a busy machine may add to the 20 ms by which the scene follows the clock."""
@@ -167,7 +167,9 @@ def test_a_load_beyond_the_range_is_a_protective_stop(tmp_path: Path) -> None:
         assert campaign.committed() == set()
 
 
-@pytest.mark.parametrize("sensor", ["run_request", "by_the_arm"])
+@pytest.mark.parametrize(
+    "sensor", ["run_request", pytest.param("by_the_arm", marks=pytest.mark.long)]
+)
 def test_the_arm_presses_to_a_force_through_the_wire(
     sensor: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:

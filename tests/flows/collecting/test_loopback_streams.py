@@ -17,7 +17,7 @@ from tests.flows.conftest import write
 from tests.flows.live import at_work, quick, request_in, stage_of, take_all
 from tests.rigs.waiting import own_address, until
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
 SIDE = {
     "kind": "events",

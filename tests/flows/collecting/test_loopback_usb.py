@@ -14,7 +14,7 @@ from tests.flows.conftest import write
 from tests.flows.live import at_work, quick, request_in, stage_of, take_all
 from tests.rigs.waiting import own_address
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
 RATE_HZ = 30
 

@@ -15,7 +15,7 @@ from tests.flows.conftest import write
 from tests.flows.detect.detecting import model_in, short_slide, slip_when_busy
 from tests.flows.live import rig_yaml, stage_of
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
 BEHIND_MS = 500.0
 """Largest acceptable latency of a decision on a busy machine."""
