@@ -14,8 +14,14 @@ from tests.crash.__main__ import PARTS
 pytestmark = pytest.mark.programs
 
 
-def test_a_short_crash_test() -> None:
-    options = ["--kills", "20", "--trials", "12", "--every", "60", "--step", "32768"]
+@pytest.mark.parametrize(
+    ("kills", "trials", "every", "step"),
+    [(10, 8, 120, 131072), pytest.param(20, 12, 60, 32768, marks=pytest.mark.long)],
+)
+def test_a_short_crash_test(kills: int, trials: int, every: int, step: int) -> None:
+    options = [
+        "--kills", str(kills), "--trials", str(trials), "--every", str(every), "--step", str(step),
+    ]  # fmt: skip
     only = [word for part in PARTS for word in ("--only", part)]
     done = subprocess.run(
         [sys.executable, "-m", "tests.crash", *only, "--seed", "3", *options],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,11 @@ from sliplab.storage.schema.document import DocumentError
 CHECKERS = {kind: Draft7Validator(file_schema(kind)) for kind in KINDS}
 
 
-def check_refusals(kind: Kind, path: Path) -> int:
+def check_refusals(kind: Kind, path: Path, *, every: bool = False) -> int:
     """Make every value nonsense, one at a time: the reader refuses what the schema does.
+
+    Args:
+        every: each value by all of `JUNK`; by default by one of them, which takes turns.
 
     Returns:
         how many were refused.
@@ -26,10 +29,10 @@ def check_refusals(kind: Kind, path: Path) -> int:
     data, refused = short(read_json(path)), 0
     assert CHECKERS[kind].is_valid(data)
     assert DOCUMENTS[kind].parse(data, path).to_json() == data
-    for at in leaves(data):
-        if any(isinstance(key, int) and key for key in at):
-            continue  # of a list the first entry stands for all
-        for junk in JUNK:
+    # of a list the first entry stands for all
+    places = [at for at in leaves(data) if not any(isinstance(key, int) and key for key in at)]
+    for at, junks in nonsense(places, every):
+        for junk in junks:
             wrong = changed_at(data, at, junk)
             if CHECKERS[kind].is_valid(wrong):
                 continue
@@ -37,6 +40,14 @@ def check_refusals(kind: Kind, path: Path) -> int:
             with pytest.raises(DocumentError, match=path.name):
                 DOCUMENTS[kind].parse(wrong, path)
     return refused
+
+
+def nonsense(
+    places: Iterable[tuple[Any, ...]], every: bool
+) -> Iterator[tuple[tuple[Any, ...], tuple[Any, ...]]]:
+    """Yield each place with what is put there: all of `JUNK`, or one that takes turns."""
+    for number, at in enumerate(places):
+        yield at, JUNK if every else JUNK[number % len(JUNK) :][:1]
 
 
 def short(part: Any) -> Any:
@@ -59,10 +70,10 @@ def leaves(part: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def changed_at(data: Any, at: tuple[Any, ...], value: Any) -> Any:
-    """Return a copy with another value at a place."""
-    changed = copy.deepcopy(data)
-    part = changed
+    """Return a copy with another value at a place; it shares what is not on the way there."""
+    part = changed = copy.copy(data)
     for key in at[:-1]:
+        part[key] = copy.copy(part[key])
         part = part[key]
     part[at[-1]] = value
     return changed

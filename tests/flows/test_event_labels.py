@@ -148,7 +148,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=pytest.mark.long) if case == "half lost before gross" else case
+        for case in CASES
+    ],
+)
 def test_lost_events_leave_the_gross_onset_right_or_in_doubt(
     case: str, slides: list[Recording]
 ) -> None:

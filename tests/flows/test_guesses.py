@@ -148,12 +148,11 @@ def test_stopped_between_two_settings_it_goes_on(
     other = Store.open(tmp_path / "store")
     file = other.folder / "derived/guesses/results.json"
     write_json(file, {"settings": {AS_IT_IS: kept(other)[AS_IT_IS]}})
-    first = guesses.measure_setting
 
     def stopped(work: StudySensitivity, setting: Setting, scenes: Any) -> SettingScores:
         if setting.factor > 1:
             raise KeyboardInterrupt
-        return first(work, setting, scenes)
+        return scores(store)[setting.name]
 
     monkeypatch.setattr(guesses, "measure_setting", stopped)
     with pytest.raises(KeyboardInterrupt):

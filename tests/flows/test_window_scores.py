@@ -35,6 +35,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     for name in ("first", "second"):
         data = tiny()
         data["name"] = name
+        data["collection"]["motion"][3]["distance"] = "5 mm"
         data["analysis"]["training"] = {"epochs": 1}
         collect(make_request(write(folder / f"{name}.yaml", data), rig_path, folder / "store"))
     store = Store.open(folder / "store")

@@ -13,12 +13,14 @@ from tests.conftest import ROOT
 pytestmark = pytest.mark.programs
 
 
-def test_a_short_fuzz_test() -> None:
-    command = [sys.executable, "-m", "tests.fuzz", "--files", "1500", "--seed", "3", "--jobs", "1"]
+@pytest.mark.parametrize("files", [500, pytest.param(1500, marks=pytest.mark.long)])
+def test_a_short_fuzz_test(files: int) -> None:
+    options = ["--files", str(files), "--seed", "3", "--jobs", "1"]
+    command = [sys.executable, "-m", "tests.fuzz", *options]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
     )
     found = json.loads(done.stdout)
     assert found["wrong"] == []
     assert done.returncode == 0
-    assert sum(sum(counts.values()) for counts in found["outcomes"].values()) == 1500
+    assert sum(sum(counts.values()) for counts in found["outcomes"].values()) == files

@@ -538,9 +538,7 @@ def _leaves(data: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 LEAVES = [(name, path) for name, data in SHIPPED.items() for path in _leaves(data)]
 
 
-@settings(max_examples=600)
-@given(st.sampled_from(LEAVES), st.sampled_from(TEXTS))
-def test_whatever_stands_at_a_key_is_taken_or_named(where: Any, text: str) -> None:
+def is_taken_or_named(where: Any, text: str) -> None:
     """Any text at any key: a plan, or one message in one line that names a key of the file."""
     name, path = where
     data = copy.deepcopy(SHIPPED[name])
@@ -556,6 +554,15 @@ def test_whatever_stands_at_a_key_is_taken_or_named(where: Any, text: str) -> No
         assert not re.search(r"[\x00-\x1f\x7f-\x9f\u202e]|Decimal\(|datetime", error.message)
         assert error.key.startswith((str(path[0]), "collection", "analysis")), error.message
         assert error.expected
+
+
+ANYWHERE = given(st.sampled_from(LEAVES), st.sampled_from(TEXTS))
+test_whatever_stands_at_a_key_is_taken_or_named = settings(max_examples=150)(
+    ANYWHERE(is_taken_or_named)
+)
+test_more_of_what_may_stand_at_a_key = pytest.mark.long(
+    settings(max_examples=600)(ANYWHERE(is_taken_or_named))
+)
 
 
 @pytest.mark.parametrize(

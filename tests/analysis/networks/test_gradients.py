@@ -33,7 +33,7 @@ from sliplab.protocols.settings import Network, Training, Windows
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NETWORK, GAIN = Network(), 0.25
-WINDOWS = Windows(length_ms=8)  # a compiler takes longer for each step
+WINDOWS = Windows(length_ms=4)  # a compiler takes longer for each step
 CELLS = WINDOWS.cells
 GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 Way = tuple[str, bool]

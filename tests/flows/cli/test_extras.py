@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -28,7 +29,21 @@ class Missing:
 MISSING = set(sys.argv.pop(1).split(","))
 sys.meta_path.insert(0, Missing())
 """
-COMMAND = f"{BLOCKED}\nfrom sliplab.flows.__main__ import main\nmain()"
+COMMANDS = f"""{BLOCKED}
+import contextlib, io, json
+from sliplab.flows.__main__ import main
+
+ended = []
+for words in json.loads(sys.argv[1]):
+    sys.argv[1:] = words
+    out, said = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as end:
+            ended.append([end.code, out, said])
+print(json.dumps([[code, out.getvalue(), said.getvalue()] for code, out, said in ended]))
+"""
 PYTHON = """
 import sliplab
 store = sliplab.open_store(sys.argv[1])
@@ -62,27 +77,44 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return older_store(tmp_path_factory.mktemp("extras") / "store")
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "--version",
-        "plan pilot",
-        "plan pilot --rig mock",
-        "rigs",
-        "schema rig",
-        "schema protocol",
-        "trials STORE",
-        "verify STORE",
-        "migrate STORE",
-        "export STORE small --format aedat4 --output OUT/aedat4",
-        "export STORE small --format dsec --output OUT/dsec",
-        "export STORE small --labels --output OUT/labels.csv",
-    ],
+CORE = (
+    "--version",
+    "plan pilot",
+    "plan pilot --rig mock",
+    "rigs",
+    "schema rig",
+    "schema protocol",
+    "trials STORE",
+    "verify STORE",
+    "migrate STORE",
+    "export STORE small --format aedat4 --output OUT/aedat4",
+    "export STORE small --format dsec --output OUT/dsec",
+    "export STORE small --labels --output OUT/labels.csv",
 )
-def test_the_core_plans_reads_and_writes(command: str, store: Path, tmp_path: Path) -> None:
-    words = command.replace("STORE", str(store)).replace("OUT", str(tmp_path)).split()
-    done = run(COMMAND, tuple(EXTRAS), *words)
+
+
+def run_all(
+    commands: Iterable[str], extras: tuple[str, ...], store: Path, out: Path
+) -> list[tuple[int, str, str]]:
+    """Run commands in one process without these extras: exit code and both streams of each."""
+    trial = next((store / "campaigns" / "small" / "trials").iterdir()).name
+    places = {"STORE": str(store), "OUT": str(out), "TRIAL": trial}
+    wanted = [
+        re.sub("|".join(places), lambda name: places[name[0]], command).split()
+        for command in commands
+    ]
+    done = run(COMMANDS, extras, json.dumps(wanted))
     assert done.returncode == 0, done.stderr
+    ended = [(code, printed, said) for code, printed, said in json.loads(done.stdout)]
+    assert len(ended) == len(wanted)
+    return ended
+
+
+def test_the_core_plans_reads_and_writes(store: Path, tmp_path: Path) -> None:
+    for command, (code, _, said) in zip(
+        CORE, run_all(CORE, tuple(EXTRAS), store, tmp_path), strict=True
+    ):
+        assert code == 0, f"{command}: {said}"
 
 
 def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
@@ -95,49 +127,53 @@ def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("extra", "module", "command"),
-    [
-        ("learn", "torch", "train STORE"),
-        ("learn", "torch", "export-model STORE --out OUT/model"),
-        ("learn", "torch", "detect --rig rehearsal --model STORE/models/small.pt"),
-        ("prefect", "prefect", "label STORE"),
-        ("prefect", "prefect", "sync STORE"),
-        ("prefect", "prefect", "collect pilot --rig rehearsal --store OUT/new --trials 1"),
-        ("report", "matplotlib", "sync STORE"),
-        ("report", "bokeh", "review STORE"),
-        ("report", "matplotlib", "calibrate board --out OUT/board.pdf"),
-        ("hardware", "abb_motion_program_exec", "rigs irb120 --ask"),
-        ("hardware", "rtde_control", "rigs ur5 --ask"),
-        ("hardware", "rtde_control", "check pilot --rig ur5 --store OUT/new"),
-        ("hardware", "rtde_control", "check pilot --rig loopback --store OUT/new"),
-        ("cluster", "distributed", "label STORE --dask 127.0.0.1:1"),
-        ("view", "rerun", "view STORE TRIAL --save OUT/trial.rrd"),
-        ("publish", "mcap", "publish STORE --as mcap --output OUT/published"),
-    ],
-)
-def test_a_command_says_which_extra_it_lacks(
-    extra: str, module: str, command: str, store: Path, tmp_path: Path
-) -> None:
-    trial = next((store / "campaigns" / "small" / "trials").iterdir()).name
-    places = {"STORE": str(store), "OUT": str(tmp_path), "TRIAL": trial}
-    words = command.split()
-    for name, place in places.items():
-        words = [word.replace(name, place) for word in words]
-    done = run(COMMAND, (extra,), *words, "--json")
-    found = json.loads(done.stdout)["error"]
-    assert (done.returncode, found["exit_code"]) == (2, 2), done.stderr
-    if extra == "cluster":  # the option is what is wrong
-        assert found["key"] == "--dask"
-        assert found["message"].endswith("`pip install 'sliplab[cluster]'`")
-    else:
-        assert (found["file"], found["key"], found["value"]) == (None, None, None)
-        assert found["message"] == (
-            f"`sliplab {words[0]}` needs {module}, from the extra '{extra}': "
-            f"pip install 'sliplab[{extra}]'"
-        )
-    assert f"error: {found['message']}\n" in done.stderr
-    assert "Traceback" not in done.stderr
+LACKING: dict[str, dict[str, str]] = {
+    "learn": {
+        "train STORE": "torch",
+        "export-model STORE --out OUT/model": "torch",
+        "detect --rig rehearsal --model STORE/models/small.pt": "torch",
+    },
+    "prefect": {
+        "label STORE": "prefect",
+        "sync STORE": "prefect",
+        "collect pilot --rig rehearsal --store OUT/new --trials 1": "prefect",
+    },
+    "report": {
+        "sync STORE": "matplotlib",
+        "review STORE": "bokeh",
+        "calibrate board --out OUT/board.pdf": "matplotlib",
+    },
+    "hardware": {
+        "rigs irb120 --ask": "abb_motion_program_exec",
+        "rigs ur5 --ask": "rtde_control",
+        "check pilot --rig ur5 --store OUT/new": "rtde_control",
+        "check pilot --rig loopback --store OUT/new": "rtde_control",
+    },
+    "cluster": {"label STORE --dask 127.0.0.1:1": "distributed"},
+    "view": {"view STORE TRIAL --save OUT/trial.rrd": "rerun"},
+    "publish": {"publish STORE --as mcap --output OUT/published": "mcap"},
+}
+"""Commands, and the module of the extra that each needs first."""
+
+
+@pytest.mark.parametrize("extra", LACKING)
+def test_a_command_says_which_extra_it_lacks(extra: str, store: Path, tmp_path: Path) -> None:
+    commands = LACKING[extra]
+    ended = run_all([f"{command} --json" for command in commands], (extra,), store, tmp_path)
+    for (command, module), (code, out, said) in zip(commands.items(), ended, strict=True):
+        found = json.loads(out)["error"]
+        assert (code, found["exit_code"]) == (2, 2), f"{command}: {said}"
+        if extra == "cluster":  # the option is what is wrong
+            assert found["key"] == "--dask"
+            assert found["message"].endswith("`pip install 'sliplab[cluster]'`")
+        else:
+            assert (found["file"], found["key"], found["value"]) == (None, None, None)
+            assert found["message"] == (
+                f"`sliplab {command.split()[0]}` needs {module}, from the extra '{extra}': "
+                f"pip install 'sliplab[{extra}]'"
+            )
+        assert f"error: {found['message']}\n" in said
+        assert "Traceback" not in said
 
 
 def test_a_damaged_package_is_not_called_missing() -> None:

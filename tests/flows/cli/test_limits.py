@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -109,14 +110,19 @@ def test_without_processes_a_collection_ends_in_one_line(
     assert "Traceback" not in done.stderr
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    """A store with one committed trial."""
-    done = here(
-        "collect", *PLAN, "--rig", "rehearsal", "--store", tmp_path / "s", "--trials", 1
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that `store` copies."""
+    folder = tmp_path_factory.mktemp("limits") / "s"
+    done = here("collect", *PLAN, "--rig", "rehearsal", "--store", folder, "--trials", 1)
     assert done.returncode == 0, done.stderr
-    return Store.open(tmp_path / "s")
+    return folder
+
+
+@pytest.fixture
+def store(taken: Path, tmp_path: Path) -> Store:
+    """A store with one committed trial."""
+    return Store.open(shutil.copytree(taken, tmp_path / "s"))
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])

@@ -34,8 +34,10 @@ OTHER = {"events": "frames", "frames": "events"}
 
 
 def take(camera: str, folder: Path, **recording: object) -> Recording:
-    """One trial of the pilot on the simulated rig that has only this camera."""
+    """One short trial of the pilot on the simulated rig that has only this camera."""
     protocol = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
+    protocol["collection"]["motion"][3]["distance"] = "2 mm"
+    protocol["collection"]["recording"]["region"] = {"width": "36 mm", "height": "36 mm"}
     protocol["collection"]["recording"].update(recording)
     path = write_yaml(folder / "pilot.yaml", protocol)
     request = make_request(path, ROOT / "rigs" / f"mock_{camera}.yaml", folder / "store", most=1)

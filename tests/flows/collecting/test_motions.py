@@ -198,7 +198,7 @@ def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
         "validation_levels": {"angle": ["35 deg"]},
         "test_levels": {"angle": ["40 deg"]},
     }
-    data["analysis"] |= {"samples": {"per_class": 50}, "training": {"epochs": 2}}
+    data["analysis"]["training"] = {"epochs": 2}
     protocol, store = write(tmp_path / "twists.yaml", data), tmp_path / "store"
     assert answer("collect", protocol, "--rig", RIG, "--store", store)["committed"] == 3
     assert answer("label", store)["done"] == 3

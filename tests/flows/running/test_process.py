@@ -38,8 +38,8 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     ("line", "code", "said"),
     [
         ("{short} >&-", 1, LOST + "it is closed\n"),
-        ("{plan} --json >&-", 1, LOST + "it is closed\n"),
-        ("{plan} --json > /dev/full", 1, LOST + "No space left on device\n"),
+        ("{short} --json >&-", 1, LOST + "it is closed\n"),
+        ("{short} --json > /dev/full", 1, LOST + "No space left on device\n"),
         ("{plan} --help > /dev/full", 1, LOST + "No space left on device\n"),
         ("set -o pipefail; {plan} --json | head -c 1 > /dev/null", 1, LOST + "Broken pipe\n"),
         ("set -o pipefail; {plan} --json | true", 1, LOST + "Broken pipe\n"),

@@ -29,7 +29,7 @@ def browser() -> Iterator[Any]:
         yield found
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+@pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("localhost", marks=pytest.mark.long)])
 def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str) -> None:
     expect = sync_api.expect
     with browser.new_context() as context:

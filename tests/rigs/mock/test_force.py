@@ -344,8 +344,8 @@ def steps_within(
 
 
 def test_a_force_step_is_timed_against_the_events(tmp_path: Path) -> None:
-    steps, maps = steps_within(tmp_path, 24)
-    assert (steps, maps) == (24, 24)
+    steps, maps = steps_within(tmp_path, 8)
+    assert (steps, maps) == (8, 8)
 
 
 def test_a_true_promise_of_the_delay_is_a_tight_bound(tmp_path: Path) -> None:
