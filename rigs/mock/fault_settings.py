@@ -192,6 +192,18 @@ class PapillaSticky(_Fault):
     """Its friction over what it would be without the fault."""
 
 
+class SkinWear(_Fault):
+    """Tips wear: each grips more or less, the further it has slid on this rig.
+
+    Friction is exp(per_m s) times that of a new tip. The path s is what the tip slid in earlier
+    trials since the rig was switched on, in metres.
+    """
+
+    kind: Literal["skin_wear"]
+    per_m: Annotated[float, Field(ge=-100, le=100)] = -0.1
+    """Relative change of friction per metre; negative: the tips become smoother."""
+
+
 class PlateSpot(_Fault):
     """A round spot on the plate, on which friction differs; factors of several multiply."""
 
@@ -270,6 +282,7 @@ AnyFault = (
     | MarkerOccluded
     | PlateStuck
     | PapillaSticky
+    | SkinWear
     | PlateSpot
     | MainsLight
     | ArmRamp

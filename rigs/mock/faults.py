@@ -26,6 +26,7 @@ from sliplab.rigs.mock.fault_settings import (
     PapillaSticky,
     PapillaTorn,
     PlateSpot,
+    SkinWear,
 )
 from sliplab.rigs.scene.skin import Skin
 
@@ -148,14 +149,20 @@ class FaultBook:
 
     # -- whole trials ----------------------------------------------------------------------
 
-    def grips(self, skin: Skin) -> Skin:
-        """Return `skin` with the friction of the papillae that are sticky in this trial."""
-        sticky = self.of(PapillaSticky)
-        if not sticky:
+    def grips(self, skin: Skin, slid_mm: F64) -> Skin:
+        """Return `skin` with the friction of papillae that are sticky or worn in this trial.
+
+        Args:
+            slid_mm: path of each tip in earlier trials, (n,).
+        """
+        sticky, wear = self.of(PapillaSticky), self.of(SkinWear)
+        if not sticky and not wear:
             return skin
         friction = skin.friction_factor.copy()
         for fault in sticky:
             friction[fault.papilla] *= fault.factor
+        for worn in wear:
+            friction *= np.exp(worn.per_m * 1e-3 * slid_mm)
         return replace(skin, friction_factor=friction)
 
     def spots(self) -> F64:

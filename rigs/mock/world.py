@@ -2,7 +2,8 @@
 
 Time passes only when the virtual clock waits. The physics are evaluated lazily: when a device reads
 the state, it advances on a fixed grid of steps up to the present. A trial's data depend on the
-rig's settings, the trial's seed and the commands to the devices, never on earlier trials:
+rig's settings, the trial's seed and the commands to the devices, never on earlier trials (but
+for a skin that wears, a fault):
 `begin_trial` puts the skin at rest, sets the true time to 0 and draws everything that varies by
 trial from the seed.
 """
@@ -52,6 +53,7 @@ class World:
         now_ns: true time since the trial began, which is also the host's monotonic clock.
         past_ns: true time spent in earlier trials.
         trials: number of calls of `begin_trial`.
+        slid_mm: path that each tip slid in earlier trials, (n,).
         board: position of a printed board in front of the outside camera; None if there is none.
         plate_marked: True once the sliding plate with its ArUco marker is used.
 
@@ -74,6 +76,7 @@ class World:
         self.path = path or ArmPath(self.plane, start_pose(settings))
         self.arm_state = ArmState.READY
         self.on_begin: list[Callable[[], None]] = []
+        self.slid_mm = np.zeros(len(self.skin))
         self._prepare(settings.seed)
 
     def begin_trial(self, seed: int) -> None:
@@ -87,6 +90,7 @@ class World:
         self.advance()
         if self.path.moving(self.now_ns):
             raise RigError("arm", "is still moving: a trial begins with the arm at rest")
+        self.slid_mm += self.physics.tips.path
         self.path.restart(self.now_ns)
         self.past_ns += self.now_ns
         self.now_ns = 0
@@ -113,8 +117,8 @@ class World:
             settings.arm.vibration_um, settings.arm.vibration_hz, settings.seed, seed
         )
         self.physics = Physics(
-            settings, self.faults.grips(self.skin), seed, self._sensor_at, self.faults.torn,
-            self.faults.spots(),
+            settings, self.faults.grips(self.skin, self.slid_mm), seed, self._sensor_at,
+            self.faults.torn, self.faults.spots(),
         )  # fmt: skip
         self.plate_marked = False
 

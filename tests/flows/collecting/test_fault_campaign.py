@@ -49,6 +49,7 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "papilla_torn", "papilla": 0},
     {"kind": "marker_occluded", "papilla": 0},
     {"kind": "papilla_sticky", "papilla": 3},
+    {"kind": "skin_wear", "per_m": -0.5},
     {"kind": "plate_spot", "centre_mm": [9, 4], "radius_mm": 4},
     {"kind": "mains_light", "share": 0.08},
     {"kind": "mains_light", "share": 0.15},
@@ -61,7 +62,7 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "device_gone", "device": "sync_box"},
 ]
 """Each happens once, in the middle of a trial of its own; a plate sticks only where one falls."""
-WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "plate_spot", "arm_ramp"}
+WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
 
 
 @dataclass(frozen=True)

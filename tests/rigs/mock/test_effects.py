@@ -89,6 +89,20 @@ def test_a_sticky_papilla_slips_later_by_its_factor_and_no_other_does() -> None:
     assert found[slipped] == pytest.approx(expected[slipped], rel=1e-6)
 
 
+def test_a_tip_wears_by_the_path_that_it_slid_before() -> None:
+    devices = plain({"kind": "skin_wear", "per_m": -50.0})
+    new = hooke_mm(devices)
+    slipped = new < 3.9
+    first = slip_mm(slide(devices, seed=11))  # worn by nothing yet
+    assert first[slipped] == pytest.approx(new[slipped], rel=1e-6)
+    second = slip_mm(slide(devices, seed=12))
+    slid_mm = devices.world.slid_mm
+    # a tip lags behind by u, so it slid the rest of the 4 mm; and a little as it was lifted
+    assert np.all(slid_mm[slipped] > 4.0 - new[slipped] - 1e-3)
+    worn = new * np.exp(-50.0 * 1e-3 * slid_mm)
+    assert second[slipped] == pytest.approx(worn[slipped], rel=1e-6)
+
+
 def test_sticky_papillae_multiply() -> None:
     sticky = {"kind": "papilla_sticky", "papilla": 9}
     devices = plain({**sticky, "factor": 0.5}, {**sticky, "factor": 3.0})
