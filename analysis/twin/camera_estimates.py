@@ -187,29 +187,32 @@ def _noise(trials: Sequence[PilotTrial], rests: F64 | None, size_px: tuple[int, 
     """Noise of pixels that see no disc; in the hold, of all pixels."""
     width, height = size_px
     clear = _clear(rests, size_px)
-    counts = np.zeros((2, height, width), np.int32)
+    in_hold, in_slide = np.zeros((2, 2, height, width), np.int32)
     hold_s = slide_s = 0.0
     for trial in trials:
         held, slid = _events(trial, trial.hold_s, 0.0), _events(trial, 0.0, trial.slide_s)
-        add_counts(held.x, held.y, held.p, True, clear, counts)
-        add_counts(slid.x, slid.y, slid.p, False, clear, counts)
+        add_counts(held.x, held.y, held.p, True, clear, in_hold)
+        add_counts(slid.x, slid.y, slid.p, False, clear, in_slide)
         hold_s, slide_s = hold_s - min(trial.hold_s, 0.0), slide_s + trial.slide_s
     seen_s = np.where(clear, hold_s + slide_s, hold_s)
+    counts = in_hold + in_slide
     total = counts.sum(axis=0)
     quiet = (clear if clear.any() else np.ones_like(clear)) & (seen_s > 0.0)
     if not quiet.any():
         return _Noise(np.nan, np.nan, np.zeros_like(clear), np.nan)
-    # those that are hot count a little at first, and not at all from then on
+    # those that are busy count a little at first, and not at all from then on
     for _ in range(10):
         off, on = (counts[:, quiet].sum(axis=1) / seen_s[quiet].sum()).tolist()
         most = poisson.isf(
             FALSE_HOT / total.size, (on + off) * np.array([hold_s, hold_s + slide_s])
         )
         # a pixel near a rim may fire once in each hold, as its disc creeps
-        hot = (total > np.where(clear, most[1], most[0] + len(trials))) & (seen_s > 0.0)
-        if not (quiet & hot).any():
+        busy = (total > np.where(clear, most[1], most[0] + len(trials))) & (seen_s > 0.0)
+        if not (quiet & busy).any():
             break
-        quiet &= ~hot
+        quiet &= ~busy
+    # one that is busy in the slide alone saw a disc after all, as where one was misplaced
+    hot = busy & ((in_hold.sum(axis=0) > most[0]) | (hold_s == 0.0))
     hot_hz = total[hot].sum() / seen_s[hot].sum() if hot.any() else np.nan
     share = (on - off) / (on + off) if on + off > 0.0 else np.nan
     return _Noise(on + off, share, hot, float(hot_hz))

@@ -153,6 +153,26 @@ def test_discs_that_sweep_give_all_numbers_of_the_picture() -> None:
     assert np.isnan(found["scan_us"])
 
 
+def test_pixels_that_are_busy_in_the_slide_alone_are_not_hot() -> None:
+    """As where the rim of a disc passes that was not found in its place."""
+    x, y = np.divmod(np.arange(400), 20)
+    found = []
+    for made in pilot():
+        assert made.camera is not None
+        t_us = np.linspace(5e5 * made.slide_s, 9e5 * made.slide_s, 400).astype(np.int64)
+        passed = EventChunk(
+            x.astype(np.uint16), (y + 1).astype(np.uint16), np.ones(400, np.int8), t_us
+        )  # fmt: skip
+        both = EventChunk.joined([made.camera.events, *[passed] * 6])
+        order = np.argsort(both.t_us, kind="stable")
+        events = EventChunk(both.x[order], both.y[order], both.p[order], both.t_us[order])
+        found.append(replace(made, camera=replace(made.camera, events=events)))
+    before, after = camera_estimates(pilot()), camera_estimates(found)
+    assert after["hot_pixels"] == before["hot_pixels"] == 5
+    assert after["hot_hz"] == before["hot_hz"]
+    assert after["noise_hz"] == pytest.approx(before["noise_hz"], rel=0.01)
+
+
 def test_a_disc_is_fitted_to_whole_counts() -> None:
     """Each parameter lies within five of its standard deviations, hot pixels or not."""
     size, place = (120, 100), np.array([[50.3, 48.7]])
