@@ -87,6 +87,18 @@ _IN_CONTACT = 0.1
 """Share of the hold's normal force below which no friction is computed."""
 
 
+def sliding_friction(recording: Recording) -> float:
+    """Return friction force over normal force in the last quarter of a slide.
+
+    Raises:
+        KeyError: the trial has no slide.
+        StoreError: it has no forces on the plate.
+    """
+    start, end = recording.step("slide")
+    mean = plate_forces(recording).between(end - (end - start) // 4, end).force_n.mean(axis=0)
+    return float(np.hypot(mean[0], mean[1]) / mean[2])
+
+
 def force_figures(t_ns: I64, force_n: F64, edges_ns: tuple[int, int, int]) -> dict[str, float]:
     """Return the figures of a trial's forces that are known, N, to a tenth of a millinewton.
 

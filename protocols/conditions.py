@@ -87,6 +87,9 @@ class ReferenceGate(StrictModel):
 
     event_rate: PositivePercent
     """Of the events a second while the arm holds still in contact."""
+    friction: PositivePercent | None = None
+    """Of friction force over normal force in the last quarter of the slide, on a rig with a force
+    sensor. Left out, it is not compared."""
 
 
 class Gates(StrictModel):

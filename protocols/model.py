@@ -192,6 +192,14 @@ class Collection(StrictModel):
                     "needs reference trials, and the protocol defines none: add references",
                 )
             return
+        gate = self.gates.reference
+        slides = any(step.phase == "slide" for step in self.motion)
+        if gate is not None and gate.friction is not None and not slides:
+            raise KeyedError(
+                "collection.gates.reference.friction",
+                f"{gate.friction} %",
+                "needs a motion that slides: leave it out",
+            )
         given = self.references.condition
         for name, factor in self.all_factors.items():
             key = f"collection.references.condition.{name}"

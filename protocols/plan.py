@@ -286,6 +286,8 @@ class Plan:
         for name in ("reference", "hold_slip", "normal_force", "hold_force"):
             if getattr(gates, name) is None:  # hashes of protocols from before it came stay
                 data["gates"].pop(name)
+        if gates.reference is not None and gates.reference.friction is None:
+            data["gates"]["reference"].pop("friction")
         if gates.speed_deviation == Gates().speed_deviation:  # the same
             data["gates"].pop("speed_deviation")
         return data

@@ -464,6 +464,11 @@ def _check_force(rig: RigFile, plan: Plan) -> None:
         if value is not None and not rig.has_force:
             text = f"needs a force sensor, and the rig {rig.name} has none: leave the gate out"
             raise InputError(plan.file, f"collection.gates.{name}", f"{value} N", text)
+    reference = gates.reference
+    if reference is not None and reference.friction is not None and not rig.has_force:
+        text = f"needs a force sensor, and the rig {rig.name} has none: leave the gate out"
+        key = "collection.gates.reference.friction"
+        raise InputError(plan.file, key, f"{reference.friction} %", text)
     presses = [
         step.until_force_n
         for trial in plan

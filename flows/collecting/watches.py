@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 
+from sliplab.analysis.force import sliding_friction
 from sliplab.analysis.quality import hold_rate
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
@@ -75,7 +77,7 @@ class DiskWatch:
 
 
 class ReferenceWatch:
-    """Compares the event rate of every reference trial with the campaign's first one.
+    """Compares every reference trial with the campaign's first one: event rate, and friction.
 
     Onsets are not compared: they are unknown until `sliplab label` has read the outside camera's
     frames.
@@ -84,7 +86,7 @@ class ReferenceWatch:
     def __init__(self, run_request: RunRequest, campaign: Campaign) -> None:
         self._run_request, self._campaign = run_request, campaign
         self._gate = run_request.plan.protocol.collection.gates.reference
-        self._first: tuple[str, float] | None = None
+        self._first: dict[str, tuple[str, float]] = {}
 
     def begin(self) -> None:
         """Check the last reference trial of earlier sessions.
@@ -107,21 +109,36 @@ class ReferenceWatch:
         """
         if self._gate is None or trial.role != "reference":
             return
-        rate = hold_rate(self._campaign.recording(trial.id))
-        if self._first is None:
-            self._first = (trial.id, rate)
-            return
-        first, expected = self._first
-        drift = 100 * (rate / expected - 1) if expected else (100.0 if rate else 0.0)
-        bound = float(self._gate.event_rate)
-        if abs(drift) <= bound:
+        recording = self._campaign.recording(trial.id)
+        self._compare(
+            trial, "event_rate", self._gate.event_rate, hold_rate(recording),
+            "{:,.0f}", "events/s in the hold", "Skin, light or lens changed",
+        )  # fmt: skip
+        if self._gate.friction is not None:
+            self._compare(
+                trial, "friction", self._gate.friction, sliding_friction(recording),
+                "{:.3f}", "N/N of friction in the slide", "Skin worn, or skin or plate dirty",
+            )  # fmt: skip
+
+    def _compare(
+        self, trial: Trial, key: str, bound: Decimal, value: float, figure: str, where: str,
+        cause: str,
+    ) -> None:  # fmt: skip
+        """Compare a figure with that of the first reference trial.
+
+        Args:
+            key: of `gates.reference`. figure: its format. where: unit and place, for people.
+        """
+        first, expected = self._first.setdefault(key, (trial.id, value))
+        drift = 100 * (value / expected - 1) if expected else (100.0 if value else 0.0)
+        if abs(drift) <= float(bound):
             return
         simulated = "simulated " if self._run_request.rig.simulated else ""
         raise CampaignStopped(
             f"campaign {self._campaign.name}: {simulated}reference trials drifted apart: "
-            f"{trial.id} has {rate:,.0f} events/s in the hold, {first} had {expected:,.0f} "
-            f"({drift:+.1f} %, gates.reference.event_rate = {bound:g} %). Skin, light or lens "
-            f"changed: see to it, then `sliplab again {self._run_request.store} {trial.id} "
+            f"{trial.id} has {figure.format(value)} {where}, {first} had {figure.format(expected)} "
+            f"({drift:+.1f} %, gates.reference.{key} = {float(bound):g} %). {cause}: see to it, "
+            f"then `sliplab again {self._run_request.store} {trial.id} "
             f"--why ...` and the same command go on (give {first} as well if the new state is the "
             "one to compare with). Onsets were not compared: they are known after `sliplab label` "
             "only"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.page import render_page
 from sliplab.flows.api import open_store
+from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.collecting.session import TrialCollector
+from sliplab.flows.collecting.supervisor import CollectionSupervisor
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.ui import view
 from sliplab.protocols import InputError, Protocol, make_plan
 from sliplab.protocols.settings import Labelling
@@ -35,7 +39,7 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import session, short, take_all
-from tests.flows.conftest import tiny
+from tests.flows.conftest import tiny, tiny_gravity
 from tests.flows.ui.test_view import Read
 
 TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
@@ -131,6 +135,53 @@ def test_a_gate_of_force_needs_a_sensor(tmp_path: Path) -> None:
     data["collection"]["gates"] = {"normal_force": "5 N"}
     with pytest.raises(InputError, match=r"gates.normal_force = 5 N: needs a force sensor"):
         session(tmp_path / "a", data, frame_camera=TRACKS)
+
+
+@pytest.mark.parametrize("per_m", [0.0, -30.0])
+def test_references_of_a_skin_that_wears_stop_a_campaign(per_m: float, tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["motion"][3]["distance"] = "6 mm"
+    condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
+    data["collection"]["references"] = {"every": 1, "condition": condition}
+    data["collection"]["gates"]["reference"] = {"event_rate": "90 %", "friction": "10 %"}
+    work, campaign = session(
+        tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS,
+        faults=[{"kind": "skin_wear", "per_m": per_m}],
+    )  # fmt: skip
+    run_request = make_request(
+        tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
+    )
+    store = Store.open(run_request.store)
+    work.supervisor = CollectionSupervisor(run_request, store, campaign)
+    if per_m == 0.0:
+        take_all(work)
+        assert len(campaign.committed()) == 6
+        return
+    with pytest.raises(CampaignStopped) as stopped:
+        take_all(work)
+    # of its 6 mm a tip slides some 4: friction of the second falls by a fifth
+    assert len(campaign.committed()) == 3
+    message = str(stopped.value)
+    assert re.search(r"has 0\.\d{3} N/N of friction in the slide, \S+ had 0\.\d{3} \(-", message)
+    assert "gates.reference.friction = 10 %). Skin worn, or skin or plate dirty" in message
+
+
+def test_a_gate_of_friction_needs_forces_and_a_slide(tmp_path: Path) -> None:
+    data = short()
+    condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
+    data["collection"]["references"] = {"every": 1, "condition": condition}
+    data["collection"]["gates"]["reference"] = {"event_rate": "90 %"}
+    rehearsed = make_plan(validate(Protocol, data, "p.yaml"), "p.yaml")
+    plain = rehearsed.collection_hash
+    data["collection"]["gates"]["reference"]["friction"] = "10 %"
+    assert make_plan(validate(Protocol, data, "p.yaml"), "p.yaml").collection_hash != plain
+    with pytest.raises(InputError, match=r"reference.friction = 10 %: needs a force sensor"):
+        session(tmp_path / "a", data, frame_camera=TRACKS)
+    falls = tiny_gravity()
+    falls["collection"]["references"] = {"every": 2, "condition": {"mass": 0.165, "speed": 0.7}}
+    falls["collection"]["gates"]["reference"] = data["collection"]["gates"]["reference"]
+    with pytest.raises(InputError, match="needs a motion that slides"):
+        validate(Protocol, falls, "p.yaml")
 
 
 def test_forces_are_read_by_the_public_interface(taken: Recording) -> None:
