@@ -47,6 +47,11 @@ _DOCUMENTS = {
         "The numbers of a twin",
         "`TWIN.json` beside `TWIN.yaml`: a simulated rig's fit to a pilot ([Twins](../twin.md)).",
     ),
+    "drift": (
+        "The numbers of a drift",
+        "`report/drift.json`: a campaign's reference trials, each fitted by a simulated rig "
+        "([Twins](../twin.md#drift-along-a-campaign)).",
+    ),
 }
 """Title and place of each document in a store."""
 _ITEM = re.compile(r"(- |1\. )\S")

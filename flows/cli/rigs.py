@@ -456,6 +456,77 @@ def calibrate_scene(
         raise typer.Exit(console.FAILED)
 
 
+@calibrate_app.command("drift")
+def calibrate_drift(
+    folder: StoreArgument,
+    rig: RigOption,
+    campaign: Annotated[
+        str | None, typer.Option("--campaign", help="May be left out if the store has one.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the page and its numbers; default: STORE/report."),
+    ] = None,
+    limit: Annotated[
+        float | None,
+        typer.Option(
+            "--limit", min=0.1, max=1000,
+            help="Exit with 1 if friction changed by more than so many percent.",
+        ),
+    ] = None,
+    worlds: Annotated[
+        int,
+        typer.Option("--worlds", min=100, max=100_000, help="Worlds to simulate."),
+    ] = 300,
+    spread: Annotated[
+        float,
+        typer.Option(
+            "--spread", min=0.05, max=5, help="Largest change of a parameter: 0.5 is by half."
+        ),
+    ] = 0.5,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=2**31, help="Seed of the simulated worlds.")
+    ] = 1,
+    as_json: JsonOption = False,
+) -> None:  # fmt: skip
+    """Fit a campaign's reference trials one by one: wear of the skin, drift of the rig."""
+    from sliplab.flows.steps import prepare_store
+    from sliplab.storage.remote.mirror import open_store
+
+    store = open_store(folder)
+    prepare_store(folder)
+    from sliplab.analysis.campaigns import collected
+    from sliplab.analysis.report.drift import HEADER, row
+    from sliplab.flows.twin.calibrate import fitted_rig
+    from sliplab.flows.twin.drift import calibrate_drift as fit_to
+    from sliplab.flows.twin.drift import verdict
+
+    simulated = fitted_rig(rig)
+    found = collected(store, None if campaign is None else [campaign])
+    if len(found) != 1:
+        names = ", ".join(item.name for item in found)
+        raise InputError("--campaign", "", None, f"is needed: the store has {names}")
+    out = store.folder / "report" if out is None else out
+    fit = fit_to(
+        store, found[0], simulated, out, worlds=worlds, spread=spread, seed=seed,
+        limit_percent=limit,
+    )  # fmt: skip
+    page = out / "drift.html"
+    if as_json:
+        console.print_json({"page": str(page), **fit.to_json()})
+    else:
+        whose = "simulated campaign" if fit.simulated else "campaign"
+        known = [it for it in fit.parameters if it.identified]
+        console.print_table(
+            f"drift of the {whose} '{fit.campaign}'", HEADER, [row(it) for it in known]
+        )
+        console.say(f"{fit.worlds} worlds, {console.duration(fit.seconds)}; page: {page}")
+    if fit.limit_percent is not None:
+        console.say(verdict(fit))
+    if fit.beyond:
+        raise typer.Exit(console.FAILED)
+
+
 @calibrate_app.command("board")
 def calibrate_board(
     out: Annotated[Path, typer.Option("--out", help="Output file, .pdf or .png.")] = Path(

@@ -25,6 +25,7 @@ from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
 from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.document import Document
+from sliplab.storage.schema.drift import DriftFit
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.summary import Summary
@@ -33,7 +34,7 @@ from sliplab.storage.schema.twin import TwinFit
 
 Kind = Literal[
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin",
+    "classes-summary", "twin", "drift",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
@@ -45,6 +46,7 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "classes": ClassEvaluation,
     "classes-summary": ClassSummary,
     "twin": TwinFit,
+    "drift": DriftFit,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
@@ -54,6 +56,7 @@ TITLES: dict[Kind, str] = {
     "classes": "An evaluation of SlipLab on recordings of classes",
     "classes-summary": "The summary of a report of SlipLab on recordings of classes",
     "twin": "A fit of a simulated rig to a pilot, by SlipLab",
+    "drift": "The drift of a campaign's reference trials, by SlipLab",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

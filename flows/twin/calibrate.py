@@ -82,13 +82,7 @@ def request(rig_path: Path, out: Path, worlds: int, spread: float, seed: int) ->
     Raises:
         InputError: the rig is not a simulated one in virtual time, or the new file cannot be made.
     """
-    rig, _ = load_rig_file(rig_path)
-    if not rig.in_virtual_time:
-        raise InputError(
-            "--rig", "", str(rig_path),
-            "must be a simulated rig with driver: mock, whose scene is fitted; such as rehearsal, "
-            "or a file that extends it with your skin and cameras",
-        )  # fmt: skip
+    rig = fitted_rig(rig_path)
     if out.suffix not in {".yaml", ".yml"}:
         raise InputError("--out", "", str(out), "must end in .yaml")
     if not out.parent.is_dir():
@@ -96,6 +90,22 @@ def request(rig_path: Path, out: Path, worlds: int, spread: float, seed: int) ->
     if out.exists() and load_rig_file(out)[0].twin is None:
         raise InputError("--out", "", str(out), "exists and is no twin: use another name")
     return Calibration(Prior(rig, spread, seed), rig_path, out, worlds)
+
+
+def fitted_rig(rig_path: Path) -> RigFile:
+    """Read the rig file of a scene to fit.
+
+    Raises:
+        InputError: the rig is not a simulated one in virtual time.
+    """
+    rig, _ = load_rig_file(rig_path)
+    if not rig.in_virtual_time:
+        raise InputError(
+            "--rig", "", str(rig_path),
+            "must be a simulated rig with driver: mock, whose scene is fitted; such as rehearsal, "
+            "or a file that extends it with your skin and cameras",
+        )  # fmt: skip
+    return rig
 
 
 @dataclass(frozen=True)

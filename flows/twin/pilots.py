@@ -34,6 +34,7 @@ from sliplab.storage.streams import (
     WrenchChunk,
 )
 from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
 LEVEL = "L3"
@@ -85,27 +86,15 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
     Raises:
         StoreError: it has no slides, or they are not labelled.
     """
-    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
-    choice = choose_level(rig, item.plan)
-    if choice is not None and choice.name != LEVEL:
-        raise StoreError(
-            f"campaign '{item.name}': was simulated at level {choice.name}, without all physics "
-            f"that is fitted; collect it on a rig with mock.scene.level: {LEVEL}"
-        )
+    check_level(item)
     labels = Derived.of(store, "labels", item.name)
     parts: dict[bool, list[Trial]] = {True: [], False: []}
     slides, sums = {}, hashlib.sha256()
     for trial, recording in item.trials:
-        slide = slide_of(item.plan.program(trial))
+        slide = read_slide(item, labels, trial, recording)
         if slide is None:
             continue
-        try:
-            places = labels.arrays(trial.id)
-        except FileNotFoundError:
-            raise StoreError(
-                f"{item.name}/{trial.id}: has no label yet; run `sliplab label` first"
-            ) from None
-        slides[trial.id] = pilot_trial(slide, recording, places)
+        slides[trial.id] = slide
         parts[trial.split == "test"].append(trial)
         if trial.split != "test":
             sums.update(recording.checksum.encode())
@@ -115,6 +104,43 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
     return Pilot(
         item.plan, fitted, tuple(parts[True]), slides, event_trials(fitted), sums.hexdigest()
     )
+
+
+def check_level(item: Collected) -> None:
+    """Check that a simulated campaign has all physics that is fitted.
+
+    Raises:
+        InputError: it was imported.
+        StoreError: it was simulated with less.
+    """
+    plan = item.plan
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
+    choice = choose_level(rig, plan)
+    if choice is not None and choice.name != LEVEL:
+        raise StoreError(
+            f"campaign '{item.name}': was simulated at level {choice.name}, without all physics "
+            f"that is fitted; collect it on a rig with mock.scene.level: {LEVEL}"
+        )
+
+
+def read_slide(
+    item: Collected, labels: Derived, trial: Trial, recording: Recording
+) -> PilotTrial | None:
+    """Read a trial as arrays; None where its motion is no straight slide.
+
+    Raises:
+        StoreError: it is not labelled.
+    """
+    slide = slide_of(item.plan.program(trial))
+    if slide is None:
+        return None
+    try:
+        places = labels.arrays(trial.id)
+    except FileNotFoundError:
+        raise StoreError(
+            f"{item.name}/{trial.id}: has no label yet; run `sliplab label` first"
+        ) from None
+    return pilot_trial(slide, recording, places)
 
 
 def event_trials(fitted: Sequence[Trial]) -> frozenset[str]:

@@ -148,3 +148,42 @@ def maps(pilot: Array, twin: Array, before: Array, *, simulated: bool) -> str:
             ax.set_yticks([])
         figure.colorbar(image, ax=axes, shrink=0.8, label="events per cell and trial")
         return svg_text(figure, simulated)
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A parameter along a campaign.
+
+    Attributes:
+        places: of the references in the plan. factors: low, middle and high of each, over the
+            line's first value. percent: the line's slope per 100 trials.
+    """
+
+    title: str
+    places: Sequence[int]
+    factors: Sequence[tuple[float, float, float]]
+    percent: float
+
+
+def trends(panels: Sequence[Trend], *, simulated: bool) -> str:
+    """Draw parameters over the campaign, each over its value at the first reference."""
+    with plt.rc_context(STYLE):
+        rows = (len(panels) + 1) // 2
+        figure, axes = plt.subplots(
+            rows, 2, figsize=(6.4, 1.5 * rows + 0.3), sharex=True, squeeze=False
+        )
+        for ax, it in zip(axes.ravel(), panels, strict=False):
+            low, middle, high = np.array(it.factors).T
+            ax.errorbar(
+                it.places, middle, (middle - low, high - middle), fmt="o", color=BLUE, ms=3, lw=1
+            )
+            along = np.linspace(it.places[0], it.places[-1], 50)
+            ax.plot(along, (1.0 + it.percent / 100.0) ** ((along - along[0]) / 100.0), color=RED)
+            # a parameter that is known to a thousandth stands still
+            ax.set_ylim(min(low.min(), 0.98), max(high.max(), 1.02))
+            ax.set_title(it.title, fontsize=8)
+        for ax in axes.ravel()[len(panels) :]:
+            ax.set_visible(False)
+        figure.supxlabel("place in the plan", fontsize=9)
+        figure.supylabel("over the first", fontsize=9)
+        return svg_text(figure, simulated)

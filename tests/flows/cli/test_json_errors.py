@@ -61,6 +61,7 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     "calibrate scene": (
         ("ROOM/nowhere", "--rig", "mock", "--out", "ROOM/t.yaml"), "ROOM/nowhere", None, None,
     ),
+    "calibrate drift": (("ROOM/nowhere", "--rig", "mock"), "ROOM/nowhere", None, None),
     "calibrate board": (("--out", "ROOM/x.doc"), None, "--out", "ROOM/x.doc"),
 }  # fmt: skip
 
