@@ -52,6 +52,11 @@ _DOCUMENTS = {
         "`report/drift.json`: a campaign's reference trials, each fitted by a simulated rig "
         "([Twins](../twin.md#drift-along-a-campaign)).",
     ),
+    "gap": (
+        "The gap of a twin",
+        "`FOLDER/gap.json`: networks trained on a twin and tested on its rig "
+        "([Twins](../twin.md#trained-on-the-twin-tested-on-the-rig)).",
+    ),
 }
 """Title and place of each document in a store."""
 _ITEM = re.compile(r"(- |1\. )\S")

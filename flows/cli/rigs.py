@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption, StoreArgument
+from sliplab.flows.cli.common import CampaignOption, JsonOption, RigOption, StoreArgument
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
@@ -525,6 +525,40 @@ def calibrate_drift(
         console.say(verdict(fit))
     if fit.beyond:
         raise typer.Exit(console.FAILED)
+
+
+@calibrate_app.command("gap")
+def calibrate_gap(
+    folder: StoreArgument,
+    rig: Annotated[Path, typer.Option("--rig", help="The twin's rig file (YAML).")],
+    protocol: Annotated[
+        Path, typer.Option("--protocol", help="Protocol whose training trials are simulated.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the page and of simulated trials.")],
+    names: CampaignOption = None,
+    worlds: Annotated[
+        int, typer.Option("--worlds", min=1, max=1000, help="Rigs drawn from the twin's posterior.")
+    ] = 8,
+    as_json: JsonOption = False,
+) -> None:
+    """Train networks on a twin, and test them on the labelled test trials of its real rig."""
+    from sliplab.flows.steps import prepare_store
+    from sliplab.storage.remote.mirror import open_store
+
+    store = open_store(folder)
+    prepare_store(folder)
+    from sliplab.analysis.campaigns import collected
+    from sliplab.analysis.report.gap import COLUMNS, cells
+    from sliplab.flows.twin.gap import NAME, measure_gap, request
+
+    found = measure_gap(request(store, collected(store, names), rig, protocol, out, worlds))
+    if as_json:
+        console.print_json({"folder": str(out), **found.to_json()})
+        return
+    trials = f"{found.trials}{' simulated' if found.simulated else ''} test trials"
+    rows = [cells(it) for it in found.networks]
+    console.print_table(f"gap of the twin {found.rig}, {trials}", COLUMNS, rows)
+    console.say(f"page: {out / NAME}.html")
 
 
 @calibrate_app.command("board")

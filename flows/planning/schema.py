@@ -30,11 +30,11 @@ from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
-from sliplab.storage.schema.twin import TwinFit
+from sliplab.storage.schema.twin import TwinFit, TwinGap
 
 Kind = Literal[
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin", "drift",
+    "classes-summary", "twin", "drift", "gap",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
@@ -47,6 +47,7 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "classes-summary": ClassSummary,
     "twin": TwinFit,
     "drift": DriftFit,
+    "gap": TwinGap,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
@@ -57,6 +58,7 @@ TITLES: dict[Kind, str] = {
     "classes-summary": "The summary of a report of SlipLab on recordings of classes",
     "twin": "A fit of a simulated rig to a pilot, by SlipLab",
     "drift": "The drift of a campaign's reference trials, by SlipLab",
+    "gap": "Networks of a twin, tested on the rig that it imitates, by SlipLab",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

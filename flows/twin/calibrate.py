@@ -29,6 +29,7 @@ from sliplab.analysis.twin.shown import QUANTITIES, compare
 from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
+from sliplab.flows.twin.drawn_rigs import plain, samples_file, write_samples
 from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
 from sliplab.flows.twin.worlds import (
     Prior,
@@ -228,6 +229,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
         misfits=tuple(f"{it.stream}: {it.title}" for it in fit.checks if it.found),
     )
     write_twin(wanted, scene, record)
+    write_samples(samples_file(wanted.out), scene.found)
     write_json(wanted.out.with_suffix(".json"), fit.to_json())
     rings = ring_of(wanted.rig)
     judged = [pilot.slides[trial.id] for trial in pilot.judged]
@@ -342,7 +344,7 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     data = {
         "extends": extends,
         "name": wanted.out.stem.replace("_", "-"),
-        "mock": _plain(mock),
+        "mock": plain(mock),
         "twin": record.model_dump(mode="json"),
     }
     text = f"# Written by `sliplab calibrate scene`: {extends}, fitted to '{record.campaign}'.\n"
@@ -352,12 +354,6 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
 def ring_of(rig: RigFile) -> F64:
     """Return each papilla's ring, 0 for the centre, (m,)."""
     return np.repeat(np.arange(len(rig.skin.ring_counts)), rig.skin.ring_counts).astype(np.float64)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _rounded(value: float) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+from sliplab.storage.schema.evaluation import Experiments
+from sliplab.storage.schema.sweeps import HoldoutScores
 
 
 class ParameterFit(Part):
@@ -90,3 +92,55 @@ class TwinFit(Document):
     statistics: dict[str, StatisticSeen]
     checks: tuple[MisfitCheck, ...] = ()
     compared: tuple[QuantityCompared, ...] = ()
+
+
+class Behind(Part):
+    """Strict accuracy of the first network less that of another, 0 to 1.
+
+    Attributes:
+        low, high: 95 %, over the same trials; null with fewer than two.
+    """
+
+    share: Number | None
+    low: Number | None
+    high: Number | None
+
+
+class GapNetwork(Part):
+    """A network that was tested on a real rig's test trials.
+
+    Attributes:
+        rig: that its training trials were taken on; of several drawn ones, what these change.
+        simulated: these trials were. rigs: their number. trials: that trained and chose it.
+        validation: strict accuracy on its own validation windows, those of its own rig.
+        windows: of the tested trials. f1: mean over classes.
+        behind: of the first network; null for that.
+    """
+
+    trained_on: Literal["own", "twin", "drawn", "assumed"]
+    rig: str
+    simulated: Bool
+    rigs: Int
+    trials: Int
+    validation: Number | None
+    windows: HoldoutScores
+    f1: Number | None
+    experiments: Experiments
+    behind: Behind | None
+
+
+class TwinGap(Document):
+    """Networks trained on a twin's simulated trials, tested on those of the rig that it imitates.
+
+    Attributes:
+        simulated: the tested trials are. campaigns: with these. trials: tested.
+        rig: the twin. protocol: of the trials that train.
+        networks: own (only where the store has one), twin, drawn, assumed.
+    """
+
+    simulated: Bool
+    campaigns: tuple[str, ...]
+    trials: Int
+    rig: str
+    protocol: str
+    networks: tuple[GapNetwork, ...]

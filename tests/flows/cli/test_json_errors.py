@@ -62,6 +62,10 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
         ("ROOM/nowhere", "--rig", "mock", "--out", "ROOM/t.yaml"), "ROOM/nowhere", None, None,
     ),
     "calibrate drift": (("ROOM/nowhere", "--rig", "mock"), "ROOM/nowhere", None, None),
+    "calibrate gap": (
+        ("ROOM/nowhere", "--rig", "t.yaml", "--protocol", "pilot", "--out", "ROOM/g"),
+        "ROOM/nowhere", None, None,
+    ),
     "calibrate board": (("--out", "ROOM/x.doc"), None, "--out", "ROOM/x.doc"),
 }  # fmt: skip
 

@@ -1,0 +1,244 @@
+"""Studies on a calibrated twin, beside those on the hidden world that it was fitted to.
+
+    python -m benchmarks.twin_studies FOLDER [--worlds 3] [--first 0] [--seed 1] [--bank 300]
+                                      [--repetitions 1]
+
+A hidden world is a clean one of `benchmarks.twin` with the same seed, and so are the worlds that a
+fit simulates. Its pilot of 36 slides calibrates a twin, beginning
+with the rig that all hidden worlds were drawn around. Then the same study is done on the hidden
+world, on its twin, and, once, on the rig as it was: the kinematic grid with `--repetitions` of each
+condition (3 in full), 4 of each gravity trial and 2 of each disturbance trial for one of these.
+Trials of one id have the same chance on each of them. The network of each is tested on the hidden
+world's test trials.
+
+FOLDER keeps all stores: a run that was stopped goes on, and more worlds may be added.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+from benchmarks.twin import BANK, CLEAN, pilot_slides, prior_of
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.evaluation.trials import Judged, judge, summaries
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.models import choose_model, rules_of, wanted_models
+from sliplab.analysis.networks.training import Fitted
+from sliplab.flows.other_rig import retake
+from sliplab.flows.planning.run_request import make_request
+from sliplab.flows.running import orchestration
+from sliplab.flows.train import train
+from sliplab.flows.twin.calibrate import calibrate_scene, request
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_inheritance import rig_yaml
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.trials.store import Store
+
+ROOT = Path(__file__).parents[1]
+ASSUMED = {
+    "extends": "mock_force",
+    "name": "assumed",
+    "poll": "1 s",
+    "mock": {"frame_camera": {"level": "tracks"}, "scene": {"level": "L3"}},
+}
+"""The rig that hidden worlds are drawn around, with all physics."""
+REPETITIONS = {"kinematic": 1, "gravity": 4, "disturbance": 2}
+"""Of each condition, for one of the kinematic ones."""
+FIGURES = {
+    "accuracy": "accuracy (%)",
+    "kinematic": "slides, incipient (ms)",
+    "gross": "slides, gross (ms)",
+    "gravity": "gravity, incipient (ms)",
+    "gravity_lead": "gravity, lead (ms)",
+    "disturbance": "disturbance, incipient (ms)",
+    "disturbance_lead": "disturbance, lead (ms)",
+}
+"""Figures of a study: strict accuracy, and medians."""
+POINTS, SHARE = 1.0, 0.1
+"""Largest difference of accuracy and, relative, of each median."""
+
+
+def protocols(folder: Path, repetitions: int) -> list[Path]:
+    """Write the study's protocols; the paper's network is left out."""
+    found = []
+    for name, count in REPETITIONS.items():
+        source = ROOT / f"protocols/{name}.yaml"
+        data = parse_yaml(source.read_text(), source)
+        data["collection"]["repetitions"] = count * repetitions
+        data["analysis"].pop("also", None)
+        found.append(folder / f"{name}.yaml")
+        found[-1].write_text(rig_yaml(data))
+    return found
+
+
+def hidden_rig(folder: Path, assumed: Path, seed: int, number: int) -> Path:
+    """Write the rig file of a hidden world."""
+    prior = replace(prior_of(CLEAN, seed), rig=load_rig_file(assumed)[0])
+    scene = prior.world(number, pilot_slides()).rig.scene
+    data = {
+        "extends": str(assumed), "name": "hidden", "mock": scene.model_dump(mode="json"),
+    }  # fmt: skip
+    path = folder / "hidden.yaml"
+    path.write_text(rig_yaml(data))
+    return path
+
+
+def calibrated(asked: argparse.Namespace, folder: Path, hidden: Path) -> Path:
+    """Take the pilot of a hidden world and write its twin; all fits share simulated worlds."""
+    assumed, worlds = asked.folder / "assumed.yaml", asked.folder / "scene-worlds"
+    twin = folder / "twin.yaml"
+    if twin.with_suffix(".html").exists():
+        return twin
+    pilot = make_request(ROOT / "protocols/pilot.yaml", hidden, folder / "pilot")
+    store, (item,) = retake([pilot])
+    kept = store.folder / "derived/scene-worlds"
+    copytree(worlds, kept, dirs_exist_ok=True)
+    try:
+        fitting = prior_of(BANK, asked.seed)
+        calibrate_scene(
+            store, item, request(assumed, twin, asked.bank, fitting.spread, fitting.seed)
+        )
+    finally:
+        copytree(kept, worlds, dirs_exist_ok=True)
+    return twin
+
+
+@dataclass(frozen=True)
+class Study:
+    """Labelled trials of a study, and the network that it trained."""
+
+    store: Store
+    campaigns: list[Collected]
+    fitted: Fitted
+
+    def judged(self, fitted: Fitted) -> Judged:
+        """Test a network on the study's test trials, by its protocols' rules."""
+        rules = rules_of(self.campaigns, fitted.network.outputs_per_class)
+        return judge(fitted, rules, self.store, self.campaigns)
+
+
+def studied(rig: Path, files: Sequence[Path], folder: Path) -> Study:
+    """Take, label and train what is missing of a study."""
+    store, campaigns = retake([make_request(file, rig, folder) for file in files])
+    train(store, campaigns)
+    model = choose_model(wanted_models(store, campaigns))
+    return Study(store, campaigns, model_file.load(model.path))
+
+
+def figures_of(judged: Judged) -> dict[str, float | None]:
+    """Return the figures of a study, see `FIGURES`."""
+    strict, of = judged.window_scores(0.0).strict, summaries(judged.rows)
+    return {
+        "accuracy": None if strict.share is None else 100.0 * strict.share,
+        "gross": of["kinematic"].latency_ms.gross.median,
+        **{name: scores.latency_ms.incipient.median for name, scores in of.items()},
+        **{f"{name}_lead": of[name].lead_ms.median for name in ("gravity", "disturbance")},
+    }
+
+
+def transferred(judged: Judged) -> dict[str, float | None]:
+    """Return the accuracy of a network on a hidden world's test trials, in percent."""
+    strict = judged.window_scores(0.0).strict
+    ends = {"share": strict.share, "low": strict.low, "high": strict.high}
+    return {name: None if value is None else 100.0 * value for name, value in ends.items()}
+
+
+def within(own: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, bool]:
+    """Return which figures of a study are as near to a hidden world's own as they should be."""
+    found = {}
+    for name in FIGURES:
+        a, b = own[name], other[name]
+        most = POINTS if name == "accuracy" else SHARE * abs(a or 0.0)
+        found[name] = a is not None and b is not None and abs(a - b) <= most
+    return found
+
+
+def world_row(asked: argparse.Namespace, number: int, files: Sequence[Path]) -> dict[str, Any]:
+    """Do everything of one hidden world; return its figures."""
+    folder: Path = asked.folder / f"world{number}"
+    folder.mkdir(exist_ok=True)
+    assumed = asked.folder / "assumed.yaml"
+    hidden = hidden_rig(folder, assumed, asked.seed, number)
+    twin = calibrated(asked, folder, hidden)
+    studies = {
+        "hidden": studied(hidden, files, folder / "hidden"),
+        "twin": studied(twin, files, folder / "twin"),
+        "assumed": studied(assumed, files, asked.folder / "assumed"),
+    }
+    return {
+        "world": number,
+        "studies": {name: figures_of(it.judged(it.fitted)) for name, it in studies.items()},
+        "networks": {
+            name: transferred(studies["hidden"].judged(it.fitted)) for name, it in studies.items()
+        },
+    }
+
+
+def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield tables of all worlds in Markdown, and summaries."""
+    yield f"| world | study on | {' | '.join(FIGURES.values())} | within |"
+    yield "| --- | --- |" + " --- |" * (len(FIGURES) + 1)
+    near: dict[str, list[bool]] = {"twin": [], "assumed": []}
+    for row in rows:
+        own = row["studies"]["hidden"]
+        for name, found in row["studies"].items():
+            cells = [
+                "-" if value is None else f"{value:.1f}" if key == "accuracy" else f"{value:.0f}"
+                for key, value in ((key, found[key]) for key in FIGURES)
+            ]
+            said = ""
+            if name in near:
+                held = within(own, found)
+                near[name].append(all(held.values()))
+                said = f"{sum(held.values())} of {len(held)}"
+            yield f"| {row['world']} | {name} | {' | '.join(cells)} | {said} |"
+    for name, held in near.items():
+        yield f"all figures within {POINTS:g} point and {100 * SHARE:g} %, {name}: " + (
+            f"{sum(held)} of {len(held)} worlds"
+        )
+    yield ""
+    yield "| world | network trained on | accuracy on the hidden world (%) | 95 % |"
+    yield "| --- | --- | --- | --- |"
+    for row in rows:
+        for name, found in row["networks"].items():
+            span = "-" if found["low"] is None else f"{found['low']:.1f} to {found['high']:.1f}"
+            yield f"| {row['world']} | {name} | {found['share']:.1f} | {span} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--worlds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="number of the first world")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--bank", type=int, default=300, help="worlds that fits simulate")
+    parser.add_argument("--repetitions", type=int, default=1, help="3 is the whole study")
+    asked = parser.parse_args()
+    asked.folder = asked.folder.resolve()
+    (asked.folder / "scene-worlds").mkdir(parents=True, exist_ok=True)
+    orchestration.configure_prefect(asked.folder)
+    (asked.folder / "assumed.yaml").write_text(rig_yaml(ASSUMED))
+    files = protocols(asked.folder, asked.repetitions)
+    kept = asked.folder / "rows.json"
+    rows = read_json(kept)["rows"] if kept.exists() else []
+    for number in range(asked.first, asked.first + asked.worlds):
+        if number in [row["world"] for row in rows]:
+            continue
+        try:
+            rows.append(world_row(asked, number, files))
+        except RigError as error:
+            print(f"world {number} cannot be collected: {error}")
+            continue
+        write_json(kept, {"simulated": True, "rows": rows})
+    print("\n".join(lines(rows)))
+
+
+if __name__ == "__main__":
+    main()
