@@ -26,6 +26,7 @@ from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.schema import file_schema
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin import calibrate, worlds
+from sliplab.flows.twin.drawn_rigs import read_samples, samples_file
 from sliplab.flows.twin.pilots import Pilot, read_pilot, simulate_pilot
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
@@ -150,7 +151,11 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     heights = np.array([it.height_mm for it in papillae])
     assert heights[0] == pytest.approx(10.1, abs=0.2)
     assert heights[1:7].mean() == pytest.approx(9.0, abs=0.1)
+    samples = read_samples(samples_file(tmp_path / "twin.yaml"), 100)
+    assert len(samples) == 100
     friction = next(it for it in fit.parameters if it.key == "scene.friction.kinetic")
+    drawn = [one[friction.key] for one in samples]
+    assert np.quantile(drawn, [0.025, 0.975]) == pytest.approx([friction.low, friction.high], 0.01)
     assert rig.scene.scene.friction.kinetic == pytest.approx(friction.value, rel=1e-4)
     said = {it.name: it.finding for it in check(Path("kinematic"), tmp_path / "twin.yaml",
                                                 tmp_path / "other", ())}  # fmt: skip
