@@ -4,12 +4,11 @@
                                       [--repetitions 1]
 
 A hidden world is a clean one of `benchmarks.twin` with the same seed, and so are the worlds that a
-fit simulates. Its pilot of 36 slides calibrates a twin, beginning
-with the rig that all hidden worlds were drawn around. Then the same study is done on the hidden
-world, on its twin, and, once, on the rig as it was: the kinematic grid with `--repetitions` of each
-condition (3 in full), 4 of each gravity trial and 2 of each disturbance trial for one of these.
-Trials of one id have the same chance on each of them. The network of each is tested on the hidden
-world's test trials.
+fit simulates. Its pilot of 36 slides calibrates a twin, beginning with the rig that all hidden
+worlds were drawn around. Then the same study is done on the hidden world, on its twin, and, once,
+on the rig as it was: the kinematic grid with `--repetitions` of each condition (3 in full), and for
+one of these 4 of each gravity and 2 of each disturbance trial. Trials of one id have the same
+chance on each of them. The network of each is tested on the hidden world's test trials.
 
 FOLDER keeps all stores: a run that was stopped goes on, and more worlds may be added.
 """
