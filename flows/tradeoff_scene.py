@@ -103,6 +103,7 @@ def tradeoff_scene(
                 families, wall_s, done, closed, plan.protocol.analysis.windows,
                 {"level": planned.name, "reason": planned.reason},
             ),
+            "needs": {} if rig.twin is None else rig.twin.needs,
             "left_out": page.left_out(falls, sum(form is not None for form in closed), len(jobs)),
         }  # fmt: skip
         if sensitivity:

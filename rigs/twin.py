@@ -54,6 +54,8 @@ class TwinRecord(StrictModel):
     """By key in the section `mock:`."""
     misfits: tuple[str, ...] = ()
     """What the pilot shows and the scene lacks, each after the stream that shows it."""
+    needs: dict[str, str] = Field(default_factory=dict)
+    """Effects of the scene: whether the pilot asks for them."""
 
 
 def warnings(twin: TwinRecord, plan: Plan) -> Iterator[str]:

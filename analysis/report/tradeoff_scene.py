@@ -68,6 +68,7 @@ def render(result: Result) -> str:
         "cost": scene_cost(result),
         "samples": Table(("class", "samples", "without a signal event"), samples),
         "rates": Table(("phase", "signal events/s"), rates),
+        "needs": Table(("effect", "by the twin's pilot"), list(result.get("needs", {}).items())),
         "sensitivity": None,
     }
     if sensitivity is not None:
@@ -141,10 +142,17 @@ def short_table(result: Result) -> tuple[list[str], list[list[str]]]:
 
 
 def choice_pairs(result: Result) -> dict[str, str]:
-    """Return both choices of a level, each with its reason."""
+    """Return both choices of a level, each with its reason, and what a twin's pilot asked for."""
     names = {"by measured windows": "measured", "by closed forms": "closed_form"}
     choice = result["choice"]
-    return {name: f"{choice[key]['level']}: {choice[key]['reason']}" for name, key in names.items()}
+    pairs = {
+        name: f"{choice[key]['level']}: {choice[key]['reason']}" for name, key in names.items()
+    }
+    needs = result.get("needs", {})
+    if needs:
+        asked = [title for title, verdict in needs.items() if verdict == "asked for"]
+        pairs = {"asked for by the twin's pilot": ", ".join(asked) or "no effect", **pairs}
+    return pairs
 
 
 def sensitivity_rows(data: Result) -> list[list[str]]:

@@ -11,7 +11,7 @@ from sliplab.analysis.report.page import Figure, Table, render_page
 from sliplab.analysis.twin.parameters import PARAMETERS
 from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.shown import event_map, rate_per_s, slips_s
-from sliplab.storage.schema.twin import TwinFit
+from sliplab.storage.schema.twin import EffectNeed, TwinFit
 from sliplab.storage.streams import F64
 
 PANELS = 3
@@ -74,6 +74,10 @@ def render(
             ],
         ),
         figures=_figures(pilot, twin, before, rings, fit.simulated) if pilot else [],
+        needs=Table(
+            ("effect", "verdict", "loss", "95 % interval", "chance", "shown by", "time"),
+            [_need(it) for it in fit.needs],
+        ),
         statistics=Table(
             ("statistic", "pilot", "worlds from", "to"),
             [
@@ -86,6 +90,17 @@ def render(
 
 def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+def _need(it: EffectNeed) -> list[str]:
+    if it.loss is None or it.low is None or it.high is None:
+        return [it.title, it.verdict, "–", "–", "–", it.shown_by or "–", "–"]
+    verdict = f"{it.verdict}; left out" if it.left_out else it.verdict
+    return [
+        it.title, verdict, f"{it.loss:.3f}", f"{it.low:.3f} to {it.high:.3f}",
+        "–" if it.limit is None else f"{it.limit:.3f}", it.shown_by,
+        "–" if it.time is None else f"{it.time:.2f}",
+    ]  # fmt: skip
 
 
 def _intervals(fit: TwinFit) -> str:

@@ -422,6 +422,7 @@ def calibrate_scene(
     from sliplab.analysis.campaigns import collected
     from sliplab.flows.twin.calibrate import calibrate_scene as fit_to
     from sliplab.flows.twin.calibrate import request
+    from sliplab.flows.twin.needs import cheapest_path
 
     wanted = request(rig, out, worlds, spread, seed)
     found = collected(store, None if campaign is None else [campaign])
@@ -448,6 +449,16 @@ def calibrate_scene(
         ["parameter", "assumed", "fitted", "95 %", "unit", "identified"],
         rows,
     )
+    if fit.needs:
+        asked = ", ".join(it.title for it in fit.needs if it.verdict == "asked for")
+        console.say(f"the pilot asks for: {asked or 'none of the effects'}")
+        left = ", ".join(it.title for it in fit.needs if it.left_out)
+        console.say(
+            "cheapest scene: the twin itself"
+            if fit.cheapest is None
+            else f"cheapest scene: {cheapest_path(out)}, {fit.cheapest.time:.2f} of the twin's "
+            f"time, without {left}"
+        )
     console.say(f"{fit.worlds} worlds, {console.duration(fit.seconds)}; twin: {out}")
     console.say(f"page: {out.with_suffix('.html')}")
     for check in misfits:

@@ -30,6 +30,7 @@ from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.drawn_rigs import plain, samples_file, write_samples
+from sliplab.flows.twin.needs import cheapest_path, measure_needs, write_cheapest
 from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
 from sliplab.flows.twin.worlds import (
     Prior,
@@ -88,8 +89,9 @@ def request(rig_path: Path, out: Path, worlds: int, spread: float, seed: int) ->
         raise InputError("--out", "", str(out), "must end in .yaml")
     if not out.parent.is_dir():
         raise InputError("--out", "", str(out), "its folder does not exist")
-    if out.exists() and load_rig_file(out)[0].twin is None:
-        raise InputError("--out", "", str(out), "exists and is no twin: use another name")
+    for path in (out, cheapest_path(out)):
+        if path.exists() and load_rig_file(path)[0].twin is None:
+            raise InputError("--out", "", str(path), "exists and is no twin: use another name")
     return Calibration(Prior(rig, spread, seed), rig_path, out, worlds)
 
 
@@ -186,7 +188,10 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     orchestration.configure_prefect(store.folder)
     pilot = read_pilot(store, item)
     scene = fit_scene(store, pilot, wanted.prior, wanted.worlds)
-    predicted = predict(scene)
+    worlds = judging_worlds(scene)
+    predicted = predict(worlds)
+    judged = [pilot.slides[trial.id] for trial in pilot.judged]
+    needs = measure_needs(judged, worlds[: len(worlds) // 2], predicted[0])
     fit = TwinFit(
         simulated=bool(item.info.get("simulated")),
         campaign=item.name,
@@ -210,6 +215,8 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
             scene.bank.s,
         ),
         compared=compared(pilot, *predicted),
+        needs=needs.effects,
+        cheapest=needs.cheapest,
     )
     record = TwinRecord(
         campaign=fit.campaign,
@@ -227,12 +234,13 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
             for it in fit.parameters
         },
         misfits=tuple(f"{it.stream}: {it.title}" for it in fit.checks if it.found),
+        needs={it.title: it.verdict for it in fit.needs},
     )
     write_twin(wanted, scene, record)
     write_samples(samples_file(wanted.out), scene.found)
+    write_cheapest(wanted.out, needs)
     write_json(wanted.out.with_suffix(".json"), fit.to_json())
     rings = ring_of(wanted.rig)
-    judged = [pilot.slides[trial.id] for trial in pilot.judged]
     text = page.render(fit, wanted.out.stem, judged, *predicted, rings, pilot.streams)
     write_text(wanted.out.with_suffix(".html"), text)
     return fit
@@ -259,25 +267,29 @@ def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
     )
 
 
-def predict(scene: SceneFit) -> tuple[list[list[PilotTrial]], list[list[PilotTrial]]]:
-    """Take the test trials in worlds of the twin and in worlds of the rig file as it was.
+def judging_worlds(scene: SceneFit) -> list[World]:
+    """Return worlds of the twin, and as many of the rig file as it was, with the test trials.
 
     Worlds of the twin differ in what the pilot leaves open of the identified parameters.
     """
     pilot, rig = scene.pilot, scene.prior.rig
     if not pilot.judged:
-        return [], []
+        return []
     rng = np.random.default_rng([scene.prior.seed, 3])
     slides = Slides(pilot.plan, pilot.judged, frozenset(trial.id for trial in pilot.judged))
     values = scene.drawn(rng, PREDICTED)
     chance = [int(n) for n in rng.integers(2**31, size=PREDICTED)]
     rigs = [other_rig(rig, one, scene.skin) for one in values]
     rigs += [other_rig(rig, {}, {})] * PREDICTED
-    worlds = [
+    return [
         World(one, slides, seed, guess_of(rig)) for one, seed in zip(rigs, chance * 2, strict=True)
     ]
-    taken = everywhere("test trials (worlds)", World.take, worlds)
-    return taken[:PREDICTED], taken[PREDICTED:]
+
+
+def predict(worlds: Sequence[World]) -> tuple[list[list[PilotTrial]], list[list[PilotTrial]]]:
+    """Take the test trials in worlds of the twin and in as many of the rig file as it was."""
+    taken, half = everywhere("test trials (worlds)", World.take, worlds), len(worlds) // 2
+    return taken[:half], taken[half:]
 
 
 def parameter_fit(it: Parameter, assumed: float, estimate: Estimate) -> ParameterFit:

@@ -71,12 +71,55 @@ class QuantityCompared(Part):
     scatter: Number
 
 
+Verdict = Literal["asked for", "not asked for", "not shown", "not in the scene"]
+
+
+class EffectNeed(Part):
+    """An effect of the scene, and how much worse test trials are predicted without it.
+
+    Attributes:
+        loss: mean of the score without the effect less that with it, in units of the twin's own
+            scatter; low, high: its 95 % interval over trials. None where it was not measured.
+        limit: largest loss by chance where the effect is not there.
+        shown_by: numbers in which it shows most, or other trials that would show it.
+        time: of a slide without the effect over that with it.
+        left_out: of the cheapest scene.
+    """
+
+    title: str
+    verdict: Verdict
+    shown_by: str = ""
+    loss: Number | None = None
+    low: Number | None = None
+    high: Number | None = None
+    limit: Number | None = None
+    time: Number | None = None
+    left_out: Bool = False
+
+
+class CheapestScene(Part):
+    """The cheapest scene that predicts the test trials as well as the twin.
+
+    Attributes:
+        loss: of all that it leaves out together; low, high: its 95 % interval over trials.
+        seconds: processor time of a slide. time: over that of the twin.
+    """
+
+    loss: Number
+    low: Number
+    high: Number
+    seconds: Number
+    time: Number
+
+
 class TwinFit(Document):
     """A fit of a simulated rig to a pilot.
 
     Attributes:
         simulated: the pilot itself was. checksum: of the fitted trials.
         trials: fitted; judged: test trials. worlds: simulated for the fit; predicted: of the twin.
+        needs: none where there are too few test trials. cheapest: None where nothing that saves
+            time can be left out.
     """
 
     simulated: Bool
@@ -92,6 +135,8 @@ class TwinFit(Document):
     statistics: dict[str, StatisticSeen]
     checks: tuple[MisfitCheck, ...] = ()
     compared: tuple[QuantityCompared, ...] = ()
+    needs: tuple[EffectNeed, ...] = ()
+    cheapest: CheapestScene | None = None
 
 
 class Behind(Part):

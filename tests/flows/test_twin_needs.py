@@ -1,0 +1,170 @@
+"""What a twin's pilot asks for: pilots that were simulated with an effect, and without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.analysis.report.tradeoff_scene import choice_pairs
+from sliplab.analysis.twin.effects import EFFECTS
+from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.flows.scene_runs import changed
+from sliplab.flows.twin import needs
+from sliplab.flows.twin.worlds import Slides, World, guess_of, other_rig
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.schema.twin import CheapestScene, EffectNeed, Verdict
+from tests.flows.conftest import tiny, write
+
+WORLDS, TRIALS = 4, 4
+OFF = {"arm": {"vibration_um": 0.0}, "event_camera": {"hot_pixels": 0}}
+
+
+@pytest.fixture(scope="module")
+def worlds(rig_path: Path, tmp_path_factory: pytest.TempPathFactory) -> list[World]:
+    """A twin whose arm trembles strongly and whose camera has many hot pixels."""
+    plan = load_plan(write(tmp_path_factory.mktemp("needs") / "tiny.yaml", tiny()))
+    own, _ = load_rig_file(rig_path)
+    rig = changed(
+        other_rig(own, {}, {}), {"arm": {"vibration_um": 60.0}, "event_camera": {"hot_pixels": 60}}
+    )
+    trials = tuple(plan.trials[:TRIALS])
+    slides = Slides(plan, trials, frozenset(trial.id for trial in trials))
+    return [World(rig, slides, seed, guess_of(own)) for seed in range(WORLDS)]
+
+
+@pytest.fixture(scope="module")
+def taken(worlds: list[World]) -> list[list[PilotTrial]]:
+    return [world.take() for world in worlds]
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two effects, worlds in this process, and scenes that take what is told of them."""
+
+    def seconds(rig: Any, *_: Any) -> float:
+        trembles = rig.scene.arm.vibration_um > 0.0
+        return 0.1 + 0.1 * trembles + 0.004 * (rig.scene.event_camera.hot_pixels > 0)
+
+    two = tuple(it for it in EFFECTS if it.key in {"vibration", "hot"})
+    monkeypatch.setattr("sliplab.analysis.twin.effects.EFFECTS", two)
+    monkeypatch.setattr("sliplab.analysis.twin.effects.LONG_STEP_MS", 0)
+    monkeypatch.setattr(needs, "everywhere", lambda _, work, jobs: [work(job) for job in jobs])
+    monkeypatch.setattr(needs, "timed", seconds)
+
+
+def verdicts(found: needs.Needs) -> dict[str, Verdict]:
+    return {it.title: it.verdict for it in found.effects}
+
+
+def written(twin: Path, found: needs.Needs) -> Path:
+    twin.write_text("extends: rehearsal\nname: twin\nmock: {scene: {level: L3}}\n")
+    needs.write_cheapest(twin, found)
+    return needs.cheapest_path(twin)
+
+
+def test_effects_of_the_pilot_are_asked_for(
+    worlds: list[World], taken: list[list[PilotTrial]], quick: None, tmp_path: Path
+) -> None:
+    pilot = replace(worlds[0], seed=99).take()
+    found = needs.measure_needs(pilot, worlds, taken)
+    said = verdicts(found)
+    assert said["vibration of the arm"] == said["hot pixels"] == "asked for"
+    assert said["dynamics of the falling plate"] == "not shown"
+    by = {it.title: it.shown_by for it in found.effects}
+    assert by["vibration of the arm"] == "motion"
+    assert by["hot pixels"] == "events at rest"
+    assert by["dynamics of the falling plate"] == "gravity trials"
+    # nothing can be left out: an older file would say otherwise
+    assert found.cheapest is None
+    needs.cheapest_path(tmp_path / "twin.yaml").write_text("extends: twin.yaml\n")
+    assert not written(tmp_path / "twin.yaml", found).exists()
+
+
+def test_effects_that_the_pilot_lacks_are_not_and_the_cheapest_scene_has_none_that_costs(
+    worlds: list[World], taken: list[list[PilotTrial]], quick: None, tmp_path: Path
+) -> None:
+    pilot = replace(worlds[0], rig=changed(worlds[0].rig, OFF), seed=99).take()
+    found = needs.measure_needs(pilot, worlds, taken)
+    said = verdicts(found)
+    assert said["vibration of the arm"] == said["hot pixels"] == "not asked for"
+    # hot pixels take 2 % of the time: that saves nothing that can be told
+    left = [it.title for it in found.effects if it.left_out]
+    assert left == ["vibration of the arm"]
+    assert found.cheapest is not None
+    assert found.cheapest.time == pytest.approx(104 / 204)
+    assert found.cheapest.loss < 0.0
+    path = written(tmp_path / "twin.yaml", found)
+    text = path.read_text()
+    assert "twin.yaml without\n#   vibration of the arm\n# A slide takes 0.51 of" in text
+    rig, _ = load_rig_file(path)
+    assert rig.name == "twin-cheapest"
+    assert rig.scene.arm.vibration_um == 0.0
+    assert rig.scene.event_camera.hot_pixels == 8
+    assert rig.scene.scene.level == "L3"
+
+
+def test_what_is_asked_for_together_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three effects two stand for each other: one of them, the one with more loss, is kept."""
+    one, two, three = EFFECTS[:3]
+    alone = {effect: _need(loss) for effect, loss in ((one, -0.1), (two, 0.01), (three, 0.0))}
+
+    class Judged:
+        def without(self, effects: Sequence[Any]) -> list[Any]:
+            skin = effects[0].without["scene"].get("skin", {})
+            friction = effects[0].without["scene"].get("friction", {})
+            both = "relaxation_share" in skin and "static_excess" in friction
+            return [_need(0.5 if both else 0.0)]
+
+        def seconds(self, settings: Sequence[Any]) -> list[float]:
+            return [1.0, 0.5]
+
+    left, cheapest = needs._cheapest(Judged(), [one, two, three], alone)  # type: ignore[arg-type]
+    assert left == [one, three]
+    assert cheapest is not None
+    assert cheapest.time == 0.5
+
+
+def _need(loss: float) -> Any:
+    from sliplab.analysis.twin.needs import Need
+
+    return Need(loss, loss - 0.01, loss + 0.01, 0.02, 1.0, "slips")
+
+
+def test_large_deflection_is_only_left_out_with_all_that_its_level_lacks() -> None:
+    chosen = {effect.key: effect for effect in EFFECTS}
+    bending = chosen["bending"]
+    assert needs._whole([bending, chosen["relaxation"]]) == [chosen["relaxation"]]
+    rich = [chosen[key] for key in ("relaxation", "stick_slip", "speed")]
+    assert needs._whole([bending, *rich]) == [bending, *rich]
+
+
+def test_too_few_test_trials_say_nothing(
+    worlds: list[World], taken: list[list[PilotTrial]], tmp_path: Path
+) -> None:
+    found = needs.measure_needs(taken[0][:2], worlds, [world[:2] for world in taken])
+    assert found == needs.Needs()
+    assert not written(tmp_path / "twin.yaml", found).exists()
+
+
+def test_a_trade_off_on_a_twin_says_what_its_pilot_asked_for() -> None:
+    choice = {"level": "L2", "reason": "so"}
+    result = {"choice": {"measured": choice, "closed_form": choice}}
+    assert "asked for by the twin's pilot" not in choice_pairs({**result, "needs": {}})
+    found = {"relaxation": "asked for", "hot pixels": "not shown"}
+    assert choice_pairs({**result, "needs": found})["asked for by the twin's pilot"] == "relaxation"
+    none = {"relaxation": "not asked for"}
+    assert choice_pairs({**result, "needs": none})["asked for by the twin's pilot"] == "no effect"
+
+
+def test_documents_of_needs_are_read_as_they_were_written() -> None:
+    whole = EffectNeed(title="a", verdict="asked for", shown_by="slips", loss=1.0, low=0.5,
+                       high=1.5, limit=0.1, time=0.9)  # fmt: skip
+    for it in (whole, EffectNeed(title="b", verdict="not in the scene")):
+        assert EffectNeed.model_validate(it.model_dump(mode="json")) == it
+    cheap = CheapestScene(loss=0.0, low=-0.1, high=0.1, seconds=0.2, time=0.8)
+    assert CheapestScene.model_validate(cheap.model_dump(mode="json")) == cheap
