@@ -75,7 +75,7 @@ def render(
         ),
         figures=_figures(pilot, twin, before, rings, fit.simulated) if pilot else [],
         needs=Table(
-            ("effect", "verdict", "loss", "95 % interval", "chance", "shown by", "time"),
+            ("effect", "verdict", "loss", "90 % interval", "chance", "shown by", "time"),
             [_need(it) for it in fit.needs],
         ),
         statistics=Table(

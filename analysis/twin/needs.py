@@ -9,13 +9,12 @@ chance, so numbers that the effect does not touch cancel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
-from sliplab.analysis.metrics.intervals import Span, interval
 from sliplab.analysis.twin.event_times import count_intervals
 from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.shown import CELLS, event_map, slips_s
@@ -130,12 +129,17 @@ class Marked:
     groups: tuple[str, ...]
 
 
-def marked(worlds: Sequence[Sequence[PilotTrial]]) -> Marked:
-    """Return the numbers of worlds that took the same trials."""
+def marked(worlds: Sequence[Sequence[PilotTrial]], kept: Collection[str]) -> Marked:
+    """Return the numbers of worlds that took the same trials.
+
+    Args:
+        kept: groups.
+    """
     found = [[marks(trial) for trial in world] for world in worlds]
-    groups = tuple(name for name, of in found[0][0].items() for _ in of)
-    values = np.array([[np.concatenate(list(one.values())) for one in row] for row in found])
-    return Marked(values, groups)
+    names = [name for name in found[0][0] if name in kept]
+    groups = tuple(name for name in names for _ in found[0][0][name])
+    values = [[np.concatenate([one[name] for name in names]) for one in row] for row in found]
+    return Marked(np.array(values), groups)
 
 
 def crps(ensemble: F64, truth: F64) -> F64:
@@ -160,7 +164,8 @@ class Need:
     """What leaving an effect out does to the prediction of test trials.
 
     Attributes:
-        loss: mean of the score without less that with it. low, high: its 95 % interval over trials.
+        loss: mean of the score without less that with it. low, high: its 90 % interval over trials,
+            of which either end holds in 95 of 100 cases.
         limit: largest loss by chance where the effect is not there, at least `NEGLIGIBLE`.
         expected: least loss where it is there as the twin has it.
         shown_by: the group of numbers with the largest loss.
@@ -210,28 +215,28 @@ def need(pilot: Marked, having: Marked, without: Marked) -> Need:
 
     every = list(range(worlds))
     found = loss(pilot.values[0], every)
-    low, high = _interval(found.sum(axis=1))
+    losses = found.sum(axis=1)
     others = [[k for k in every if k != own] for own in every]
     absent, present = (
         np.array([loss(one, kept).sum(axis=1).mean() for one, kept in zip(of, others, strict=True)])
         for of in (without.values, having.values)
     )
     return Need(
-        loss=float(found.sum(axis=1).mean()),
-        low=low,
-        high=high,
-        limit=max(float(absent.mean() + _reach(absent)), NEGLIGIBLE),
-        expected=float(present.mean() - _reach(present)),
+        loss=float(losses.mean()),
+        low=float(losses.mean() - _reach(losses, 0.0)),
+        high=float(losses.mean() + _reach(losses, 0.0)),
+        limit=max(float(absent.mean() + _reach(absent, 1.0)), NEGLIGIBLE),
+        expected=float(present.mean() - _reach(present, 1.0)),
         shown_by=names[int(np.argmax(found.mean(axis=0)))],
     )
 
 
-def _interval(losses: F64) -> Span:
-    found = interval(losses)
-    return (float(losses.mean()),) * 2 if found is None else found
+def _reach(values: F64, more: float) -> float:
+    """Return how far a mean may lie above the mean of these, in 95 of 100 cases (Student's t).
 
-
-def _reach(values: F64) -> float:
-    """Return how far one more value may lie above the mean of these, in 95 of 100 cases."""
+    Args:
+        more: what it varies by besides the error of these values' own mean: 1 for one more value, 0
+            for the mean of infinitely many.
+    """
     n = len(values)
-    return float(student.ppf(0.95, n - 1) * values.std(ddof=1) * np.sqrt(1.0 + 1.0 / n))
+    return float(student.ppf(0.95, n - 1) * values.std(ddof=1) * np.sqrt(more + 1.0 / n))

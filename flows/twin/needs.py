@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from time import process_time
 
@@ -20,6 +21,7 @@ from sliplab.analysis.twin.needs import (
     Marked,
     Need,
     marked,
+    marks,
     need,
 )
 from sliplab.analysis.twin.pilot import PilotTrial
@@ -65,13 +67,16 @@ class _Judged:
     worlds: Sequence[World]
     having: Marked
 
-    def without(self, effects: Sequence[Effect]) -> list[Need]:
-        """Return what leaving out each of some effects does."""
-        found = self._under([effect.without for effect in effects])
-        having = iter(self._under([effect.beside for effect in effects if effect.beside]))
+    def without(self, effects: Sequence[Effect], beside: Json) -> list[Need]:
+        """Return what leaving out each of some effects does under other settings."""
+        bases = [merged(beside, effect.beside) for effect in effects]
+        others = [base for k, base in enumerate(bases) if base and base not in bases[:k]]
+        changes = [merged(beside, effect.without) for effect in effects]
+        taken = self._under([*changes, *others])
+        having = [({}, self.having), *zip(others, taken[len(changes) :], strict=True)]
         return [
-            need(self.pilot, next(having) if effect.beside else self.having, one)
-            for effect, one in zip(effects, found, strict=True)
+            need(self.pilot, next(it for own, it in having if own == base), found)
+            for base, found in zip(bases, taken, strict=False)
         ]
 
     def _under(self, settings: Sequence[Json]) -> list[Marked]:
@@ -79,7 +84,8 @@ class _Judged:
         jobs = [
             replace(world, rig=changed(world.rig, one)) for one in settings for world in self.worlds
         ]
-        found, count = everywhere("effects (worlds)", _numbers, jobs), len(self.worlds)
+        work = partial(_numbers, kept=frozenset(self.pilot.groups))
+        found, count = everywhere("effects (worlds)", work, jobs), len(self.worlds)
         return [
             replace(self.having, values=np.concatenate(found[k : k + count]))
             for k in range(0, len(jobs), count)
@@ -96,8 +102,8 @@ class _Judged:
         return [min(times) for times in zip(*rounds, strict=True)]
 
 
-def _numbers(world: World) -> F64:
-    return marked([world.take()]).values
+def _numbers(world: World, kept: frozenset[str]) -> F64:
+    return marked([world.take()], kept).values
 
 
 def measure_needs(
@@ -110,10 +116,11 @@ def measure_needs(
     """
     if len(pilot) < FEWEST_TRIALS or len(worlds) < FEWEST_WORLDS:
         return Needs()
-    judged = _Judged(marked([pilot]), worlds[:WORLDS], marked(taken[:WORLDS]))
+    both = marks(pilot[0]).keys() & marks(taken[0][0]).keys()
+    judged = _Judged(marked([pilot], both), worlds[:WORLDS], marked(taken[:WORLDS], both))
     scene = worlds[0].rig.scene
     effects = list(effects_of(scene))
-    found = dict(zip(effects, judged.without(effects), strict=True))
+    found, against = _measured(judged, effects)
     whole_s, *each_s = judged.seconds([{}, *(effect.without for effect in effects)])
     times = {effect: one / whole_s for effect, one in zip(effects, each_s, strict=True)}
     spare = [
@@ -121,7 +128,7 @@ def measure_needs(
         for effect, it in found.items()
         if it.verdict != "asked for" and times[effect] <= SAVES
     ]
-    left, cheapest = _cheapest(judged, spare, found)
+    left, cheapest = _cheapest(judged, spare, found, against)
     rows = [
         EffectNeed(
             title=effect.title, verdict=it.verdict, shown_by=it.shown_by, loss=it.loss, low=it.low,
@@ -137,18 +144,42 @@ def measure_needs(
     return Needs(tuple(rows), cheapest, merged(*(effect.without for effect in left)))
 
 
+def _measured(judged: _Judged, effects: Sequence[Effect]) -> tuple[dict[Effect, Need], Json]:
+    """Return what leaving out each effect does, and settings without those that do harm.
+
+    Where the pilot lacks an effect, others look superfluous, too: they are measured again without
+    the one that does most harm.
+    """
+    found = dict(zip(effects, judged.without(effects, {}), strict=True))
+    against: Json = {}
+    doubtful = list(effects)
+    while doubtful := [effect for effect in doubtful if found[effect].verdict == "not asked for"]:
+        worst = min(doubtful, key=lambda effect: found[effect].loss)
+        if found[worst].high >= 0.0:
+            break
+        against = merged(against, worst.without)
+        doubtful.remove(worst)
+        found.update(zip(doubtful, judged.without(doubtful, against), strict=True))
+    return found, against
+
+
 def _cheapest(
-    judged: _Judged, spare: Sequence[Effect], found: Mapping[Effect, Need]
+    judged: _Judged, spare: Sequence[Effect], found: Mapping[Effect, Need], against: Json
 ) -> tuple[list[Effect], CheapestScene | None]:
-    """Return those effects that can be left out together, and the scene without them."""
+    """Return those effects that can be left out together, and the scene without them.
+
+    Args:
+        against: settings without the effects that do harm: what these gain hides no loss of others.
+    """
     left = _whole(spare)
     while left:
         settings = merged(*(effect.without for effect in left))
-        (it,) = judged.without([Effect("", "", settings)])
-        if it.verdict != "asked for":
+        together = Effect("", "", settings)
+        if judged.without([together], against)[0].verdict != "asked for":
             before_s, after_s = judged.seconds([{}, settings])
             if after_s > SAVES * before_s:
                 break
+            (it,) = judged.without([together], {})
             return left, CheapestScene(
                 loss=it.loss, low=it.low, high=it.high, seconds=after_s, time=after_s / before_s
             )

@@ -79,7 +79,7 @@ class EffectNeed(Part):
 
     Attributes:
         loss: mean of the score without the effect less that with it, in units of the twin's own
-            scatter; low, high: its 95 % interval over trials. None where it was not measured.
+            scatter; low, high: its 90 % interval over trials. None where it was not measured.
         limit: largest loss by chance where the effect is not there.
         shown_by: numbers in which it shows most, or other trials that would show it.
         time: of a slide without the effect over that with it.
@@ -101,7 +101,7 @@ class CheapestScene(Part):
     """The cheapest scene that predicts the test trials as well as the twin.
 
     Attributes:
-        loss: of all that it leaves out together; low, high: its 95 % interval over trials.
+        loss: of all that it leaves out together; low, high: its 90 % interval over trials.
         seconds: processor time of a slide. time: over that of the twin.
     """
 
