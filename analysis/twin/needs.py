@@ -168,7 +168,7 @@ class Need:
             of which either end holds in 95 of 100 cases.
         limit: largest loss by chance where the effect is not there, at least `NEGLIGIBLE`.
         expected: least loss where it is there as the twin has it.
-        shown_by: the group of numbers with the largest loss.
+        shown_by: the group of numbers with the largest loss or gain.
     """
 
     loss: float
@@ -227,7 +227,7 @@ def need(pilot: Marked, having: Marked, without: Marked) -> Need:
         high=float(losses.mean() + _reach(losses, 0.0)),
         limit=max(float(absent.mean() + _reach(absent, 1.0)), NEGLIGIBLE),
         expected=float(present.mean() - _reach(present, 1.0)),
-        shown_by=names[int(np.argmax(found.mean(axis=0)))],
+        shown_by=names[int(np.argmax(np.abs(found.mean(axis=0))))],
     )
 
 

@@ -34,7 +34,7 @@ from sliplab.storage.streams import F64, Json
 
 WORLDS = 8
 """Worlds with each effect, and as many without it."""
-ROUNDS = 3
+ROUNDS = 5
 """A scene is timed so often; the fastest counts."""
 SAVES = 0.95
 """A scene is cheaper where it takes at most this share of the time."""
@@ -124,9 +124,7 @@ def measure_needs(
     whole_s, *each_s = judged.seconds([{}, *(effect.without for effect in effects)])
     times = {effect: one / whole_s for effect, one in zip(effects, each_s, strict=True)}
     spare = [
-        effect
-        for effect, it in found.items()
-        if it.verdict != "asked for" and times[effect] <= SAVES
+        effect for effect, it in found.items() if it.loss <= it.limit and times[effect] <= SAVES
     ]
     left, cheapest = _cheapest(judged, spare, found, against)
     rows = [
@@ -175,7 +173,8 @@ def _cheapest(
     while left:
         settings = merged(*(effect.without for effect in left))
         together = Effect("", "", settings)
-        if judged.without([together], against)[0].verdict != "asked for":
+        (it,) = judged.without([together], against)
+        if it.loss <= it.limit:
             before_s, after_s = judged.seconds([{}, settings])
             if after_s > SAVES * before_s:
                 break
