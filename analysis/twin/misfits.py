@@ -19,7 +19,7 @@ from sliplab.analysis.twin import camera_estimates
 from sliplab.analysis.twin.contact_estimates import Contact
 from sliplab.analysis.twin.contact_lags import Growth, settled_lags
 from sliplab.analysis.twin.contact_slips import Slips
-from sliplab.analysis.twin.contact_springs import Fit
+from sliplab.analysis.twin.contact_springs import SCATTER, Fit
 from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.storage.schema.twin import MisfitCheck
 from sliplab.storage.streams import F64, I64
@@ -114,12 +114,17 @@ def gap_slope(place_mm: F64, raised_mm: F64, ring: I64) -> float:
     return float(np.hypot(*best[:2]))
 
 
+LEAST_SCATTER = 0.3
+"""Estimates of a papilla's friction are taken to scatter by at least so much of the prior's."""
+
+
 def odd_friction(fit: Fit, ring: I64) -> float:
     """Largest deviation of one papilla's friction from all others', over the scatter of these.
 
     Each is compared with the mean and scatter of the others (an externally studentised residual;
-    Cook and Weisberg 1982), with the usual standard error of its ring: its own is large where it
-    is odd.
+    Cook and Weisberg 1982). The fit's prior draws an estimate to the mean, the more the less its
+    ring shows: with the prior's variance s^2 and the usual error e of the ring, estimates scatter
+    by sqrt(s^2 - e^2), which deviations are divided by.
     """
     known = ring >= 0
     n = int(known.sum())
@@ -128,10 +133,12 @@ def odd_friction(fit: Fit, ring: I64) -> float:
     friction, inside = np.log(fit.friction[known]), ring[known]
     errors = {r: np.median(fit.friction_error[ring == r]) for r in np.unique(inside).tolist()}
     error = np.array([errors[r] for r in inside.tolist()])
-    mean = (friction.sum() - friction) / (n - 1)
-    square = ((friction**2).sum() - friction**2) / (n - 1) - mean**2
-    variance = np.maximum(square, 0.0) * n / (n - 2)
-    return float(np.max(np.abs(friction - mean) / np.sqrt(variance + error**2)))
+    scatter = np.sqrt(np.maximum(SCATTER**2 - error**2, (LEAST_SCATTER * SCATTER) ** 2))
+    others = ~np.eye(n, dtype=np.bool_) / scatter**2
+    mean = others @ friction / others.sum(axis=1)
+    off = (friction - mean[:, None]) / scatter
+    square = (off**2).sum(axis=1) - np.diag(off) ** 2
+    return float(np.max(np.abs(np.diag(off)) / np.sqrt(square / (n - 2))))
 
 
 LOADED_MM = 0.8
