@@ -568,7 +568,7 @@ def calibrate_gap(
         return
     trials = f"{found.trials}{' simulated' if found.simulated else ''} test trials"
     rows = [cells(it) for it in found.networks]
-    console.print_table(f"gap of the twin {found.rig}, {trials}", COLUMNS, rows)
+    console.print_table(f"gap of the twin {found.rig}, {trials}", COLUMNS, rows, spare=4)
     console.say(f"page: {out / NAME}.html")
 
 
