@@ -20,6 +20,7 @@ from sliplab.flows.cli import (
     store,
     study,
     sweeps,
+    twin,
 )
 from sliplab.flows.running import console
 
@@ -67,3 +68,4 @@ for part in (
     new.app,
 ):
     app.add_typer(part)
+rigs.calibrate_app.add_typer(twin.app)
