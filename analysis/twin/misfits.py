@@ -115,7 +115,8 @@ def gap_slope(place_mm: F64, raised_mm: F64, ring: I64) -> float:
 
 
 LEAST_SCATTER = 0.3
-"""Estimates of a papilla's friction are taken to scatter by at least so much of the prior's."""
+"""Estimates of papillae's friction are taken to scatter by at least so much of what is expected:
+where all are alike, the smallest difference would stand out."""
 
 
 def odd_friction(fit: Fit, ring: I64) -> float:
@@ -138,7 +139,8 @@ def odd_friction(fit: Fit, ring: I64) -> float:
     mean = others @ friction / others.sum(axis=1)
     off = (friction - mean[:, None]) / scatter
     square = (off**2).sum(axis=1) - np.diag(off) ** 2
-    return float(np.max(np.abs(np.diag(off)) / np.sqrt(square / (n - 2))))
+    usual = np.maximum(np.sqrt(square / (n - 2)), LEAST_SCATTER)
+    return float(np.max(np.abs(np.diag(off)) / usual))
 
 
 LOADED_MM = 0.8
