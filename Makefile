@@ -23,7 +23,7 @@ demo: $(DONE)
 	$(BIN)/sliplab demo
 
 test: $(DONE)
-	$(PYTEST) -n 2 --dist worksteal -m 'not realtime and not programs and not long'
+	$(PYTEST) -n 2 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not programs and not long'
 
 # whole programs, servers and clusters; they wait more than they compute
 test-programs: $(DONE)

@@ -30,6 +30,18 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return f"mark.{mark}" not in collection_path.read_text() or None
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep the tests of a file, and all that use the small study, in one worker.
+
+    What they share is made once then. Tests in real time name their groups themselves.
+    """
+    for item in items:
+        if item.get_closest_marker("realtime") is None:
+            shared = "ran" in getattr(item, "fixturenames", ())
+            item.add_marker(pytest.mark.xdist_group("ran" if shared else str(item.path)))
+
+
 @pytest.fixture
 def root() -> Path:
     """The checkout."""
