@@ -80,7 +80,7 @@ def _filled(command: Command, folder: Path, trials: list[str]) -> str:
     moves = words[0] == "teach" or words[:2] in (["calibrate", "lens"], ["calibrate", "crop"])
     if moves and "--dry-run" not in words:
         return ""
-    if words[:2] == ["calibrate", "scene"]:
+    if words[:2] in (["calibrate", "scene"], ["calibrate", "drift"], ["calibrate", "gap"]):
         return ""  # simulates hundreds of pilots
     if not command.fenced and not any(word.isupper() or "/" in word for word in words):
         return ""  # named in prose, without what it works on

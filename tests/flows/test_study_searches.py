@@ -49,6 +49,7 @@ def test_they_stand_before_the_report_with_their_own_time(
     assert sum(more.values()) - sum(plain.values()) > 3600
 
 
+@pytest.mark.long
 def test_each_is_done_once_and_reported(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     return six_trials(tmp_path_factory.mktemp("dask"), rig_path)
 
 
+@pytest.mark.long  # test_dask.py has the same steps in this process
 def test_the_documented_commands_make_the_same_bytes(taken: Path, tmp_path: Path) -> None:
     scheduler, worker, step = documented()
     assert [scheduler[:2], worker[:2], step[:2]] == [

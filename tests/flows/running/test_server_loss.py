@@ -132,7 +132,10 @@ def fill(server: int) -> None:
     resource.prlimit(server, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
 
 
-@pytest.mark.parametrize("lose", [stand_still, die, fill])
+@pytest.mark.parametrize(
+    "lose",
+    [die, *(pytest.param(how, marks=pytest.mark.long) for how in (stand_still, fill))],
+)
 def test_a_campaign_goes_on_without_its_server(lose: Callable[[int], None], tmp_path: Path) -> None:
     with collecting(tmp_path) as running:
         running.begun()
