@@ -29,9 +29,9 @@ test: $(DONE)
 test-programs: $(DONE)
 	$(PYTEST) -n 3 --dist worksteal -m 'programs and not realtime and not long'
 
-# fakes in real time: whole scenes, which compute, one after another; beside them what waits
+# fakes in real time: whole scenes, which compute, one after another; beside them the rest
 test-realtime: $(DONE)
-	$(PYTEST) -n 3 --dist loadgroup -m 'realtime and not long'
+	$(PYTEST) -n 2 --dist loadgroup -m 'realtime and not long'
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)

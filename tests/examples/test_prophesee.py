@@ -314,6 +314,7 @@ def test_a_camera_that_is_absent_is_a_fault(
 
 
 @realtime
+@pytest.mark.long  # test_lab_plugin.py installs a package and runs a campaign every time
 @pytest.mark.xdist_group("scene")
 def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
     before = checkout()
