@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import warnings
 from tokenize import TokenError
 from typing import Any
 from zipfile import ZipFile
@@ -32,7 +33,10 @@ def read_header(file: Any) -> tuple[tuple[int, ...], bool, Any]:
     """
     try:
         version = np.lib.format.read_magic(file)
-        return _HEADERS[version](file)
+        with warnings.catch_warnings():
+            # headers of Python 2 are read as well, only slower
+            warnings.simplefilter("ignore", UserWarning)
+            return _HEADERS[version](file)
     except _FAULTS as error:
         raise FormatError(f"has a damaged numpy header ({' '.join(str(error).split())})") from None
 
