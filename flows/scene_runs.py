@@ -33,7 +33,7 @@ from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
 from sliplab.rigs.mock.settings import Clocks, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
-from sliplab.storage.streams import EventChunk, NullSink
+from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 
 MOTION = frozenset(ACTING)
 PERFECT = Clocks(
@@ -68,17 +68,26 @@ def ideal(rig: RigFile) -> RigFile:
 
 
 @dataclass
-class _Memory(NullSink):
-    """A sink that keeps the events and lets the rest go."""
+class Memory(NullSink):
+    """A sink that keeps what analyses of simulated trials need."""
 
     events: list[EventChunk] = field(default_factory=list)
+    frames: list[FrameChunk] = field(default_factory=list)
+    poses: list[PoseChunk] = field(default_factory=list)
+    forces: list[WrenchChunk] = field(default_factory=list)
 
     def add_events(self, chunk: EventChunk) -> None:
         self.events.append(chunk)
 
-    def joined(self) -> EventChunk:
-        """Return all events in one chunk."""
-        return EventChunk.joined(self.events)
+    def add_frames(self, chunk: FrameChunk) -> None:
+        self.frames.append(chunk)
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        self.poses.append(chunk)
+
+    def add_stream(self, name: str, chunk: Any) -> None:
+        if name == "force" and isinstance(chunk, WrenchChunk):
+            self.forces.append(chunk)
 
 
 def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
@@ -90,7 +99,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
     Raises:
         RigError: the trial cannot be run on this rig.
     """
-    sink = _Memory()
+    sink = Memory()
     built = _ready(rig, plan, trial)
     try:
         done = _run(built, plan, trial, seed, sink)
@@ -98,7 +107,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
         built.close()
     start_ns = next(step.start_ns for step, _ in done.steps if step.phase in MOTION)
     begin_us, end_us = ((t - start_ns) // 1000 for t in done.recorded_ns)
-    events, truth = sink.joined(), done.truth
+    events, truth = EventChunk.joined(sink.events), done.truth
     assert truth is not None, "a simulated rig has a truth"
     t_us = events.t_us - start_ns // 1000
     inside = slice(*np.searchsorted(t_us, (begin_us, end_us)))
@@ -129,7 +138,7 @@ def timed(
     built = _ready(rig, plan, trial)
     try:
         start = clock()
-        _run(built, plan, trial, seed, _Memory())
+        _run(built, plan, trial, seed, Memory())
         return clock() - start
     finally:
         built.close()
@@ -145,7 +154,7 @@ def _ready(rig: RigFile, plan: Plan, trial: Trial) -> Rig:
     return built
 
 
-def _run(built: Rig, plan: Plan, trial: Trial, seed: int, sink: _Memory) -> TrialRun:
+def _run(built: Rig, plan: Plan, trial: Trial, seed: int, sink: Memory) -> TrialRun:
     rate_hz = plan.protocol.collection.recording.sync_rate
     return built.run_trial(plan.program(trial), sink, seed, None, rate_hz)
 

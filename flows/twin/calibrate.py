@@ -29,7 +29,7 @@ from sliplab.analysis.twin.shown import QUANTITIES, compare
 from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin.drawn_rigs import plain, samples_file, write_samples
+from sliplab.flows.twin.drawn_rigs import samples_file, write_samples
 from sliplab.flows.twin.needs import cheapest_path, measure_needs, write_cheapest
 from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
 from sliplab.flows.twin.worlds import (
@@ -356,7 +356,7 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     data = {
         "extends": extends,
         "name": wanted.out.stem.replace("_", "-"),
-        "mock": plain(mock),
+        "mock": mock,
         "twin": record.model_dump(mode="json"),
     }
     text = f"# Written by `sliplab calibrate scene`: {extends}, fitted to '{record.campaign}'.\n"

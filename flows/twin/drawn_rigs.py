@@ -11,7 +11,6 @@ import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -63,13 +62,6 @@ def write_drawn(twin: Path, values: Mapping[str, float], out: Path) -> None:
     data = {
         "extends": os.path.relpath(twin.resolve(), out.parent.resolve()),
         "name": out.stem,
-        "mock": plain(settings_of(rig.scene, values)),
+        "mock": settings_of(rig.scene, values),
     }
     write_text(out, rig_yaml(data))
-
-
-def plain(value: Any) -> Any:
-    """Return nested settings as a rig file has them, with lists in place of tuples."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    return list(value) if isinstance(value, tuple) else value

@@ -61,7 +61,7 @@ class OneSpecimen(Prior):
 
     Attributes:
         with_forces: stiffnesses may change too. Without forces friction and stiffness cannot be
-            told apart: then the stiffnesses are the rig file's, and friction stands for both.
+            distinguished: then the stiffnesses are the rig file's, and friction stands for both.
     """
 
     with_forces: bool

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,17 +20,13 @@ from sliplab.analysis.twin.pilot import (
     slide_of,
 )
 from sliplab.analysis.twin.statistics import Statistics, statistics
-from sliplab.flows.scene_runs import changed, with_true_times
+from sliplab.flows.scene_runs import Memory, changed, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.levels import choose_level
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import (
     EventChunk,
-    FrameChunk,
-    NullSink,
-    PoseChunk,
-    WrenchChunk,
 )
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -149,29 +144,6 @@ def event_trials(fitted: Sequence[Trial]) -> frozenset[str]:
     return frozenset(fitted[k].id for k in chosen)
 
 
-@dataclass
-class _Memory(NullSink):
-    """A sink that keeps what a pilot is made of."""
-
-    events: list[EventChunk] = field(default_factory=list)
-    frames: list[FrameChunk] = field(default_factory=list)
-    poses: list[PoseChunk] = field(default_factory=list)
-    forces: list[WrenchChunk] = field(default_factory=list)
-
-    def add_events(self, chunk: EventChunk) -> None:
-        self.events.append(chunk)
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        self.frames.append(chunk)
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        self.poses.append(chunk)
-
-    def add_stream(self, name: str, chunk: Any) -> None:
-        if name == "force" and isinstance(chunk, WrenchChunk):
-            self.forces.append(chunk)
-
-
 def simulate_pilot(
     rig: RigFile,
     plan: Plan,
@@ -209,7 +181,7 @@ def simulate_pilot(
             slide = slide_of(program)
             if slide is None:
                 continue
-            sink = _Memory()
+            sink = Memory()
             chance = (trial.seed * 1_000_003 + seed) % 2**63
             done = built.run_trial(program, sink, chance, size, rate_hz, with_events)
             steps = {step.phase: step for step, _ in done.steps}

@@ -193,9 +193,9 @@ def simulated(
     """
     rig = prior.rig.model_dump(mode="json", exclude={"name", "twin"})
     wanted = [rig, slides.plan.collection_hash, sorted(trial.id for trial in slides.trials)]
-    key = make_key(
-        "scene worlds", VERSION, wanted, [sorted(slides.with_events), prior.spread, prior.seed]
-    )
+    # what is drawn depends on the kind of prior, too
+    drawn_by = [type(prior).__name__, [it.key for it in prior.parameters], prior.spread, prior.seed]
+    key = make_key("scene worlds", VERSION, wanted, [sorted(slides.with_events), *drawn_by])
     name = f"worlds-{key[:16]}"
     found = _read(kept, name) if kept.fresh(name, key) else {}
     missing = [number for number in range(worlds) if number not in found]

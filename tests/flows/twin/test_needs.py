@@ -43,7 +43,7 @@ def taken(worlds: list[World]) -> list[list[PilotTrial]]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two effects, worlds in this process, and scenes that take what is told of them."""
+    """Two effects, worlds in this process, and scenes that take the stated times."""
 
     def seconds(rig: Any, *_: Any) -> float:
         trembles = rig.scene.arm.vibration_um > 0.0
