@@ -503,6 +503,7 @@ def collect(
     trials: int | None = None,
     campaign: str | None = None,
     enable: Iterable[str] = (),
+    no_stopping: bool = False,
 ) -> Store:
     """Take the trials of a protocol that a store lacks, on a rig.
 
@@ -513,6 +514,7 @@ def collect(
         trials: take this many at most.
         campaign: name of the campaign; the protocol's by default.
         enable: optional levels to switch on, as ``factor=level``.
+        no_stopping: the protocol's claims do not end the campaign.
 
     Raises:
         InputError: protocol or rig is wrong, or the rig cannot take the protocol.
@@ -528,7 +530,7 @@ def collect(
         raise InputError("trials", "", trials, "must be 1 or more")
     run_request = make_request(
         Path(protocol), Path(rig), Path(store), enable=tuple(enable), campaign=campaign,
-        most=trials,
+        most=trials, claims="overrule" if no_stopping else "use",
     )  # fmt: skip
     with stopping.signals(), extras.named("collect"):
         prepare_store(run_request.store)

@@ -14,6 +14,7 @@ from prefect.cache_policies import NO_CACHE
 from sliplab.flows.collecting.progress import shown
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
 from sliplab.flows.collecting.session import TrialCollector, open_session, refresh
+from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import CampaignCounts, RunRequest, check_disk
 from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import Opaque, run
@@ -72,13 +73,16 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
                 taken = 0
                 while taken < len(trials):
                     taken += take_trials(Opaque(collector), Opaque(trials[taken:]))
-                trials = session.supervisor.more() if request.most is None else []
+                trials = session.more() if request.most is None else []
                 progress.add(trials)
+        left_out = session.left_out
+        if session.claims is not None:
+            left_out = len(pending_trials(request.plan, collector.campaign))
         return {
             **request.counts(collector.campaign),
             "taken": collector.taken,
             "retaken": collector.retaken,
-            "left_out": session.left_out,
+            "left_out": left_out,
         }
 
 
@@ -97,9 +101,10 @@ def collect(run_request: RunRequest) -> CollectResult:
     if run_request.due_trials(store.campaign(run_request.campaign)):
         check_disk([run_request])
         return run(collect_flow, Opaque(run_request))
+    campaign = refresh(run_request)
     return {
-        **run_request.counts(refresh(run_request)),
+        **run_request.counts(campaign),
         "taken": 0,
         "retaken": 0,
-        "left_out": 0,
+        "left_out": len(pending_trials(run_request.plan, campaign)),
     }

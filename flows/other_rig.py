@@ -45,6 +45,7 @@ def other_request(
         enable=tuple(item.info.get("enabled", ())),
         campaign=item.name,
         most=most,
+        claims="ignore",
     )
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from sliplab.protocols.claims import Choice, Stopping
 from sliplab.protocols.conditions import (
     Gates,
     Limits,
@@ -92,7 +93,11 @@ class Collection(StrictModel):
     """What is known of a trial and moves nothing: skin, temperature, serial number, operator. It
     is part of every condition, id, table and split."""
     repetitions: Annotated[int, Field(ge=1, le=100_000)]
-    order: Literal["shuffled", "listed"] = "shuffled"
+    order: Literal["shuffled", "listed", "adaptive"] = "shuffled"
+    """Inside a block; ``adaptive``: the next trials are those that tell most about the claims."""
+    stopping: Stopping | None = None
+    choice: Choice | None = None
+    """Of `order: adaptive`; left out, its defaults."""
     references: References | None = None
     plate: PlateSetup | None = None
     motion: tuple[Phase, ...] = Field(json_schema_extra=_or_template)
@@ -172,6 +177,7 @@ class Collection(StrictModel):
                     f"{count:,} trials",
                     f"the factorial has more than {MAX_TRIALS:,} trials",
                 )
+        self._check_stopping()
         self._check_references()
         self._check_motion()
         return self
@@ -182,6 +188,23 @@ class Collection(StrictModel):
             *_references_in(self.motion, "collection.motion"),
             *_references_in(self.plate, "collection.plate"),
         ]
+
+    @property
+    def adaptive(self) -> Choice | None:
+        """How the next trials are chosen; None where the plan says their order."""
+        return (self.choice or Choice()) if self.order == "adaptive" else None
+
+    def _check_stopping(self) -> None:
+        if self.order == "adaptive" and self.stopping is None:
+            raise KeyedError(
+                "collection.stopping",
+                None,
+                "is needed by order: adaptive: its claims say what the trials are chosen for",
+            )
+        if self.choice is not None and self.order != "adaptive":
+            raise KeyedError("collection.choice", None, "is only used by order: adaptive")
+        if self.stopping is not None:
+            self.stopping.check_factors(self.all_factors)
 
     def _check_references(self) -> None:
         if self.references is None:

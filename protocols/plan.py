@@ -268,14 +268,20 @@ class Plan:
                 factor.pop(key)
         for key in ("repetitions", "references"):
             data.pop(key)
+        # which of the trials are taken, and when, makes none of them another one
+        for key in ("stopping", "choice"):
+            data.pop(key, None)
+        if data["order"] == "adaptive":
+            data["order"] = "shuffled"
         return hash_data(data)
 
     @property
     def collection_data(self) -> dict[str, Any]:
         """The `collection:` section as JSON data, defaults written out."""
         data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
-        if not data["context"]:  # as in protocols from before it came
-            data.pop("context")
+        for key in ("context", "stopping", "choice"):
+            if not data[key]:  # as in protocols from before it came
+                data.pop(key)
         for name in ("twist", "twist_speed"):
             if data["limits"][name] is None:
                 data["limits"].pop(name)
@@ -412,6 +418,7 @@ def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iter
         seed = hash_integer(collection.seed, trial_id)
         return Trial(index, trial_id, role, block, repetition, ordered, split, seed)
 
+    stretches = []
     for outer_levels in product(*(levels[name] for name in outer)):
         fixed = dict(zip(outer, outer_levels, strict=True))
         cells = []
@@ -422,9 +429,15 @@ def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iter
             parts = assign(condition, ids, protocol.analysis.split)
             splits.update(zip(ids, parts, strict=True))
             cells.append((cell, condition))
-        for repetition in repetitions:
+        stretches.append(cells)
+    size = collection.repetitions
+    if collection.stopping is not None and collection.adaptive is None:
+        size = collection.stopping.repetitions
+    rounds = [repetitions[first : first + size] for first in range(0, len(repetitions), size)]
+    for within, cells in product(rounds, stretches):
+        for repetition in within:
             ordered = cells
-            if collection.order == "shuffled":
+            if collection.order != "listed":
                 ordered = sorted(
                     cells, key=lambda item: hash_integer(collection.seed, repetition, item[0])
                 )

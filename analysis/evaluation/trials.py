@@ -186,7 +186,7 @@ def judge(
     for item in campaigns:
         settings = detection[item.name]
         for trial, recording in item.of_split("test"):
-            counts, end_ns = _counts(recording, fitted, settings)
+            counts, end_ns = window_counts(recording, fitted, settings)
             of_trial = labels.read(item, recording)
             row = score_row(item, trial, of_trial, counts, end_ns, settings)
             rows.append((row, recording))
@@ -194,7 +194,7 @@ def judge(
     return Judged(training.predict_counts(fitted, samples.windows), samples, rows)
 
 
-def _counts(
+def window_counts(
     recording: Recording, fitted: Fitted, settings: Detection
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return spikes of consecutive windows (n, 3), and where they end (n,), ns."""

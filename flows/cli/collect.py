@@ -96,6 +96,10 @@ def collect(
         float | None, typer.Option("--humidity", min=0, max=100, help="Relative humidity, percent.")
     ] = None,
     note: Annotated[str, typer.Option("--note", help="A note to store with the session.")] = "",
+    no_stopping: Annotated[
+        bool,
+        typer.Option("--no-stopping", help="Go on where the protocol's claims would end it."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Collect the missing trials. Ctrl-C stops the arm; run the same command to resume."""
@@ -111,6 +115,7 @@ def collect(
         campaign=campaign,
         metadata=SessionMetadata(operator, temperature, humidity, note),
         most=trials,
+        claims="overrule" if no_stopping else "use",
     )
     for warning in run_request.plan.warnings():
         console.say(f"note: {warning}")
@@ -122,7 +127,11 @@ def collect(
 
     result = run(run_request)
     if not result["taken"]:
-        console.say("nothing to do: all available trials are collected")
+        console.say(
+            "nothing to do: all available trials are collected"
+            if not result["left_out"]
+            else "nothing to do: the campaign ended by its claims; --no-stopping goes on"
+        )
     if not as_json:
         from sliplab.flows.planning.campaign_trials import print_excluded
 

@@ -20,6 +20,7 @@ from functools import cache
 from importlib.metadata import version
 
 from sliplab.analysis.quality import Assessment, Motion, assess
+from sliplab.flows.collecting.claims import ClaimWatch
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -57,7 +58,8 @@ class CollectionSession:
     """An open session at the rig: the objects that run it and the trials to take.
 
     Attributes:
-        trials: pending trials that the run request asks for.
+        claims: of the protocol, if they are looked at.
+        trials: pending trials that the run request asks for; with claims, the first of them.
         left_out: number of pending trials that it does not ask for.
     """
 
@@ -65,6 +67,11 @@ class CollectionSession:
     supervisor: CollectionSupervisor
     trials: list[Trial]
     left_out: int = 0
+    claims: ClaimWatch | None = None
+
+    def more(self) -> list[Trial]:
+        """Return what is to be taken after all that was: asked for again, or the next round."""
+        return self.supervisor.more() or ([] if self.claims is None else self.claims.next_trials())
 
 
 @contextmanager
@@ -84,8 +91,6 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         with held(run_request.rig, store.folder):
             rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
-            trials = run_request.due_trials(campaign)
-            left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
             campaign.add_bench_record(_session_record(run_request))
             collector = TrialCollector(
                 run_request.plan, run_request.rig, rig, campaign, run_request.metadata.operator
@@ -93,9 +98,26 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
             collector.supervisor = supervisor
             supervisor.fresh_start = collector.fresh_start
             try:
-                yield CollectionSession(collector, supervisor, trials, left_out)
+                with _claim_watch(run_request, store, campaign) as claims:
+                    trials = run_request.due_trials(campaign)
+                    left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
+                    if claims is not None:
+                        trials = claims.next_trials()[: run_request.most]
+                        collector.on_commit = claims.committed
+                    yield CollectionSession(collector, supervisor, trials, left_out, claims)
             finally:
                 rig.close()
+
+
+@contextmanager
+def _claim_watch(
+    run_request: RunRequest, store: Store, campaign: Campaign
+) -> Iterator[ClaimWatch | None]:
+    if not run_request.has_claims:
+        yield None
+        return
+    with ClaimWatch(run_request, store, campaign).opened() as claims:
+        yield claims
 
 
 def refresh(run_request: RunRequest) -> Campaign:
@@ -151,6 +173,7 @@ class TrialCollector:
 
     Attributes:
         on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
+        on_commit: called after each trial that was committed.
         supervisor: asked before each attempt and notified after each trial, if there is one.
         taken, retaken: attempts so far, and those of them that repeat one.
     """
@@ -161,6 +184,7 @@ class TrialCollector:
     campaign: Campaign
     operator: str = ""
     on_trial: Callable[[Trial, str], None] = field(default=lambda trial, outcome: None)
+    on_commit: Callable[[Trial], None] = field(default=lambda trial: None)
     supervisor: CollectionSupervisor | None = None
     taken: int = 0
     retaken: int = 0
@@ -196,6 +220,8 @@ class TrialCollector:
         return False
 
     def _finish(self, trial: Trial, outcome: str) -> None:
+        if outcome == "committed":
+            self.on_commit(trial)
         self.on_trial(trial, outcome)
         if self.supervisor is not None:
             self.supervisor.after(trial, outcome)

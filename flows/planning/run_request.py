@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 from sliplab.flows.planning.campaign_trials import (
     ExcludedTrial,
@@ -18,13 +18,17 @@ from sliplab.flows.planning.campaign_trials import (
 )
 from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.claims import section_hash
 from sliplab.protocols.shown import shown
 from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
+from sliplab.storage.schema.claims import RECORD, StoppingRecord
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
+Claims = Literal["use", "overrule", "ignore"]
+"""`overrule`: they are looked at and do not end the campaign."""
 MOST_CHANGES = 12
 _MISSING = object()
 
@@ -67,6 +71,8 @@ class RunRequest:
         most: how many trials to take at most; None for all.
         until: when the rig has to be free again, seconds since 1970; None for no such time.
         only: ids of the trials that may be taken; None for all.
+        claims: what the protocol's claims do.
+        judging_model: file of the network that claims are judged by; None where none needs one.
     """
 
     plan: Plan
@@ -79,11 +85,30 @@ class RunRequest:
     most: int | None = None
     until: float | None = None
     only: frozenset[str] | None = None
+    claims: Claims = "use"
+    judging_model: Path | None = None
 
     def due_trials(self, campaign: Campaign) -> list[Trial]:
         """Return the trials to take now, in the plan's order."""
         pending = pending_trials(self.plan, campaign)
+        if self.has_claims and self._ended(campaign):
+            return []
         return [t for t in pending if self.only is None or t.id in self.only][: self.most]
+
+    @property
+    def has_claims(self) -> bool:
+        """Whether claims are looked at."""
+        return self.plan.protocol.collection.stopping is not None and self.claims != "ignore"
+
+    def _ended(self, campaign: Campaign) -> bool:
+        """Return whether the campaign ended by its claims, and is to stay so."""
+        claims = self.plan.protocol.collection.stopping
+        try:
+            record = StoppingRecord.load(campaign.folder / RECORD)
+        except FileNotFoundError:
+            return False
+        same = claims is not None and record.section == section_hash(claims)
+        return same and self.claims == "use" and record.verdict in ("settled", "most")
 
     def counts(self, campaign: Campaign) -> CampaignCounts:
         """Count what the campaign holds now; planned = committed + missing."""
@@ -112,6 +137,7 @@ def make_request(
     metadata: SessionMetadata = SessionMetadata(),
     most: int | None = None,
     until: float | None = None,
+    claims: Claims = "use",
 ) -> RunRequest:
     """Read protocol and rig file, and check everything that can be known before anything moves.
 
@@ -133,10 +159,35 @@ def make_request(
     # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
-    run_request = RunRequest(plan, rig_file, rig_text, store, name, enable, metadata, most, until)
+    run_request = RunRequest(
+        plan, rig_file, rig_text, store, name, enable, metadata, most, until,
+        claims=claims, judging_model=None if claims == "ignore" else _judging_model(plan),
+    )  # fmt: skip
     if begun:
         _check_same(run_request, begun)
     return run_request
+
+
+def _judging_model(plan: Plan) -> Path | None:
+    """Return the file of the network that the claims of a plan are judged by.
+
+    Raises:
+        InputError: one is needed, and there is none.
+    """
+    claims = plan.protocol.collection.stopping
+    if claims is None or not claims.needs_network:
+        return None
+    key = "collection.stopping.model"
+    if claims.model is not None:
+        path = Path(plan.file).parent / claims.model
+        if not path.is_file():
+            raise InputError(plan.file, key, claims.model, f"{path} is no file")
+        return path.resolve()
+    raise InputError(
+        plan.file, key, None,
+        "is needed: a claim is about a network's output; name the file of a trained one, such as "
+        "STORE/models/seed0.pt of a pilot",
+    )  # fmt: skip
 
 
 def _check_same(run_request: RunRequest, campaign: Campaign) -> None:

@@ -163,7 +163,7 @@ class _Step:
 
 
 @dataclass(frozen=True)
-class _Job:
+class TrialJob:
     """A trial as another process, perhaps on another machine, finds it.
 
     Attributes:
@@ -179,6 +179,15 @@ class _Job:
     clocks: SyncResult | None
     make: Make
     settings: Any
+
+
+def trial_job(store: Store, work: TrialWork, make: Make) -> TrialJob:
+    """Return some work as another process can do it, by `make_in_process`."""
+    recording = work.recording
+    return TrialJob(
+        place_of(store), work.campaign, recording.folder.name, recording.checksum,
+        recording.clocks_elsewhere, make, work.settings,
+    )  # fmt: skip
 
 
 def run_trials(
@@ -249,20 +258,15 @@ def each_trial(
         while here < len(work) and not (processes and time.monotonic() - began >= START_S):
             done(here, make(work[here].recording, work[here].settings))
             here += 1
-    place = place_of(store)
-    jobs = [
-        _Job(
-            place, item.campaign, item.recording.folder.name, item.recording.checksum,
-            item.recording.clocks_elsewhere, make, item.settings,
-        )
-        for item in work[here:]
-    ]  # fmt: skip
+    jobs = [trial_job(store, item, make) for item in work[here:]]
     if cluster is not None and jobs:
         cluster.check_store(_find, jobs[0])
-    parallel_map(title, _make, jobs, lambda number, made: done(here + number, made), cluster)
+    parallel_map(
+        title, make_in_process, jobs, lambda number, made: done(here + number, made), cluster
+    )
 
 
-def _find(job: _Job) -> None:
+def _find(job: TrialJob) -> None:
     """Check on a worker that it can read the trial.
 
     Raises:
@@ -271,11 +275,12 @@ def _find(job: _Job) -> None:
     _recording(job)
 
 
-def _make(job: _Job) -> Any:
+def make_in_process(job: TrialJob) -> Any:
+    """Return what a job makes of its trial."""
     return job.make(_recording(job), job.settings)
 
 
-def _recording(job: _Job) -> Recording:
+def _recording(job: TrialJob) -> Recording:
     store = open_for_trial(job.place, job.campaign, job.trial)
     recording = store.campaign(job.campaign).recording(job.trial)
     recording.use_clocks(job.clocks)

@@ -259,6 +259,7 @@ def _collect(wanted: Collect, here: Service, run: Any) -> str:
     run_request = _run_request(
         here, wanted, here.protocol(wanted.protocol), run,
         most=wanted.trials, campaign=wanted.campaign, enable=tuple(wanted.enable),
+        claims="overrule" if wanted.no_stopping else "use",
     )  # fmt: skip
     return _take(wanted, run_request, run)
 

@@ -127,6 +127,9 @@ class Collect(OnRig):
     )
     enable: list[str] = Field(default=[], description="Optional levels to enable: factor=level.")
     campaign: str | None = Field(default=None, description="Its name; the protocol's by default.")
+    no_stopping: bool = Field(
+        default=False, description="Go on where the protocol's claims would end the campaign."
+    )
 
 
 class Chain(Collect):

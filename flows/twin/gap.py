@@ -170,7 +170,9 @@ def requests(wanted: Gap) -> dict[TrainedOn, list[RunRequest]]:
     return {
         name: [
             replace(
-                make_request(protocol, rig, wanted.out / name, campaign=f"{name}-{k + 1}"),
+                make_request(
+                    protocol, rig, wanted.out / name, campaign=f"{name}-{k + 1}", claims="ignore"
+                ),
                 only=frozenset(training[k :: len(files)]),
             )
             for k, rig in enumerate(files)

@@ -1,0 +1,212 @@
+"""Claims that a campaign is to settle, and when it may stop: `collection.stopping`.
+
+A claim is about one figure of a trial, taken over the whole grid with every condition counted
+alike. Which figures there are, their units and statistics are in `FIGURES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, PlainSerializer, WithJsonSchema, field_validator, model_validator
+
+from sliplab.protocols.factors import MAX_TRIALS, ContextLevel, Factor, unknown_factor
+from sliplab.protocols.hashing import hash_data
+from sliplab.protocols.quantity import canonical, parse
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
+
+FigureName = Literal[
+    "accuracy", "latency_incipient", "latency_gross", "lead", "slip_duration", "first_slip"
+]
+Statistic = Literal["mean", "median", "p05", "p10", "p25", "p75", "p90", "p95"]
+QUANTILES: Mapping[str, float] = {
+    "median": 0.5, "p05": 0.05, "p10": 0.1, "p25": 0.25, "p75": 0.75, "p90": 0.9, "p95": 0.95,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure that each trial has.
+
+    Attributes:
+        unit: that claims are stated in; canonical: the unit of their decimals.
+        scale: of the figure in that unit, times this, is the figure as `trial_figures` gives it.
+        network: a network's output is needed.
+    """
+
+    title: str
+    unit: str
+    canonical: str
+    scale: float
+    network: bool
+
+
+FIGURES: Mapping[str, Figure] = {
+    "accuracy": Figure("windows of a trial classified correctly", "%", "percent", 1.0, True),
+    "latency_incipient": Figure("latency of incipient slip", "ms", "s", 1000.0, True),
+    "latency_gross": Figure("latency of gross slip", "ms", "s", 1000.0, True),
+    "lead": Figure("lead of the detection before gross slip", "ms", "s", 1000.0, True),
+    "slip_duration": Figure("true length of incipient slip", "ms", "s", 1000.0, False),
+    "first_slip": Figure("incipient onset after the motion's start", "ms", "s", 1000.0, False),
+}
+
+
+def _quantity(info: Any, raw: object) -> object:
+    name = info.data.get("figure")
+    if raw is None or name not in FIGURES:
+        return raw
+    return parse(raw, FIGURES[name].canonical)
+
+
+Amount = Annotated[
+    Decimal, PlainSerializer(canonical), WithJsonSchema({"type": "string"})
+]  # fmt: skip
+"""A percentage or a time, by the claim's figure."""
+
+
+class Difference(StrictModel):
+    """Two levels of a factor that are compared, all else averaged."""
+
+    factor: str
+    levels: tuple[ContextLevel, ContextLevel]
+
+
+class Claim(StrictModel):
+    """One claim; exactly one of `within`, `at_least` and `at_most` says what holds."""
+
+    figure: FigureName
+    statistic: Statistic | None = None
+    """Left out: the mean of accuracy, the median of times."""
+    between: Difference | None = None
+    """The claim is about the second level's statistic less the first one's; with `at_least`, about
+    its size."""
+    within: Amount | None = None
+    """Half the width of the interval that the statistic shall be known to."""
+    at_least: Amount | None = None
+    at_most: Amount | None = None
+
+    _read = field_validator("within", "at_least", "at_most", mode="before")(
+        lambda raw, info: _quantity(info, raw)
+    )
+
+    @model_validator(mode="after")
+    def _whole(self) -> Claim:
+        said = [
+            name for name in ("within", "at_least", "at_most") if getattr(self, name) is not None
+        ]
+        if len(said) != 1:
+            raise ValueError(
+                "must have exactly one of 'within', 'at_least' and 'at_most'"
+                f"{', not ' + ' and '.join(said) if said else ''}"
+            )
+        if self.figure == "accuracy" and self.statistic not in {None, "mean"}:
+            raise KeyedError(".statistic", self.statistic, "must be 'mean' for the accuracy")
+        if self.figure != "accuracy" and self.statistic == "mean":
+            raise KeyedError(
+                ".statistic", "mean", "must be 'median' or a percentile such as 'p95': times have "
+                "no bound, and a trial without a detection has none",
+            )  # fmt: skip
+        if self.within is not None and self.within <= 0:
+            raise KeyedError(".within", canonical(self.within), "must be more than 0")
+        return self
+
+    @property
+    def of(self) -> Statistic:
+        """The statistic, the default written out."""
+        return self.statistic or ("mean" if self.figure == "accuracy" else "median")
+
+    @property
+    def value(self) -> float:
+        """What is claimed, in the figure's own unit: percent or ms."""
+        said = next(v for v in (self.within, self.at_least, self.at_most) if v is not None)
+        return float(said) * FIGURES[self.figure].scale
+
+    def text(self, factors: Mapping[str, Factor]) -> str:
+        """Return the claim in words, with units.
+
+        Args:
+            factors: of the protocol, with its context.
+        """
+        figure = FIGURES[self.figure]
+        words = f"{self.of} {figure.title}"
+        if self.between is not None:
+            name = self.between.factor
+            first, second = map(factors[name].text, self.between.levels)
+            words = f"{words}, {name} {second} less {first},"
+        kind = "known within +-" if self.within is not None else (
+            "at least " if self.at_least is not None else "at most "
+        )  # fmt: skip
+        return f"{words} {kind}{self.value:g} {figure.unit}"
+
+
+class Choice(StrictModel):
+    """How `order: adaptive` chooses the next trials."""
+
+    batch: Annotated[int, Field(ge=1, le=1000)] = 12
+    """Trials that are chosen at once, while those before them are taken."""
+    random: Annotated[float, Field(ge=0.05, le=1)] = 0.3
+    """Share of chance in each choice, which keeps the estimates free of bias."""
+    start: Annotated[int, Field(ge=2, le=MAX_TRIALS)] = 36
+    """Trials taken first, spread over the grid."""
+
+
+class Stopping(StrictModel):
+    """A campaign ends when every claim holds, or is refuted, at the stated error."""
+
+    claims: Annotated[tuple[Claim, ...], Field(min_length=1, max_length=20)]
+    error: Annotated[float, Field(gt=0, le=0.5)] = 0.05
+    """Chance at most of calling a claim that is false, for each claim, over all looks together."""
+    least: Annotated[int, Field(ge=1, le=MAX_TRIALS)] = 1
+    """Trials before which no decision is taken."""
+    most: Annotated[int, Field(ge=1, le=MAX_TRIALS)] | None = None
+    """Trials after which the campaign ends in any case; left out: the whole plan."""
+    repetitions: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Of each condition between two looks, with `order: shuffled` or `listed`. Every one of these
+    rounds goes through all levels that a person changes."""
+    model: str | None = None
+    """File of the network that judges the trials, from the protocol's folder; it was trained on
+    other ones. Needed where a claim is about a network's output."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Stopping:
+        if self.most is not None and self.most < self.least:
+            raise KeyedError(
+                ".most", self.most, f"must be at least collection.stopping.least = {self.least}"
+            )
+        return self
+
+    @property
+    def needs_network(self) -> bool:
+        """Whether a claim is about the output of a network."""
+        return any(FIGURES[claim.figure].network for claim in self.claims)
+
+    def check_factors(self, factors: Mapping[str, Factor]) -> None:
+        """Check that compared levels are in the plan.
+
+        Raises:
+            KeyedError: a factor or a level is unknown.
+        """
+        for number, claim in enumerate(self.claims):
+            if claim.between is None:
+                continue
+            key = f"collection.stopping.claims[{number}].between"
+            name, levels = claim.between.factor, claim.between.levels
+            if name not in factors:
+                raise KeyedError(f"{key}.factor", name, unknown_factor(name, factors))
+            there = (*factors[name].levels(), *factors[name].optional)
+            for place, level in enumerate(levels):
+                if level not in there:
+                    texts = ", ".join(factors[name].text(item) for item in there)
+                    raise KeyedError(
+                        f"{key}.levels[{place}]", level, f"is not a level of {name}: {texts}"
+                    )
+            if levels[0] == levels[1]:
+                raise KeyedError(f"{key}.levels", levels[0], "must be two different levels")
+
+
+def section_hash(stopping: Stopping) -> str:
+    """Return a hash of all that claims ask for."""
+    return hash_data(stopping.model_dump(mode="json"))

@@ -1,0 +1,102 @@
+"""What a campaign's claims were at each look, and how it was decided to end: `stopping.json`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+
+RECORD, CHOICES = "stopping.json", "choices.json"
+"""Files in a campaign's folder."""
+Verdict = Literal["open", "settled", "most", "all", "overruled"]
+"""`most`: as many trials as the protocol takes at most; `all`: nothing is left to take."""
+
+
+class ClaimState(Part):
+    """One claim at one look, in the unit that its text names."""
+
+    claim: str
+    trials: Int
+    """With a figure."""
+    estimate: Number | None
+    low: Number | None
+    """Ends of the interval, which holds at all looks together; null: no bound."""
+    high: Number | None
+    holds: Bool
+    refuted: Bool
+
+
+class Look(Part):
+    """All claims after a round."""
+
+    round: Int
+    taken: Int
+    """Committed measured trials."""
+    claims: tuple[ClaimState, ...]
+
+
+class StoppingRecord(Document):
+    """Looks at a campaign's claims, in order; the last decides."""
+
+    simulated: Bool
+    section: str
+    """Hash of the protocol's section `collection.stopping`."""
+    model: str | None
+    """Hash of the network's file; null where no claim needs one."""
+    verdict: Verdict
+    looks: tuple[Look, ...] = ()
+
+
+class ChosenTrial(Part):
+    """A trial that was chosen."""
+
+    trial: str
+    chance: Number | None
+    """With which it was drawn from what was left; null: by its place in the grid."""
+
+
+class Batch(Part):
+    """Trials that were chosen at once."""
+
+    known: Int
+    """Trials whose figures were used."""
+    least: Number | None
+    """The smallest chance that any trial left had; null: no chance was used."""
+    trials: tuple[ChosenTrial, ...]
+
+
+class ChoiceRecord(Document):
+    """The order of an adaptive campaign, written before it is taken: `choices.json`."""
+
+    simulated: Bool
+    batches: tuple[Batch, ...] = ()
+
+    @staticmethod
+    def of(campaign: Path) -> ChoiceRecord:
+        """Return the choices in a campaign's folder; none where nothing was chosen.
+
+        Raises:
+            DocumentError, NewerFormat: the file cannot be read.
+        """
+        try:
+            return ChoiceRecord.load(campaign / CHOICES)
+        except FileNotFoundError:
+            return ChoiceRecord(simulated=False)
+
+
+class TrialFigures(Part):
+    """Figures of one trial that claims are about."""
+
+    values: dict[str, Number | None]
+    """By figure, percent or ms; null where the trial's label lacks an onset."""
+    undetected: tuple[str, ...] = ()
+    """Figures of detections that were missed, late or false."""
+
+    def of(self, name: str) -> float:
+        """Return a figure; NaN where it has none, infinite where nothing was detected."""
+        if name in self.undetected:
+            return -math.inf if name == "lead" else math.inf
+        value = self.values.get(name)
+        return math.nan if value is None else float(value)
