@@ -129,9 +129,7 @@ def plain_bets(evidence: Evidence, x: F64, members: Mask) -> Bets:
     return Bets.of(x[used], np.asarray(counts[evidence.looks], np.int64))
 
 
-def weighted_bets(
-    evidence: Evidence, x: F64, members: Mask, expected: Sequence[F64]
-) -> Bets:  # fmt: skip
+def weighted_bets(evidence: Evidence, x: F64, members: Mask, expected: Sequence[F64]) -> Bets:
     """Return bets on the mean of `x` over the whole grid, of trials that were chosen by chance.
 
     What was taken is known, what is left is expected, and the trial drawn next corrects that by its
@@ -155,7 +153,9 @@ def weighted_bets(
         worst = [0.0, 0.0]
         for stretch in np.unique(grid.stretch[batch]):
             ours = members & (grid.stretch == stretch)
-            size = max(int(ours.sum()), 1)
+            size = int(ours.sum())
+            if not size:
+                continue
             drawn = begin + np.flatnonzero(grid.stretch[batch] == stretch)
             left = ours & ~there
             known = found[ours & there].sum() + guess[left].sum()
@@ -163,13 +163,11 @@ def weighted_bets(
             most, least = (guess[left].max(), guess[left].min()) if left.any() else (0.0, 1.0)
             worst[0] = min(worst[0], (known - len(drawn)) / size - most * far)
             worst[1] = max(worst[1], (known + len(drawn)) / size + (1.0 - least) * far)
-            for n in drawn:
-                trial, chance = taken[n], evidence.chances.chosen[n]
-                value = guess[trial] if np.isnan(x[n]) else x[n]
-                away = (value - guess[trial]) if members[trial] else 0.0
-                z[n] = np.nan if np.isnan(chance) else (known + away / chance) / size
-                known += away
-                there[trial], found[trial] = True, value
+            trials, chance = taken[drawn], evidence.chances.chosen[drawn]
+            value = np.where(np.isnan(x[drawn]), guess[trials], x[drawn])
+            away = np.where(members[trials], value - guess[trials], 0.0)
+            z[drawn] = (known + np.cumsum(away) - away + away / chance) / size
+            there[trials], found[trials] = True, value
         low[begin:end], high[begin:end] = worst[0], worst[1]
         begin = int(end)
     used = ~np.isnan(z)

@@ -124,14 +124,19 @@ class ClaimWatch:
     def next_trials(self) -> list[Trial]:
         """Return what is pending of the earliest round that is not complete; none at the end."""
         pending = {trial.id for trial in pending_trials(self._run_request.plan, self._campaign)}
-        last = -1
+        begun, last = 0, -1
         for last, trials in enumerate(self._rounds()):
             if left := [trial for trial in trials if trial.id in pending]:
                 return left
-            if self._look(last - self._late) in ("settled", "most"):
-                self._look(last)
+            begun += sum(trial.role == "measured" for trial in trials)
+            room = (
+                self._stopping.most is None
+                or begun + self._round_size(last + 1) <= self._stopping.most
+            )
+            if self._look(last - self._late, "open" if room else "most") in ("settled", "most"):
+                self._look(last, "most")
                 return []
-        self._look(last, everything=True)
+        self._look(last, "all")
         return []
 
     @property
@@ -232,14 +237,14 @@ class ClaimWatch:
         }
         return Evidence(grid, np.array(taken, np.int64), np.array(looks, np.int64), values, chances)
 
-    def _look(self, number: int, *, everything: bool = False) -> Verdict:
+    def _look(self, number: int, otherwise: Verdict) -> Verdict:
         """Look at the claims after a round, and all before it; keep what was seen.
 
         Args:
-            everything: nothing is left to take.
+            otherwise: the verdict where not all claims are settled.
         """
         if number < 0:
-            return "open"
+            return otherwise
         record = self.record()
         looks = list(record.looks)
         if len(looks) <= number:
@@ -249,23 +254,14 @@ class ClaimWatch:
                 taken = int(evidence.looks[n])
                 looks.append(Look(round=n + 1, taken=taken, claims=found))
                 self._say(looks[-1])
-        verdict = self._verdict(looks[number], number, everything)
+        done = looks[number].taken >= self._stopping.least and settled(looks[number].claims)
+        verdict: Verdict = "settled" if done else otherwise
         if self._run_request.claims == "overrule" and verdict in ("settled", "most"):
             verdict = "overruled"
         if (verdict, len(looks)) != (record.verdict, len(record.looks)):
             made = record.model_copy(update={"verdict": verdict, "looks": tuple(looks)})
             write_json(self._campaign.folder / RECORD, made.to_json())
         return verdict
-
-    def _verdict(self, look: Look, number: int, everything: bool) -> Verdict:
-        if look.taken >= self._stopping.least and settled(look.claims):
-            return "settled"
-        if everything:
-            return "all"
-        most = self._stopping.most
-        if most is not None and look.taken + self._round_size(number + 1) > most:
-            return "most"
-        return "open"
 
     def _round_size(self, number: int) -> int:
         if self._choice is not None:

@@ -1,0 +1,278 @@
+"""Campaigns that end by their claims: how often they are wrong, and how many trials they take.
+
+    python -m benchmarks.fewer [--worlds 200] [--adaptive 200] [--seed 1] [--cores 2]
+
+A world is the simulated rig `rehearsal` with its parameters drawn 30 % around the defaults and
+another skin; the contact alone is simulated, so that all 864 slides of the kinematic grid take a
+fraction of a second. Figures are the physical ones: the first slip of any tip, and the time from
+there to the centre's. Every world has the same claims, stated around its own truth: of the grid
+taken ten times for `order: shuffled`, and of the grid itself for `order: adaptive`, which is what
+either estimates. A false one is false by the least that there is: a bound at the truth itself.
+
+Campaigns look after every block of `order: shuffled` (288 trials), or after every batch of
+`order: adaptive`. All figures are simulated.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from benchmarks.twin import CLEAN, pilot_slides, prior_of
+from sliplab.analysis.claims.choosing import next_batch
+from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
+from sliplab.analysis.claims.states import settled, states
+from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.protocols import Plan
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.plan import make_plan
+from sliplab.protocols.yaml_file import parse_yaml, validate
+from sliplab.rigs.mock.physics import springs_of
+from sliplab.rigs.mock.settings import MockSettings, skin_of
+from sliplab.rigs.scene.slides import run_slide
+from sliplab.storage.schema.claims import Batch, ClaimState
+
+F64 = npt.NDArray[np.float64]
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "protocols/kinematic.yaml"
+ERROR = 0.05
+TIMES = 5
+"""Grids of which the truth is the figure."""
+ORDERS = ("shuffled", "adaptive")
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A claim around the truth.
+
+    Attributes:
+        share: the value as a share of the true one. true: whether the claim is.
+    """
+
+    name: str
+    figure: str
+    statistic: str
+    kind: str
+    share: float
+    true: bool
+    between: tuple[str, float, float] | None = None
+
+
+CLAIMS = (
+    Stated("median duration known to 5 %", "slip_duration", "median", "within", 0.05, True),
+    Stated("median first slip known to 5 %", "first_slip", "median", "within", 0.05, True),
+    Stated("p05 of duration at least 80 % of it", "slip_duration", "p05", "at_least", 0.8, True),
+    Stated("p05 of duration at least itself", "slip_duration", "p05", "at_least", 1.0, False),
+    Stated("median duration at most itself", "slip_duration", "median", "at_most", 1.0, False),
+    Stated("p90 of first slip at most itself", "first_slip", "p90", "at_most", 1.0, False),
+    Stated("duration differs by half, slow and fast", "slip_duration", "median", "at_least", 0.5,
+           True, ("speed", 0.6, 1.6)),
+    Stated("duration differs by all, slow and fast", "slip_duration", "median", "at_least", 1.0,
+           False, ("speed", 0.6, 1.6)),
+)  # fmt: skip
+QUANTILES = {"median": 0.5, "p05": 0.05, "p90": 0.9}
+
+
+def world(number: int, seed: int) -> MockSettings:
+    """Return the settings of a simulated rig."""
+    return prior_of(CLEAN, seed).world(number, pilot_slides()).rig.scene
+
+
+def figures(settings: MockSettings, grid: Grid, times: int) -> dict[str, F64]:
+    """Return what slides show, (times, N) by figure, ms; infinite where the centre never slips."""
+    skin = skin_of(settings)
+    found = {name: np.empty((times, len(grid.trials))) for name in ("first_slip", "slip_duration")}
+    for time in range(times):
+        for k, trial in enumerate(grid.trials):
+            levels = {name: float(level) for name, level in trial.condition}
+            springs = springs_of(settings, skin, hash_integer(trial.seed, time))
+            slips = run_slide(springs, levels["depth"], levels["speed"], levels["direction"])
+            first = 1000.0 * float(np.nanmin(slips.slipped_s))
+            centre = 1000.0 * float(slips.slipped_s[0])
+            found["first_slip"][time, k] = first
+            found["slip_duration"][time, k] = np.inf if np.isnan(centre) else centre - first
+    return found
+
+
+def quantile(values: F64, share: float) -> float:
+    """Return the smallest value that at least a share of values does not exceed."""
+    ordered = np.sort(values, axis=None)
+    return float(ordered[max(int(np.ceil(share * len(ordered) - 1e-9)) - 1, 0)])
+
+
+def truth(stated: Stated, values: F64, grid: Grid) -> float:
+    """Return the true figure of a claim, ms."""
+    share = QUANTILES[stated.statistic]
+    if stated.between is None:
+        return quantile(values, share)
+    name, *levels = stated.between
+    of = np.array([float(dict(trial.condition)[name]) for trial in grid.trials])  # type: ignore[arg-type]
+    first, second = (quantile(values[:, of == level], share) for level in levels)
+    return abs(second - first)
+
+
+def claim_of(stated: Stated, true: float) -> dict[str, Any]:
+    """Return a claim as a protocol has it; a false one by the least that there is."""
+    nudge = {True: 0.0, False: 1e-3 if stated.kind == "at_least" else -1e-3}[stated.true]
+    made: dict[str, Any] = {
+        "figure": stated.figure, "statistic": stated.statistic,
+        stated.kind: f"{stated.share * true + nudge:.6f} ms",
+    }  # fmt: skip
+    if stated.between is not None:
+        name, *levels = stated.between
+        made["between"] = {"factor": name, "levels": levels}
+    return made
+
+
+def plan_of(order: str, claims: Sequence[dict[str, Any]], batch: int) -> Plan:
+    """Return the plan of the kinematic grid with claims."""
+    data = parse_yaml(SOURCE.read_text(), SOURCE)
+    data["collection"] |= {"order": order, "stopping": {"error": ERROR, "claims": list(claims)}}
+    if order == "adaptive":
+        data["collection"]["choice"] = {"batch": batch}
+    return make_plan(validate(Protocol, data, SOURCE), str(SOURCE))
+
+
+def looks_of(plan: Plan, values: dict[str, F64]) -> Iterator[Evidence]:
+    """Yield what a campaign has seen at each look.
+
+    Args:
+        values: (N,) by figure, of the grid's trials in the plan's order.
+    """
+    collection, grid = plan.protocol.collection, Grid.of(plan)
+    stopping, choice = collection.stopping, collection.adaptive
+    assert stopping is not None
+
+    def seen(taken: list[int], looks: list[int], chances: Chances | None) -> Evidence:
+        numbers = np.array(taken, np.int64)
+        shown = {name: value[numbers] for name, value in values.items()}
+        return Evidence(grid, numbers, np.array(looks, np.int64), shown, chances)
+
+    if choice is None:
+        size = len(grid.trials) // collection.repetitions
+        ends = [size * (k + 1) for k in range(collection.repetitions)]
+        for k, end in enumerate(ends):
+            yield seen(list(range(end)), ends[: k + 1], None)
+        return
+    batches: list[Batch] = []
+    taken: list[int] = []
+    chance: list[float] = []
+    least: list[float] = []
+    looks: list[int] = []
+    while True:
+        known = looks[-2] if len(looks) > 1 else 0  # the last batch's figures are not known yet
+        before = seen(
+            taken[:known], looks[:-1] if known else [],
+            Chances(np.array(chance[:known]), np.array(least[:known])),
+        )  # fmt: skip
+        batch = next_batch(before, batches, stopping, choice, collection.seed)
+        if batch is None:
+            return
+        batches.append(batch)
+        for item in batch.trials:
+            taken.append(grid.number[item.trial])
+            chance.append(np.nan if item.chance is None else item.chance)
+            least.append(np.nan if batch.least is None else batch.least)
+        looks.append(len(taken))
+        yield seen(taken, looks, Chances(np.array(chance), np.array(least)))
+
+
+@dataclass(frozen=True)
+class Call:
+    """A claim that was called, after how many trials."""
+
+    trials: int
+    state: ClaimState
+
+    def wrong(self, stated: Stated, true: float) -> bool:
+        """Return whether the call, or the interval of a width, is wrong."""
+        low, high = self.state.low, self.state.high
+        if stated.kind != "within":
+            return self.state.holds != stated.true
+        return low is None or high is None or not low <= true <= high
+
+
+def campaign(
+    order: str, claims: list[dict[str, Any]], values: dict[str, F64], batch: int
+) -> list[Call | None]:
+    """Return the call of each claim; None for never."""
+    plan = plan_of(order, claims, batch)
+    stopping = plan.protocol.collection.stopping
+    assert stopping is not None
+    called: list[Call | None] = [None] * len(claims)
+    for evidence in looks_of(plan, values):
+        found = states(evidence, stopping)
+        for k, state in enumerate(found):
+            if called[k] is None and (state.holds or state.refuted):
+                called[k] = Call(len(evidence.taken), state)
+        if settled(found):
+            break
+    return called
+
+
+def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, Any]:
+    """Do both campaigns in one world."""
+    with threadpool_limits(1):
+        grid = Grid.of(plan_of("shuffled", [claim_of(CLAIMS[0], 1000.0)], batch))
+        settings = world(number, seed)
+        grids = figures(settings, grid, TIMES)
+        values = {name: each[0] for name, each in grids.items()}
+        row: dict[str, Any] = {"world": number}
+        for order in ORDERS if number < adaptive else ORDERS[:1]:
+            row[order] = []
+            for stated in CLAIMS:
+                whole = grids[stated.figure] if order == "shuffled" else values[stated.figure]
+                true = truth(stated, np.atleast_2d(whole), grid)
+                (call,) = campaign(order, [claim_of(stated, true)], values, batch)
+                row[order].append(call and (call.trials, call.wrong(stated, true)))
+    return row
+
+
+def lines(rows: Sequence[dict[str, Any]], total: int) -> Iterator[str]:
+    """Yield a table in Markdown."""
+    yield "| claim | true | order | called | wrongly | 95 % | median trials | of the grid |"
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
+    for k, stated in enumerate(CLAIMS):
+        for order in ORDERS:
+            found = [row[order][k] for row in rows if order in row]
+            if not found:
+                continue
+            called = [each for each in found if each is not None]
+            wrong = sum(off for _, off in called)
+            low, high = exact_interval(wrong, len(found))
+            trials = float(np.median([total if each is None else each[0] for each in found]))
+            yield (
+                f"| {stated.name} | {'yes' if stated.true else 'no'} | {order} "
+                f"| {len(called)} of {len(found)} | {100 * wrong / len(found):.1f} % "
+                f"| {100 * low:.1f} to {100 * high:.1f} % | {trials:.0f} "
+                f"| {100 * trials / total:.0f} % |"
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--worlds", type=int, default=200)
+    parser.add_argument("--adaptive", type=int, default=200, help="worlds with this order, too")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--batch", type=int, default=24)
+    parser.add_argument("--cores", type=int, default=2)
+    asked = parser.parse_args()
+    one = partial(world_row, seed=asked.seed, adaptive=asked.adaptive, batch=asked.batch)
+    with ProcessPoolExecutor(asked.cores, get_context("spawn")) as pool:
+        rows = list(pool.map(one, range(asked.worlds)))
+    print("\n".join(lines(rows, 864)))
+
+
+if __name__ == "__main__":
+    main()

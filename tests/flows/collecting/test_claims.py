@@ -1,0 +1,165 @@
+"""Campaigns that end by their claims: cut anywhere they take the same trials in the same order."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.flows.collecting.session import open_session
+from sliplab.flows.planning.run_request import Claims, RunRequest, make_request
+from sliplab.protocols import InputError
+from sliplab.storage.schema.claims import CHOICES, RECORD, ChoiceRecord, StoppingRecord
+from sliplab.storage.trials.store import Campaign, Store
+from tests.conftest import ROOT
+from tests.flows.collecting.test_session import short
+from tests.flows.conftest import write
+
+# the first slip of these slides comes after 0.3 to 1 s
+SURE = {"figure": "first_slip", "at_most": "10 s"}
+NEVER = {"figure": "first_slip", "within": "0.001 ms"}
+RIG = {
+    "extends": str(ROOT / "rigs" / "mock.yaml"), "name": "mock",
+    "mock": {"frame_camera": {"level": "tracks"}},
+}  # fmt: skip
+
+
+@pytest.fixture
+def in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make figures in a thread: a process takes seconds to begin."""
+
+    def thread(workers: int, context: object, initializer: object) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(workers)
+
+    monkeypatch.setattr("sliplab.flows.collecting.claims.ProcessPoolExecutor", thread)
+
+
+def request(
+    folder: Path, claims: list[dict[str, Any]], use: Claims = "use", **collection: Any
+) -> RunRequest:
+    """Three short slides, eight of each, with claims that are looked at after each block."""
+    folder.mkdir(exist_ok=True)
+    data = short()
+    data["collection"] |= {"repetitions": 8, "maintenance": {}, **collection}
+    stopping = {"error": 0.3, "claims": claims, **collection.get("stopping", {})}
+    data["collection"]["stopping"] = stopping
+    rig = write(folder / "rig.yaml", RIG)
+    return make_request(write(folder / "p.yaml", data), rig, folder / "store", claims=use)
+
+
+def collect(run_request: RunRequest, most: int | None = None) -> list[str]:
+    """Take trials until the campaign ends, or is cut after so many; return their ids."""
+    taken: list[str] = []
+    with open_session(run_request) as session:
+        session.collector.rig.connect()
+        trials = session.trials
+        while trials:
+            for trial in trials:
+                if most is not None and len(taken) == most:
+                    return taken
+                session.collector.take([trial])
+                taken.append(trial.id)
+            trials = session.more()
+    return taken
+
+
+def campaign_of(run_request: RunRequest) -> Campaign:
+    """The campaign in its store."""
+    return Store.open(run_request.store).campaign(run_request.campaign)
+
+
+def record_of(run_request: RunRequest) -> StoppingRecord:
+    """Its looks."""
+    return StoppingRecord.load(campaign_of(run_request).folder / RECORD)
+
+
+def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(tmp_path: Path) -> None:
+    run_request = request(tmp_path / "a", [SURE])
+    taken = collect(run_request)
+    record = record_of(run_request)
+    assert record.verdict == "settled"
+    assert record.simulated
+    assert record.looks[-1].taken == len(taken) < 24
+    assert len(taken) % 3 == 0  # blocks stay whole
+    assert taken == [trial.id for trial in run_request.plan][: len(taken)]
+    (state,) = record.looks[-1].claims
+    assert state.holds
+    assert not any(each.holds for look in record.looks[:-1] for each in look.claims)
+    assert run_request.due_trials(campaign_of(run_request)) == []
+    # overruled, it goes on to the end, and says so
+    more = request(tmp_path / "a", [SURE], use="overrule")
+    assert len(collect(more)) == 24 - len(taken)
+    assert record_of(more).verdict == "overruled"
+    assert len(record_of(more).looks) == 8
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_least_and_most_bound_the_trials(tmp_path: Path) -> None:
+    late = request(tmp_path / "a", [SURE], stopping={"least": 18})
+    assert len(collect(late)) == 18
+    early = request(tmp_path / "b", [NEVER], stopping={"most": 8})
+    assert len(collect(early)) == 6  # another block would be more
+    assert record_of(early).verdict == "most"
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_cut_anywhere_an_adaptive_campaign_goes_on_with_the_same_trial(tmp_path: Path) -> None:
+    options = {"order": "adaptive", "choice": {"batch": 4, "start": 3}}
+    whole = request(tmp_path / "a", [SURE, NEVER], stopping={"most": 16}, **options)
+    taken = collect(whole)
+    kept = campaign_of(whole).folder
+    assert 10 < len(taken) <= 16
+    assert len(set(taken)) == len(taken)
+    pieces: list[str] = []
+    for most in (1, 3, 5, None):  # in the first batch, at its end, in a later one
+        part = request(tmp_path / "b", [SURE, NEVER], stopping={"most": 16}, **options)
+        pieces += collect(part, most)
+    assert pieces == taken
+    again = campaign_of(part).folder
+    for name in (CHOICES, RECORD):
+        assert (again / name).read_bytes() == (kept / name).read_bytes()
+    checksums = [
+        {each.trial_id: each.checksum for each in campaign_of(one).recordings()}
+        for one in (whole, part)
+    ]
+    assert checksums[0] == checksums[1]
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_a_chosen_trial_is_the_grids_own(tmp_path: Path) -> None:
+    options = {"order": "adaptive", "choice": {"batch": 4, "start": 3}}
+    chosen = request(tmp_path / "a", [NEVER], stopping={"most": 8}, **options)
+    taken = collect(chosen)
+    plain = request(tmp_path / "b", [NEVER])
+    collect(plain)
+    own = {each.trial_id: each.checksum for each in campaign_of(plain).recordings()}
+    for each in campaign_of(chosen).recordings():
+        assert own[each.trial_id] == each.checksum
+    batches = ChoiceRecord.of(campaign_of(chosen).folder).batches
+    assert [item.trial for batch in batches for item in batch.trials][: len(taken)] == taken
+    assert batches[0].least is None
+    assert batches[1].least is not None
+    # what was begun with either goes on with the other: the collection is the same
+    assert len(collect(request(tmp_path / "a", [NEVER]))) == 24 - len(taken)
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_other_claims_are_looked_at_anew(tmp_path: Path) -> None:
+    first = request(tmp_path / "a", [SURE])
+    taken = len(collect(first))
+    other = request(tmp_path / "a", [NEVER], stopping={"most": taken + 3})
+    assert len(collect(other)) == 3
+    record = record_of(other)
+    assert len(record.looks) == taken // 3 + 1
+    assert json.loads(record.model_dump_json())["verdict"] == "most"
+
+
+def test_a_claim_about_a_network_needs_one(tmp_path: Path) -> None:
+    lead = {"figure": "lead", "within": "10 ms"}
+    with pytest.raises(InputError, match=r"collection\.stopping\.model.*needed"):
+        request(tmp_path / "a", [lead])
+    with pytest.raises(InputError, match=r"none\.pt is no file"):
+        request(tmp_path / "a", [lead], stopping={"model": "none.pt"})
