@@ -22,6 +22,7 @@ FigureName = Literal[
     "accuracy", "latency_incipient", "latency_gross", "lead", "slip_duration", "first_slip"
 ]
 Statistic = Literal["mean", "median", "p05", "p10", "p25", "p75", "p90", "p95"]
+Kind = Literal["within", "at_least", "at_most", "apart"]
 QUANTILES: Mapping[str, float] = {
     "median": 0.5, "p05": 0.05, "p10": 0.1, "p25": 0.25, "p75": 0.75, "p90": 0.9, "p95": 0.95,
 }  # fmt: skip
@@ -119,6 +120,15 @@ class Claim(StrictModel):
         return self.statistic or ("mean" if self.figure == "accuracy" else "median")
 
     @property
+    def kind(self) -> Kind:
+        """Which of the three is said; a difference of at least a size is `apart`."""
+        if self.within is not None:
+            return "within"
+        if self.between is not None and self.at_least is not None:
+            return "apart"
+        return "at_least" if self.at_least is not None else "at_most"
+
+    @property
     def value(self) -> float:
         """What is claimed, in the figure's own unit: percent or ms."""
         said = next(v for v in (self.within, self.at_least, self.at_most) if v is not None)
@@ -136,10 +146,11 @@ class Claim(StrictModel):
             name = self.between.factor
             first, second = map(factors[name].text, self.between.levels)
             words = f"{words}, {name} {second} less {first},"
-        kind = "known within +-" if self.within is not None else (
-            "at least " if self.at_least is not None else "at most "
-        )  # fmt: skip
-        return f"{words} {kind}{self.value:g} {figure.unit}"
+        said = {
+            "within": "known within +-", "at_least": "at least ", "at_most": "at most ",
+            "apart": "in size at least ",
+        }  # fmt: skip
+        return f"{words} {said[self.kind]}{self.value:g} {figure.unit}"
 
 
 class Choice(StrictModel):

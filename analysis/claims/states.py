@@ -17,7 +17,7 @@ from sliplab.analysis.claims.evidence import (
 )
 from sliplab.analysis.claims.expectation import Expectation, coded, expectation
 from sliplab.analysis.claims.sequences import F64, Bets, mean_bounds, refuted
-from sliplab.protocols.claims import QUANTILES, Claim, Stopping
+from sliplab.protocols.claims import FIGURES, QUANTILES, Claim, Stopping
 from sliplab.storage.schema.claims import ClaimState
 
 PERCENT = 100.0
@@ -99,7 +99,10 @@ def state_of(claim: Claim, history: History, error: float) -> ClaimState:
         holds, against = _bound_verdict(claim, history, groups[0], error)
     used = [np.isfinite(_values(claim, history, members)).sum() for members in groups]
     return ClaimState(
-        claim=claim.text(history.evidence.grid.factors), trials=int(sum(used)), estimate=estimate,
+        claim=claim.text(history.evidence.grid.factors),
+        kind=claim.kind,
+        value=claim.value,
+        unit=FIGURES[claim.figure].unit, trials=int(sum(used)), estimate=estimate,
         low=low if np.isfinite(low) else None, high=high if np.isfinite(high) else None,
         holds=holds, refuted=against,
     )  # fmt: skip

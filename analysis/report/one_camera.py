@@ -15,6 +15,7 @@ from sliplab.analysis.labels import label_errors
 from sliplab.analysis.labels.reviewed import Labels as KeptLabels
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.campaign import collected_section, quality_section, references_of
+from sliplab.analysis.report.claims import claims_key, claims_section
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.marker_network import (
@@ -110,7 +111,7 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
     if is_evaluated(store, campaigns):
         inputs.append([report_key(store, campaigns)])
     plans = [[item.planned.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
-    return make_key("report, one camera", VERSION, [inputs, plans], None)
+    return make_key("report, one camera", VERSION, [inputs, plans, *claims_key(campaigns)], None)
 
 
 def one_camera_summary(
@@ -283,6 +284,7 @@ def one_camera_sections(
     sections: list[Content | None] = [
         left_out_section(summary),
         collected_section(campaigns, summary),
+        claims_section(campaigns, simulated=simulated),
         quality_section(campaigns, summary.references, simulated=simulated),
     ]
     if judged is not None:

@@ -15,6 +15,7 @@ from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report import clocks, windows
 from sliplab.analysis.report.campaign import collected_section, quality_section
+from sliplab.analysis.report.claims import claims_section
 from sliplab.analysis.report.detectors import detector_section
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.holdout import holdout_section
@@ -153,6 +154,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         paper_section(summary),
         holdout,
         collected_section(campaigns, summary),
+        claims_section(campaigns, simulated=simulated),
         quality_section(campaigns, summary.references, simulated=simulated),
         trial,
         force_section(store, campaigns, seen, simulated=simulated),

@@ -13,6 +13,7 @@ from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
 from sliplab.analysis.networks.models import training_settings
+from sliplab.analysis.report.claims import claims_key
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
 from sliplab.analysis.report.programs import read_programs
 from sliplab.protocols.settings import AnalysisSettings
@@ -93,6 +94,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
         Derived.of(store, label_errors.CHECK).key(label_errors.CHECK),
         # commands in the page name the store's folder
         str(store.folder.resolve()),
+        *claims_key(campaigns),
     ]
     return make_key(STEP, VERSION, inputs, None)
 

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Literal
 
+from sliplab.protocols.claims import Kind
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
 RECORD, CHOICES = "stopping.json", "choices.json"
@@ -15,9 +16,14 @@ Verdict = Literal["open", "settled", "most", "all", "overruled"]
 
 
 class ClaimState(Part):
-    """One claim at one look, in the unit that its text names."""
+    """One claim at one look; numbers are in its unit."""
 
     claim: str
+    """In words."""
+    kind: Kind
+    value: Number
+    """That is claimed; of kind `apart` the least size of a difference of either sign."""
+    unit: str
     trials: Int
     """With a figure."""
     estimate: Number | None
