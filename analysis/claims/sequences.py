@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scipy.special import logsumexp
 
 F64 = npt.NDArray[np.float64]
-STAKES: F64 = np.geomspace(0.01, 0.95, 8)
+STAKES: F64 = np.geomspace(0.03, 0.95, 6)
 _STEPS = 50
 """Halvings: far below what a figure is printed to."""
 
