@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypedDict
 
@@ -131,6 +132,21 @@ def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> PlanJson:
     }
 
 
+def _claims(found: Plan) -> Iterator[str]:
+    """Yield lines about the claims of a plan, and what they do to it."""
+    collection = found.protocol.collection
+    if collection.stopping is None:
+        return
+    if (choice := collection.adaptive) is not None:
+        how = f"every batch of {choice.batch} trials, which are chosen then, not in this order"
+    else:
+        often = collection.stopping.repetitions
+        how = f"{'each' if often == 1 else f'every {often}'} repetition of all conditions"
+    yield f"The campaign ends when these claims are settled; they are looked at after {how}:"
+    for claim in collection.stopping.claims:
+        yield f"  {claim.text(collection.all_factors)}"
+
+
 def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
     """Print the plan as tables."""
     factors = list(found.protocol.collection.all_factors)
@@ -169,5 +185,7 @@ def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
     )
     if scene is not None:
         console.print_pairs("The simulated scene", scene.as_pairs())
+    for line in _claims(found):
+        console.say(line)
     for warning in found.warnings():
         console.say(f"note: {warning}")
