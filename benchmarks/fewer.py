@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
+from benchmarks.measure import SEED, Figures
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
 from sliplab.analysis.claims.choosing import next_batch
 from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
@@ -45,11 +46,11 @@ from sliplab.storage.schema.claims import Batch, ClaimState
 
 F64 = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[1]
-SOURCE = ROOT / "protocols/kinematic.yaml"
 ERROR = 0.05
 TIMES = 5
 """Grids of which the truth is the figure."""
 ORDERS = ("shuffled", "adaptive")
+TRIALS, BATCH = 864, 24
 
 
 @dataclass(frozen=True)
@@ -135,13 +136,16 @@ def claim_of(stated: Stated, true: float) -> dict[str, Any]:
     return made
 
 
-def plan_of(order: str, claims: Sequence[dict[str, Any]], batch: int) -> Plan:
-    """Return the plan of the kinematic grid with claims."""
-    data = parse_yaml(SOURCE.read_text(), SOURCE)
+def plan_of(
+    order: str, claims: Sequence[dict[str, Any]], batch: int, experiment: str = "kinematic"
+) -> Plan:
+    """Return the plan of an experiment with claims."""
+    source = ROOT / f"protocols/{experiment}.yaml"
+    data = parse_yaml(source.read_text(), source)
     data["collection"] |= {"order": order, "stopping": {"error": ERROR, "claims": list(claims)}}
     if order == "adaptive":
         data["collection"]["choice"] = {"batch": batch}
-    return make_plan(validate(Protocol, data, SOURCE), str(SOURCE))
+    return make_plan(validate(Protocol, data, source), str(source))
 
 
 def looks_of(plan: Plan, values: dict[str, F64]) -> Iterator[Evidence]:
@@ -160,8 +164,8 @@ def looks_of(plan: Plan, values: dict[str, F64]) -> Iterator[Evidence]:
         return Evidence(grid, numbers, np.array(looks, np.int64), shown, chances)
 
     if choice is None:
-        size = len(grid.trials) // collection.repetitions
-        ends = [size * (k + 1) for k in range(collection.repetitions)]
+        rounds = -(-collection.repetitions // stopping.repetitions)
+        ends = [len(grid.trials) * (k + 1) // rounds for k in range(rounds)]
         for k, end in enumerate(ends):
             yield seen(list(range(end)), ends[: k + 1], None)
         return
@@ -204,10 +208,14 @@ class Call:
 
 
 def campaign(
-    order: str, claims: list[dict[str, Any]], values: dict[str, F64], batch: int
+    order: str,
+    claims: list[dict[str, Any]],
+    values: dict[str, F64],
+    batch: int,
+    experiment: str = "kinematic",
 ) -> list[Call | None]:
     """Return the call of each claim; None for never."""
-    plan = plan_of(order, claims, batch)
+    plan = plan_of(order, claims, batch, experiment)
     stopping = plan.protocol.collection.stopping
     assert stopping is not None
     called: list[Call | None] = [None] * len(claims)
@@ -239,8 +247,9 @@ def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, An
     return row
 
 
-def lines(rows: Sequence[dict[str, Any]], total: int) -> Iterator[str]:
+def lines(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a table in Markdown."""
+    total = TRIALS
     yield "| claim | true | order | called | wrongly | 95 % | median trials | of the grid |"
     yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
     for k, stated in enumerate(CLAIMS):
@@ -260,18 +269,42 @@ def lines(rows: Sequence[dict[str, Any]], total: int) -> Iterator[str]:
             )
 
 
+def rows_of(worlds: int, seed: int, adaptive: int, batch: int, cores: int) -> list[dict[str, Any]]:
+    """Do all worlds."""
+    one = partial(world_row, seed=seed, adaptive=adaptive, batch=batch)
+    with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
+        return list(pool.map(one, range(worlds)))
+
+
+def measure(worlds: int = 200, adaptive: int = 10, cores: int = 2) -> Figures:
+    """Return rates of wrong calls, and trials taken as a share of the grid."""
+    rows = rows_of(worlds, SEED, adaptive, BATCH, cores)
+    found: Figures = {}
+    for order in ORDERS:
+        calls = [(stated, row[order][k]) for row in rows if order in row
+                 for k, stated in enumerate(CLAIMS)]  # fmt: skip
+        found[f"{order}_wrong_percent"] = 100.0 * float(
+            np.mean([call is not None and call[1] for _, call in calls])
+        )
+        true = [TRIALS if call is None else call[0] for stated, call in calls if stated.true]
+        found[f"{order}_true_trials_percent"] = 100.0 * float(np.median(true)) / TRIALS
+    both = [(row["shuffled"][k], row["adaptive"][k]) for row in rows if "adaptive" in row
+            for k, stated in enumerate(CLAIMS) if stated.true]  # fmt: skip
+    ratios = [(TRIALS if b is None else b[0]) / (TRIALS if a is None else a[0]) for a, b in both]
+    found["adaptive_over_shuffled"] = float(np.median(ratios))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--worlds", type=int, default=200)
     parser.add_argument("--adaptive", type=int, default=200, help="worlds with this order, too")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--batch", type=int, default=24)
+    parser.add_argument("--batch", type=int, default=BATCH)
     parser.add_argument("--cores", type=int, default=2)
     asked = parser.parse_args()
-    one = partial(world_row, seed=asked.seed, adaptive=asked.adaptive, batch=asked.batch)
-    with ProcessPoolExecutor(asked.cores, get_context("spawn")) as pool:
-        rows = list(pool.map(one, range(asked.worlds)))
-    print("\n".join(lines(rows, 864)))
+    rows = rows_of(asked.worlds, asked.seed, asked.adaptive, asked.batch, asked.cores)
+    print("\n".join(lines(rows)))
 
 
 if __name__ == "__main__":
