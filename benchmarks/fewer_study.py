@@ -140,9 +140,10 @@ def print_claims(asked: argparse.Namespace) -> None:
             size = found[0][0]
             trials = float(np.median([size if n is None else n for _, n, _ in found]))
             called = sum(n is not None for _, n, _ in found)
+            span = f"{100 * low:.1f} to {100 * high:.1f}"
             print(
                 f"| {title} | {order} | {called} of {len(found)} "
-                f"| {100 * wrong / len(found):.1f} % ({100 * low:.1f} to {100 * high:.1f}) | {trials:.0f} of {size} "
+                f"| {100 * wrong / len(found):.1f} % ({span}) | {trials:.0f} of {size} "
                 f"| {100 * trials / size:.0f} % |"
             )
 
