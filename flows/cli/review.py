@@ -141,7 +141,7 @@ def _print_order(trials: TrialList, found: ReviewOrder, count: int) -> None:
     done = "this review" if len(first) == 1 else f"these {len(first)} reviews"
     console.show(
         f"{best.experiment} {best.figure}{simulated}: 95 % interval over trials {width} wide; "
-        f"labels alone leave {label} open, and {left} after {done} "
+        f"labels alone leave {label} open, and at best {left} after {done} "
         f"({1 - best.left / best.label_width:.0%} less)."
     )
 
