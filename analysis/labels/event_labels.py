@@ -202,7 +202,9 @@ def _onsets(
     slip_times = SlipTimes(at, low, high, centre, WIDEST_NS // 2)
     held = slipped_in_hold(hold, settings.hold_slip_px)
     lost_ns = t_ns[tracks.lost & (t_ns > start_ns)]
-    intervals = _intervals(t_ns, moved_px, sigma, paper, centre, settings.threshold_px, start_ns)
+    intervals = crossing_intervals(
+        t_ns, moved_px, sigma, paper, centre, settings.threshold_px, start_ns
+    )
 
     def doubts(onsets: Onsets) -> Doubts:
         return (
@@ -226,11 +228,17 @@ def _times(t_ns: I64, way: F64, places_mm: tuple[float, ...]) -> list[int]:
     ]  # fmt: skip
 
 
-def _intervals(
+def crossing_intervals(
     t_ns: I64, moved_px: F64, sigma_px: F64, paper: Onsets, centre: int, threshold_px: float,
     start_ns: int,
 ) -> tuple[Interval | None, Interval | None]:  # fmt: skip
-    """Return when the displacements, give or take two deviations, cross the threshold."""
+    """Return when the displacements, give or take two deviations, cross the threshold.
+
+    Args:
+        t_ns: (n,) int64. moved_px, sigma_px: (n, m), NaN where unknown.
+        paper: onsets by the paper's rule of the same displacements.
+        start_ns: crossings after it count.
+    """
     moving = (t_ns > start_ns)[:, None]
     end = len(t_ns) - 1
     bounds = []

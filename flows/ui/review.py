@@ -7,8 +7,8 @@ that a running campaign has committed. A trial's data are loaded when it is chos
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -16,11 +16,12 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected, has_plan, need_slip
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
+from sliplab.analysis.review.doubt import reasons_for_doubt, suggested_onsets
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.adapter import CLASSES
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
+from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import F64, I64, U8
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
@@ -30,8 +31,6 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.video import FrameReader
 
 LabelState = Literal["fresh", "stale", "missing"]
-_GRAVE, _ODD, _SLIGHT = 3, 2, 1
-"""An onset in doubt; an onset that is not there; something to look at."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +45,7 @@ class Row:
         severity: of the gravest reason, 0 for none.
         state: of the decision; who: its reviewer; decisions: number of all decisions.
         problem: why the decisions cannot be read; empty if they can.
+        rank: its place among those that a review would change most; 0 for all without that order.
     """
 
     order: int
@@ -59,6 +59,7 @@ class Row:
     who: str
     decisions: int
     problem: str = ""
+    rank: int = 0
 
     @property
     def name(self) -> tuple[str, str]:
@@ -78,23 +79,6 @@ class Row:
     def doubtful(self) -> bool:
         """True if there is a reason for doubt."""
         return self.severity > 0
-
-
-def reasons_for_doubt(label: TrialLabel) -> list[tuple[int, str]]:
-    """Return the reasons to doubt a label, with their severity, gravest first."""
-    found: list[tuple[int, str]] = []
-    for kind in KINDS:
-        if doubt := label.doubts.of(kind):
-            found.append((_GRAVE, f"{kind}: {doubt}"))
-        elif label.at_ns(kind) is None:
-            nothing = "no slip was found" if kind == "incipient" else "no gross slip was found"
-            found.append((_ODD, nothing))
-    found += [(_ODD, text) for text in label.flags]
-    if label.markers_lost:
-        found.append((_SLIGHT, f"{label.markers_lost} times a marker was not seen"))
-    if label.plate_lost:
-        found.append((_SLIGHT, f"the plate's marker was not seen in {label.plate_lost} frames"))
-    return sorted(dict.fromkeys(found), key=lambda item: -item[0])
 
 
 def row_of(store: Store, item: Collected, trial: str, order: int) -> Row:
@@ -141,6 +125,7 @@ class TrialList:
         self.store = store
         self._names = list(campaigns)
         self._folders: object = None
+        self._ranks: Mapping[tuple[str, str], int] = {}
         self.items: dict[str, Collected] = {}
         self.rows: list[Row] = []
         self.refresh()
@@ -180,7 +165,7 @@ class TrialList:
             planned = [trial.id for trial in item.planned if trial.id in whole]
             for trial in [*planned, *sorted(whole.difference(planned))]:
                 try:
-                    rows.append(row_of(self.store, item, trial, len(rows)))
+                    rows.append(self._ranked(row_of(self.store, item, trial, len(rows))))
                 except StoreError:
                     continue  # it was damaged or taken away in the meantime: `verify` names it
         self.items, self.rows, self._folders = items, rows, folders
@@ -188,9 +173,23 @@ class TrialList:
 
     def renew(self, row: Row) -> Row:
         """Make the row of a trial again."""
-        fresh = row_of(self.store, self.items[row.campaign], row.trial, row.order)
+        item = self.items[row.campaign]
+        fresh = self._ranked(row_of(self.store, item, row.trial, row.order))
         self.rows = [fresh if other.name == row.name else other for other in self.rows]
         return fresh
+
+    def rank(self, names: Sequence[tuple[str, str]]) -> None:
+        """List trials, by campaign and id, in this order, and others behind them."""
+        self._ranks = {name: place for place, name in enumerate(names)}
+        self.rows = [self._ranked(row) for row in self.rows]
+
+    @property
+    def ranked(self) -> bool:
+        """True if `rank` gave an order."""
+        return bool(self._ranks)
+
+    def _ranked(self, row: Row) -> Row:
+        return replace(row, rank=self._ranks.get(row.name, len(self._ranks)))
 
     def _look(self) -> tuple[object, dict[str, dict[str, int]]]:
         """Return what changes when a row does: folders' times, and numbers of decisions."""
@@ -220,7 +219,8 @@ def filtered_rows(
         campaign, state: only these; all where empty. The state ``doubtful`` means trials that
             nobody has decided on and that have a reason for doubt.
         text: only trials whose id holds it.
-        doubtful_first: undecided trials come first, those with the gravest doubts before others.
+        doubtful_first: undecided trials come first, by their rank, then those with the gravest
+            doubts before others.
     """
     found = [
         row
@@ -230,7 +230,7 @@ def filtered_rows(
         and text.strip().lower() in row.trial.lower()
     ]
     if doubtful_first:
-        found.sort(key=lambda row: (not _waits(row), -row.severity, row.order))
+        found.sort(key=lambda row: (not _waits(row), row.rank, -row.severity, row.order))
     return found
 
 
@@ -310,16 +310,7 @@ class ShownTrial:
     @property
     def suggested(self) -> Onsets:
         """Onsets by the markers that were seen, also where the label is in doubt."""
-        known = self.onsets
-        times = () if self.label is None else self.label.per_marker_ns
-        slipped = [time for time in times if time >= 0]
-        incipient = known.incipient_ns
-        if incipient is None:
-            incipient = min(slipped, default=None)
-        gross = known.gross_ns
-        if gross is None and self.centre < len(times) and times[self.centre] >= 0:
-            gross = times[self.centre]
-        return Onsets(incipient, gross)
+        return Onsets() if self.label is None else suggested_onsets(self.label, self.centre)
 
     def frame_at(self, time_s: float) -> int:
         """Return the index of the frame nearest to a time; -1 without frames."""

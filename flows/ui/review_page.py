@@ -63,6 +63,8 @@ class Page:
         self.plots = TimePlots(self._moved, self._cursor)
         self.frame = FramePlot()
         self.see = Widgets([*trials.items], who)
+        if trials.ranked:
+            self.see.first.label = "most change first"
         self._connect()
         doc.title = "SlipLab review"
         doc.add_root(self.see.layout(self.plots.moved, self.plots.rate, self.frame.plot))

@@ -102,7 +102,11 @@ class Derived:
         """Return the path of a result's arrays."""
         return self.folder / f"{safe_name(name)}.npz"
 
-    def arrays(self, name: str) -> Arrays:
-        """Return a result's arrays."""
+    def arrays(self, name: str, *only: str) -> Arrays:
+        """Return a result's arrays.
+
+        Args:
+            only: these, as far as they are there; all if none is named.
+        """
         with np.load(self.arrays_path(name), allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
+            return {key: file[key] for key in file.files if not only or key in only}

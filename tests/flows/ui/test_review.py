@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.review.doubt import reasons_for_doubt
 from sliplab.flows.label import report_states
-from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial, reasons_for_doubt
+from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import trials_in

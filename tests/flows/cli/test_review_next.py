@@ -1,0 +1,111 @@
+"""`sliplab review --next`: the table, its one JSON object, and the page's list in that order."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bokeh.document import Document
+
+from sliplab.flows.ui.review import TrialList, filtered_rows
+from sliplab.flows.ui.review_page import Page
+from sliplab.storage.trials.store import Store
+from tests.analysis.review.evaluated import Evaluated
+from tests.command_line import here
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Evaluated:
+    """An evaluated campaign with three labels in doubt; one of these is decided."""
+    made = Evaluated(tmp_path / "s")
+    for trial, ms in zip(made.tests, (30.0, 60.0, 50.0), strict=False):
+        made.widen(trial, ms)
+    made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
+    made.decide(made.tests[2], "accept")
+    return made
+
+
+def test_the_order_as_an_object_and_as_a_table(made: Evaluated) -> None:
+    words = ("review", made.store.folder, "--next", "--no-page", "--count", "1")
+    done = here(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert list(found) == [
+        "trials", "to_decide", "simulated", "in_doubt", "next", "gains", "notes"
+    ]  # fmt: skip
+    assert (found["simulated"], found["in_doubt"], found["to_decide"]) == (True, 2, 109)
+    (first,) = found["next"]
+    assert list(first) == [
+        "campaign", "trial", "split", "spread_ms", "unusable", "score", "moves", "reasons"
+    ]  # fmt: skip
+    assert first["spread_ms"] == {"incipient": 60.0, "gross": 0.0}
+    assert first["score"] == first["moves"][0]["of_interval"] > 0
+    assert found["gains"][0]["left"] < found["gains"][0]["label_width"]
+    done = here(*words)
+    assert done.returncode == 0, done.stderr
+    assert first["trial"] in done.stdout
+    assert "1 of 2 trials in doubt, by what a review would change (simulated)" in done.stdout
+    assert "after this review" in done.stdout.splitlines()[-1]
+    assert "1 decisions that there are" in done.stderr
+
+
+def test_without_doubts_it_says_so(tmp_path: Path) -> None:
+    made = Evaluated(tmp_path / "s")
+    made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
+    done = here("review", made.store.folder, "--next", "--no-page")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ("No label is in doubt: a review would change nothing (simulated).\n")
+
+
+@pytest.mark.parametrize("option", [("--count", "3"), ("--no-page",)])
+def test_its_options_go_with_it(option: tuple[str, ...], tmp_path: Path) -> None:
+    done = here("review", tmp_path, *option, "--json")
+    error = json.loads(done.stdout)["error"]
+    assert (error["exit_code"], error["key"]) == (2, option[0])
+    assert error["message"].endswith("goes with --next")
+
+
+def test_the_page_lists_in_this_order(made: Evaluated) -> None:
+    trials = TrialList(made.store)
+    made.change(made.tests[5], flags=["knocked"])
+    assert trials.refresh()
+    assert filtered_rows(trials.rows)[0].trial == made.tests[5]
+    two, one, decided = made.tests[1], made.tests[0], made.tests[2]
+    trials.rank([(made.item.name, two), (made.item.name, one)])
+    listed = [row.trial for row in filtered_rows(trials.rows)]
+    assert listed[:3] == [two, one, made.tests[5]]
+    assert listed[-1] == decided
+    # what is decided in the meantime goes to the end, and the rest keep their places
+    made.decide(two, "accept")
+    assert trials.refresh()
+    assert [row.trial for row in filtered_rows(trials.rows)][:2] == [one, made.tests[5]]
+    made.change(one, flags=["knocked"])
+    assert trials.refresh()
+    assert filtered_rows(trials.rows)[0].trial == one
+    with ThreadPoolExecutor(1) as pool:
+        page = Page(Document(), trials, pool, "anna")
+        assert page.see.source.data["trial"][:2] == [one, made.tests[5]]
+        assert page.see.first.label == "most change first"
+        page.close()
+
+
+def test_opened_with_it_the_page_has_the_order(
+    made: Evaluated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sliplab.flows.ui import review_server
+
+    def serve(store: Store, *others: Any) -> None:
+        trials = TrialList(store)
+        others[-1]("http://127.0.0.1:1/x", trials)
+        assert [row.trial for row in filtered_rows(trials.rows)][:2] == made.tests[1::-1]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(review_server, "serve", serve)
+    done = here("review", made.store.folder, "--next", "--json")
+    assert done.returncode == 130
+    found = json.loads(done.stdout)
+    assert (found["url"], len(found["next"])) == ("http://127.0.0.1:1/x", 2)
