@@ -88,7 +88,11 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         campaign = _recover(store, run_request)
         supervisor = CollectionSupervisor(run_request, store, campaign)
         supervisor.begin()
-        with held(run_request.rig, store.folder):
+        # the rig is closed before anybody waits for figures
+        with (
+            held(run_request.rig, store.folder),
+            _claim_watch(run_request, store, campaign) as claims,
+        ):
             rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
             campaign.add_bench_record(_session_record(run_request))
@@ -98,13 +102,12 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
             collector.supervisor = supervisor
             supervisor.fresh_start = collector.fresh_start
             try:
-                with _claim_watch(run_request, store, campaign) as claims:
-                    trials = run_request.due_trials(campaign)
-                    left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
-                    if claims is not None:
-                        trials = claims.next_trials()[: run_request.most]
-                        collector.on_commit = claims.committed
-                    yield CollectionSession(collector, supervisor, trials, left_out, claims)
+                trials = run_request.due_trials(campaign)
+                left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
+                if claims is not None:
+                    trials = claims.next_trials()[: run_request.most]
+                    collector.on_commit = claims.committed
+                yield CollectionSession(collector, supervisor, trials, left_out, claims)
             finally:
                 rig.close()
 
