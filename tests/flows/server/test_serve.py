@@ -27,6 +27,7 @@ from sliplab.flows.server.schedules import Ask, Chain, Collect, OnRig, Scheduled
 from sliplab.flows.server.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
+from sliplab.storage.schema.claims import RECORD, StoppingRecord
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import Store
@@ -96,6 +97,23 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
     assert made["image"]["data"].startswith("data:image/svg+xml;base64,")
     assert "(simulated)" in made["image"]["description"]
     assert (limit.limit, limit.active_slots) == (1, 0)
+
+
+def test_claims_end_a_collection_of_the_service_too(service: Service, tmp_path: Path) -> None:
+    from sliplab.flows.server.deployments import collect
+
+    data = campaign.protocol(2)
+    claim = {"figure": "first_slip", "at_most": "60 s"}
+    data["collection"] |= {"repetitions": 4, "stopping": {"error": 0.4, "claims": [claim]}}
+    protocol = tmp_path / "claims.yaml"
+    protocol.write_text(yaml.safe_dump(data))
+    state = collect(Collect(protocol=protocol), return_state=True)
+    assert state.type.value == "COMPLETED", state.message
+    record = StoppingRecord.load(service.folder / "campaigns" / data["name"] / RECORD)
+    assert record.verdict == "settled"
+    assert f"{record.looks[-1].taken} of 8 committed" in state.message
+    state = collect(Collect(protocol=protocol, no_stopping=True), return_state=True)
+    assert "8 of 8 committed" in state.message
 
 
 def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> None:
