@@ -32,7 +32,7 @@ from benchmarks.measure import SEED, Figures
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
 from sliplab.analysis.claims.choosing import next_batch
 from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
-from sliplab.analysis.claims.states import settled, states
+from sliplab.analysis.claims.states import Fits, settled, states
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
@@ -148,11 +148,11 @@ def plan_of(
     return make_plan(validate(Protocol, data, source), str(source))
 
 
-def looks_of(plan: Plan, values: dict[str, F64]) -> Iterator[Evidence]:
+def looks_of(plan: Plan, values: dict[str, F64], fits: Fits) -> Iterator[Evidence]:
     """Yield what a campaign has seen at each look.
 
     Args:
-        values: (N,) by figure, of the grid's trials in the plan's order.
+        values: (N,) by figure, of the grid's trials in the plan's order. fits: kept of the looks.
     """
     collection, grid = plan.protocol.collection, Grid.of(plan)
     stopping, choice = collection.stopping, collection.adaptive
@@ -180,7 +180,7 @@ def looks_of(plan: Plan, values: dict[str, F64]) -> Iterator[Evidence]:
             taken[:known], looks[:-1] if known else [],
             Chances(np.array(chance[:known]), np.array(least[:known])),
         )  # fmt: skip
-        batch = next_batch(before, batches, stopping, choice, collection.seed)
+        batch = next_batch(before, batches, stopping, choice, collection.seed, fits)
         if batch is None:
             return
         batches.append(batch)
@@ -219,8 +219,9 @@ def campaign(
     stopping = plan.protocol.collection.stopping
     assert stopping is not None
     called: list[Call | None] = [None] * len(claims)
-    for evidence in looks_of(plan, values):
-        found = states(evidence, stopping)
+    fits: Fits = {}
+    for evidence in looks_of(plan, values, fits):
+        found = states(evidence, stopping, fits)
         for k, state in enumerate(found):
             if called[k] is None and (state.holds or state.refuted):
                 called[k] = Call(len(evidence.taken), state)

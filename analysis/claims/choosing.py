@@ -13,14 +13,19 @@ import numpy as np
 
 from sliplab.analysis.claims.evidence import I64, Evidence, Grid, members_of
 from sliplab.analysis.claims.sequences import F64
-from sliplab.analysis.claims.states import History, estimate_of, state_of
+from sliplab.analysis.claims.states import Fits, History, estimate_of, state_of
 from sliplab.protocols.claims import Choice, Claim, Stopping
 from sliplab.protocols.hashing import hash_integer
 from sliplab.storage.schema.claims import Batch, ChosenTrial
 
 
 def next_batch(
-    known: Evidence, chosen: Sequence[Batch], stopping: Stopping, choice: Choice, seed: int
+    known: Evidence,
+    chosen: Sequence[Batch],
+    stopping: Stopping,
+    choice: Choice,
+    seed: int,
+    fits: Fits | None = None,
 ) -> Batch | None:
     """Choose the trials that follow `chosen`; None where nothing is left.
 
@@ -29,7 +34,7 @@ def next_batch(
 
     Args:
         known: trials of earlier batches whose figures are known.
-        seed: the protocol's.
+        seed: the protocol's. fits: as for `states`.
     """
     grid = known.grid
     stretches = grid.stretches
@@ -51,7 +56,7 @@ def next_batch(
             for k in spread_out(grid, here, count, rng)
         ]
         return Batch(known=0, least=None, trials=tuple(items))
-    share = chances(known, here, stopping, float(choice.random))
+    share = chances(History(known, {} if fits is None else fits), here, stopping, choice.random)
     items = []
     p = share.copy()
     for _ in range(min(choice.batch, len(here))):
@@ -62,16 +67,16 @@ def next_batch(
     return Batch(known=len(known.taken), least=float(share.min()), trials=tuple(items))
 
 
-def chances(known: Evidence, here: I64, stopping: Stopping, random: float) -> F64:
+def chances(history: History, here: I64, stopping: Stopping, random: float) -> F64:
     """Return the chance of each trial of `here`, (k,), all above 0.
 
     Args:
         random: share that is even over them.
     """
     even = np.full(len(here), 1.0 / len(here))
-    if not len(known.taken):
+    if not len(history.evidence.taken):
         return even
-    history, total = History(known), np.zeros(len(here))
+    total = np.zeros(len(here))
     for claim in stopping.claims:
         state = state_of(claim, history, stopping.error)
         if state.holds or state.refuted:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -98,6 +98,20 @@ class Evidence:
     values: dict[str, F64]
     chances: Chances | None = None
 
+    @cached_property
+    def rounds(self) -> I64:
+        """(n,) number of each trial's round."""
+        return np.asarray(
+            np.searchsorted(self.looks, np.arange(len(self.taken)), "right"), np.int64
+        )
+
+    @cached_property
+    def left(self) -> Mask:
+        """(k, N) what was left when each round began."""
+        since = np.full(len(self.grid.trials), len(self.looks), np.int64)
+        since[self.taken] = self.rounds
+        return np.asarray(np.arange(len(self.looks))[:, None] <= since)
+
     def until(self, look: int) -> Evidence:
         """Return the evidence at an earlier look, by its number."""
         n = int(self.looks[look])
@@ -129,7 +143,7 @@ def plain_bets(evidence: Evidence, x: F64, members: Mask) -> Bets:
     return Bets.of(x[used], np.asarray(counts[evidence.looks], np.int64))
 
 
-def weighted_bets(evidence: Evidence, x: F64, members: Mask, expected: Sequence[F64]) -> Bets:
+def weighted_bets(evidence: Evidence, x: F64, members: Mask, expected: F64) -> Bets:
     """Return bets on the mean of `x` over the whole grid, of trials that were chosen by chance.
 
     What was taken is known, what is left is expected, and the trial drawn next corrects that by its
@@ -139,37 +153,42 @@ def weighted_bets(evidence: Evidence, x: F64, members: Mask, expected: Sequence[
 
     Args:
         x, members: as for `plain_bets`.
-        expected: (N,) from 0 to 1, of each round, by what was known when it began.
+        expected: (k, N) from 0 to 1, of each round, by what was known when it began.
     """
     assert evidence.chances is not None
-    grid, taken = evidence.grid, evidence.taken
-    z, low, high = (np.full(len(taken), np.nan) for _ in range(3))
-    there = np.zeros(len(grid.trials), np.bool_)
-    found = np.zeros(len(grid.trials))
-    begin = 0
-    for round_number, end in enumerate(evidence.looks):
-        guess = expected[round_number]
-        batch = taken[begin:end]
-        worst = [0.0, 0.0]
-        for stretch in np.unique(grid.stretch[batch]):
-            ours = members & (grid.stretch == stretch)
-            size = int(ours.sum())
-            if not size:
-                continue
-            drawn = begin + np.flatnonzero(grid.stretch[batch] == stretch)
-            left = ours & ~there
-            known = found[ours & there].sum() + guess[left].sum()
-            far = 1.0 / (evidence.chances.least[drawn[0]] * size)
-            most, least = (guess[left].max(), guess[left].min()) if left.any() else (0.0, 1.0)
-            worst[0] = min(worst[0], (known - len(drawn)) / size - most * far)
-            worst[1] = max(worst[1], (known + len(drawn)) / size + (1.0 - least) * far)
-            trials, chance = taken[drawn], evidence.chances.chosen[drawn]
-            value = np.where(np.isnan(x[drawn]), guess[trials], x[drawn])
-            away = np.where(members[trials], value - guess[trials], 0.0)
-            z[drawn] = (known + np.cumsum(away) - away + away / chance) / size
-            there[trials], found[trials] = True, value
-        low[begin:end], high[begin:end] = worst[0], worst[1]
-        begin = int(end)
+    grid, taken, left = evidence.grid, evidence.taken, evidence.left
+    rounds, chance = evidence.rounds, evidence.chances.chosen
+    guess = expected[rounds, taken]
+    value = np.where(np.isnan(x), guess, x)
+    z = np.full(len(taken), np.nan)
+    low, high = np.full(len(expected), np.inf), np.full(len(expected), -np.inf)
+    for stretch in range(grid.stretches):
+        ours = members & (grid.stretch == stretch)
+        size = int(ours.sum())
+        drawn = np.flatnonzero(grid.stretch[taken] == stretch)
+        if not size or not len(drawn):
+            continue
+        of = rounds[drawn]
+        inside = ours[taken[drawn]]
+        away = np.where(inside, value[drawn] - guess[drawn], 0.0)
+        counted = np.concatenate([[0.0], np.cumsum(np.where(inside, value[drawn], 0.0))])
+        begin = np.searchsorted(of, np.arange(len(expected)))  # places of the rounds' first draws
+        rest = left & ours
+        known = counted[begin] + np.where(rest, expected, 0.0).sum(axis=1)
+        before = np.cumsum(away) - away
+        before -= before[begin[of]]
+        with np.errstate(invalid="ignore"):
+            z[drawn] = (known[of] + before + away / chance[drawn]) / size
+        count = np.bincount(of, minlength=len(expected))
+        there = count > 0
+        least = np.ones(len(expected))
+        least[of] = evidence.chances.least[drawn]
+        far = 1.0 / (least * size)
+        most = np.where(rest, expected, 0.0).max(axis=1, initial=0.0)
+        fewest = np.where(rest, expected, 1.0).min(axis=1, initial=1.0)
+        low = np.where(there, np.minimum(low, (known - count) / size - most * far), low)
+        high = np.where(there, np.maximum(high, (known + count) / size + (1 - fewest) * far), high)
     used = ~np.isnan(z)
     counts = np.concatenate([[0], np.cumsum(used)])
-    return Bets(z[used], low[used], high[used], np.asarray(counts[evidence.looks], np.int64))
+    looks = np.asarray(counts[evidence.looks], np.int64)
+    return Bets(z[used], low[rounds][used], high[rounds][used], looks)

@@ -30,14 +30,14 @@ class Expectation:
     """Mean and standard deviation that each trial of a grid is expected to have.
 
     Attributes:
-        mean, spread: (N,) float64.
+        mean, spread: (N,) float64, or a row of it for each round.
     """
 
     mean: F64
     spread: F64
 
     def below(self, value: float) -> F64:
-        """Return the chance of a figure of at most `value`, (N,)."""
+        """Return the chance of a figure of at most `value`, in the same shape."""
         return np.asarray(ndtr((value - self.mean) / self.spread))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -23,9 +23,19 @@ from sliplab.storage.schema.claims import ClaimState
 PERCENT = 100.0
 
 
-def states(evidence: Evidence, stopping: Stopping) -> tuple[ClaimState, ...]:
-    """Return the state of every claim at the last look."""
-    history = History(evidence)
+Fits = dict[tuple[str, bytes], Expectation]
+"""What the first figures of a campaign let expect: the same at each later look."""
+
+
+def states(
+    evidence: Evidence, stopping: Stopping, fits: Fits | None = None
+) -> tuple[ClaimState, ...]:
+    """Return the state of every claim at the last look.
+
+    Args:
+        fits: of earlier looks at the same campaign; those made here are added.
+    """
+    history = History(evidence, {} if fits is None else fits)
     return tuple(state_of(claim, history, stopping.error) for claim in stopping.claims)
 
 
@@ -34,27 +44,32 @@ class History:
     """Evidence, and what was expected of the grid when each round began."""
 
     evidence: Evidence
+    fits: Fits = field(default_factory=dict)
 
     @cached_property
     def _code(self) -> F64:
         return coded(self.evidence.grid.levels)
 
-    def expected(self, figure: str) -> list[Expectation]:
-        """Return what was expected of a figure in each round."""
-        evidence = self.evidence
-        begins = [0, *evidence.looks[:-1]]
-        return [self.expected_after(figure, int(n)) for n in begins]
+    def expected(self, figure: str) -> Expectation:
+        """Return what was expected of a figure in each round, (k, N)."""
+        if figure not in self._by_round:
+            begins = [0, *(int(n) for n in self.evidence.looks[:-1])]
+            each = [self.expected_after(figure, n) for n in begins]
+            self._by_round[figure] = Expectation(
+                np.array([one.mean for one in each]), np.array([one.spread for one in each])
+            )
+        return self._by_round[figure]
 
     def expected_after(self, figure: str, n: int) -> Expectation:
         """Return what the first `n` trials let expect of a figure."""
-        key = figure, n
-        if key not in self._kept:
-            values = self.evidence.values[figure][:n]
-            self._kept[key] = expectation(self._code, self.evidence.taken[:n], values)
-        return self._kept[key]
+        values = self.evidence.values[figure][:n]
+        key = figure, values.tobytes()
+        if key not in self.fits:
+            self.fits[key] = expectation(self._code, self.evidence.taken[:n], values)
+        return self.fits[key]
 
     @cached_property
-    def _kept(self) -> dict[tuple[str, int], Expectation]:
+    def _by_round(self) -> dict[str, Expectation]:
         return {}
 
     def bets_below(self, figure: str, value: float, members: Mask, *, at: bool) -> Bets:
@@ -67,16 +82,15 @@ class History:
         x = np.where(np.isnan(y), np.nan, (y <= value) if at else (y < value))
         if self.evidence.chances is None:
             return plain_bets(self.evidence, x, members)
-        guesses = [each.below(value) for each in self.expected(figure)]
-        return weighted_bets(self.evidence, x, members, guesses)
+        return weighted_bets(self.evidence, x, members, self.expected(figure).below(value))
 
     def bets_on_mean(self, figure: str, members: Mask) -> Bets:
         """Return bets on the mean of a share in percent, as a number from 0 to 1."""
         x = self.evidence.values[figure] / PERCENT
         if self.evidence.chances is None:
             return plain_bets(self.evidence, x, members)
-        guesses = [np.clip(each.mean / PERCENT, 0, 1) for each in self.expected(figure)]
-        return weighted_bets(self.evidence, x, members, guesses)
+        guess = np.clip(self.expected(figure).mean / PERCENT, 0.0, 1.0)
+        return weighted_bets(self.evidence, x, members, guess)
 
 
 def state_of(claim: Claim, history: History, error: float) -> ClaimState:

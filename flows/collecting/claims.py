@@ -23,7 +23,7 @@ from sliplab.analysis.claims import trial_figures as figures
 from sliplab.analysis.claims.choosing import next_batch
 from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
 from sliplab.analysis.claims.sequences import F64
-from sliplab.analysis.claims.states import settled, states
+from sliplab.analysis.claims.states import Fits, settled, states
 from sliplab.analysis.trial_work import TrialWork
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -67,6 +67,7 @@ class ClaimWatch:
         self._batches = ChoiceRecord.of(campaign.folder).batches
         self._kept = Derived.of(store, figures.STEP, campaign.name)
         self._making: dict[str, Future[TrialFigures]] = {}
+        self._fits: Fits = {}
         self._pool: ProcessPoolExecutor | None = None
 
     @contextmanager
@@ -178,7 +179,7 @@ class ClaimWatch:
         seed = self._run_request.plan.seed
         known = self._evidence(first // count - 2)
         while len(batches) < first + count:
-            batch = next_batch(known, batches, self._stopping, self._choice, seed)
+            batch = next_batch(known, batches, self._stopping, self._choice, seed, self._fits)
             if batch is None:
                 break
             batches.append(batch)
@@ -250,7 +251,7 @@ class ClaimWatch:
         if len(looks) <= number:
             evidence = self._evidence(number)
             for n in range(len(looks), len(evidence.looks)):
-                found = states(evidence.until(n), self._stopping)
+                found = states(evidence.until(n), self._stopping, self._fits)
                 taken = int(evidence.looks[n])
                 looks.append(Look(round=n + 1, taken=taken, claims=found))
                 self._say(looks[-1])

@@ -142,7 +142,7 @@ def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
             grid, np.array([k]), np.array([1]), {},
             Chances(chance[[k]], np.array([chance.min()])),
         )  # fmt: skip
-        bets = weighted_bets(one, y[[k]], members, [expected])
+        bets = weighted_bets(one, y[[k]], members, expected[None])
         assert bets.low[0] <= bets.z[0] <= bets.high[0]
         found.append(bets.z[0])
     error = np.std(found) / np.sqrt(len(found))
