@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -97,6 +98,13 @@ class Evidence:
     looks: I64
     values: dict[str, F64]
     chances: Chances | None = None
+
+    def digest(self) -> str:
+        """Return a hash of the trials and their figures."""
+        whole = hashlib.sha256(self.taken.tobytes())
+        for name in sorted(self.values):
+            whole.update(name.encode() + self.values[name].tobytes())
+        return whole.hexdigest()
 
     @cached_property
     def rounds(self) -> I64:

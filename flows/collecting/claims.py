@@ -68,6 +68,7 @@ class ClaimWatch:
         self._kept = Derived.of(store, figures.STEP, campaign.name)
         self._making: dict[str, Future[TrialFigures]] = {}
         self._fits: Fits = {}
+        self._known = False
         self._pool: ProcessPoolExecutor | None = None
 
     @contextmanager
@@ -84,6 +85,7 @@ class ClaimWatch:
 
     def committed(self, trial: Trial) -> None:
         """Begin to make the figures of a trial that was just committed."""
+        self._known = False
         if trial.role == "measured" and trial.id not in self._making and self._pool is not None:
             work = self._work(trial.id)
             if not self._kept.fresh(trial.id, work.key):
@@ -251,9 +253,11 @@ class ClaimWatch:
         if len(looks) <= number:
             evidence = self._evidence(number)
             for n in range(len(looks), len(evidence.looks)):
-                found = states(evidence.until(n), self._stopping, self._fits)
-                taken = int(evidence.looks[n])
-                looks.append(Look(round=n + 1, taken=taken, claims=found))
+                seen = evidence.until(n)
+                found = states(seen, self._stopping, self._fits)
+                looks.append(
+                    Look(round=n + 1, taken=len(seen.taken), evidence=seen.digest(), claims=found)
+                )
                 self._say(looks[-1])
         done = looks[number].taken >= self._stopping.least and settled(looks[number].claims)
         verdict: Verdict = "settled" if done else otherwise
@@ -271,7 +275,7 @@ class ClaimWatch:
         return sum(trial.role == "measured" for trials in following for trial in trials)
 
     def record(self) -> StoppingRecord:
-        """Return the looks so far; none where claims or network are other ones now."""
+        """Return the looks so far; none where claims, network or figures are other ones now."""
         empty = StoppingRecord(
             simulated=self._run_request.rig.simulated,
             section=section_hash(self._stopping),
@@ -283,8 +287,14 @@ class ClaimWatch:
             found = StoppingRecord.load(self._campaign.folder / RECORD)
         except FileNotFoundError:
             return empty
-        same = (found.section, found.model) == (empty.section, empty.model)
-        return found if same else empty
+        if (found.section, found.model) != (empty.section, empty.model):
+            return empty
+        if found.looks and not self._known:  # a trial may have been taken again since
+            seen = self._evidence(len(found.looks) - 1)
+            if seen.digest() != found.looks[-1].evidence:
+                return empty
+        self._known = True
+        return found
 
     def _say(self, look: Look) -> None:
         simulated = "simulated " if self._run_request.rig.simulated else ""

@@ -24,7 +24,7 @@ from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from sliplab.storage.schema.claims import RECORD, StoppingRecord
+from sliplab.storage.schema.claims import RECORD, ChoiceRecord, StoppingRecord
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
@@ -91,8 +91,8 @@ class RunRequest:
     def due_trials(self, campaign: Campaign) -> list[Trial]:
         """Return the trials to take now, in the plan's order."""
         pending = pending_trials(self.plan, campaign)
-        if self.has_claims and self._ended(campaign):
-            return []
+        if (begun := self._begun(campaign)) is not None:
+            pending = [trial for trial in pending if trial.id in begun]
         return [t for t in pending if self.only is None or t.id in self.only][: self.most]
 
     @property
@@ -100,15 +100,23 @@ class RunRequest:
         """Whether claims are looked at."""
         return self.plan.protocol.collection.stopping is not None and self.claims != "ignore"
 
-    def _ended(self, campaign: Campaign) -> bool:
-        """Return whether the campaign ended by its claims, and is to stay so."""
-        claims = self.plan.protocol.collection.stopping
+    def _begun(self, campaign: Campaign) -> set[str] | None:
+        """Return the trials that a campaign had begun when its claims ended it; else None."""
+        collection = self.plan.protocol.collection
+        claims = collection.stopping
+        if claims is None or self.claims != "use":
+            return None
         try:
             record = StoppingRecord.load(campaign.folder / RECORD)
         except FileNotFoundError:
-            return False
-        same = claims is not None and record.section == section_hash(claims)
-        return same and self.claims == "use" and record.verdict in ("settled", "most")
+            return None
+        if record.section != section_hash(claims) or record.verdict not in ("settled", "most"):
+            return None
+        if collection.adaptive is not None:
+            batches = ChoiceRecord.of(campaign.folder).batches
+            return {item.trial for batch in batches for item in batch.trials}
+        repetitions = len(record.looks) * claims.repetitions
+        return {t.id for t in self.plan if t.role == "measured" and t.repetition <= repetitions}
 
     def counts(self, campaign: Campaign) -> CampaignCounts:
         """Count what the campaign holds now; planned = committed + missing."""

@@ -40,6 +40,8 @@ class Look(Part):
     round: Int
     taken: Int
     """Committed measured trials."""
+    evidence: str = ""
+    """Hash of these trials and their figures."""
     claims: tuple[ClaimState, ...]
 
 

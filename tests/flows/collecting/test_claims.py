@@ -147,6 +147,23 @@ def test_a_chosen_trial_is_the_grids_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_a_thread")
+def test_a_trial_that_is_taken_again_is_looked_at_again(tmp_path: Path) -> None:
+    run_request = request(tmp_path / "a", [NEVER], stopping={"most": 8})
+    taken = collect(run_request)
+    before = record_of(run_request).looks[-1].evidence
+    campaign = campaign_of(run_request)
+    campaign.quarantine(campaign.folder / "trials" / taken[1], "again")
+    again = request(tmp_path / "a", [NEVER], stopping={"most": 8})
+    assert collect(again) == [taken[1]]  # and no trial more
+    record = record_of(again)
+    assert (record.verdict, len(record.looks)) == ("most", 2)
+    assert record.looks[-1].taken == 6
+    attempt = campaign.recording(taken[1]).record.attempt
+    assert attempt == 1
+    assert (record.looks[-1].evidence == before) is False
+
+
+@pytest.mark.usefixtures("in_a_thread")
 def test_other_claims_are_looked_at_anew(tmp_path: Path) -> None:
     first = request(tmp_path / "a", [SURE])
     taken = len(collect(first))
