@@ -72,10 +72,10 @@ def fitted(experiment: str, figure: str) -> tuple[Grid, F64, F64, float, float]:
     table = pd.read_csv(TABLE)
     table = table[table["experiment"] == experiment].reset_index(drop=True)
     grid = Grid.of(load_plan(ROOT / f"protocols/{experiment}.yaml"))
-    keys = [tuple(str(level) for _, level in trial.condition) for trial in grid.trials]
+    keys = [tuple(_number(level) for _, level in trial.condition) for trial in grid.trials]
     first = {key: number for number, key in reversed(list(enumerate(keys)))}
     names = [name for name, _ in grid.trials[0].condition]
-    levels = [tuple(_text(v) for v in row) for row in table[names].itertuples(index=False)]
+    levels = [tuple(map(_number, row)) for row in table[names].itertuples(index=False)]
     at = np.array([first[key] for key in levels])
     y = table[figure].to_numpy(np.float64)
     found = expectation(coded(grid.levels), at, y)
@@ -85,8 +85,8 @@ def fitted(experiment: str, figure: str) -> tuple[Grid, F64, F64, float, float]:
     return grid, found.mean, (y - found.mean[at])[ok], float(lost.mean()), never
 
 
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+def _number(level: Any) -> float | str:
+    return level if isinstance(level, str) else float(level)
 
 
 def world_row(number: int, seed: int, adaptive: int) -> dict[str, Any]:
