@@ -6,13 +6,14 @@ from sliplab.analysis.report.figures import twin as figures
 from sliplab.analysis.report.page import Figure, Table, render_page
 from sliplab.storage.schema.drift import DriftFit, ParameterDrift
 
-HEADER = ("parameter", "at first", "unit", "per 100 trials", "over the campaign", "changed")
+HEADER = ("parameter", "at first", "per 100 trials", "over the campaign", "changed")
 
 
 def row(it: ParameterDrift) -> list[str]:
     """Return an identified parameter as a row below `HEADER`."""
+    start = f"{it.start:,.0f}" if it.start >= 1000.0 else f"{it.start:.3g}"
     return [
-        it.title, f"{it.start:,.0f}" if it.start >= 1000.0 else f"{it.start:.3g}", it.unit,
+        it.title, f"{start} {it.unit}".strip(),
         _percent(it.percent_per_100_trials, it.low, it.high),
         _percent(it.change_percent, it.change_low, it.change_high),
         "yes" if it.changed else "no",

@@ -16,6 +16,8 @@ COLUMNS = (
     "trained on", "trials", "validation (%)", "accuracy (%)", "95 %", "behind (points)", "95 %",
     "F1 (%)", "slides: incipient, gross (ms)", "gravity: lead (ms)", "disturbance: lead (ms)",
 )  # fmt: skip
+LATENCIES = 8
+"""Column of the first latency; on a page the others would not fit beside them."""
 
 
 def render(found: TwinGap) -> str:
@@ -29,13 +31,17 @@ def render(found: TwinGap) -> str:
         "strict accuracy on the test trials (%)",
         simulated=found.simulated,
     )
+    table = [cells(it) for it in found.networks]
     return render_page(
         "gap.html",
         simulated=found.simulated,
         found=found,
-        campaigns=", ".join(found.campaigns),
+        campaigns=" and ".join(found.campaigns),
         accuracy=Figure(svg),
-        networks=Table(COLUMNS, [cells(it) for it in found.networks]),
+        networks=Table(COLUMNS[:LATENCIES], [row[:LATENCIES] for row in table]),
+        latencies=Table(
+            ("trained on", *COLUMNS[LATENCIES:]), [[row[0], *row[LATENCIES:]] for row in table]
+        ),
         first=TITLES[found.networks[0].trained_on],
     )
 

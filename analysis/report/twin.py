@@ -11,7 +11,7 @@ from sliplab.analysis.report.page import Figure, Table, render_page
 from sliplab.analysis.twin.parameters import PARAMETERS
 from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.shown import event_map, rate_per_s, slips_s
-from sliplab.storage.schema.twin import EffectNeed, TwinFit
+from sliplab.storage.schema.twin import EffectNeed, ParameterFit, TwinFit
 from sliplab.storage.streams import F64
 
 PANELS = 3
@@ -54,13 +54,13 @@ def render(
         misfits=Table(("check", "stream", "pilot", "most that the scene shows"), misfits),
         intervals=Figure(_intervals(fit)),
         parameters=Table(
-            ("parameter", "key", "assumed", "fitted", "95 % interval", "unit", "identified"),
+            ("parameter", "key", "assumed", "fitted", "95 % interval", "identified"),
             [
                 [
-                    it.title, it.key, _short(it.assumed),
-                    _short(it.value) if it.identified else "–",
-                    f"{_short(it.low)} to {_short(it.high)}", it.unit,
-                    "yes" if it.identified else "no",
+                    f"{it.title} ({it.unit})" if it.unit else it.title, it.key,
+                    _short(it.assumed), _short(it.value) if it.identified else "–",
+                    f"{_short(it.low)} to {_short(it.high)}",
+                    _identified(it),
                 ]
                 for it in fit.parameters
             ],
@@ -92,6 +92,12 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
+def _identified(it: ParameterFit) -> str:
+    if not it.identified:
+        return "no"
+    return "at the edge" if it.low <= it.least or it.high >= it.most else "yes"
+
+
 def _need(it: EffectNeed) -> list[str]:
     if it.loss is None or it.low is None or it.high is None:
         return [it.title, it.verdict, "–", "–", "–", it.shown_by or "–", "–"]
@@ -117,14 +123,15 @@ def _intervals(fit: TwinFit) -> str:
 def _missing(fit: TwinFit, streams: frozenset[str]) -> Table | None:
     """Return what is not identified, and which trials would identify it."""
     known = {parameter.key: parameter for parameter in PARAMETERS}
-    rows = []
+    found: dict[str, list[str]] = {}
     for it in fit.parameters:
         if it.identified:
             continue
         lacking = [name for name in known[it.key].streams if name not in streams]
         needs = ", ".join(WOULD_IDENTIFY[name] for name in lacking)
-        rows.append([it.title, needs or "more trials; these leave it as likely as it was assumed"])
-    return Table(("parameter", "what would identify it"), rows) if rows else None
+        found.setdefault(needs or "more trials of the same kind", []).append(it.title)
+    rows = [[needs, "; ".join(titles)] for needs, titles in found.items()]
+    return Table(("would be identified by", "parameters"), rows) if rows else None
 
 
 def _figures(
@@ -167,7 +174,8 @@ def _figures(
     found.append(
         (
             Figure(svg),
-            "Slip of each marker in each test trial: median of the worlds, over the pilot's.",
+            "Time of each marker's slip in each test trial, since the slide began: median of the "
+            "worlds, over the pilot's.",
         )
     )
     if all(trial.camera is not None for trial in pilot):
@@ -176,7 +184,8 @@ def _figures(
             for worlds in ([pilot], twin, before)
         ]
         svg = figures.maps(means[0], means[1], means[2], simulated=simulated)
-        found.append((Figure(svg), "Where positive events came from during the slides."))
+        caption = "Positive events of the slides in the middle of the event camera's picture."
+        found.append((Figure(svg), caption))
     return found
 
 

@@ -43,51 +43,53 @@ LAYER_STEP = "scene.skin.layer_step_mm"
 
 CONTACT = (
     Parameter("scene.friction.kinetic", "kinetic friction", "", ("frames", "force")),
-    Parameter("scene.friction.static_excess", "static over kinetic friction", "", ("frames",), 0.9),
+    Parameter("scene.friction.static_excess", "excess of static friction", "", ("frames",), 0.9),
     Parameter(
         "scene.friction.path_variation", "friction's variation along a path", "", ("frames",), 0.3
     ),
-    Parameter("scene.friction.correlation_mm", "length of that variation", "mm", ("frames",)),
+    Parameter("scene.friction.correlation_mm", "length of friction's variation", "mm", ("frames",)),
     Parameter(
         "scene.friction.papilla_scatter", "friction's scatter by papilla", "", ("frames",), 0.3
     ),
     Parameter("scene.skin.youngs_modulus_mpa", "Young's modulus of the skin", "MPa", ("force",)),
-    Parameter("scene.skin.base_normal_n_per_m", "stiffness of the base, along", "N/m", ("force",)),
+    Parameter("scene.skin.base_normal_n_per_m", "normal stiffness of the base", "N/m", ("force",)),
     Parameter(
         "scene.skin.base_tangential_n_per_m",
-        "stiffness of the base, across",
+        "tangential stiffness of the base",
         "N/m",
         ("frames", "force"),
     ),
     Parameter(LAYER_STEP, "step of height between layers", "mm", ("frames",)),
     Parameter(
-        "scene.skin.height_scatter_mm", "scatter of heights, half the range", "mm", ("frames",)
+        "scene.skin.height_scatter_mm", "scatter of the papillae's heights", "mm", ("frames",)
     ),
-    Parameter("scene.skin.position_scatter_mm", "scatter of places", "mm", ("frames",)),
+    Parameter(
+        "scene.skin.position_scatter_mm", "scatter of the papillae's places", "mm", ("frames",)
+    ),
     Parameter("scene.skin.relaxation_share", "share of a force that relaxes", "", ("frames",), 0.9),
     Parameter("scene.skin.relaxation_s", "time of relaxation", "s", ("frames",)),
     Parameter("arm.vibration_um", "arm's vibration", "um", ("frames",)),
-    Parameter("arm.vibration_hz", "its frequency", "Hz", ("frames",)),
+    Parameter("arm.vibration_hz", "frequency of the vibration", "Hz", ("frames",)),
 )
 CAMERA = (
     Parameter("event_camera.px_per_mm", "scale of the event camera", "px/mm", ("events",)),
     Parameter("event_camera.radius_mm", "radius of the markers", "mm", ("events",)),
-    Parameter("event_camera.shift_mm_per_n", "image's shift by force", "mm/N", ("events", "force")),
     Parameter(
-        "event_camera.growth_mm_per_n", "image's growth by force", "mm/N", ("events", "force")
+        "event_camera.shift_mm_per_n", "image's shift per force", "mm/N", ("events", "force")
+    ),
+    Parameter(
+        "event_camera.growth_mm_per_n", "markers' growth per force", "mm/N", ("events", "force")
     ),
     Parameter("event_camera.edge_px", "width of the markers' edge", "px", ("events",)),
-    Parameter(
-        "event_camera.contrast", "contrast of the markers, at this threshold", "", ("events",)
-    ),
+    Parameter("event_camera.contrast", "markers' contrast (threshold kept)", "", ("events",)),
     Parameter("event_camera.threshold_sigma", "mismatch of the threshold", "", ("events",)),
     Parameter("event_camera.cutoff_hz", "bandwidth of a pixel", "Hz", ("events",)),
     Parameter("event_camera.refractory_us", "refractory time", "us", ("events",)),
     Parameter("event_camera.noise_hz", "noise of a pixel", "Hz", ("events",)),
-    Parameter("event_camera.leak_share", "share of leakage in it", "", ("events",), 1.0),
+    Parameter("event_camera.leak_share", "share of leakage in the noise", "", ("events",), 1.0),
     Parameter("event_camera.hot_pixels", "hot pixels", "", ("events",)),
     Parameter("event_camera.hot_hz", "rate of a hot pixel", "Hz", ("events",)),
-    Parameter("event_camera.readout_hz", "scans of the read-out", "Hz", ("events",)),
+    Parameter("event_camera.readout_hz", "scan rate of the read-out", "Hz", ("events",)),
     Parameter("event_camera.scan_us", "duration of a scan", "us", ("events",)),
 )
 PARAMETERS = (*CONTACT, *CAMERA)

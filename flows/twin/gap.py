@@ -153,7 +153,11 @@ def own_network(wanted: Gap) -> Iterator[Trained]:
 
 
 def requests(wanted: Gap) -> dict[TrainedOn, list[RunRequest]]:
-    """Return what each simulated network's trials are requested by; write the files for it."""
+    """Return what each simulated network's trials are requested by; write the files for it.
+
+    Raises:
+        StoreError: the folder holds trials of another twin or protocol.
+    """
     protocol = wanted.out / "protocol.yaml"
     data = parse_yaml(read_text(Path(wanted.plan.file), "protocol"), wanted.plan.file)
     # the network of `also` is tested nowhere
@@ -167,18 +171,26 @@ def requests(wanted: Gap) -> dict[TrainedOn, list[RunRequest]]:
     rigs: dict[TrainedOn, list[Path]] = {
         "twin": [wanted.rig], "drawn": drawn, "assumed": [wanted.assumed],
     }  # fmt: skip
-    return {
-        name: [
-            replace(
-                make_request(
-                    protocol, rig, wanted.out / name, campaign=f"{name}-{k + 1}", claims="ignore"
-                ),
-                only=frozenset(training[k :: len(files)]),
-            )
-            for k, rig in enumerate(files)
-        ]
-        for name, files in rigs.items()
-    }
+    try:
+        return {
+            name: [
+                replace(
+                    make_request(
+                        protocol,
+                        rig,
+                        wanted.out / name,
+                        campaign=f"{name}-{k + 1}",
+                        claims="ignore",
+                    ),
+                    only=frozenset(training[k :: len(files)]),
+                )
+                for k, rig in enumerate(files)
+            ]
+            for name, files in rigs.items()
+        }
+    except StoreError as error:
+        text = f"holds trials of another twin or protocol; name another folder with --out ({error})"
+        raise StoreError(f"{wanted.out}: {text}") from error
 
 
 def simulated_network(name: TrainedOn, run_requests: list[RunRequest]) -> Trained:

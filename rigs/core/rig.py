@@ -350,12 +350,16 @@ class Rig:
         while not self.arm.progress().done:
             self.wait(POLL_S)
             depth = self.plate_frame.position(self.arm.pose().xyz_mm).depth_mm
-            if rate.touched(self.central_events()):
+            if rate.touched(self.central_events(), depth, self.clock.now_ns()):
                 self.arm.stop()
-                return depth - speed_mm_s * rate.LATE_S - self.touch_mm
-        state = self.arm.state()
-        if not state.healthy:  # the arm was stopped; the taught plane may still be right
-            raise arm_fault(state, "touching off")
+                break
+        else:
+            state = self.arm.state()
+            if not state.healthy:  # the arm was stopped; the taught plane may still be right
+                raise arm_fault(state, "touching off")
+        surface = rate.surface_mm(speed_mm_s)
+        if surface is not None:
+            return surface - self.touch_mm
         raise RigError(
             "arm",
             f"touching off found no plate within {search_mm:g} mm of the taught plane; "

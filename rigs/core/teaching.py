@@ -185,11 +185,10 @@ class _TouchDetector:
         rig = self._rig
         depth = rig.position().depth_mm
         self.deepest_mm = max(self.deepest_mm, depth)
-        if self._rate.touched(rig.central_events()) and self._by_events_mm is None:
-            self._by_events_mm = depth - self.speed_mm_s * self._rate.LATE_S - rig.touch_mm
+        touched = self._rate.touched(rig.central_events(), depth, rig.clock.now_ns())
+        if touched and self._by_events_mm is None:
+            self._look_back()
             self._limit_mm = min(self._limit_mm, depth + self._creep.after_mm)
-            if self._find is None:
-                self.touched_mm = self._by_events_mm
         if self._find is not None:
             self._host_ns.append(rig.clock.now_ns())
             self._depth_mm.append(depth)
@@ -200,6 +199,21 @@ class _TouchDetector:
                 self.touched_mm = float(np.interp(when, self._host_ns, self._depth_mm))
         return self.touched_mm is not None or depth > self._limit_mm
 
+    def end(self) -> None:
+        """Look at the events of the whole creep, if no touch was noticed on the way."""
+        if self._by_events_mm is None and not self._stopped_outside():
+            self._look_back()
+
+    def _look_back(self) -> None:
+        surface = self._rate.surface_mm(self.speed_mm_s)
+        if surface is not None:
+            self._by_events_mm = surface - self._rig.touch_mm
+            if self._find is None:
+                self.touched_mm = self._by_events_mm
+
+    def _stopped_outside(self) -> bool:
+        return self.deepest_mm < self._creep.search_mm - _OVERTRAVEL_MM
+
     def not_found(self) -> RigError:
         """Return the error that says why no touch was found."""
         if self._by_events_mm is not None:
@@ -209,7 +223,7 @@ class _TouchDetector:
                 f"at {self._by_events_mm:.3f} mm: check that the centre marker is in view, or use "
                 "--by events",
             )
-        if self.deepest_mm < self._creep.search_mm - _OVERTRAVEL_MM:
+        if self._stopped_outside():
             return ArmFault("arm", f"was stopped from outside, at {self.deepest_mm:.2f} mm")
         return RigError(
             "arm",
@@ -232,6 +246,7 @@ def _creep(rig: Rig, clear: Position, deepest: Position, detector: _TouchDetecto
     state = rig.arm.state()
     if not state.healthy:  # a stopped arm finds no plate, though the taught plane may be right
         raise arm_fault(state, "creeping")
+    detector.end()
 
 
 def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:

@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from sliplab.storage.streams import EventChunk
 
@@ -42,22 +43,71 @@ class RateTouch:
     """Detects a touch from the events around the centre papilla.
 
     The noise is the count in `QUIET_S` at rest; a touch is a count in 50 ms above the noise mean by
-    eight standard deviations (Poisson) plus ten events.
+    eight standard deviations (Poisson) plus ten events. Where a touch makes few events, or noise
+    many, no count may exceed that, or a late one only: the whole creep then shows where the rate
+    rose.
     """
 
     LATE_S: ClassVar[float] = 0.025
     """Delay from the middle of those 50 ms to their end, when the touch is detected."""
+    LONG_S: ClassVar[float] = 0.4
+    """Time for which the rate must have risen before the rise, not the 50 ms, is the touch."""
+    LEAST_S: ClassVar[float] = 0.5
+    """Time before a rise: what comes sooner is due to the motion, or to contact."""
+    RISE: ClassVar[float] = 1.7
+    """Smallest rate after a rise, over that before it."""
+    LOG_RATIO: ClassVar[float] = 32.0
+    """Smallest logarithm of a rise's likelihood ratio: that of eight standard deviations."""
 
     def __init__(self, quiet: int) -> None:
         """Set the limit from `quiet`, the number of central events in `QUIET_S`."""
         mean = quiet * 0.1  # per 50 ms
         self.limit = mean + 8 * mean**0.5 + 10
-        self._recent: deque[int] = deque(maxlen=5)
+        self._counts: list[int] = []
+        self._depths_mm: list[float] = []
+        self._at_ns: list[int] = []
+        self._noticed = False
 
-    def touched(self, count: int) -> bool:
+    def touched(self, count: int, depth_mm: float, now_ns: int) -> bool:
         """Return whether the last 50 ms, with `count` events in the last `POLL_S`, are a touch."""
-        self._recent.append(count)
-        return sum(self._recent) > self.limit
+        self._counts.append(count)
+        self._depths_mm.append(depth_mm)
+        self._at_ns.append(now_ns)
+        self._noticed = sum(self._counts[-5:]) > self.limit
+        return self._noticed
+
+    def surface_mm(self, speed_mm_s: float) -> float | None:
+        """Return the depth of the touch, None if there was none.
+
+        It is the depth at which the rate rose, if that is well before the last count; else the last
+        depth less the delay, if that count was a touch.
+        """
+        if not self._counts:
+            return None
+        rise = self._rise()
+        if rise is not None and self._at_ns[-1] - self._at_ns[rise] > self.LONG_S * 1e9:
+            return self._depths_mm[rise]
+        return self._depths_mm[-1] - speed_mm_s * self.LATE_S if self._noticed else None
+
+    def _rise(self) -> int | None:
+        """Return the last count before the rate rose by `RISE` or more, None if it did not.
+
+        The rise is the most likely change of a Poisson process. A light that brightens slowly has
+        one, too, but less high, unless the noise grows more than threefold.
+        """
+        at_s = (np.array(self._at_ns) - self._at_ns[0]) * 1e-9
+        first = int(np.searchsorted(at_s, self.LEAST_S))
+        if first > len(at_s) - 2:
+            return None
+        sums = np.cumsum(self._counts) - self._counts[0]
+        before, all_s = sums[first:-1], at_s[-1]
+        after, rate = sums[-1] - before, before / at_s[first:-1]
+        later = after / (all_s - at_s[first:-1])
+        gain = special.xlogy(before, rate) + special.xlogy(after, later)
+        best = int(np.argmax(gain))
+        ratio = gain[best] - special.xlogy(sums[-1], sums[-1] / all_s)
+        risen = ratio > self.LOG_RATIO and later[best] >= self.RISE * rate[best]
+        return first + best if risen else None
 
 
 class MarkerTouch:

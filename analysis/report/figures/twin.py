@@ -52,7 +52,7 @@ def intervals(factors: Sequence[Factor], *, simulated: bool) -> str:
         ticks = [0.5, 0.7, 1.0, 1.4, 2.0]
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
-        axes.set_xlabel("factor of the rig file's value")
+        axes.set_xlabel("value over the rig file's")
         axes.plot([], [], color=BLUE, lw=2, label="identified, 95 %")
         axes.plot([], [], color=GREY, lw=2, label="not identified")
         axes.plot([], [], color="#dddddd", lw=6, label="simulated worlds")
@@ -123,7 +123,7 @@ def slip_order(
                     label=title,
                 )  # fmt: skip
             ax.set_title(name)
-            ax.set_xlabel("slip of a marker, pilot (s)")
+            ax.set_xlabel("time of a marker's slip, pilot (s)")
         axes[0].set_ylabel("the same, simulated (s)")
         handles, titles = axes[0].get_legend_handles_labels()
         figure.legend(handles, titles, loc="outside lower center", ncols=4, fontsize=8)
@@ -180,10 +180,11 @@ def trends(panels: Sequence[Trend], *, simulated: bool) -> str:
             along = np.linspace(it.places[0], it.places[-1], 50)
             ax.plot(along, (1.0 + it.percent / 100.0) ** ((along - along[0]) / 100.0), color=RED)
             # a parameter that is known to a thousandth stands still
-            ax.set_ylim(min(low.min(), 0.98), max(high.max(), 1.02))
+            least, most = min(low.min(), 0.98), max(high.max(), 1.02)
+            ax.set_ylim(least - 0.05 * (most - least), most + 0.05 * (most - least))
             ax.set_title(it.title, fontsize=8)
         for ax in axes.ravel()[len(panels) :]:
             ax.set_visible(False)
-        figure.supxlabel("place in the plan", fontsize=9)
-        figure.supylabel("over the first", fontsize=9)
+        figure.supxlabel("number of the trial in the plan", fontsize=9)
+        figure.supylabel("value over that at the first reference", fontsize=9)
         return svg_text(figure, simulated)

@@ -162,6 +162,18 @@ def test_numbers_and_page_are_kept_and_nothing_is_made_again(
             assert word in text  # cells of a table may be folded
 
 
+def test_a_twin_that_was_fitted_again_is_asked_for_another_folder(
+    found: TwinGap, wanted: gap.Gap, store: Store, tmp_path: Path
+) -> None:
+    again = twin_file(tmp_path / "twin.yaml")
+    again.write_text(again.read_text().replace("0.75", "0.76"))
+    before = made(wanted.out)
+    asked = gap.request(store, collected(store), again, Path(wanted.plan.file), wanted.out, DRAWN)
+    with pytest.raises(StoreError, match=f"{wanted.out}: holds trials of another twin.*--out"):
+        gap.requests(asked)
+    assert made(wanted.out) == before
+
+
 def test_what_cannot_be_compared_is_refused_before_anything_is_simulated(
     store: Store, tmp_path: Path
 ) -> None:

@@ -260,6 +260,26 @@ def test_touching_off_finds_a_surface_that_was_taught_wrong() -> None:
     assert rig.touch_off(0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
 
 
+FAR_CAMERA: dict[str, Any] = {
+    "event_camera": {"px_per_mm": 11.0, "growth_mm_per_n": 0.31, "contrast": 1.74, "edge_px": 0.68},
+    "scene": {"skin": {"youngs_modulus_mpa": 0.57, "base_normal_n_per_m": 144.0}},
+}
+"""A soft skin, faint markers and a camera so far off that a touch makes a third of the events."""
+
+
+def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
+    rig = make_rig(**FAR_CAMERA)
+    found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 7)]
+    assert min(found) > 0.0  # such a skin is noticed deeper than at the shipped `touch_depth`
+    assert max(found) < 0.4
+
+
+def test_touching_off_in_much_noise_finds_the_surface_nevertheless() -> None:
+    """In 50 ms nothing shows with the first of these seeds, and too late with the others."""
+    rig = make_rig(event_camera={"noise_hz": 0.1})
+    assert np.abs([rig.touch_off(0.5, 1.5, seed) for seed in (1037, 1064, 1128)]).max() < 0.1
+
+
 def test_touching_off_goes_no_deeper_than_its_limit() -> None:
     rig = make_rig()
     rig.plate_frame = PlateFrame(

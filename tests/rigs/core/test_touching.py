@@ -74,14 +74,89 @@ def test_noise_alone_is_no_touch(noise: float) -> None:
     assert all(noticed(way("nothing", seed, noise), 1) is None for seed in range(20))
 
 
+def creep(
+    rates_hz: Floats, seed: int = 0, quiet_hz: float = 35.0, period_s: float = 0.01
+) -> RateTouch:
+    """Creep in from -1.5 mm at 0.5 mm/s to the first touch, with rates of central events."""
+    rng = np.random.default_rng(seed)
+    watch = RateTouch(int(rng.poisson(0.5 * quiet_hz)))
+    for number, rate in enumerate(rates_hz):
+        at_s = (number + 1) * period_s
+        if watch.touched(int(rng.poisson(rate * period_s)), 0.5 * at_s - 1.5, int(1e9 * at_s)):
+            break
+    return watch
+
+
+def rates(kind: str, noise_hz: float = 35.0) -> Floats:
+    """Rates of central events in 600 counts."""
+    t = np.arange(600)
+    if kind == "rises":  # to five times the noise, and never near a touch within 50 ms
+        return np.where(t < 350, noise_hz, 5.0 * noise_hz)
+    if kind == "doubles":
+        return np.where(t < 350, noise_hz, 2.2 * noise_hz)
+    if kind == "moves":  # since the arm moves
+        return np.where(t < 30, noise_hz, 2.2 * noise_hz)
+    if kind == "brightens":
+        return noise_hz * (1.0 + t / 600)
+    if kind == "flashes":
+        return np.where((t >= 350) & (t < 353), 100.0 + noise_hz, noise_hz)
+    if kind == "goes out":
+        return np.where(t < 350, noise_hz, noise_hz / 3.0)
+    return np.full(600, noise_hz)
+
+
 def test_a_rate_is_a_touch_only_above_its_noise() -> None:
     quiet = RateTouch(quiet=1000)  # 100 in 50 ms
-    assert not any(quiet.touched(20) for _ in range(200))
-    assert not any(quiet.touched(30) for _ in range(200))  # 150: five deviations
-    assert any(quiet.touched(45) for _ in range(5))
+    assert not any(quiet.touched(20, 0.0, 10_000_000 * k) for k in range(200))
+    five_deviations = (quiet.touched(30, 0.0, 10_000_000 * k) for k in range(200, 400))
+    assert not any(five_deviations)
+    assert any(quiet.touched(45, 0.0, 10_000_000 * k) for k in range(400, 405))
     silent = RateTouch(quiet=0)
-    assert not silent.touched(10)
-    assert silent.touched(1)
+    assert not silent.touched(10, 0.0, 0)
+    assert silent.touched(1, 0.0, 10_000_000)
+
+
+def test_a_touch_within_50_ms_is_half_of_these_before_it_is_noticed() -> None:
+    jump = np.append(np.full(400, 35.0), np.full(200, 2000.0))
+    watch = creep(jump)
+    assert watch.surface_mm(0.5) == pytest.approx(0.5 * 4.01 - 1.5 - 0.0125, abs=0.011)
+
+
+@pytest.mark.parametrize(("kind", "noise_hz"), [("rises", 35.0), ("doubles", 350.0)])
+def test_a_rate_that_rises_too_little_for_50_ms_is_a_touch_where_it_rose(
+    kind: str, noise_hz: float
+) -> None:
+    """A soft skin on a rig of little noise, and the shipped skin in ten times the noise."""
+    for seed in range(30):
+        surface = creep(rates(kind, noise_hz), seed, noise_hz).surface_mm(0.5)
+        assert surface == pytest.approx(0.25, abs=0.15)
+
+
+def test_a_touch_that_is_noticed_late_is_where_the_rate_rose() -> None:
+    late = np.append(rates("rises")[:500], np.full(20, 2000.0))
+    assert creep(late).surface_mm(0.5) == pytest.approx(0.25, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["nothing", "moves", "brightens", "flashes", "goes out"])
+@pytest.mark.parametrize("noise_hz", [1.0, 35.0, 150.0])
+def test_a_rate_that_changes_otherwise_is_no_touch(kind: str, noise_hz: float) -> None:
+    assert all(
+        creep(rates(kind, noise_hz), seed, noise_hz).surface_mm(0.5) is None for seed in range(30)
+    )
+
+
+def test_counts_that_come_less_often_are_no_rise() -> None:
+    """A busy computer reads the events late: more at once, in as much more time."""
+    watch = RateTouch(quiet=175)
+    rng = np.random.default_rng(1)
+    at_s = np.cumsum(np.append(np.full(300, 0.01), np.full(100, 0.025)))
+    for when, took in zip(at_s, np.diff(at_s, prepend=0.0), strict=True):
+        watch.touched(int(rng.poisson(350 * took)), 0.5 * when, int(1e9 * when))
+    assert watch.surface_mm(0.5) is None
+
+
+def test_a_creep_without_counts_is_no_touch() -> None:
+    assert RateTouch(0).surface_mm(0.5) is None
 
 
 def test_only_events_near_the_centre_count() -> None:
