@@ -33,6 +33,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration
 from sliplab.flows.train import train
 from sliplab.flows.twin.calibrate import calibrate_scene, request
+from sliplab.flows.twin.worlds import touch_depth_mm
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
@@ -80,9 +81,11 @@ def protocols(folder: Path, repetitions: int) -> list[Path]:
 def hidden_rig(folder: Path, assumed: Path, seed: int, number: int) -> Path:
     """Write the rig file of a hidden world."""
     prior = replace(prior_of(CLEAN, seed), rig=load_rig_file(assumed)[0])
-    scene = prior.world(number, pilot_slides()).rig.scene
+    world = prior.world(number, pilot_slides()).rig
     data = {
-        "extends": str(assumed), "name": "hidden", "mock": scene.model_dump(mode="json"),
+        "extends": str(assumed), "name": "hidden", "mock": world.scene.model_dump(mode="json"),
+        # a lab measures it
+        "calibration": {"touch_depth": f"{touch_depth_mm(world):.3f} mm"},
     }  # fmt: skip
     path = folder / "hidden.yaml"
     path.write_text(rig_yaml(data))

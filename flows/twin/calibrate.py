@@ -27,7 +27,7 @@ from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
 from sliplab.analysis.twin.shown import QUANTITIES, compare
 from sliplab.analysis.twin.statistics import Statistics, of_names
-from sliplab.flows.running import orchestration
+from sliplab.flows.running import console, orchestration
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.drawn_rigs import samples_file, write_samples
 from sliplab.flows.twin.needs import cheapest_path, measure_needs, write_cheapest
@@ -40,8 +40,10 @@ from sliplab.flows.twin.worlds import (
     guess_of,
     other_rig,
     simulated,
+    touch_depth_mm,
 )
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
@@ -356,11 +358,21 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     data = {
         "extends": extends,
         "name": wanted.out.stem.replace("_", "-"),
+        **_touch(changed(wanted.rig, mock)),
         "mock": mock,
         "twin": record.model_dump(mode="json"),
     }
     text = f"# Written by `sliplab calibrate scene`: {extends}, fitted to '{record.campaign}'.\n"
     write_text(wanted.out, text + rig_yaml(data))
+
+
+def _touch(rig: RigFile) -> dict[str, Any]:
+    """Return the calibration that depends on skin and camera: where a touch is detected."""
+    try:
+        return {"calibration": {"touch_depth": f"{touch_depth_mm(rig):.3f} mm"}}
+    except RigError as error:
+        console.say(f"warning: touching off does not work on the twin: {error}")
+        return {}
 
 
 def ring_of(rig: RigFile) -> F64:

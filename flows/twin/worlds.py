@@ -26,11 +26,15 @@ from sliplab.flows.running import console, orchestration
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.pilots import LEVEL, simulate_pilot
 from sliplab.protocols import Plan, Trial
+from sliplab.rigs.build import simulated_rig
+from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived, make_key
 
 T = TypeVar("T")
+TOUCH_MM_S, TOUCH_SEARCH_MM, TOUCHES = 0.5, 1.5, 5
+"""As the shipped protocols touch off, and how often here."""
 ZERO_MM = 0.1
 """Largest error of depth zero: touching off finds the plate only so exactly."""
 
@@ -110,6 +114,26 @@ def other_specimen(rig: RigFile, values: Mapping[str, float], seed: int, zero_mm
     """
     made = other_rig(rig, values, {"seed": None, "papillae": None}, zero_mm)
     return changed(made, {"seed": seed})
+
+
+def touch_depth_mm(rig: RigFile) -> float:
+    """Return how deep the skin of a simulated rig is when touching off detects it, mm.
+
+    A lab measures it with a gauge; here the surface is known. It depends on camera and skin.
+
+    Raises:
+        RigError: no touch is detected at all.
+    """
+    devices = build_mock(rig.scene, rig.timing)
+    made = simulated_rig(rig, devices)
+    try:
+        made.connect()
+        surface = devices.world.plane.pose(0.0, 0.0, 0.0).xyz_mm
+        taught = made.plate_frame.with_zero(0.0).position(surface).depth_mm
+        found = [made.touch_off(TOUCH_MM_S, TOUCH_SEARCH_MM, seed) for seed in range(TOUCHES)]
+    finally:
+        made.close()
+    return float(np.median(found)) + made.touch_mm - taught
 
 
 def guess_of(rig: RigFile) -> Guess:
