@@ -349,16 +349,19 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     noise_px = scene.prior.rig.scene.frame_camera.centroid_noise_px
     if noise_px != wanted.rig.scene.frame_camera.centroid_noise_px:
         mock["frame_camera"] = {"centroid_noise_px": noise_px}
+    skin = mock["scene"].setdefault("skin", {})
     if scene.skin:
-        papillae = [papilla.model_dump(mode="json") for papilla in scene.skin["papillae"]]
-        mock.setdefault("scene", {}).setdefault("skin", {})["papillae"] = papillae
+        skin["papillae"] = tuple(scene.skin["papillae"])
+    touch = _touch(changed(wanted.rig, mock))
+    if scene.skin:
+        skin["papillae"] = [papilla.model_dump(mode="json") for papilla in scene.skin["papillae"]]
     path = rig_path(wanted.rig_path)
     shipped = path in shipped_rigs().values()
     extends = path.stem if shipped else os.path.relpath(path.resolve(), wanted.out.parent.resolve())
     data = {
         "extends": extends,
         "name": wanted.out.stem.replace("_", "-"),
-        **_touch(changed(wanted.rig, mock)),
+        **touch,
         "mock": mock,
         "twin": record.model_dump(mode="json"),
     }
