@@ -136,11 +136,11 @@ def more_trials(claim: Claim, state: ClaimState) -> float:
     at, low, high, value = state.estimate, state.low, state.high, claim.value
     if low is None or high is None or at is None:
         return math.inf
-    if claim.within is not None:
+    if claim.kind == "within":
         short, gap = 0.5 * (high - low), value
-    elif claim.between is not None and claim.at_least is not None and abs(at) < value:
+    elif claim.kind == "apart" and abs(at) < value:
         short, gap = max(abs(low), abs(high)) - abs(at), value - abs(at)
-    elif claim.between is not None and claim.at_least is not None:
+    elif claim.kind == "apart":
         short, gap = (at - low if at > 0.0 else high - at), abs(at) - value
     else:
         short, gap = (at - low if at >= value else high - at), abs(at - value)

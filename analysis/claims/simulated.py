@@ -14,7 +14,7 @@ import numpy as np
 from sliplab.analysis.claims.choosing import next_batch
 from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
 from sliplab.analysis.claims.sequences import F64
-from sliplab.analysis.claims.states import History, state_of, states
+from sliplab.analysis.claims.states import Fits, History, state_of, states
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import Claim, Stopping
 from sliplab.storage.schema.claims import Batch, ClaimState
@@ -124,10 +124,11 @@ def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
     stopping = claims_of(plan)
     called: dict[int, Called] = {}
     claims: tuple[Called, ...] = ()
-    rounds = chosen_evidence(plan, grid, values)
+    fits: Fits = {}
+    rounds = chosen_evidence(plan, grid, values, fits)
     evidence = next(rounds)
     while True:
-        found = states(evidence, stopping)
+        found = states(evidence, stopping, fits)
         for number, state in enumerate(found):
             if is_called(state):
                 called.setdefault(number, Called(len(evidence.looks) - 1, state))
@@ -143,8 +144,14 @@ def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
     return Course(evidence, claims, len(evidence.taken) if settled else None)
 
 
-def chosen_evidence(plan: Plan, grid: Grid, values: dict[str, F64]) -> Iterator[Evidence]:
-    """Yield what an adaptive campaign has seen after each round; it goes on to the whole grid."""
+def chosen_evidence(
+    plan: Plan, grid: Grid, values: dict[str, F64], fits: Fits
+) -> Iterator[Evidence]:
+    """Yield what an adaptive campaign has seen after each round; it goes on to the whole grid.
+
+    Args:
+        fits: as for `states`.
+    """
     stopping, choice = claims_of(plan), plan.protocol.collection.adaptive
     assert choice is not None
     batches: list[Batch] = []
@@ -152,7 +159,7 @@ def chosen_evidence(plan: Plan, grid: Grid, values: dict[str, F64]) -> Iterator[
     while True:
         known = _seen(grid, batches, looks[:-1], values)  # nobody waits for the last round's
         for _ in range(grid.stretches):
-            batch = next_batch(known, batches, stopping, choice, plan.seed)
+            batch = next_batch(known, batches, stopping, choice, plan.seed, fits)
             if batch is not None:
                 batches.append(batch)
         taken = sum(len(batch.trials) for batch in batches)

@@ -115,7 +115,16 @@ def test_an_estimate_at_what_is_claimed_is_never_called() -> None:
     plan = plan_of([{"figure": "first_slip", "at_least": "1 s"}])
     claim = claims_of(plan).claims[0]
     at = ClaimState(
-        claim="", trials=9, estimate=1000.0, low=900.0, high=1100.0, holds=False, refuted=False
+        claim="",
+        kind="at_least",
+        value=1000.0,
+        unit="ms",
+        trials=9,
+        estimate=1000.0,
+        low=900.0,
+        high=1100.0,
+        holds=False,
+        refuted=False,
     )
     assert more_trials(claim, at) == np.inf
     half = at.model_copy(update={"estimate": 1050.0, "low": 950.0})
