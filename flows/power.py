@@ -8,7 +8,7 @@ so a stop resumes, and a second run with other claims takes only the drawing.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -52,11 +52,11 @@ FEWEST_TRAINING = 8
 CAMPAIGNS, ADAPTIVE_CAMPAIGNS = 100, 20
 """Drawn where the plan gives the order, and where trials are chosen, which takes longer."""
 SPLITS = ("train", "validation", "test")
-LOGISTIC, NETWORK = "logistic", "network"
 Classifier = Literal["logistic", "network"]
-TITLES = {
-    LOGISTIC: "logistic regression on cells and parts of a window",
-    NETWORK: "the protocol's network",
+LOGISTIC: Classifier = "logistic"
+TITLES: Mapping[Classifier, str] = {
+    "logistic": "logistic regression on cells and parts of a window",
+    "network": "the pilot's network",
 }
 PilotTrial = tuple[Collected, Trial, Recording]
 

@@ -62,10 +62,12 @@ def power(
     prepare_store(store)  # before anything imports Prefect
     from sliplab.analysis.campaigns import collected
     from sliplab.analysis.report.power import COLUMNS, rows, sentence
-    from sliplab.flows.power import measure_power, plan_with_claims, request
+    from sliplab.flows.power import Classifier, measure_power, plan_with_claims, request
 
     plan, judging = plan_with_claims(protocol, claims or (), enable or (), model)
-    classifier = None if no_training else "network" if network else "logistic"
+    classifier: Classifier | None = "network" if network else "logistic"
+    if no_training:
+        classifier = None
     asked = request(pilot, collected(pilot, names), plan, judging, draws, seed, classifier)
     out = pilot.folder / "report" if out is None else out
     found = measure_power(asked, out)
