@@ -57,6 +57,11 @@ _DOCUMENTS = {
         "`FOLDER/gap.json`: networks trained on a twin and tested on its rig "
         "([Twins](../twin.md#trained-on-the-twin-tested-on-the-rig)).",
     ),
+    "power": (
+        "The trials that claims need",
+        "`report/power.json`: after how many trials claims are called in campaigns that were drawn "
+        "from a pilot ([Fewer trials](../fewer.md#how-many-are-enough)).",
+    ),
 }
 """Title and place of each document in a store."""
 _ITEM = re.compile(r"(- |1\. )\S")

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import logsumexp
 
 F64 = npt.NDArray[np.float64]
 STAKES: F64 = np.geomspace(0.03, 0.95, 6)
@@ -65,7 +64,7 @@ def capital(bets: Bets, mean: float, *, above: bool) -> F64:
     share = gain / np.maximum(room, 1e-12)  # of a stake, at least -1
     grown = np.cumsum(np.log1p(STAKES[:, None] * np.maximum(share, -1.0)), axis=1)
     at_looks = np.where(bets.looks > 0, grown[:, np.maximum(bets.looks - 1, 0)], 0.0)
-    return np.asarray(logsumexp(at_looks, axis=0) - np.log(len(STAKES)))
+    return np.asarray(np.logaddexp.reduce(at_looks, axis=0) - np.log(len(STAKES)))
 
 
 def refuted(bets: Bets, mean: float, error: float, *, above: bool) -> bool:

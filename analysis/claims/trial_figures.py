@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sliplab.analysis.labels.labelling import label_results
+from sliplab.analysis.trial_work import TrialWork
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import MARGIN, AnalysisSettings
 from sliplab.storage.schema.claims import TrialFigures
 from sliplab.storage.schema.label import TrialLabel
+from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
 
 if TYPE_CHECKING:
@@ -34,6 +37,22 @@ class Judge:
 
     settings: AnalysisSettings
     model: Path | None
+
+    @cached_property
+    def model_hash(self) -> str | None:
+        """Hash of the network's file; None without one."""
+        return None if self.model is None else hashlib.sha256(self.model.read_bytes()).hexdigest()
+
+    def work(self, recording: Recording, campaign: str) -> TrialWork:
+        """Return a trial's figures as work, with the key that they are kept by."""
+        settings = self.settings.model_dump(mode="json")
+        key = make_key(STEP, VERSION, [recording.checksum, self.model_hash], settings)
+        return TrialWork(recording, campaign, key, self)
+
+
+def kept_figures(recording: Recording, judge: Judge) -> tuple[TrialFigures, None]:
+    """Return the figures of a trial as a result to keep."""
+    return trial_figures(recording, judge), None
 
 
 def trial_figures(recording: Recording, judge: Judge) -> TrialFigures:

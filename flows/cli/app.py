@@ -12,6 +12,7 @@ from sliplab.flows.cli import (
     detect,
     exchange,
     new,
+    power,
     publish,
     review,
     rigs,
@@ -54,6 +55,7 @@ def options(
 
 for part in (
     collect.app,
+    power.app,
     steps.app,
     sweeps.app,
     study.app,

@@ -8,7 +8,6 @@ whoever resumes chooses the same.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -43,7 +42,7 @@ from sliplab.storage.schema.claims import (
     TrialFigures,
     Verdict,
 )
-from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Campaign, Store
 
 WAIT_S = 600.0
@@ -62,7 +61,8 @@ class ClaimWatch:
         self._run_request, self._store, self._campaign = run_request, store, campaign
         self._stopping: Stopping = collection.stopping
         self._choice = collection.adaptive
-        self._model = run_request.judging_model
+        analysis = run_request.plan.protocol.analysis
+        self._judge = figures.Judge(analysis, run_request.judging_model)
         self._grid = Grid.of(run_request.plan)
         self._batches = ChoiceRecord.of(campaign.folder).batches
         self._kept = Derived.of(store, figures.STEP, campaign.name)
@@ -93,16 +93,7 @@ class ClaimWatch:
                 self._making[trial.id] = self._pool.submit(make_in_process, job)
 
     def _work(self, trial: str) -> TrialWork:
-        recording = self._campaign.recording(trial)
-        judge = figures.Judge(self._run_request.plan.protocol.analysis, self._model)
-        settings = judge.settings.model_dump(mode="json")
-        inputs = [recording.checksum, self._model_hash]
-        key = make_key(figures.STEP, figures.VERSION, inputs, settings)
-        return TrialWork(recording, self._campaign.name, key, judge)
-
-    @cached_property
-    def _model_hash(self) -> str | None:
-        return None if self._model is None else hashlib.sha256(self._model.read_bytes()).hexdigest()
+        return self._judge.work(self._campaign.recording(trial), self._campaign.name)
 
     def _figures(self, trial: str) -> TrialFigures:
         """Return the figures of a committed trial; make them if need be.
@@ -279,7 +270,7 @@ class ClaimWatch:
         empty = StoppingRecord(
             simulated=self._run_request.rig.simulated,
             section=section_hash(self._stopping),
-            model=self._model_hash,
+            model=self._judge.model_hash,
             verdict="open",
             looks=(),
         )

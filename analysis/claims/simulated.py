@@ -1,0 +1,184 @@
+"""Campaigns that end by their claims, with the figures of all trials given: no rig, no store.
+
+The same procedure as that of a campaign that is collected (`flows.collecting.claims`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplab.analysis.claims.choosing import next_batch
+from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
+from sliplab.analysis.claims.sequences import F64
+from sliplab.analysis.claims.states import Fits, History, state_of, states
+from sliplab.protocols import Plan
+from sliplab.protocols.claims import Claim, Stopping
+from sliplab.storage.schema.claims import Batch, ClaimState
+
+
+@dataclass(frozen=True)
+class Called:
+    """How a claim came out.
+
+    Attributes:
+        look: number of the look at which it was called; None: never.
+        state: then, or at the last look.
+    """
+
+    look: int | None
+    state: ClaimState
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a campaign went.
+
+    Attributes:
+        evidence: at its end; its looks are all that a campaign of a given order might have had.
+        claims: in order.
+        ended: trials of the campaign where its claims ended it; None: they did not.
+    """
+
+    evidence: Evidence
+    claims: tuple[Called, ...]
+    ended: int | None
+
+
+def course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
+    """Return how a campaign of a plan with claims goes.
+
+    Args:
+        grid: of the plan. values: (N,) by figure, of its trials in its order.
+    """
+    if plan.protocol.collection.adaptive is not None:
+        return _chosen_course(plan, grid, values)
+    stopping = claims_of(plan)
+    evidence = planned_evidence(plan, grid, values)
+    claims = tuple(_called(evidence, claim, stopping.error) for claim in stopping.claims)
+    settled = _settled(evidence, claims, stopping.least)
+    return Course(evidence, claims, None if settled is None else int(evidence.looks[settled]))
+
+
+def claims_of(plan: Plan) -> Stopping:
+    """Return the claims of a plan that has some."""
+    stopping = plan.protocol.collection.stopping
+    assert stopping is not None
+    return stopping
+
+
+def is_called(state: ClaimState) -> bool:
+    """Return whether a claim holds or is refuted."""
+    return state.holds or state.refuted
+
+
+def _settled(evidence: Evidence, claims: Sequence[Called], least: int) -> int | None:
+    """Return the first look at which all claims are called; None before it."""
+    called = [it.look for it in claims if it.look is not None]
+    if len(called) < len(claims):
+        return None
+    enough = (k for k in range(max(called), len(evidence.looks)) if evidence.looks[k] >= least)
+    return next(enough, None)
+
+
+def planned_evidence(plan: Plan, grid: Grid, values: dict[str, F64]) -> Evidence:
+    """Return all that a campaign sees whose order its plan gives, with a look after each round.
+
+    A round with which it would take more trials than it may is left out.
+    """
+    stopping = claims_of(plan)
+    rounds = [(trial.repetition - 1) // stopping.repetitions for trial in grid.trials]
+    ends = np.flatnonzero(np.diff([*rounds, rounds[-1] + 1])) + 1
+    if stopping.most is not None:
+        ends = ends[: max(int((ends <= stopping.most).sum()), 1)]
+    taken = np.arange(int(ends[-1]))
+    shown = {name: value[: len(taken)] for name, value in values.items()}
+    return Evidence(grid, taken, np.asarray(ends, np.int64), shown)
+
+
+def _called(evidence: Evidence, claim: Claim, error: float) -> Called:
+    """Return how a claim comes out. Once called it stays so, and the look is found by halving."""
+
+    def state(look: int) -> ClaimState:
+        return state_of(claim, History(evidence.until(look)), error)
+
+    begin, end = 0, len(evidence.looks) - 1
+    last = state(end)
+    if not is_called(last):
+        return Called(None, last)
+    while begin < end:
+        middle = (begin + end) // 2
+        found = state(middle)
+        if is_called(found):
+            end, last = middle, found
+        else:
+            begin = middle + 1
+    return Called(end, last)
+
+
+def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
+    """Return how an adaptive campaign goes: it takes one more round than it needs."""
+    stopping = claims_of(plan)
+    called: dict[int, Called] = {}
+    claims: tuple[Called, ...] = ()
+    fits: Fits = {}
+    rounds = chosen_evidence(plan, grid, values, fits)
+    evidence = next(rounds)
+    while True:
+        found = states(evidence, stopping, fits)
+        for number, state in enumerate(found):
+            if is_called(state):
+                called.setdefault(number, Called(len(evidence.looks) - 1, state))
+        claims = tuple(called.get(k, Called(None, state)) for k, state in enumerate(found))
+        settled = _settled(evidence, claims, stopping.least) is not None
+        following = next(rounds, None)
+        too_many = following is not None and len(following.taken) > (stopping.most or math.inf)
+        if following is None or too_many:
+            break
+        evidence = following
+        if settled:
+            break
+    return Course(evidence, claims, len(evidence.taken) if settled else None)
+
+
+def chosen_evidence(
+    plan: Plan, grid: Grid, values: dict[str, F64], fits: Fits
+) -> Iterator[Evidence]:
+    """Yield what an adaptive campaign has seen after each round; it goes on to the whole grid.
+
+    Args:
+        fits: as for `states`.
+    """
+    stopping, choice = claims_of(plan), plan.protocol.collection.adaptive
+    assert choice is not None
+    batches: list[Batch] = []
+    looks: list[int] = []
+    while True:
+        known = _seen(grid, batches, looks[:-1], values)  # nobody waits for the last round's
+        for _ in range(grid.stretches):
+            batch = next_batch(known, batches, stopping, choice, plan.seed, fits)
+            if batch is not None:
+                batches.append(batch)
+        taken = sum(len(batch.trials) for batch in batches)
+        if looks and taken == looks[-1]:
+            return
+        looks.append(taken)
+        yield _seen(grid, batches, looks, values)
+
+
+def _seen(
+    grid: Grid, batches: Sequence[Batch], looks: Sequence[int], values: dict[str, F64]
+) -> Evidence:
+    """Return what rounds that end at `looks` show."""
+    items = [(item, batch) for batch in batches for item in batch.trials]
+    items = items[: looks[-1] if looks else 0]
+    taken = np.array([grid.number[item.trial] for item, _ in items], np.int64)
+    chances = Chances(
+        np.array([item.chance for item, _ in items], np.float64),
+        np.array([batch.least for _, batch in items], np.float64),
+    )
+    shown = {name: value[taken] for name, value in values.items()}
+    return Evidence(grid, taken, np.array(looks, np.int64), shown, chances)

@@ -1,0 +1,84 @@
+"""`sliplab power`: how many trials the claims of a protocol need."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sliplab.flows.cli.common import CampaignOption, EnableOption, JsonOption, ProtocolArgument
+from sliplab.flows.running import console
+
+app = typer.Typer()
+
+
+@app.command()
+def power(
+    protocol: ProtocolArgument,
+    store: Annotated[
+        Path, typer.Option("--store", help="Folder of a store with trials of a pilot or a twin.")
+    ],
+    names: CampaignOption = None,
+    claims: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--claim",
+            help="In place of the protocol's claims: '{figure: accuracy, within: 1 %}'. "
+            "Repeatable.",
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", help="The network that judges trials, in place of the protocol's."),
+    ] = None,
+    enable: EnableOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the page and its numbers; default: STORE/report."),
+    ] = None,
+    draws: Annotated[
+        int | None,
+        typer.Option(
+            "--draws", min=10, max=10_000,
+            help="Campaigns to draw; default: 100, and 20 with order: adaptive.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31, help="Of the draws.")] = 1,
+    network: Annotated[
+        bool,
+        typer.Option("--network", help="Train the network itself for the learning curve."),
+    ] = False,
+    no_training: Annotated[
+        bool, typer.Option("--no-training", help="Leave the learning curve out.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:  # fmt: skip
+    """Say after how many trials a protocol's claims are called, by a pilot's labelled trials."""
+    from sliplab.flows.steps import prepare_store
+    from sliplab.storage.remote.mirror import open_store
+
+    pilot = open_store(store)
+    prepare_store(store)  # before anything imports Prefect
+    from sliplab.analysis.campaigns import collected
+    from sliplab.analysis.report.power import COLUMNS, rows, sentence
+    from sliplab.flows.power import Classifier, measure_power, plan_with_claims, request
+
+    plan, judging = plan_with_claims(protocol, claims or (), enable or (), model)
+    classifier: Classifier | None = "network" if network else "logistic"
+    if no_training:
+        classifier = None
+    asked = request(pilot, collected(pilot, names), plan, judging, draws, seed, classifier)
+    out = pilot.folder / "report" if out is None else out
+    found = measure_power(asked, out)
+    if as_json:
+        console.print_json({"page": str(out / "power.html"), **found.to_json()})
+        return
+    kind = "simulated pilot" if found.simulated else "pilot"
+    title = f"claims of {found.protocol}, by {found.pilot_trials} trials of a {kind}"
+    console.print_table(title, COLUMNS, rows(found), spare=0)
+    for note in found.notes:
+        console.say(f"note: {note}")
+    for text in sentence(found):
+        console.say(text)
+    console.say(f"page: {out / 'power.html'}")

@@ -1,0 +1,240 @@
+"""Numbers of trials that claims need, as a pilot lets expect, against campaigns that were taken."""
+
+from __future__ import annotations
+
+import copy
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.claims.evidence import Grid
+from sliplab.analysis.claims.power import Drawing, claim_powers, more_trials, spread
+from sliplab.analysis.claims.resampling import Axis, Pilot, shared_axes
+from sliplab.analysis.claims.sequences import F64
+from sliplab.analysis.claims.simulated import claims_of, course
+from sliplab.protocols import Plan
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.plan import make_plan
+from sliplab.protocols.yaml_file import KeyedError, validate
+from sliplab.storage.schema.claims import ClaimState
+from sliplab.storage.schema.power import ClaimPower
+from tests.conftest import SMALL
+
+DEPTHS = (Decimal("2.4"), Decimal("2.8"), Decimal("3.4"))
+MEDIAN = {"figure": "first_slip", "within": "50 ms"}
+
+
+def plan_of(claims: list[dict[str, Any]], repetitions: int = 60, **collection: Any) -> Plan:
+    """Three depths, nothing else varied."""
+    data = copy.deepcopy(SMALL)
+    data["collection"]["factors"] = {
+        "depth": {"unit": "mm", "values": [Decimal("2.4"), Decimal("2.8"), Decimal("3.4")]},
+        "speed": {"unit": "mm/s", "values": [1]},
+        "direction": {"unit": "deg", "values": [0]},
+    }
+    stopping = {"claims": claims, **collection.pop("stopping", {})}
+    data["collection"] |= {"repetitions": repetitions, "stopping": stopping, **collection}
+    return make_plan(validate(Protocol, data, "p.yaml"), "p.yaml")
+
+
+def pilot_of(plan: Plan, depths: list[Decimal], values: dict[str, F64]) -> Pilot:
+    """Trials at these depths, all in one block."""
+    conditions = [{"depth": depth} for depth in depths]
+    axes, _ = shared_axes(
+        conditions, plan.protocol.collection.all_factors, plan.enabled, claims_of(plan).claims
+    )
+    return Pilot(axes, tuple(conditions), np.zeros(len(depths), np.int64), values)
+
+
+def normal_pilot(plan: Plan, count: int, seed: int, deviation: float = 200.0) -> Pilot:
+    """First slips of normal distribution around 1 s, the same at all depths."""
+    values = np.random.default_rng(seed).normal(1000.0, deviation, count)
+    return pilot_of(plan, [DEPTHS[k % 3] for k in range(count)], {"first_slip": values})
+
+
+def power_of(plan: Plan, pilot: Pilot, campaigns: int = 20) -> tuple[ClaimPower, ...]:
+    """Draw campaigns."""
+    drawing = Drawing(plan, pilot, 1)
+    return claim_powers(drawing, [drawing.campaign(k) for k in range(campaigns)])
+
+
+@pytest.mark.long
+def test_normal_figures_take_as_many_trials_as_foretold() -> None:
+    """The real procedure on fresh data of 20 worlds, each foretold by a pilot of 36 trials.
+
+    Campaigns of one and the same world differ by a factor of 1.3 in their trials themselves.
+    """
+    plan = plan_of([{"figure": "first_slip", "within": "80 ms"}], repetitions=120)
+    grid = Grid.of(plan)
+    ratios, inside = [], 0
+    for world in range(20):
+        deviation = 150.0 + 5.0 * world
+        (found,) = power_of(plan, normal_pilot(plan, 36, world, deviation), 10)
+        fresh = np.random.default_rng([7, world]).normal(1000.0, deviation, len(grid.trials))
+        taken = course(plan, grid, {"first_slip": fresh}).ended
+        low, median, high = found.trials.low, found.trials.median, found.trials.high
+        assert None not in (taken, low, median, high)
+        ratios.append(median / taken)  # type: ignore[operator]
+        inside += low <= taken <= high  # type: ignore[operator]
+    assert 1 / 1.3 < np.median(ratios) < 1.3
+    assert inside >= 12
+
+
+def test_a_claim_that_is_certain_needs_few_trials() -> None:
+    plan = plan_of([{"figure": "first_slip", "statistic": "p90", "at_most": "5 s"}])
+    (found,) = power_of(plan, normal_pilot(plan, 36, 1))
+    assert found.holds == 1.0
+    assert found.trials.high is not None
+    assert found.trials.high < 60
+    assert found.repetitions is None
+
+
+def test_a_claim_that_is_false_is_refuted() -> None:
+    plan = plan_of([{"figure": "first_slip", "at_least": "1.3 s"}])
+    (found,) = power_of(plan, normal_pilot(plan, 36, 1))
+    assert found.refuted == 1.0
+
+
+def test_a_claim_that_the_plan_cannot_have_says_how_many_repetitions_would() -> None:
+    """Of normal figures a median known to 20 ms takes more than the plan's 180 trials."""
+    claim = {"figure": "first_slip", "within": "20 ms"}
+    plan = plan_of([claim])
+    pilot = normal_pilot(plan, 60, 3)
+    (found,) = power_of(plan, pilot)
+    assert found.never == 1.0
+    assert found.trials.median is None
+    assert found.repetitions is not None
+    (enough,) = power_of(plan_of([claim], repetitions=4 * found.repetitions), pilot, 6)
+    assert enough.trials.median is not None
+    assert 0.4 < enough.trials.median / (3 * found.repetitions) < 2.5
+
+
+def test_an_estimate_at_what_is_claimed_is_never_called() -> None:
+    plan = plan_of([{"figure": "first_slip", "at_least": "1 s"}])
+    claim = claims_of(plan).claims[0]
+    at = ClaimState(
+        claim="",
+        kind="at_least",
+        value=1000.0,
+        unit="ms",
+        trials=9,
+        estimate=1000.0,
+        low=900.0,
+        high=1100.0,
+        holds=False,
+        refuted=False,
+    )
+    assert more_trials(claim, at) == np.inf
+    half = at.model_copy(update={"estimate": 1050.0, "low": 950.0})
+    assert more_trials(claim, half) == pytest.approx(4.0)
+    assert more_trials(claim, at.model_copy(update={"low": None})) == np.inf
+
+
+def test_undetected_trials_come_as_often_as_in_the_pilot() -> None:
+    """At one depth nothing is detected in half of the trials; a sixth of the campaign's then."""
+    plan = plan_of([{"figure": "latency_gross", "at_most": "100 ms"}])
+    depths = [DEPTHS[k % 3] for k in range(60)]
+    values = np.random.default_rng(1).normal(40.0, 10.0, 60)
+    values[2::6] = np.inf
+    values[0] = np.nan
+    pilot = pilot_of(plan, depths, {"latency_gross": values})
+    grid = Grid.of(plan)
+    drawn = [
+        pilot.campaign(grid, np.random.default_rng(k))["latency_gross"] for k in range(20)
+    ]  # fmt: skip
+    deepest = np.array([dict(trial.condition)["depth"] == DEPTHS[2] for trial in grid.trials])
+    share = np.mean([np.isinf(each[deepest]).mean() for each in drawn])
+    assert share == pytest.approx(0.5, abs=0.08)
+    assert not any(np.isinf(each[~deepest]).any() for each in drawn)
+    missing = np.mean([np.isnan(each).mean() for each in drawn])
+    assert missing == pytest.approx(1 / 60, abs=0.01)
+    (found,) = power_of(plan, pilot)
+    assert found.holds > 0.9
+    (against,) = power_of(
+        plan_of([{"figure": "latency_gross", "statistic": "p90", "at_most": "100 ms"}]), pilot
+    )
+    assert against.holds == 0.0
+
+
+def test_effects_of_factors_and_of_blocks_are_kept() -> None:
+    plan = plan_of([MEDIAN])
+    rng = np.random.default_rng(2)
+    depths = [DEPTHS[k % 3] for k in range(120)]
+    blocks = np.arange(120) // 6
+    of_block = rng.normal(0.0, 100.0, 20)[blocks]
+    values = 300.0 * (np.arange(120) % 3) + of_block + rng.normal(0.0, 30.0, 120)
+    pilot = Pilot(
+        pilot_of(plan, depths, {}).axes, tuple({"depth": depth} for depth in depths), blocks,
+        {"first_slip": values},
+    )  # fmt: skip
+    grid = Grid.of(plan)
+    drawn = np.array(
+        [pilot.campaign(grid, np.random.default_rng(k))["first_slip"] for k in range(30)]
+    )
+    by_depth = [
+        drawn[:, [dict(trial.condition)["depth"] == depth for trial in grid.trials]].mean()
+        for depth in DEPTHS
+    ]
+    assert np.diff(by_depth) == pytest.approx([300.0, 300.0], abs=40.0)
+    within = drawn.reshape(30, 60, 3).mean(axis=2).std(axis=1)
+    assert within.mean() == pytest.approx(100.0, rel=0.3)
+
+
+def test_levels_between_are_said_and_those_outside_are_refused() -> None:
+    plan = plan_of([MEDIAN])
+    factors = plan.protocol.collection.all_factors
+    few: list[dict[str, Any]] = [{"depth": DEPTHS[0]}, {"depth": DEPTHS[2]}]
+    axes, notes = shared_axes(few, factors, plan.enabled, ())
+    assert any("lacks depth 2.8 mm" in note for note in notes)
+    (depth,) = axes
+    assert depth.weights(DEPTHS[1], np.random.default_rng(0)) == pytest.approx([0.6, 0.4])
+    outside: list[dict[str, Any]] = [{"depth": DEPTHS[0]}, {"depth": DEPTHS[1]}]
+    with pytest.raises(
+        KeyedError, match=r"outside of the pilot's levels, 2\.4 mm, 2\.8 mm"
+    ) as error:
+        shared_axes(outside, factors, plan.enabled, ())
+    assert (error.value.key, error.value.value) == ("collection.factors.depth", "3.4 mm")
+
+
+def test_directions_go_round() -> None:
+    axis = Axis("direction", tuple(map(Decimal, (0, 90, 180, 270))), turns=True)
+    rng = np.random.default_rng(0)
+    assert axis.knows(Decimal(315))
+    assert axis.weights(Decimal(315), rng) == pytest.approx([0.5, 0, 0, 0.5])
+    assert axis.weights(Decimal(-30), rng) == pytest.approx([2 / 3, 0, 0, 1 / 3])
+    assert not Axis("twist", axis.levels).knows(Decimal(315))
+
+
+def test_words_that_the_pilot_lacks_are_taken_for_one_of_its_own() -> None:
+    axis = Axis("skin", ("a", "b"))
+    rng = np.random.default_rng(0)
+    drawn = np.array([axis.weights("c", rng) for _ in range(200)])
+    assert set(map(tuple, drawn)) == {(1.0, 0.0), (0.0, 1.0)}
+    assert drawn.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.1)
+
+
+def test_a_number_of_trials_that_few_campaigns_reach() -> None:
+    assert spread([30, None, 10, 20, None]).median == 30
+    assert spread([30, None, 10, None, None]).median is None
+
+
+def test_an_adaptive_campaign_takes_one_more_round_than_it_needs() -> None:
+    plan = plan_of([MEDIAN], order="adaptive", choice={"batch": 15, "start": 30})
+    grid = Grid.of(plan)
+    values = {"first_slip": np.random.default_rng(1).normal(1000.0, 120.0, len(grid.trials))}
+    found = course(plan, grid, values)
+    (claim,) = found.claims
+    assert claim.look is not None
+    assert found.ended == found.evidence.looks[claim.look] + 15
+
+
+def test_least_and_most_bound_a_campaign() -> None:
+    certain = {"figure": "first_slip", "at_most": "9 s"}
+    grid = Grid.of(plan := plan_of([certain], stopping={"least": 100}))
+    values = {"first_slip": np.random.default_rng(1).normal(1000.0, 120.0, len(grid.trials))}
+    assert course(plan, grid, values).ended == 102
+    short = plan_of([MEDIAN], stopping={"most": 20})
+    found = course(short, grid, values)
+    assert (found.ended, len(found.evidence.taken)) == (None, 18)

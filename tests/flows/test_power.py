@@ -1,0 +1,153 @@
+"""`sliplab power` on a small store: figures, draws, page, learning curve, and wrong input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.analysis.claims import learning, trial_figures
+from sliplab.flows import power
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.study import Outcome
+from sliplab.storage.schema.power import PowerRecord
+from tests.command_line import answer, here
+from tests.flows.conftest import tiny, write
+
+DURATION = "{figure: slip_duration, within: 400 ms}"
+ACCURACY = "{figure: accuracy, at_least: 1 %}"
+Ran = tuple[list[RunRequest], Outcome]
+
+
+@pytest.fixture
+def protocol(tmp_path: Path) -> Path:
+    """The small campaign's own protocol, with many repetitions."""
+    data = tiny()
+    data["collection"]["repetitions"] = 20
+    return write(tmp_path / "wanted.yaml", data)
+
+
+def error_of(*words: object) -> dict[str, Any]:
+    done = here("power", *words, "--json")
+    assert done.returncode == 2, done.stderr
+    error: dict[str, Any] = json.loads(done.stdout)["error"]
+    return error
+
+
+def test_figures_are_made_once_and_the_page_says_simulated(
+    ran: Ran, protocol: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (protocol, "--store", ran[0][0].store, "--out", tmp_path, "--draws", 10)
+    found = answer("power", *words, "--claim", DURATION)
+    record = PowerRecord.load(tmp_path / "power.json")
+    assert found.pop("page") == str(tmp_path / "power.html")
+    assert found == record.to_json()
+    assert (record.simulated, record.pilot_trials, record.planned) == (True, 6, 120)
+    assert record.pilots == ("tiny",)
+    (claim,) = record.claims
+    assert claim.holds + claim.refuted + claim.never == pytest.approx(1.0)
+    assert len(record.ended) == 10
+    page = (tmp_path / "power.html").read_text()
+    assert "simulated pilot" in page
+    assert claim.claim in page
+
+    def fail(*_: object) -> None:
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(trial_figures, "trial_figures", fail)
+    assert answer("power", *words, "--claim", DURATION)["ended"] == list(record.ended)
+
+
+def test_a_claim_that_cannot_be_had_is_said_so(ran: Ran, protocol: Path, tmp_path: Path) -> None:
+    done = here(
+        "power", protocol, "--store", ran[0][0].store, "--out", tmp_path, "--draws", 10,
+        "--claim", "{figure: slip_duration, within: 1 ms}",
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert "cannot be had by this plan" in done.stderr
+    assert "repetitions of each condition in place of 20" in done.stderr
+    assert "Cannot be had by this plan" in (tmp_path / "power.html").read_text()
+
+
+def test_a_network_is_not_asked_about_trials_that_trained_it(
+    ran: Ran, protocol: Path, tmp_path: Path
+) -> None:
+    store = ran[0][0].store
+    model = next((store / "models").glob("seed*.pt"))
+    words = (protocol, "--store", store, "--claim", ACCURACY)
+    assert error_of(*words)["key"] == "--model"
+    error = error_of(*words, "--model", model)
+    assert (error["key"], error["value"]) == ("--store", str(store))
+    assert "has 2 test trials" in error["message"]
+    other = shutil.copy(model, tmp_path / "other.pt")
+    found = answer("power", *words, "--model", other, "--out", tmp_path, "--draws", 10)
+    assert found["pilot_trials"] == 6
+    assert found["learning"] is None
+    assert any("no learning curve: it takes 8 training" in note for note in found["notes"])
+
+
+def test_a_learning_curve_is_trained_once(
+    ran: Ran, protocol: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = ran[0][0].store
+    monkeypatch.setattr(power, "FEWEST", 2)
+    monkeypatch.setattr(power, "FEWEST_TRAINING", 2)
+    model = shutil.copy(next((store / "models").glob("seed*.pt")), tmp_path / "other.pt")
+    words = (
+        "power", protocol, "--store", store, "--claim", ACCURACY, "--model", model,
+        "--out", tmp_path, "--draws", 10,
+    )  # fmt: skip
+    curve = answer(*words)["learning"]
+    assert [point["trials"] for point in curve["points"]] == [1, 1, 2, 2]
+    assert (curve["test_trials"], curve["planned"]) == (2, 40)
+    assert curve["low"] <= curve["expected"] <= curve["high"]
+    assert "Training" in (tmp_path / "power.html").read_text()
+
+    def fail(*_: object) -> None:
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(learning, "logistic_accuracy", fail)
+    assert answer(*words)["learning"] == curve
+    assert answer(*words, "--no-training")["learning"] is None
+
+
+@pytest.mark.parametrize(
+    ("claim", "key", "value"),
+    [
+        ("{figure: speed, within: 1 ms}", "--claim figure", "speed"),
+        ("{figure: accuracy, within: 1 ms}", "--claim within", "1 ms"),
+        ("{figure: accuracy}", "--claim", "{figure: accuracy}"),
+        ("accuracy", "--claim", None),
+        ("{figure: accuracy, within: 1 %, error: 0}", "--claim error", "0"),
+        (
+            "{figure: lead, at_least: 1 ms, between: {factor: skin, levels: [a, b]}}",
+            "--claim between.factor", "skin",
+        ),
+        (
+            "{figure: lead, at_least: 1 ms, between: {factor: direction, levels: [0, 17]}}",
+            "--claim between.levels[1]", "17",
+        ),
+    ],
+)  # fmt: skip
+def test_a_wrong_claim_names_option_key_and_value(
+    claim: str, key: str, value: str | None, ran: Ran, protocol: Path
+) -> None:
+    error = error_of(protocol, "--store", ran[0][0].store, "--claim", claim)
+    assert (error["key"], error["value"]) == (key, value)
+
+
+def test_a_protocol_without_claims_and_levels_outside_are_refused(
+    ran: Ran, protocol: Path, tmp_path: Path
+) -> None:
+    store = ran[0][0].store
+    assert error_of(protocol, "--store", store)["key"] == "--claim"
+    data = tiny()
+    data["collection"]["factors"]["depth"]["values"] = [2.8]
+    other = write(tmp_path / "deeper.yaml", data)
+    error = error_of(other, "--store", store, "--claim", DURATION)
+    assert (error["file"], error["key"], error["value"]) == (
+        str(other), "collection.factors.depth", "2.8 mm",
+    )  # fmt: skip
