@@ -35,6 +35,8 @@ from sliplab.protocols.plan import load_plan
 from sliplab.storage.trials.store import Store
 
 TABLE = ROOT / "benchmarks/results/trial_figures.csv"
+BATCHES = {"kinematic": BATCH, "gravity": 8}
+"""A round of gravity trials has a batch of each of three plates."""
 SHIFT = 0.2
 GRIDS = 20
 """Of which the truth is the figure, for `order: shuffled`."""
@@ -105,9 +107,9 @@ def world_row(number: int, seed: int, adaptive: int) -> dict[str, Any]:
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
                 whole = y if order == "shuffled" else y[:1]
-                trials = Grid.of(plan_of(order, [claim], BATCH, experiment)).trials
+                trials = Grid.of(plan_of(order, [claim], BATCHES[experiment], experiment)).trials
                 taken = y[0][[grid.number[trial.id] for trial in trials]]
-                (call,) = campaign(order, [claim], {figure: taken}, BATCH, experiment)
+                (call,) = campaign(order, [claim], {figure: taken}, BATCHES[experiment], experiment)
                 row[title][order] = [len(mean), call and call.trials, _wrong(claim, call, whole)]
     return row
 

@@ -14,9 +14,13 @@ import numpy as np
 from sliplab.analysis.claims.evidence import I64, Evidence, Grid, members_of
 from sliplab.analysis.claims.sequences import F64
 from sliplab.analysis.claims.states import Fits, History, estimate_of, state_of
-from sliplab.protocols.claims import Choice, Claim, Stopping
+from sliplab.protocols.claims import QUANTILES, Choice, Claim, Stopping
 from sliplab.protocols.hashing import hash_integer
 from sliplab.storage.schema.claims import Batch, ChosenTrial
+
+CENTRE = 0.2, 0.8
+"""Percentiles outside are about rare trials. Unequal chances make the largest weight large, which
+bounds the stakes against a small share more than a smaller spread gains."""
 
 
 def next_batch(
@@ -95,6 +99,8 @@ def _spread(claim: Claim, history: History) -> F64:
     for members in members_of(claim, grid):
         if claim.of == "mean":
             spread = expected.spread
+        elif not CENTRE[0] <= QUANTILES[claim.of] <= CENTRE[1]:
+            spread = np.ones(len(found))
         else:
             at = estimate_of(claim, history, members)
             if claim.within is None and claim.between is None:
