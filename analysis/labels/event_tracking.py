@@ -289,7 +289,8 @@ def _follow(
     before, total = np.empty((m, 2)), np.zeros((m, 2))
     e = np.searchsorted(t_us, edges_us[0])
     for i in range(n):
-        before[:] = centre
+        for k in range(m):
+            before[k, 0], before[k, 1] = centre[k, 0], centre[k, 1]
         while e < t_us.size and t_us[e] < edges_us[i + 1]:
             for k in range(m):
                 dx, dy = column[e] - centre[k, 0], row[e] - centre[k, 1]

@@ -170,7 +170,9 @@ def feel_spots(blocks, n, clean, field, spots, factors):  # type: ignore[no-unty
         factor = spot_factor(w.place_x[j], w.place_y[j], spots)
         if factor != factors[i]:
             factors[i] = factor
-            field[i] = clean[i] * factor
+            for k in range(field.shape[1]):
+                for c in range(field.shape[2]):
+                    field[i, k, c] = clean[i, k, c] * factor
             _take_knot(w, field, i, j, w.knot[j])
 
 

@@ -404,7 +404,9 @@ def trace(  # type: ignore[no-untyped-def]
     room = 1 << 13
     t_ns, ps = np.empty(room, np.int64), np.empty(room, np.uint8)
     xs, ys = np.empty(room, np.uint16), np.empty(room, np.uint16)
-    waiting, kept, begin = pending.shape[0], 0, 0
+    waiting = pending.shape[0]
+    # with a literal numba would compile what takes them twice
+    kept, begin = np.int64(0), np.int64(0)
     lead_ns = period_ns + np.int64(width * column_ns)
     noise_at = np.searchsorted(noise_t, row_ns[0])
     events[:waiting] = pending
@@ -468,7 +470,7 @@ def trace(  # type: ignore[no-untyped-def]
             else:
                 origin[i, 3] = 0.0
             widen(i, column, row, radius + reach + strays, seen)
-            amount = 0
+            amount = np.int64(0)
             for block in range(blocks):
                 amount = cut_block(
                     first[block], first[block + 1], block, rows[first[block]], reach, since,
@@ -477,7 +479,7 @@ def trace(  # type: ignore[no-untyped-def]
                 behind[block] = amount
             pack_steps(last, since, inverse, curve, steps)
             # pixels that are not from a list are those near the rim, block by block
-            done = 0
+            done = np.int64(0)
             for block in range(blocks):
                 end = amount if listed else behind[block]
                 whole = 0.0

@@ -72,9 +72,10 @@ def _smoothed(white, kernel, mean, variation):  # type: ignore[no-untyped-def]
     padded, smooth = np.empty(count + 2 * reach), np.empty(count)
     knots = np.empty((rows, count))
     for i in range(rows):
-        padded[:reach], padded[reach + count :] = white[i, count - reach :], white[i, :reach]
-        padded[reach : reach + count] = white[i]
-        smooth[:] = 0.0
+        for k in range(reach):
+            padded[k], padded[reach + count + k] = white[i, count - reach + k], white[i, k]
+        for k in range(count):
+            padded[reach + k], smooth[k] = white[i, k], 0.0
         for shift in range(kernel.shape[0]):
             weight = kernel[shift]
             for k in range(count):

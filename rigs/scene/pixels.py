@@ -357,7 +357,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
         how many events `out` holds now.
     """
     reach, amount = CUT * edge, segments.shape[0]
-    waiting = 0
+    waiting = np.int64(0)  # with a literal numba compiles what is called with it twice
     active = np.empty(LANES + 1, np.int64)
     for index in range(amount):
         # a tree's node 0, which it has no use for, says whether there is one
@@ -381,7 +381,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
             segment = segments[number]
             classify(tile, size, segment, reach)
             head = (segment.zero + origin) * float(1 << 25)
-            firing = 0
+            firing = np.int64(0)
             busy = 0
             for j in range(size):
                 active[busy] = j
@@ -428,7 +428,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                 refine(fire, firing)
                 if waiting + firing > LANES:
                     n = finish(wait, waiting, since, until, steps, inverse, curve, out, n)
-                    waiting = 0
+                    waiting = np.int64(0)
                 for j in range(firing):
                     if fire[R_GOOD + j] > 0.0:
                         out[n] = np.int64(fire[R_SINCE + j])

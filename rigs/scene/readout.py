@@ -92,7 +92,8 @@ def read_each(  # type: ignore[no-untyped-def]
     Returns:
         how many they hold now.
     """
-    sort_packed(events, n, other, 25, 25 + bits_for(span_ns))
+    # with literals numba would compile it once more
+    sort_packed(events, n, other, np.int64(25), 25 + bits_for(span_ns))
     for k in range(n):
         event = events[k]
         t = base_ns + (event >> 25)
@@ -126,7 +127,7 @@ def read_scans(  # type: ignore[no-untyped-def]
     start_ns = phase_ns + first * period_ns
     lead_ns = base_ns - start_ns + period_ns - 1
     past = (end_ns - np.int64(width * column_ns) - phase_ns) // period_ns - first
-    left, inside, per_ns = 0, 0, 1.0 / period_ns
+    left, inside, per_ns = 0, np.int64(0), 1.0 / period_ns
     for k in range(n):
         event = events[k]
         # exact, for a half is far more than what rounding adds, and cheaper than a division
