@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 from jsonschema import Draft7Validator
 
-from sliplab.flows.planning.schema import DOCUMENTS, KINDS, Kind, file_schema
+from sliplab.flows.planning.schema import DOCUMENTS, Kind, file_schema
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.document import DocumentError
 
-CHECKERS = {kind: Draft7Validator(file_schema(kind)) for kind in KINDS}
+
+@cache
+def checker(kind: Kind) -> Draft7Validator:
+    """The published schema of a kind of file or document."""
+    return Draft7Validator(file_schema(kind))
 
 
 def check_refusals(kind: Kind, path: Path, *, every: bool = False) -> int:
@@ -27,14 +32,14 @@ def check_refusals(kind: Kind, path: Path, *, every: bool = False) -> int:
         how many were refused.
     """
     data, refused = short(read_json(path)), 0
-    assert CHECKERS[kind].is_valid(data)
+    assert checker(kind).is_valid(data)
     assert DOCUMENTS[kind].parse(data, path).to_json() == data
     # of a list the first entry stands for all
     places = [at for at in leaves(data) if not any(isinstance(key, int) and key for key in at)]
     for at, junks in nonsense(places, every):
         for junk in junks:
             wrong = changed_at(data, at, junk)
-            if CHECKERS[kind].is_valid(wrong):
+            if checker(kind).is_valid(wrong):
                 continue
             refused += 1
             with pytest.raises(DocumentError, match=path.name):

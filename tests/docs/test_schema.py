@@ -20,7 +20,7 @@ from sliplab.protocols.yaml_file import StrictModel, validate
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.files import json_text, read_json
 from tests.conftest import ROOT
-from tests.docs.nonsense import CHECKERS, changed_at, check_refusals, leaves, nonsense
+from tests.docs.nonsense import changed_at, check_refusals, checker, leaves, nonsense
 from tests.flows.older import older_store
 from tests.storage.formats.adapters import SLIDES
 
@@ -56,7 +56,7 @@ def test_schemas_are_schemas_and_published_as_they_are(kind: Kind) -> None:
 @pytest.mark.parametrize(("kind", "path"), FILES, ids=lambda item: getattr(item, "name", item))
 def test_every_shipped_file_is_accepted(kind: Kind, path: Path) -> None:
     found = [
-        f"{error.json_path}: {error.message}" for error in CHECKERS[kind].iter_errors(_read(path))
+        f"{error.json_path}: {error.message}" for error in checker(kind).iter_errors(_read(path))
     ]
     assert not found
 
@@ -83,7 +83,7 @@ def test_documents_of_a_store_are_accepted_and_read(
     assert len(paths) == count
     for path in paths:
         data = read_json(path)
-        found = [f"{e.json_path}: {e.message}" for e in CHECKERS[kind].iter_errors(data)]
+        found = [f"{e.json_path}: {e.message}" for e in checker(kind).iter_errors(data)]
         assert not found
         assert DOCUMENTS[kind].parse(data, path).to_json() == data
 
@@ -124,7 +124,7 @@ def test_nothing_is_refused_that_the_readers_take(kind: Kind, data: Any, every: 
     for at, junks in nonsense(leaves(data), every):
         for junk in junks:
             wrong = changed_at(data, at, junk)
-            if CHECKERS[kind].is_valid(wrong):
+            if checker(kind).is_valid(wrong):
                 continue
             refused += 1
             with pytest.raises(InputError):
@@ -171,12 +171,12 @@ WRONG_PROTOCOLS = {
 
 @pytest.mark.parametrize("at_to", WRONG_PROTOCOLS.values(), ids=WRONG_PROTOCOLS.keys())
 def test_wrong_protocols_are_refused(at_to: tuple[tuple[Any, ...], Any]) -> None:
-    assert not CHECKERS["protocol"].is_valid(changed_at(PILOT, *at_to))
+    assert not checker("protocol").is_valid(changed_at(PILOT, *at_to))
 
 
 @pytest.mark.parametrize("key", ["protocol", "name", "collection"])
 def test_a_missing_key_is_refused(key: str) -> None:
-    assert not CHECKERS["protocol"].is_valid({k: v for k, v in PILOT.items() if k != key})
+    assert not checker("protocol").is_valid({k: v for k, v in PILOT.items() if k != key})
 
 
 UR5 = _read(ROOT / "rigs" / "ur5.yaml")
@@ -201,12 +201,12 @@ WRONG_RIGS = {
 
 @pytest.mark.parametrize(("data", "at_to"), WRONG_RIGS.values(), ids=WRONG_RIGS.keys())
 def test_wrong_rig_files_are_refused(data: Any, at_to: tuple[tuple[Any, ...], Any]) -> None:
-    assert not CHECKERS["rig"].is_valid(changed_at(data, *at_to))
+    assert not checker("rig").is_valid(changed_at(data, *at_to))
 
 
 def test_only_a_file_that_extends_may_leave_keys_out() -> None:
-    assert CHECKERS["rig"].is_valid(NOISY)
-    assert not CHECKERS["rig"].is_valid({k: v for k, v in NOISY.items() if k != "extends"})
+    assert checker("rig").is_valid(NOISY)
+    assert not checker("rig").is_valid({k: v for k, v in NOISY.items() if k != "extends"})
 
 
 def test_keys_are_explained() -> None:

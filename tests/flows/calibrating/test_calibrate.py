@@ -21,7 +21,7 @@ from sliplab.flows.calibrating.calibrate import PNG_PX_PER_MM, print_board
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import InputError
 from sliplab.protocols.program import Position
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import build_rig, taught_frame
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
@@ -32,7 +32,7 @@ from tests.conftest import ROOT
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
 QUICK = Creep(clearance_mm=2.5, search_mm=2.0)
-TRUE_PLANE = build_rig(load_rig_file(Path("mock"))[0]).plate_frame
+TRUE_PLANE = taught_frame(load_rig_file(Path("mock"))[0])
 """The shipped file's plane, which is the true one to 0.01 mm."""
 
 
