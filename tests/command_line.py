@@ -20,6 +20,22 @@ from tests.conftest import ROOT
 SECRET = "marked-secret-51b2"
 """In the environment of every command; must never be found in a store."""
 SLIPLAB = [sys.executable, "-m", "sliplab"]
+MANY = """
+import contextlib, io, json, sys
+from sliplab.flows.__main__ import main
+
+ended = []
+for words in json.loads(sys.argv[1]):
+    sys.argv[1:] = words
+    out, said = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as end:
+            ended.append([end.code, out, said])
+print(json.dumps([[code, out.getvalue(), said.getvalue()] for code, out, said in ended]))
+"""
+"""Program that runs commands, given as JSON, one after the other: exit code and both streams."""
 
 
 def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:

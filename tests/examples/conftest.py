@@ -7,9 +7,11 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.command_line import MANY
 from tests.conftest import ROOT
 
 EXAMPLES = ROOT / "examples"
@@ -32,13 +34,16 @@ class Lab:
         }  # fmt: skip
         self._call(sys.executable, "-m", "pip", "install", *_OFFLINE, "--target", site, source)
 
-    def __call__(self, *words: str) -> Any:
-        """Run a command of SlipLab; what it prints as JSON."""
-        return json.loads(self._call(sys.executable, "-m", "sliplab", *words, "--json"))
-
-    def python(self, code: str) -> str:
-        """Run Python there; what it prints."""
-        return self._call(sys.executable, "-c", code)
+    def __call__(self, *commands: Sequence[str]) -> list[Any]:
+        """Run commands of SlipLab in one process; what each prints as JSON."""
+        wanted = json.dumps([[*words, "--json"] for words in commands])
+        found = []
+        for words, (code, out, said) in zip(
+            commands, json.loads(self._call(sys.executable, "-c", MANY, wanted)), strict=True
+        ):
+            assert code == 0, f"{words}\n{out}{said}"
+            found.append(json.loads(out))
+        return found
 
     def _call(self, *words: object) -> str:
         done = subprocess.run(

@@ -319,17 +319,21 @@ def test_a_camera_that_is_absent_is_a_fault(
 def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
     before = checkout()
     sliplab = Lab(tmp_path, "prophesee")
-    drivers = {found["name"]: found for found in sliplab("rigs", "--drivers")["drivers"]}
+    on = ("protocol.yaml", "--rig", "rig.yaml", "--store", "store")
+    listed, checked, taken, _, labelled = sliplab(
+        ("rigs", "--drivers"),
+        ("check", *on),
+        ("collect", *on, "--trials", "1"),
+        ("sync", "store"),
+        ("label", "store"),
+    )
+    drivers = {found["name"]: found for found in listed["drivers"]}
     assert drivers["prophesee"]["package"] == "sliplab-prophesee 0.1.0"
     assert drivers["prophesee"]["simulated_on_loopback"]
-    on = ("protocol.yaml", "--rig", "rig.yaml", "--store", "store")
-    checks = sliplab("check", *on)["checks"]
-    assert all(check["passed"] for check in checks), checks
-    taken = sliplab("collect", *on, "--trials", "1")
+    assert all(check["passed"] for check in checked["checks"]), checked["checks"]
     assert (taken["planned"], taken["committed"]) == (4, 1)
     assert taken["simulated"] is True
-    sliplab("sync", "store")
-    assert sliplab("label", "store")["done"] == 1
+    assert labelled["done"] == 1
     store = Store.open(sliplab.folder / "store")
     assert verify(store) == []
     for recording in store.campaign("prophesee").recordings():

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from sliplab.flows.running.extras import EXTRAS, lacking
+from tests.command_line import MANY
 from tests.conftest import ROOT
 from tests.flows.older import older_store
 
@@ -28,21 +29,6 @@ class Missing:
 
 MISSING = set(sys.argv.pop(1).split(","))
 sys.meta_path.insert(0, Missing())
-"""
-COMMANDS = f"""{BLOCKED}
-import contextlib, io, json
-from sliplab.flows.__main__ import main
-
-ended = []
-for words in json.loads(sys.argv[1]):
-    sys.argv[1:] = words
-    out, said = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
-        try:
-            main()
-        except SystemExit as end:
-            ended.append([end.code, out, said])
-print(json.dumps([[code, out.getvalue(), said.getvalue()] for code, out, said in ended]))
 """
 PYTHON = """
 import sliplab
@@ -103,7 +89,7 @@ def run_all(
         re.sub("|".join(places), lambda name: places[name[0]], command).split()
         for command in commands
     ]
-    done = run(COMMANDS, extras, json.dumps(wanted))
+    done = run(BLOCKED + MANY, extras, json.dumps(wanted))
     assert done.returncode == 0, done.stderr
     ended = [(code, printed, said) for code, printed, said in json.loads(done.stdout)]
     assert len(ended) == len(wanted)
