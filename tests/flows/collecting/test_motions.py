@@ -17,7 +17,7 @@ from sliplab.storage.trials.store import Store
 from tests.command_line import answer
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.live import free_udp_port
+from tests.flows.live import free_udp_port, rig_yaml
 from tests.rigs.waiting import own_address
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
@@ -31,6 +31,8 @@ def collected(folder: Path, motion: Any, rig: Path = RIG, **factors: Any) -> Sto
     collection["motion"] = motion
     collection["factors"].pop("direction")
     collection["factors"] |= factors
+    # one press through real drivers, in real time, is as good as three
+    collection["maintenance"]["warm_up"] |= {"presses": 1, "speed": "6 mm/s", "clearance": "2 mm"}
     collection["limits"] |= {"twist": "60 deg", "twist_speed": "20 deg/s"}
     data["analysis"]["split"] = {"method": "ranked", "strata": ["depth"]}
     protocol = write(folder / "moves.yaml", data)
@@ -118,7 +120,7 @@ def test_a_twist_of_a_ur_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
         "settle": "0.5 s", "hold": "1.5 s", "press": "4 mm/s",
     }  # fmt: skip
     speed = {"unit": "deg/s", "values": [10]}
-    store = collected(tmp_path, motion, ROOT / "rigs" / "loopback.yaml", speed=speed)
+    store = collected(tmp_path, motion, rig_yaml(tmp_path), speed=speed)
     (recording,) = store.campaign("moves").recordings()
     begin, end = recording.motion_ns
     assert (end - begin) / 1e9 == pytest.approx(40 / 10 + 0.2, abs=0.1)  # with its ramps
@@ -142,6 +144,7 @@ def abb_yaml(folder: Path, driver: str = "abb") -> Path:
         "name": "loopback",
         "devices": {"arm": arm},
         "timing": {**irb120["timing"], "pose_delay": {"shortest_us": 0, "longest_us": 200_000}},
+        "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}},  # not far from the plate
     }
     return write(folder / "abb.yaml", data)
 
