@@ -37,8 +37,6 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
 from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
 
-pytestmark = pytest.mark.programs
-
 
 def store_of(ran: tuple[list[RunRequest], Outcome]) -> Store:
     """The study's store."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shlex
@@ -53,9 +52,7 @@ def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
     """The results of the steps without a cluster, in this process alone."""
     folder = tmp_path_factory.mktemp("here") / "store"
     shutil.copytree(taken, folder)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parallel_map, "START_S", math.inf)
-        return run_steps(folder, None)
+    return run_steps(folder, None)
 
 
 @pytest.fixture(scope="module")

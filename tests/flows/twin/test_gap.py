@@ -16,7 +16,6 @@ from sliplab.analysis.twin.posterior import Estimate, Posterior
 from sliplab.flows.judge_network import judge_model
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.planning.schema import file_schema
-from sliplab.flows.running import parallel_map
 from sliplab.flows.study import Outcome
 from sliplab.flows.twin import gap
 from sliplab.flows.twin.drawn_rigs import read_samples, samples_file, write_samples
@@ -80,8 +79,6 @@ def found(wanted: gap.Gap) -> TwinGap:
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        # six trials take less time than processes take to start
-        patch.setattr(parallel_map, "START_S", 60.0)
         patch.setattr(gap, "train", stopped)
         with pytest.raises(KeyboardInterrupt):
             gap.measure_gap(wanted)
