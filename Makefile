@@ -27,7 +27,7 @@ test: $(DONE)
 
 # whole programs, servers and clusters; they wait more than they compute
 test-programs: $(DONE)
-	$(PYTEST) -n 3 --dist worksteal -m 'programs and not realtime and not long'
+	$(PYTEST) -n 3 --dist loadgroup --no-loadscope-reorder -m 'programs and not realtime and not long'
 
 # fakes in real time: whole scenes, which compute, one after another; beside them the rest
 test-realtime: $(DONE)

@@ -164,6 +164,7 @@ def test_ctrl_c_acts_while_the_server_stands_still(tmp_path: Path) -> None:
     assert known["collect"] == "CRASHED"
 
 
+@pytest.mark.long  # the test before is of the same, while a trial is taken
 def test_ctrl_c_acts_while_the_end_is_reported(tmp_path: Path) -> None:
     with collecting(tmp_path) as running:
         running.begun()
@@ -185,6 +186,7 @@ def users_server(home: Path) -> Iterator[EmbeddedServer]:
         server.stop()
 
 
+@pytest.mark.long  # a lost server of ours is reported to again above
 def test_a_named_server_that_stands_still_is_reported_to_again(tmp_path: Path) -> None:
     with (
         users_server(tmp_path / "home") as server,
