@@ -12,7 +12,7 @@ from sliplab.analysis.report.page import Content, Figure, Table
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.schema.claims import (
     CHOICES,
-    RECORD,
+    STOPPING,
     ClaimState,
     Look,
     StoppingRecord,
@@ -68,7 +68,7 @@ def claims_key(campaigns: Sequence[Collected]) -> list[str]:
 
 def _record(item: Collected) -> StoppingRecord | None:
     try:
-        return StoppingRecord.load(item.campaign.folder / RECORD)
+        return StoppingRecord.load(item.campaign.folder / STOPPING)
     except FileNotFoundError:
         return None
 

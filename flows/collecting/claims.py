@@ -34,7 +34,7 @@ from sliplab.protocols.claims import Stopping, section_hash
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.claims import (
     CHOICES,
-    RECORD,
+    STOPPING,
     ChoiceRecord,
     ClaimState,
     Look,
@@ -256,7 +256,7 @@ class ClaimWatch:
             verdict = "overruled"
         if (verdict, len(looks)) != (record.verdict, len(record.looks)):
             made = record.model_copy(update={"verdict": verdict, "looks": tuple(looks)})
-            write_json(self._campaign.folder / RECORD, made.to_json())
+            write_json(self._campaign.folder / STOPPING, made.to_json())
         return verdict
 
     def _round_size(self, number: int) -> int:
@@ -275,7 +275,7 @@ class ClaimWatch:
             looks=(),
         )
         try:
-            found = StoppingRecord.load(self._campaign.folder / RECORD)
+            found = StoppingRecord.load(self._campaign.folder / STOPPING)
         except FileNotFoundError:
             return empty
         if (found.section, found.model) != (empty.section, empty.model):

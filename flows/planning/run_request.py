@@ -24,7 +24,7 @@ from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from sliplab.storage.schema.claims import RECORD, ChoiceRecord, StoppingRecord
+from sliplab.storage.schema.claims import STOPPING, ChoiceRecord, StoppingRecord
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
@@ -107,7 +107,7 @@ class RunRequest:
         if claims is None or self.claims != "use":
             return None
         try:
-            record = StoppingRecord.load(campaign.folder / RECORD)
+            record = StoppingRecord.load(campaign.folder / STOPPING)
         except FileNotFoundError:
             return None
         if record.section != section_hash(claims) or record.verdict not in ("settled", "most"):

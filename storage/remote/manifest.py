@@ -22,6 +22,7 @@ from typing import Any, Literal
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.files import json_text, read_json, safe_name
 from sliplab.storage.remote.objects import SMALL_BYTES, Remote, RemoteError, RemoteMissing
+from sliplab.storage.schema.claims import CHOICES, STOPPING
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
     DATA,
@@ -46,7 +47,7 @@ NEEDED: Mapping[Kind, frozenset[str]] = {
     "quarantine": frozenset({CAUSE}),
 }
 ALLOWED: Mapping[Kind, frozenset[str]] = {
-    "about": NEEDED["about"] | {SKIPPED},
+    "about": NEEDED["about"] | {SKIPPED, CHOICES, STOPPING},
     "trials": NEEDED["trials"] | {FRAMES},
     "quarantine": NEEDED["trials"] | {FRAMES, CAUSE, SPOOL},
 }
@@ -187,7 +188,8 @@ def campaign_manifest(campaign: Campaign) -> Manifest:
     folder = campaign.folder
     sums = read_sums(folder, (PROTOCOL, RIG, INFO))
     files = {name: sums[name] for name in (PROTOCOL, RIG, INFO)}
-    more = [CHECKSUMS, *([SKIPPED] if (folder / SKIPPED).exists() else [])]
+    more = [CHECKSUMS]
+    more += [name for name in (SKIPPED, CHOICES, STOPPING) if (folder / name).exists()]
     bench = sorted(f"bench/{path.name}" for path in (folder / "bench").glob("*.json"))
     more += filter(_BENCH.fullmatch, bench)
     return Manifest("about", campaign.name, "", files | _measured(folder, more))

@@ -9,7 +9,7 @@ from typing import Literal
 from sliplab.protocols.claims import Kind
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
-RECORD, CHOICES = "stopping.json", "choices.json"
+STOPPING, CHOICES = "stopping.json", "choices.json"
 """Files in a campaign's folder."""
 Verdict = Literal["open", "settled", "most", "all", "overruled"]
 """`most`: as many trials as the protocol takes at most; `all`: nothing is left to take."""

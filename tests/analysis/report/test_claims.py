@@ -11,7 +11,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.claims import claims_key, claims_section
 from sliplab.analysis.report.page import render_section
 from sliplab.storage.files import write_json
-from sliplab.storage.schema.claims import RECORD, ClaimState, Look, StoppingRecord
+from sliplab.storage.schema.claims import STOPPING, ClaimState, Look, StoppingRecord
 from sliplab.storage.trials.store import Store
 
 
@@ -34,7 +34,7 @@ def campaign(folder: Path, small: dict[str, Any], looks: tuple[Look, ...] | None
         record = StoppingRecord(
             simulated=True, section="s", model=None, verdict="settled", looks=looks
         )
-        write_json(found.folder / RECORD, record.to_json())
+        write_json(found.folder / STOPPING, record.to_json())
     return Collected(found)
 
 

@@ -12,7 +12,7 @@ import pytest
 from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.run_request import Claims, RunRequest, make_request
 from sliplab.protocols import InputError
-from sliplab.storage.schema.claims import CHOICES, RECORD, ChoiceRecord, StoppingRecord
+from sliplab.storage.schema.claims import CHOICES, STOPPING, ChoiceRecord, StoppingRecord
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import short
@@ -73,7 +73,7 @@ def campaign_of(run_request: RunRequest) -> Campaign:
 
 def record_of(run_request: RunRequest) -> StoppingRecord:
     """Its looks."""
-    return StoppingRecord.load(campaign_of(run_request).folder / RECORD)
+    return StoppingRecord.load(campaign_of(run_request).folder / STOPPING)
 
 
 def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_cut_anywhere_an_adaptive_campaign_goes_on_with_the_same_trial(tmp_path:
         pieces += collect(part, most)
     assert pieces == taken
     again = campaign_of(part).folder
-    for name in (CHOICES, RECORD):
+    for name in (CHOICES, STOPPING):
         assert (again / name).read_bytes() == (kept / name).read_bytes()
     checksums = [
         {each.trial_id: each.checksum for each in campaign_of(one).recordings()}

@@ -27,7 +27,7 @@ from sliplab.flows.server.schedules import Ask, Chain, Collect, OnRig, Scheduled
 from sliplab.flows.server.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.schema.claims import RECORD, StoppingRecord
+from sliplab.storage.schema.claims import STOPPING, StoppingRecord
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import Store
@@ -109,7 +109,7 @@ def test_claims_end_a_collection_of_the_service_too(service: Service, tmp_path: 
     protocol.write_text(yaml.safe_dump(data))
     state = collect(Collect(protocol=protocol), return_state=True)
     assert state.type.value == "COMPLETED", state.message
-    record = StoppingRecord.load(service.folder / "campaigns" / data["name"] / RECORD)
+    record = StoppingRecord.load(service.folder / "campaigns" / data["name"] / STOPPING)
     assert record.verdict == "settled"
     assert f"{record.looks[-1].taken} of 8 committed" in state.message
     state = collect(Collect(protocol=protocol, no_stopping=True), return_state=True)
