@@ -35,7 +35,10 @@ def review(
         typer.Option("--next", help="Begin with the trials whose review would change most."),
     ] = False,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Trials that --next prints; default: 20.")
+        int | None,
+        typer.Option(
+            "--count", min=1, max=1_000_000, help="Trials that --next prints; default: 20."
+        ),
     ] = None,
     page: Annotated[
         bool, typer.Option("--page/--no-page", help="With --next: serve the page, or only print.")
