@@ -17,7 +17,7 @@ import numpy as np
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
 from sliplab.rigs.core.library_process import LibraryProcess, of_device
 from sliplab.rigs.devices.uvc.capture import Taken
-from sliplab.rigs.devices.uvc.settings import UvcSettings
+from sliplab.rigs.devices.uvc.settings import UvcSettings, is_camera
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
 DEVICE = "frame camera"
@@ -36,7 +36,7 @@ class Stamping(NamedTuple):
 
 def why_unreachable(device: str) -> str | None:
     """Return why a device cannot be opened, as far as its path says; None if it may be."""
-    if not device.startswith("/dev/"):
+    if not is_camera(device):
         return None if "://" in device or Path(device).exists() else f"there is no {device}"
     try:
         kind = os.stat(device).st_mode

@@ -10,6 +10,11 @@ from sliplab.protocols.yaml_file import KeyedError
 from sliplab.rigs.core.device_settings import FrameCameraSettings
 
 
+def is_camera(path: str) -> bool:
+    """Return whether a path is a device's; files in memory are none."""
+    return path.startswith("/dev/") and not path.startswith("/dev/shm/")
+
+
 class UvcSettings(FrameCameraSettings):
     """A USB camera, which runs by itself and stamps nothing that could be trusted."""
 
@@ -51,4 +56,4 @@ class UvcSettings(FrameCameraSettings):
     @property
     def is_camera(self) -> bool:
         """True for a device of V4L2; False for a file, a pipe or a URL."""
-        return self.device.startswith("/dev/")
+        return is_camera(self.device)
