@@ -22,9 +22,8 @@ $(DONE): pyproject.toml setup.py constraints.txt
 demo: $(DONE)
 	$(BIN)/sliplab demo
 
-# TESTS: which of them, and further options
 test: $(DONE)
-	$(PYTEST) -n 2 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not programs and not long' $(TESTS)
+	$(PYTEST) -n 2 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not programs and not long'
 
 # whole programs, servers and clusters; they wait more than they compute
 test-programs: $(DONE)
