@@ -28,7 +28,6 @@ from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console, stopping
-from sliplab.flows.running.parallel_map import make_in_process, trial_job
 from sliplab.protocols import Trial
 from sliplab.protocols.claims import Stopping, section_hash
 from sliplab.storage.files import write_json
@@ -85,6 +84,8 @@ class ClaimWatch:
 
     def committed(self, trial: Trial) -> None:
         """Begin to make the figures of a trial that was just committed."""
+        from sliplab.flows.running.parallel_map import make_in_process, trial_job  # loads Prefect
+
         self._known = False
         if trial.role == "measured" and trial.id not in self._making and self._pool is not None:
             work = self._work(trial.id)
