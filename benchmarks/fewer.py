@@ -30,9 +30,8 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import SEED, Figures
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
-from sliplab.analysis.claims.choosing import next_batch
-from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
-from sliplab.analysis.claims.states import Fits, settled, states
+from sliplab.analysis.claims.evidence import Grid
+from sliplab.analysis.claims.simulated import course
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
@@ -42,7 +41,7 @@ from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.slides import run_slide
-from sliplab.storage.schema.claims import Batch, ClaimState
+from sliplab.storage.schema.claims import ClaimState
 
 F64 = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[1]
@@ -148,50 +147,6 @@ def plan_of(
     return make_plan(validate(Protocol, data, source), str(source))
 
 
-def looks_of(plan: Plan, values: dict[str, F64], fits: Fits) -> Iterator[Evidence]:
-    """Yield what a campaign has seen at each look.
-
-    Args:
-        values: (N,) by figure, of the grid's trials in the plan's order. fits: kept of the looks.
-    """
-    collection, grid = plan.protocol.collection, Grid.of(plan)
-    stopping, choice = collection.stopping, collection.adaptive
-    assert stopping is not None
-
-    def seen(taken: list[int], looks: list[int], chances: Chances | None) -> Evidence:
-        numbers = np.array(taken, np.int64)
-        shown = {name: value[numbers] for name, value in values.items()}
-        return Evidence(grid, numbers, np.array(looks, np.int64), shown, chances)
-
-    if choice is None:
-        rounds = -(-collection.repetitions // stopping.repetitions)
-        ends = [len(grid.trials) * (k + 1) // rounds for k in range(rounds)]
-        for k, end in enumerate(ends):
-            yield seen(list(range(end)), ends[: k + 1], None)
-        return
-    batches: list[Batch] = []
-    taken: list[int] = []
-    chance: list[float] = []
-    least: list[float] = []
-    looks: list[int] = []
-    while True:
-        known = looks[-2] if len(looks) > 1 else 0  # the last batch's figures are not known yet
-        before = seen(
-            taken[:known], looks[:-1] if known else [],
-            Chances(np.array(chance[:known]), np.array(least[:known])),
-        )  # fmt: skip
-        batch = next_batch(before, batches, stopping, choice, collection.seed, fits)
-        if batch is None:
-            return
-        batches.append(batch)
-        for item in batch.trials:
-            taken.append(grid.number[item.trial])
-            chance.append(np.nan if item.chance is None else item.chance)
-            least.append(np.nan if batch.least is None else batch.least)
-        looks.append(len(taken))
-        yield seen(taken, looks, Chances(np.array(chance), np.array(least)))
-
-
 @dataclass(frozen=True)
 class Call:
     """A claim that was called, after how many trials."""
@@ -216,18 +171,9 @@ def campaign(
 ) -> list[Call | None]:
     """Return the call of each claim; None for never."""
     plan = plan_of(order, claims, batch, experiment)
-    stopping = plan.protocol.collection.stopping
-    assert stopping is not None
-    called: list[Call | None] = [None] * len(claims)
-    fits: Fits = {}
-    for evidence in looks_of(plan, values, fits):
-        found = states(evidence, stopping, fits)
-        for k, state in enumerate(found):
-            if called[k] is None and (state.holds or state.refuted):
-                called[k] = Call(len(evidence.taken), state)
-        if settled(found):
-            break
-    return called
+    went = course(plan, Grid.of(plan), values)
+    ends = went.evidence.looks
+    return [None if it.look is None else Call(int(ends[it.look]), it.state) for it in went.claims]
 
 
 def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, Any]:

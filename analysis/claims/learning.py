@@ -25,7 +25,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 ORDERS = 3
 """Orders of the training trials of which shares are taken."""
 EXPONENTS: F64 = np.linspace(0.1, 2.0, 20)
-"""Tried ones: slower than the slowest cannot be told from a higher floor."""
+"""Tried ones: slower than the slowest cannot be distinguished from a higher floor."""
 DRAWS = 400
 LINE = 12
 """Points of the fit."""
