@@ -91,6 +91,7 @@ class BaslerCamera:
     def __init__(self, settings: BaslerSettings, device: Any = None) -> None:
         self.settings, self.px_per_mm = settings, settings.px_per_mm or math.nan
         self._device = device if device is not None else find_camera(settings.serial)
+        self._nodes: Nodes | None = None
         self._grab: Grab | None = None
         self._running = False
         self._ends: dict[int, int] = {}
@@ -113,7 +114,7 @@ class BaslerCamera:
             raise
 
     def _configure(self) -> None:
-        nodes, settings = self._nodes, self.settings
+        nodes, settings = self.nodes, self.settings
         write_settings(nodes, settings)
         exposure = "ExposureTime" if nodes.has("ExposureTime") else "ExposureTimeAbs"
         self.mid_exposure_ns = round(float(nodes.get(exposure)) * 500)
@@ -123,10 +124,10 @@ class BaslerCamera:
 
     def _abilities(self) -> Abilities:
         """Detect the camera's abilities, and enable those that are used."""
-        nodes, settings = self._nodes, self.settings
+        nodes, settings = self.nodes, self.settings
         chunk = self._chunk("Timestamp")
         level = chunk and settings.sync_line is not None and self._chunk("LineStatusAll")
-        result = bool(self._device.IsUsb() or self._device.IsGigE())
+        result = bool(self.device.IsUsb() or self.device.IsGigE())
         event = not (chunk or result) and nodes.offers("EventSelector", "ExposureEnd")
         if event:
             self._listen()
@@ -141,7 +142,7 @@ class BaslerCamera:
 
     def _chunk(self, name: str) -> bool:
         """Enable a chunk if the camera has it; return whether it does."""
-        nodes = self._nodes
+        nodes = self.nodes
         if not nodes.has("ChunkModeActive"):
             return False
         nodes.put(True, "ChunkModeActive")
@@ -168,12 +169,12 @@ class BaslerCamera:
 
         # pylon keeps no reference, so deregister the listener before it is deleted
         self._listener = Listener()
-        self._device.RegisterCameraEventHandler(
+        self.device.RegisterCameraEventHandler(
             self._listener, _END_OF_EXPOSURE, 1, pylon.RegistrationMode_Append,
             pylon.Cleanup_None, pylon.CameraEventAvailability_Mandatory,
         )  # fmt: skip
-        self._nodes.put("ExposureEnd", "EventSelector")
-        self._nodes.put("On", "EventNotification")
+        self.nodes.put("ExposureEnd", "EventSelector")
+        self.nodes.put("On", "EventNotification")
 
     @property
     def counts(self) -> GrabCounts:
@@ -182,7 +183,7 @@ class BaslerCamera:
 
     def describe(self) -> Json:
         """Return the camera's part of a trial's record: device, region, times and losses."""
-        info, stamping = self._device.GetDeviceInfo(), self.stamping
+        info, stamping = self.device.GetDeviceInfo(), self.stamping
         height, width = self._shape
         return {
             "model": info.GetModelName(),
@@ -204,7 +205,7 @@ class BaslerCamera:
         Raises:
             RigError: the camera is disconnected.
         """
-        device, nodes, stamping = self._device, self._nodes, self.stamping
+        device, nodes, stamping = self.device, self.nodes, self.stamping
         if device.IsCameraDeviceRemoved():
             raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
         info = device.GetDeviceInfo()
@@ -251,7 +252,7 @@ class BaslerCamera:
         """
         if self._running:
             raise RigError(DEVICE, "the region cannot change while grabbing; stop first")
-        centre_region(self._nodes, width_px, height_px)
+        centre_region(self.nodes, width_px, height_px)
         self._shape = (height_px, width_px)
 
     def start(self) -> None:
@@ -265,18 +266,18 @@ class BaslerCamera:
         if self._running:
             raise RigError(DEVICE, "is already grabbing; stop first")
         settings = self.settings
-        check_rate(self._nodes, settings)
+        check_rate(self.nodes, settings)
         self._ends.clear()
         try:
-            self._device.MaxNumBuffer.Value = self._buffers
-            self._device.StartGrabbing(pylon.GrabStrategy_OneByOne)
+            self.device.MaxNumBuffer.Value = self._buffers
+            self.device.StartGrabbing(pylon.GrabStrategy_OneByOne)
         except self._genicam.GenericException as error:
             raise RigError(DEVICE, f"cannot start grabbing: {error}") from None
         wired = self.stamping.grade == "hardware trigger" and settings.sync_line is not None
         grab_settings = GrabSettings(
             stamping=self.stamping,
             mid_exposure_ns=self.mid_exposure_ns,
-            first_id=1 if self._device.IsGigE() else 0,
+            first_id=1 if self.device.IsGigE() else 0,
             period_ns=0 if settings.trigger == "software" else round(1e9 / settings.rate_hz),
             late_ns=round(settings.late_s * 1e9),
             sync_bit=(settings.sync_line or 1) - 1 if wired else None,
@@ -284,7 +285,7 @@ class BaslerCamera:
             first_ns=round(settings.first_frame_s * 1e9) if settings.trigger == "free run" else 0,
             stall_ns=0 if settings.trigger == "software" else round(settings.stall_s * 1e9),
         )
-        self._grab, self._running = Grab(self._device, grab_settings, self._ends), True
+        self._grab, self._running = Grab(self.device, grab_settings, self._ends), True
 
     def trigger(self) -> None:
         """Trigger one frame, where the trigger is `software`.
@@ -295,11 +296,11 @@ class BaslerCamera:
         from pypylon import pylon
 
         try:
-            if self._device.CanWaitForFrameTriggerReady():
-                self._device.WaitForFrameTriggerReady(
+            if self.device.CanWaitForFrameTriggerReady():
+                self.device.WaitForFrameTriggerReady(
                     TRIGGER_READY_MS, pylon.TimeoutHandling_ThrowException
                 )
-            self._device.ExecuteSoftwareTrigger()
+            self.device.ExecuteSoftwareTrigger()
         except self._genicam.GenericException as error:
             raise RigError(DEVICE, f"cannot be triggered: {error}") from None
 
@@ -334,7 +335,7 @@ class BaslerCamera:
         Raises:
             RigError: this camera has no clock that the host can read.
         """
-        return latch_clock(self._nodes)
+        return latch_clock(self.nodes)
 
     def stop(self) -> None:
         """Stop grabbing; frames exposed before can still be read. Bounded by `STOP_S`."""
@@ -343,15 +344,17 @@ class BaslerCamera:
         self._running = False
         # exposures end first, so that all frames in pylon can be read
         with suppress(RigError):
-            self._nodes.execute("AcquisitionStop")
+            self.nodes.execute("AcquisitionStop")
         try:
             self._grab.stop()
         finally:
             with suppress(self._genicam.GenericException):
-                self._device.StopGrabbing()
+                self.device.StopGrabbing()
 
     def close(self) -> None:
         """Close the device; safe at any time and more than once."""
+        if self._device is None:
+            return
         with suppress(RigError):
             self.stop()
         if self._listener is not None:
@@ -360,8 +363,30 @@ class BaslerCamera:
                 self._listener = None
         with suppress(self._genicam.GenericException):
             self._device.Close()
+        # A closed device keeps some 50 file descriptors until the last reference to it goes, and
+        # an error's traceback may keep this object: a camera that is often reopened used them up.
+        self._device = self._nodes = None
+        if self._grab is not None:
+            self._grab.forget_device()
 
     @property
     def device(self) -> Any:
-        """pypylon's `InstantCamera`, for fakes and for interactive use."""
+        """pypylon's `InstantCamera`, for fakes and for interactive use.
+
+        Raises:
+            RigError: the camera was closed.
+        """
+        if self._device is None:
+            raise RigError(DEVICE, "is closed; open it again")
         return self._device
+
+    @property
+    def nodes(self) -> Nodes:
+        """The camera's features.
+
+        Raises:
+            RigError: the camera was closed, or is not open yet.
+        """
+        if self._nodes is None:
+            raise RigError(DEVICE, "is closed; open it again")
+        return self._nodes

@@ -181,6 +181,11 @@ class Grab:
         if self._thread.is_alive():
             raise RigError(DEVICE, f"grabbing has not ended within {STOP_S:g} s")
 
+    def forget_device(self) -> None:
+        """Drop the reference to a closed device. A thread that has not ended keeps it."""
+        if not self._thread.is_alive():
+            self._device = None
+
     def _run(self) -> None:
         from pypylon import pylon
 
