@@ -95,13 +95,16 @@ class AbbArm(ThreadedArm):
     def connect(self) -> None:
         """Connect to the web services, start the pose stream, and check that their poses agree.
 
-        Takes at most (14 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `STATUS_S`.
+        A connection that is open already is kept if the controller answers. Takes at most
+        (15 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + 3 `STATUS_S`.
 
         Raises:
             ArmFault: no connection, no poses, no watchdog, or the arm is not ready to move.
         """
         if self._lost is None:
-            return
+            if self._answers():
+                return
+            self._release()  # lost, and not noticed yet
         try:
             self._open()
         except WebError as error:
@@ -350,6 +353,16 @@ class AbbArm(ThreadedArm):
         if last is None or first is None or self._is_stale(last):
             return False
         return last.host_ns - first[1] >= seconds * 1e9
+
+    def _answers(self) -> bool:
+        """Ask the controller for its state; return whether it answered."""
+        if self._web is None:
+            return False
+        try:
+            self._update(self._web.status())
+        except WebError:
+            return False
+        return True
 
     def _open(self) -> None:
         settings = self._settings
