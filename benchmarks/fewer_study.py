@@ -2,12 +2,15 @@
 
     python -m benchmarks.fewer_study figures STORE MODEL > benchmarks/results/trial_figures.csv
     python -m benchmarks.fewer_study claims [--worlds 200] [--adaptive 20] [--seed 1]
+    python -m benchmarks.fewer_study forecasts [--worlds 20] [--adaptive 10] [--seed 1]
 
 `figures` judges every trial of a store by a network that was trained on another one, and writes
 what it found. `claims` draws worlds around these figures: what a condition is expected to give, by
 a fit over the factors; the scatter of the fit, drawn anew for each trial; and a shift of the whole
-world by a fifth of its scatter. A trial was not detected as often as in the study. All figures are
-simulated.
+world by a fifth of its scatter. A trial was not detected as often as in the study. `forecasts`
+compares what `sliplab power` foretells from a pilot of such a world with what a campaign in it then
+took, beside a forecast by other campaigns in the same world, which nobody can better. All figures
+are simulated.
 """
 
 from __future__ import annotations
@@ -28,8 +31,12 @@ from benchmarks.fewer import BATCH, F64, ORDERS, ROOT, campaign, plan_of, quanti
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.expectation import coded, expectation
+from sliplab.analysis.claims.power import SHARES, Drawing
+from sliplab.analysis.claims.resampling import Axis, Pilot
+from sliplab.analysis.claims.simulated import course
 from sliplab.analysis.claims.trial_figures import Judge, trial_figures
 from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES
 from sliplab.protocols.plan import load_plan
 from sliplab.storage.trials.store import Store
@@ -40,6 +47,10 @@ BATCHES = {"kinematic": BATCH, "gravity": 8}
 SHIFT = 0.2
 GRIDS = 20
 """Of which the truth is the figure, for `order: shuffled`."""
+PILOT = 72
+"""Trials of a pilot, at most a third of the grid."""
+FACTOR = 1.3
+"""By which a forecast may be off."""
 CLAIMS: dict[str, tuple[str, dict[str, Any]]] = {
     "accuracy known to 1 point": ("kinematic", {"figure": "accuracy", "within": "1 %"}),
     "median latency known to 10 ms":
@@ -91,26 +102,37 @@ def _number(level: Any) -> float | str:
     return level if isinstance(level, str) else float(level)
 
 
+def figures_of(number: int, seed: int, title: str) -> tuple[Grid, F64]:
+    """Return the figures of `GRIDS` campaigns in one world, (GRIDS, N) by the grid's trials."""
+    experiment, claim = CLAIMS[title]
+    grid, mean, residuals, lost, never = fitted(experiment, claim["figure"])
+    rng = np.random.default_rng([seed, number, list(CLAIMS).index(title)])
+    size = (GRIDS, len(mean))
+    y = mean + rng.normal(0, SHIFT * residuals.std()) + rng.choice(residuals, size)
+    if claim["figure"] == "accuracy":
+        y = np.clip(y, 0.0, 100.0)
+    y[rng.random(size) < lost] = never
+    return grid, y
+
+
 def world_row(number: int, seed: int, adaptive: int) -> dict[str, Any]:
     """Do all claims in one world."""
     row: dict[str, Any] = {"world": number}
     with threadpool_limits(1):
         for title, (experiment, claim) in CLAIMS.items():
             figure = claim["figure"]
-            grid, mean, residuals, lost, never = fitted(experiment, figure)
-            rng = np.random.default_rng([seed, number, list(CLAIMS).index(title)])
-            size = (GRIDS, len(mean))
-            y = mean + rng.normal(0, SHIFT * residuals.std()) + rng.choice(residuals, size)
-            if figure == "accuracy":
-                y = np.clip(y, 0.0, 100.0)
-            y[rng.random(size) < lost] = never
+            grid, y = figures_of(number, seed, title)
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
                 whole = y if order == "shuffled" else y[:1]
                 trials = Grid.of(plan_of(order, [claim], BATCHES[experiment], experiment)).trials
                 taken = y[0][[grid.number[trial.id] for trial in trials]]
                 (call,) = campaign(order, [claim], {figure: taken}, BATCHES[experiment], experiment)
-                row[title][order] = [len(mean), call and call.trials, _wrong(claim, call, whole)]
+                row[title][order] = [
+                    len(grid.trials),
+                    call and call.trials,
+                    _wrong(claim, call, whole),
+                ]
     return row
 
 
@@ -123,6 +145,76 @@ def _wrong(claim: dict[str, Any], call: Any, y: F64) -> bool:
         true = float(y.mean()) if claim["figure"] == "accuracy" else quantile(y, 0.5)
         return not (state.low or 0.0) <= true <= (np.inf if state.high is None else state.high)
     return bool(state.holds != (quantile(y, 0.05) >= state.value))
+
+
+def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str, Any]:
+    """Foretell all claims in one world, by a pilot and by other campaigns in it."""
+    row: dict[str, Any] = {}
+    with threadpool_limits(1):
+        for title, (experiment, claim) in CLAIMS.items():
+            grid, y = figures_of(number, seed, title)
+            pilot = _pilot(grid, y[-1], claim["figure"], np.random.default_rng([seed, number]))
+            row[title] = {}
+            for order in ORDERS if number < adaptive else ORDERS[:1]:
+                plan = plan_of(order, [claim], BATCHES[experiment], experiment)
+                own = [grid.number[trial.id] for trial in Grid.of(plan).trials]
+                took = [_trials(plan, {claim["figure"]: each[own]}) for each in y[:-1]]
+                drawing = Drawing(plan, pilot, seed)
+                foretold = [drawing.campaign(k).called[0] or len(own) for k in range(draws)]
+                row[title][order] = [
+                    took[0], float(np.median(took[1:])),
+                    *(float(n) for n in np.quantile(foretold, SHARES)),
+                ]  # fmt: skip
+    return row
+
+
+def _pilot(grid: Grid, y: F64, figure: str, rng: np.random.Generator) -> Pilot:
+    """Return a twelfth or so of a grid's trials, `PILOT` of them, as a pilot."""
+    taken = rng.choice(len(grid.trials), min(PILOT, len(grid.trials) // 3), replace=False)
+    trials = [grid.trials[k] for k in taken]
+    conditions = [dict(trial.condition) for trial in trials]
+    levels: dict[str, list[Any]] = {}
+    for condition in conditions:
+        for name, level in condition.items():
+            levels.setdefault(name, []).append(level)
+    axes = tuple(
+        Axis(name, tuple(dict.fromkeys(sorted(each))), name == "direction")
+        for name, each in levels.items()
+    )
+    blocks = np.array([trial.block for trial in trials], np.int64)
+    return Pilot(axes, tuple(conditions), blocks, {figure: y[taken]})
+
+
+def _trials(plan: Plan, values: dict[str, F64]) -> int:
+    """Return after how many trials a plan's only claim is called, all if it is not."""
+    grid = Grid.of(plan)
+    went = course(plan, grid, values)
+    look = went.claims[0].look
+    return len(grid.trials) if look is None else int(went.evidence.looks[look])
+
+
+def print_forecasts(asked: argparse.Namespace) -> None:
+    """Print the table of forecasts."""
+    one = partial(forecast_row, seed=asked.seed, adaptive=asked.adaptive, draws=asked.draws)
+    with ProcessPoolExecutor(asked.cores, get_context("spawn")) as pool:
+        rows = list(pool.map(one, range(asked.worlds)))
+    print("| claim | order | within 1.3, by a pilot | by the world itself | 80 % range holds |")
+    print("| --- | --- | --- | --- | --- |")
+    for title in CLAIMS:
+        for order in ORDERS:
+            found = np.array([row[title][order] for row in rows if order in row[title]])
+            if not len(found):
+                continue
+            took, known, low, median, high = found.T
+            close = [
+                int((np.abs(np.log(n / took)) <= np.log(FACTOR)).sum()) for n in (median, known)
+            ]
+            holds = int(((low <= took) & (took <= high)).sum())
+            count = len(found)
+            print(
+                f"| {title} | {order} | {close[0]} of {count} | {close[1]} of {count} "
+                f"| {holds} of {count} |"
+            )
 
 
 def print_claims(asked: argparse.Namespace) -> None:
@@ -161,9 +253,17 @@ def main() -> None:
     claims.add_argument("--adaptive", type=int, default=20, help="worlds with this order, too")
     claims.add_argument("--seed", type=int, default=1)
     claims.add_argument("--cores", type=int, default=2)
+    forecasts = kinds.add_parser("forecasts")
+    forecasts.add_argument("--worlds", type=int, default=20)
+    forecasts.add_argument("--adaptive", type=int, default=10, help="worlds with this order, too")
+    forecasts.add_argument("--draws", type=int, default=40, help="campaigns drawn from a pilot")
+    forecasts.add_argument("--seed", type=int, default=1)
+    forecasts.add_argument("--cores", type=int, default=2)
     asked = parser.parse_args()
     if asked.kind == "figures":
         write_figures(asked.store, asked.model)
+    elif asked.kind == "forecasts":
+        print_forecasts(asked)
     else:
         print_claims(asked)
 

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.claims import learning
 from sliplab.analysis.claims import trial_figures as figures
 from sliplab.analysis.claims.evidence import Grid
@@ -106,8 +106,21 @@ def plan_with_claims(
         )
     changed = collection.model_copy(update={"stopping": stopping})
     plan = make_plan(plan.protocol.model_copy(update={"collection": changed}), plan.file, enable)
+    return plan, judging_model(plan, model)
+
+
+def judging_model(plan: Plan, model: Path | None) -> Path | None:
+    """Return the file of the network that judges a plan's claims; None where none is needed.
+
+    Args:
+        model: instead of the protocol's.
+
+    Raises:
+        InputError: a network is needed, and none is named, or it is no file.
+    """
+    stopping = claims_of(plan)
     if not stopping.needs_network:
-        return plan, None
+        return None
     if model is None and stopping.model is not None:
         model = Path(plan.file).parent / stopping.model
     if model is None or not model.is_file():
@@ -116,7 +129,7 @@ def plan_with_claims(
             "is no file" if model is not None else "is needed: a claim is about a network's "
             "output; name the file of a trained one, such as STORE/models/seed0.pt",
         )  # fmt: skip
-    return plan, model.resolve()
+    return model.resolve()
 
 
 def read_claim(text: str, plan: Plan) -> Claim:
@@ -171,11 +184,38 @@ def request(
     return Request(store, plan, used, pilot, judge, count, seed, classifier)
 
 
+def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
+    """Draw campaigns of a plan by a pilot's trials, without a learning curve.
+
+    Raises:
+        InputError: the plan has no claims, or the pilot cannot tell.
+    """
+    if plan.protocol.collection.stopping is None:
+        raise InputError(
+            "--pilot", "", str(pilot.folder), f"{plan.file} has no claims (collection.stopping)"
+        )
+    model = judging_model(plan, None)
+    return foretell(request(pilot, collected(pilot), plan, model, classifier=None))
+
+
 def measure_power(asked: Request, out: Path) -> PowerRecord:
     """Draw campaigns and write `power.html` and `power.json`.
 
     Args:
         out: their folder.
+
+    Raises:
+        InputError: the pilot has too few figures, or lacks levels of the protocol.
+    """
+    record = foretell(asked)
+    make_folder(out)
+    write_json(out / f"{NAME}.json", record.to_json())
+    write_text(out / f"{NAME}.html", page.render(record))
+    return record
+
+
+def foretell(asked: Request) -> PowerRecord:
+    """Draw campaigns, and return what they say of each claim.
 
     Raises:
         InputError: the pilot has too few figures, or lacks levels of the protocol.
@@ -189,7 +229,7 @@ def measure_power(asked: Request, out: Path) -> PowerRecord:
     ended = tuple(it.ended for it in found)
     taken = [min(stopping.most or planned, planned) if n is None else n for n in ended]
     hours = plan.total_seconds / 3600.0
-    record = PowerRecord(
+    return PowerRecord(
         simulated=any(bool(item.info.get("simulated")) for item in asked.campaigns),
         protocol=plan.name,
         order=plan.protocol.collection.order,
@@ -208,10 +248,6 @@ def measure_power(asked: Request, out: Path) -> PowerRecord:
         expected_hours=tuple(hours * float(n) / planned for n in np.quantile(taken, SHARES)),
         learning=curve,
     )
-    make_folder(out)
-    write_json(out / f"{NAME}.json", record.to_json())
-    write_text(out / f"{NAME}.html", page.render(record))
-    return record
 
 
 def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:

@@ -45,13 +45,18 @@ def sentence(record: PowerRecord) -> Iterator[str]:
     for it in record.claims:
         if it.never > MOST_OPEN:
             yield f"cannot be had by this plan: {it.claim}: {impossible(it, record)}"
-    low, median, high = record.expected_hours
+    low, median, high = map(hours, record.expected_hours)
     yield (
-        f"a campaign that ends by its claims is expected to take {median:.1f} h of motion "
-        f"({low:.1f} to {high:.1f} h), the whole plan {record.hours:.1f} h"
+        f"a campaign that ends by its claims is expected to take {median} of motion "
+        f"({low} to {high}), the whole plan {hours(record.hours)}"
     )
     if record.learning is not None:
         yield expected(record.learning, simulated=record.simulated)
+
+
+def hours(number: float) -> str:
+    """Return a time in hours, or in minutes below one."""
+    return f"{number:.1f} h" if number >= 1.0 else f"{60.0 * number:.0f} min"
 
 
 def impossible(it: ClaimPower, record: PowerRecord) -> str:

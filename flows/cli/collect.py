@@ -27,6 +27,14 @@ def plan(
     rig: Annotated[
         Path | None, typer.Option("--rig", help="A rig file or name, to estimate bytes.")
     ] = None,
+    pilot: Annotated[
+        Path | None,
+        typer.Option(
+            "--pilot",
+            help="Folder of a store with labelled trials, to foretell when the protocol's claims "
+            "end the campaign.",
+        ),
+    ] = None,
     enable: EnableOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -44,10 +52,19 @@ def plan(
         check_plan(rig_file, found, str(rig))
         needed = round(plan_bytes(rig_file, found))
         scene = plan_view.scene_of(rig_file, found)
+    power = None
+    if pilot is not None:
+        from sliplab.storage.remote.mirror import open_store
+
+        opened = open_store(pilot)
+        prepare_store(pilot)  # before anything imports Prefect
+        from sliplab.flows.power import of_plan
+
+        power = of_plan(found, opened)
     if as_json:
-        console.print_json(plan_view.plan_json(found, needed, scene))
+        console.print_json(plan_view.plan_json(found, needed, scene, power))
     else:
-        plan_view.print_plan(found, needed, scene)
+        plan_view.print_plan(found, needed, scene, power)
 
 
 @app.command()

@@ -61,7 +61,7 @@ def power(
     pilot = open_store(store)
     prepare_store(store)  # before anything imports Prefect
     from sliplab.analysis.campaigns import collected
-    from sliplab.analysis.report.power import COLUMNS, rows, sentence
+    from sliplab.flows.planning.plan_view import print_power
     from sliplab.flows.power import Classifier, measure_power, plan_with_claims, request
 
     plan, judging = plan_with_claims(protocol, claims or (), enable or (), model)
@@ -74,11 +74,5 @@ def power(
     if as_json:
         console.print_json({"page": str(out / "power.html"), **found.to_json()})
         return
-    kind = "simulated pilot" if found.simulated else "pilot"
-    title = f"claims of {found.protocol}, by {found.pilot_trials} trials of a {kind}"
-    console.print_table(title, COLUMNS, rows(found), spare=0)
-    for note in found.notes:
-        console.say(f"note: {note}")
-    for text in sentence(found):
-        console.say(text)
+    print_power(found)
     console.say(f"page: {out / 'power.html'}")

@@ -12,6 +12,8 @@ from sliplab.protocols import Plan
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
     from sliplab.rigs.levels import Choice, SlipExpected
     from sliplab.rigs.rig_file import RigFile
+    from sliplab.storage.schema.power import PowerRecord
+    from sliplab.storage.streams import Json
 
 
 class SceneJson(TypedDict):
@@ -50,6 +52,7 @@ class PlanJson(TypedDict):
     Attributes:
         bytes: None without a rig; scene: None but on a simulated rig.
         stretches: first and last trial of each stretch without a person.
+        claims: what a pilot foretells of them, as in power.json; None without one.
     """
 
     protocol: str
@@ -60,6 +63,7 @@ class PlanJson(TypedDict):
     scene: SceneJson | None
     stretches: list[tuple[int, int]]
     warnings: list[str]
+    claims: Json | None
 
 
 @dataclass(frozen=True)
@@ -101,8 +105,15 @@ def scene_of(rig: RigFile, plan: Plan) -> Scene | None:
     return None if choice is None else Scene(choice, slip_expected(rig, plan))
 
 
-def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> PlanJson:
-    """Return the plan as one JSON object; `needed` is its bytes, None without a rig."""
+def plan_json(
+    found: Plan, needed: int | None, scene: Scene | None, power: PowerRecord | None
+) -> PlanJson:
+    """Return the plan as one JSON object.
+
+    Args:
+        needed: its bytes; None without a rig.
+        power: what a pilot foretells of its claims; None without one.
+    """
     rows: list[TrialRow] = [
         {
             "index": trial.index,
@@ -129,6 +140,7 @@ def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> PlanJson:
         "scene": scene.as_json() if scene else None,
         "stretches": found.stretches(),
         "warnings": found.warnings(),
+        "claims": power.to_json() if power else None,
     }
 
 
@@ -147,8 +159,10 @@ def _claims(found: Plan) -> Iterator[str]:
         yield f"  {claim.text(collection.all_factors)}"
 
 
-def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
-    """Print the plan as tables."""
+def print_plan(
+    found: Plan, needed: int | None, scene: Scene | None, power: PowerRecord | None
+) -> None:
+    """Print the plan as tables; arguments as of `plan_json`."""
     factors = list(found.protocol.collection.all_factors)
     table = []
     for trial in found:
@@ -187,5 +201,20 @@ def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
         console.print_pairs("The simulated scene", scene.as_pairs())
     for line in _claims(found):
         console.say(line)
+    if power is not None:
+        print_power(power)
     for warning in found.warnings():
         console.say(f"note: {warning}")
+
+
+def print_power(power: PowerRecord) -> None:
+    """Print after how many trials, and hours at the rig, claims are expected to be called."""
+    from sliplab.analysis.report.power import COLUMNS, rows, sentence
+
+    kind = "simulated pilot" if power.simulated else "pilot"
+    title = f"claims of {power.protocol}, by {power.pilot_trials} trials of a {kind}"
+    console.print_table(title, COLUMNS, rows(power), spare=0)
+    for note in power.notes:
+        console.say(f"note: {note}")
+    for text in sentence(power):
+        console.say(text)

@@ -13,6 +13,7 @@ from sliplab.analysis.claims import learning, trial_figures
 from sliplab.flows import power
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome
+from sliplab.protocols.plan import load_plan
 from sliplab.storage.schema.power import PowerRecord
 from tests.command_line import answer, here
 from tests.flows.conftest import tiny, write
@@ -59,6 +60,23 @@ def test_figures_are_made_once_and_the_page_says_simulated(
 
     monkeypatch.setattr(trial_figures, "trial_figures", fail)
     assert answer("power", *words, "--claim", DURATION)["ended"] == list(record.ended)
+
+
+def test_a_plan_says_it_with_its_hours(ran: Ran, protocol: Path) -> None:
+    store = ran[0][0].store
+    refused = here("plan", protocol, "--pilot", store, "--json")
+    assert json.loads(refused.stdout)["error"]["key"] == "--pilot"
+    data = tiny()
+    data["collection"]["repetitions"] = 20
+    data["collection"]["stopping"] = {"claims": [{"figure": "slip_duration", "within": "400 ms"}]}
+    write(protocol, data)
+    record = PowerRecord.model_validate(answer("plan", protocol, "--pilot", store)["claims"])
+    assert (record.planned, record.pilot_trials, record.learning) == (120, 6, None)
+    assert record.hours == pytest.approx(load_plan(protocol).total_seconds / 3600)
+    done = here("plan", protocol, "--pilot", store)
+    said = done.stdout + done.stderr
+    assert "by 6 trials of a simulated pilot" in said
+    assert f"{60 * record.expected_hours[1]:.0f} min of motion" in said
 
 
 def test_a_claim_that_cannot_be_had_is_said_so(ran: Ran, protocol: Path, tmp_path: Path) -> None:
