@@ -135,15 +135,30 @@ def claim_of(stated: Stated, true: float) -> dict[str, Any]:
     return made
 
 
-def plan_of(
-    order: str, claims: Sequence[dict[str, Any]], batch: int, experiment: str = "kinematic"
-) -> Plan:
+@dataclass(frozen=True)
+class Setting:
+    """How campaigns of one world are planned.
+
+    Attributes:
+        seed: of the plan. Every world needs its own: with one for all, the same draw would be
+            lucky or unlucky in each of them, and their errors would be one error counted often.
+    """
+
+    seed: int
+    batch: int = BATCH
+    experiment: str = "kinematic"
+
+
+def plan_of(order: str, claims: Sequence[dict[str, Any]], setting: Setting) -> Plan:
     """Return the plan of an experiment with claims."""
-    source = ROOT / f"protocols/{experiment}.yaml"
+    source = ROOT / f"protocols/{setting.experiment}.yaml"
     data = parse_yaml(source.read_text(), source)
-    data["collection"] |= {"order": order, "stopping": {"error": ERROR, "claims": list(claims)}}
+    data["collection"] |= {
+        "order": order, "seed": setting.seed,
+        "stopping": {"error": ERROR, "claims": list(claims)},
+    }  # fmt: skip
     if order == "adaptive":
-        data["collection"]["choice"] = {"batch": batch}
+        data["collection"]["choice"] = {"batch": setting.batch}
     return make_plan(validate(Protocol, data, source), str(source))
 
 
@@ -166,11 +181,10 @@ def campaign(
     order: str,
     claims: list[dict[str, Any]],
     values: dict[str, F64],
-    batch: int,
-    experiment: str = "kinematic",
+    setting: Setting,
 ) -> list[Call | None]:
     """Return the call of each claim; None for never."""
-    plan = plan_of(order, claims, batch, experiment)
+    plan = plan_of(order, claims, setting)
     went = course(plan, Grid.of(plan), values)
     ends = went.evidence.looks
     return [None if it.look is None else Call(int(ends[it.look]), it.state) for it in went.claims]
@@ -179,7 +193,8 @@ def campaign(
 def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, Any]:
     """Do both campaigns in one world."""
     with threadpool_limits(1):
-        grid = Grid.of(plan_of("shuffled", [claim_of(CLAIMS[0], 1000.0)], batch))
+        setting = Setting(hash_integer("campaign", seed, number), batch)
+        grid = Grid.of(plan_of("shuffled", [claim_of(CLAIMS[0], 1000.0)], setting))
         settings = world(number, seed)
         grids = figures(settings, grid, TIMES)
         values = {name: each[0] for name, each in grids.items()}
@@ -189,7 +204,7 @@ def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, An
             for stated in CLAIMS:
                 whole = grids[stated.figure] if order == "shuffled" else values[stated.figure]
                 true = truth(stated, np.atleast_2d(whole), grid)
-                (call,) = campaign(order, [claim_of(stated, true)], values, batch)
+                (call,) = campaign(order, [claim_of(stated, true)], values, setting)
                 row[order].append(call and (call.trials, call.wrong(stated, true)))
     return row
 

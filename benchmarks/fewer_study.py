@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
-from benchmarks.fewer import BATCH, F64, ORDERS, ROOT, campaign, plan_of, quantile
+from benchmarks.fewer import BATCH, F64, ORDERS, ROOT, Setting, campaign, plan_of, quantile
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.expectation import coded, expectation
@@ -38,6 +38,7 @@ from sliplab.analysis.claims.trial_figures import Judge, trial_figures
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES
+from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plan import load_plan
 from sliplab.storage.trials.store import Store
 
@@ -115,6 +116,17 @@ def figures_of(number: int, seed: int, title: str) -> tuple[Grid, F64]:
     return grid, y
 
 
+def setting_of(number: int, seed: int, experiment: str) -> Setting:
+    """Return how campaigns of one world are planned."""
+    return Setting(hash_integer("campaign", seed, number), BATCHES[experiment], experiment)
+
+
+def _places(grid: Grid, other: Grid) -> list[int]:
+    """Return where the trials of a grid with another seed stand in the first one."""
+    at = {(trial.condition, trial.repetition): k for k, trial in enumerate(grid.trials)}
+    return [at[trial.condition, trial.repetition] for trial in other.trials]
+
+
 def world_row(number: int, seed: int, adaptive: int) -> dict[str, Any]:
     """Do all claims in one world."""
     row: dict[str, Any] = {"world": number}
@@ -122,12 +134,12 @@ def world_row(number: int, seed: int, adaptive: int) -> dict[str, Any]:
         for title, (experiment, claim) in CLAIMS.items():
             figure = claim["figure"]
             grid, y = figures_of(number, seed, title)
+            setting = setting_of(number, seed, experiment)
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
                 whole = y if order == "shuffled" else y[:1]
-                trials = Grid.of(plan_of(order, [claim], BATCHES[experiment], experiment)).trials
-                taken = y[0][[grid.number[trial.id] for trial in trials]]
-                (call,) = campaign(order, [claim], {figure: taken}, BATCHES[experiment], experiment)
+                taken = y[0][_places(grid, Grid.of(plan_of(order, [claim], setting)))]
+                (call,) = campaign(order, [claim], {figure: taken}, setting)
                 row[title][order] = [
                     len(grid.trials),
                     call and call.trials,
@@ -156,8 +168,8 @@ def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str,
             pilot = _pilot(grid, y[-1], claim["figure"], np.random.default_rng([seed, number]))
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
-                plan = plan_of(order, [claim], BATCHES[experiment], experiment)
-                own = [grid.number[trial.id] for trial in Grid.of(plan).trials]
+                plan = plan_of(order, [claim], setting_of(number, seed, experiment))
+                own = _places(grid, Grid.of(plan))
                 took = [_trials(plan, {claim["figure"]: each[own]}) for each in y[:-1]]
                 drawing = Drawing(plan, pilot, seed)
                 foretold = [drawing.campaign(k).called[0] or len(own) for k in range(draws)]
