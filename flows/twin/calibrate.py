@@ -27,7 +27,7 @@ from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
 from sliplab.analysis.twin.shown import QUANTITIES, compare
 from sliplab.analysis.twin.statistics import Statistics, of_names
-from sliplab.flows.running import console, orchestration
+from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.drawn_rigs import samples_file, write_samples
 from sliplab.flows.twin.needs import cheapest_path, measure_needs, write_cheapest
@@ -40,10 +40,9 @@ from sliplab.flows.twin.worlds import (
     guess_of,
     other_rig,
     simulated,
-    touch_depth_mm,
+    touch_section,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
@@ -352,7 +351,7 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     skin = mock["scene"].setdefault("skin", {})
     if scene.skin:
         skin["papillae"] = tuple(scene.skin["papillae"])
-    touch = _touch(changed(wanted.rig, mock))
+    touch = touch_section(changed(wanted.rig, mock))
     if scene.skin:
         skin["papillae"] = [papilla.model_dump(mode="json") for papilla in scene.skin["papillae"]]
     path = rig_path(wanted.rig_path)
@@ -367,15 +366,6 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
     }
     text = f"# Written by `sliplab calibrate scene`: {extends}, fitted to '{record.campaign}'.\n"
     write_text(wanted.out, text + rig_yaml(data))
-
-
-def _touch(rig: RigFile) -> dict[str, Any]:
-    """Return the calibration that depends on skin and camera: where a touch is detected."""
-    try:
-        return {"calibration": {"touch_depth": f"{touch_depth_mm(rig):.3f} mm"}}
-    except RigError as error:
-        console.say(f"warning: touching off does not work on the twin: {error}")
-        return {}
 
 
 def ring_of(rig: RigFile) -> F64:

@@ -16,6 +16,8 @@ import numpy as np
 
 from sliplab.analysis.twin.parameters import settings_of
 from sliplab.analysis.twin.posterior import Posterior
+from sliplab.flows.scene_runs import changed
+from sliplab.flows.twin.worlds import touch_section
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
@@ -59,9 +61,11 @@ def read_samples(path: Path, count: int) -> list[dict[str, float]]:
 def write_drawn(twin: Path, values: Mapping[str, float], out: Path) -> None:
     """Write the rig file of one sample, which extends the twin's."""
     rig, _ = load_rig_file(twin)
+    mock = settings_of(rig.scene, values)
     data = {
         "extends": os.path.relpath(twin.resolve(), out.parent.resolve()),
         "name": out.stem,
-        "mock": settings_of(rig.scene, values),
+        **touch_section(changed(rig, mock)),
+        "mock": mock,
     }
     write_text(out, rig_yaml(data))

@@ -27,6 +27,7 @@ from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.pilots import LEVEL, simulate_pilot
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import simulated_rig
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
@@ -134,6 +135,15 @@ def touch_depth_mm(rig: RigFile) -> float:
     finally:
         made.close()
     return float(np.median(found)) + made.touch_mm - taught
+
+
+def touch_section(rig: RigFile) -> dict[str, Any]:
+    """Return the section of a rig file that depends on skin and camera: where a touch is seen."""
+    try:
+        return {"calibration": {"touch_depth": f"{touch_depth_mm(rig):.3f} mm"}}
+    except RigError as error:
+        console.say(f"warning: touching off does not work on {rig.name}: {error}")
+        return {}
 
 
 def guess_of(rig: RigFile) -> Guess:
