@@ -28,6 +28,7 @@ TINY: dict[str, dict[str, Any]] = {
         "pictures": 4,
         "saturating": 20,
     },
+    "fewer": {"worlds": 1, "adaptive": 1, "cores": 1},
 }
 PROMISED = {
     "orchestration": {
@@ -61,11 +62,18 @@ PROMISED = {
         "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
         "aruco_x_realtime",
     },
+    "fewer": {
+        "shuffled_worst_claim_wrong_percent", "adaptive_worst_claim_wrong_percent",
+        "shuffled_true_trials_percent", "adaptive_true_trials_percent", "adaptive_over_shuffled",
+    },
 }  # fmt: skip
 
 
-MARKS = {"acquisition": pytest.mark.realtime, "scene": pytest.mark.long}
-"""The scene's takes longest to compile, and is all of it elsewhere in the tests."""
+MARKS = {
+    "acquisition": pytest.mark.realtime, "scene": pytest.mark.long, "fewer": pytest.mark.long,
+}  # fmt: skip
+"""The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
+campaigns."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in TINY])
