@@ -14,9 +14,11 @@ from sliplab.flows.planning.run_request import Claims, RunRequest, make_request
 from sliplab.protocols import InputError
 from sliplab.storage.schema.claims import CHOICES, STOPPING, ChoiceRecord, StoppingRecord
 from sliplab.storage.trials.store import Campaign, Store
+from tests.command_line import answer
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write
+from tests.flows.live import quick
 
 # the first slip of these slides comes after 0.3 to 1 s
 SURE = {"figure": "first_slip", "at_most": "10 s"}
@@ -180,3 +182,24 @@ def test_a_claim_about_a_network_needs_one(tmp_path: Path) -> None:
         request(tmp_path / "a", [lead])
     with pytest.raises(InputError, match=r"none\.pt is no file"):
         request(tmp_path / "a", [lead], stopping={"model": "none.pt"})
+
+
+@pytest.mark.realtime
+@pytest.mark.long
+@pytest.mark.xdist_group("scene")
+def test_through_real_drivers_a_campaign_ends_by_its_claims(tmp_path: Path) -> None:
+    data = quick(trials=2, repetitions=5)
+    data["collection"] |= {
+        "order": "adaptive", "choice": {"batch": 2, "start": 2},
+        "stopping": {"error": 0.4, "claims": [SURE]},
+    }  # fmt: skip
+    protocol, store = write(tmp_path / "quick.yaml", data), tmp_path / "store"
+    words = ("collect", protocol, "--rig", "loopback", "--store", store)
+    taken = answer(*words)["taken"]
+    campaign = Store.open(store).campaign("quick")
+    record = StoppingRecord.load(campaign.folder / STOPPING)
+    assert (record.verdict, record.looks[-1].taken) == ("settled", taken)
+    assert taken < 10
+    assert len(campaign.committed()) == taken
+    assert answer(*words)["taken"] == 0
+    assert answer(*words, "--no-stopping")["taken"] == 10 - taken
