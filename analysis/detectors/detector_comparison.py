@@ -9,7 +9,7 @@ interval.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,11 @@ from sliplab.analysis.detectors.latency import (
     summarise_latency,
     summarise_lead,
 )
+from sliplab.analysis.detectors.onset_references import (
+    Decided,
+    References,
+    judge_by_reference,
+)
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.settings import Comparison, Detection, Windows
 from sliplab.storage.schema.evaluation import (
@@ -41,6 +46,7 @@ from sliplab.storage.schema.evaluation import (
     DetectorRate,
     DetectorScores,
     DetectorTrials,
+    OnsetFigures,
     PartTrials,
     Rate,
     TrialLatency,
@@ -49,15 +55,16 @@ from sliplab.storage.schema.evaluation import (
 
 @dataclass(frozen=True)
 class Judged:
-    """A trial's evidence with its true onsets."""
+    """A trial's evidence with its true onsets, and those by other references."""
 
     evidence: Evidence
     slip: TrueSlip
+    references: References = field(default_factory=dict)
 
 
 def judge(detector: Detector, trials: Sequence[Labelled]) -> list[Judged]:
     """Evidence of a detector on labelled trials."""
-    return [Judged(detector.evidence(t.predictions), t.slip) for t in trials]
+    return [Judged(detector.evidence(t.predictions), t.slip, t.references) for t in trials]
 
 
 def allowed_early(rate: float, trials: int) -> int:
@@ -187,7 +194,7 @@ def thinned(trial: Labelled, every: int) -> Labelled:
     kept = Predictions(
         predictions.counts[::every], predictions.events[::every], predictions.end_ns[::every]
     )
-    return Labelled(kept, trial.slip)
+    return replace(trial, predictions=kept)
 
 
 def _detectors(
@@ -241,6 +248,7 @@ class _Best:
     levels: DetectorLevels
     validation: DetectorTrials
     test: DetectorTrials
+    by_reference: dict[str, OnsetFigures]
 
 
 def _best(
@@ -254,11 +262,13 @@ def _best(
         ranked.append((*merit(scored), key, levels))
     # keys differ, so levels are never compared
     _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
-    parts = [
+    of_validation, of_test = (
         _summary(trials, outcomes(trials, levels, tolerance), levels) for trials in judged[key]
-    ]
+    )
     plain = {name: _plain(value) for name, value in vars(levels).items()}
-    return _Best(key, DetectorLevels(**plain), *parts)
+    tested = [Decided(decide(t.evidence, levels), t.references, tolerance) for t in judged[key][1]]
+    figures = judge_by_reference(tested)
+    return _Best(key, DetectorLevels(**plain), of_validation, of_test, figures)
 
 
 def _summary(

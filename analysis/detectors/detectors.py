@@ -9,7 +9,7 @@ is fair: each can be made as quick as one likes by allowing it more false alarms
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.onset_references import References
 from sliplab.analysis.detectors.smoothing_rule import Found, lead_of
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
 
@@ -345,10 +346,11 @@ class Predictions:
 
 @dataclass(frozen=True)
 class Labelled:
-    """A trial with its true slip, on the time line of its windows."""
+    """A trial with its true slip, and that by other references, on the time line of its windows."""
 
     predictions: Predictions
     slip: TrueSlip
+    references: References = field(default_factory=dict)
 
     def states(self, length_ns: int) -> IntArray:
         """The class that each window of this length holds most of, by its middle; int64 (n,)."""

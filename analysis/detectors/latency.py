@@ -61,10 +61,14 @@ def true_slip(label: TrialLabel) -> TrueSlip | None:
 
     A reviewer may have set the gross onset after the end: the slip then ends as it begins.
     """
-    incipient, gross = label.incipient_ns, label.gross_ns
-    if incipient is None or gross is None:
+    return slip_of(label.incipient_ns, label.gross_ns, label.end_ns)
+
+
+def slip_of(incipient_ns: int | None, gross_ns: int | None, end_ns: int) -> TrueSlip | None:
+    """Return a slip that ends with its gross onset at the earliest; None where an onset lacks."""
+    if incipient_ns is None or gross_ns is None:
         return None
-    return TrueSlip(incipient, gross, max(label.end_ns, gross))
+    return TrueSlip(incipient_ns, gross_ns, max(end_ns, gross_ns))
 
 
 def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:

@@ -9,6 +9,7 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.detector_comparison import Parts, compare
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
+from sliplab.analysis.detectors.onset_references import References, references_of
 from sliplab.analysis.detectors.predictions import (
     PredictionRequest,
     prediction_request,
@@ -29,6 +30,7 @@ class KnownTrial:
     request: PredictionRequest
     label: str
     slip: TrueSlip
+    references: References
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,8 @@ def detector_work(
         found: list[KnownTrial] = []
         for item in used:
             for _, recording in item.of_split(split):
-                slip = true_slip(labels.read(item, recording))
+                label = labels.read(item, recording)
+                slip = true_slip(label)
                 if slip is None:
                     continue
                 if most is not None and len(found) >= most:
@@ -142,6 +145,7 @@ def detector_work(
                         request(item.name, recording, stride_ms, stateful),
                         labels.key(item, recording),
                         slip,
+                        references_of(recording, label),
                     )
                 )
         return found
@@ -183,7 +187,8 @@ def _parts(store: Store, known: dict[str, list[KnownTrial]] | None) -> Parts | N
 
 def _labelled(store: Store, trial: KnownTrial) -> Labelled:
     arrays = predictions(store, trial.request)
-    return Labelled(Predictions(arrays["counts"], arrays["events"], arrays["end_ns"]), trial.slip)
+    windows = Predictions(arrays["counts"], arrays["events"], arrays["end_ns"])
+    return Labelled(windows, trial.slip, trial.references)
 
 
 def _counted(store: Store, trial: KnownTrial) -> Counted:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.detectors.onset_references import VERSION as REFERENCES_VERSION
 from sliplab.analysis.detectors.predictions import (
     COUNTS,
     COUNTS_VERSION,
@@ -97,7 +98,9 @@ def make_job(
     # decisions on trials other than test trials are counted in the result
     states = labels.states(campaigns)
     of_review = [] if states is None else [states]
-    key = make_key(STEP, VERSION, [model.key, inputs, detectors.inputs, *of_review], used)
+    # evaluations of before, which lack the figures by each reference, can be read all the same
+    made_of = [model.key, inputs, detectors.inputs, REFERENCES_VERSION, *of_review]
+    key = make_key(STEP, VERSION, made_of, used)
     return Job(store, campaigns, labels, model, models, detection, trials, detectors, key)
 
 

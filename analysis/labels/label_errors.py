@@ -18,6 +18,7 @@ from sliplab.storage.schema.evaluation import (
 from sliplab.storage.schema.label import KINDS, LABELS, Kind, Rule, TrialLabel
 from sliplab.storage.schema.summary import Hold
 from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
 REFERENCES = ("hold_start", "hold_end")
@@ -180,20 +181,28 @@ def _cases(
     for item in campaigns:
         labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
-            truth = recording.simulation_truth()
             label = labels.load(trial.id, TrialLabel)
             if label.rule == "given":  # nothing here found it
                 continue
-            centre, twists = recording.record.geometry.centre, recording.motion_phase == "twist"
-            for rule, keys in _TRUTH.items():
-                known = truth
-                if truth is not None and rule == "paper" and label.reference == "hold_start":
-                    known = truth.get("from_hold", truth)  # older records have the motion's
+            for rule in _TRUTH:
                 for kind in KINDS:
-                    true = None if known is None else known.get(keys[kind])
-                    if isinstance(true, list):
-                        true = _last_other(true, centre) if twists else true[centre]
-                    yield rule, kind, label, true
+                    yield rule, kind, label, true_ns(recording, label, rule, kind)
+
+
+def true_ns(recording: Recording, label: TrialLabel, rule: Rule, kind: Kind) -> int | None:
+    """Return the time that is true of a rule's onset in a simulated trial; None where unknown.
+
+    Args:
+        rule: `paper`, the true crossing; `change_point`, the true start of the slip.
+    """
+    truth = recording.simulation_truth()
+    if truth is not None and rule == "paper" and label.reference == "hold_start":
+        truth = truth.get("from_hold", truth)  # older records have the motion's
+    true: int | list[int | None] | None = (truth or {}).get(_TRUTH[rule][kind])
+    if isinstance(true, list):
+        centre, twists = recording.record.geometry.centre, recording.motion_phase == "twist"
+        return _last_other(true, centre) if twists else true[centre]
+    return true
 
 
 def _last_other(times: list[int | None], centre: int) -> int | None:

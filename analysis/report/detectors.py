@@ -69,8 +69,7 @@ def detector_section(
     """Show the comparison; None if there is none."""
     if compared is None:
         return None
-    entries = [(WORDS[entry.name], entry) for entry in compared.detectors]
-    entries += [(f"{WORDS[entry.name]}, states carried", entry) for entry in compared.carried or ()]
+    entries = titled(compared)
     panels = {}
     for stride in sorted(compared.strides_ms, reverse=True):
         ending = "" if stride < max(compared.strides_ms) else ", no overlap"
@@ -103,6 +102,15 @@ def detector_section(
         ),
         _tables(entries, compared.trials.validation),
     )
+
+
+def titled(compared: DetectorComparison | None) -> list[tuple[str, DetectorScores]]:
+    """Return every detector of a comparison with its title; none without a comparison."""
+    if compared is None:
+        return []
+    entries = [(WORDS[entry.name], entry) for entry in compared.detectors]
+    carried = compared.carried or ()
+    return entries + [(f"{WORDS[entry.name]}, states carried", entry) for entry in carried]
 
 
 def _tables(entries: Sequence[tuple[str, DetectorScores]], trials: int) -> list[Table]:

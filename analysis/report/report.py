@@ -21,6 +21,7 @@ from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.holdout import holdout_section
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.latency import latency_section
+from sliplab.analysis.report.onsets import onset_section
 from sliplab.analysis.report.outcomes import failure_section
 from sliplab.analysis.report.page import (
     Content,
@@ -168,6 +169,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         latency_section("disturbance", campaigns, rows, summary),
         failure_section(store.folder, summary.trials),
         detector_section(summary.detectors, simulated=simulated),
+        onset_section(summary),
         label_section(store, campaigns, summary, shown.distances),
         clocks.clock_section(
             campaigns, summary.sync, page=(store.folder / "report" / clocks.PAGE).exists(),

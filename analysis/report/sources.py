@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.detectors.onset_references import References, references_of
 from sliplab.analysis.evaluation import baselines as window_baselines
 from sliplab.analysis.evaluation import networks as other_networks
 from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks.models import training_settings
 from sliplab.analysis.report.claims import claims_key
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
@@ -30,7 +32,7 @@ from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
 STEP = "report"
-VERSION = 10
+VERSION = 11
 
 
 def report_folder(store: Store) -> Path:
@@ -49,6 +51,7 @@ class Sources:
         label_check: of labels with video; holds: slips in the hold, by campaign.
         planned_bytes: of the committed trials, by campaign.
         step_seconds: wall time of each step.
+        references: slips of the test trials by each onset, by campaign and trial.
         programs: results of other programs, by name.
     """
 
@@ -64,6 +67,7 @@ class Sources:
     planned_bytes: Mapping[str, int]
     step_seconds: Mapping[str, float]
     programs: Mapping[str, Json]
+    references: Mapping[tuple[str, str], References]
 
 
 def report_key(store: Store, campaigns: list[Collected]) -> str:
@@ -114,12 +118,13 @@ def read_sources(
         StoreError: there is no evaluation of this version yet.
     """
     evaluation = evaluation_of(store)
+    labels = Labels(store, evaluation.reviewed is not None)
     return Sources(
         store,
         campaigns,
         settings=training_settings(campaigns),
         evaluation=evaluation,
-        networks=other_networks.kept(store, campaigns, evaluation.reviewed is not None),
+        networks=other_networks.kept(store, campaigns, labels.reviewed),
         baselines=window_baselines.slip_methods().results(store),
         window_intervals=window_scores.window_intervals(store, evaluation.key),
         label_check=label_errors.read_check(store),
@@ -127,4 +132,9 @@ def read_sources(
         planned_bytes=planned_bytes,
         step_seconds=step_seconds,
         programs=read_programs(store),
+        references={
+            (item.name, trial.id): references_of(recording, labels.read(item, recording))
+            for item in campaigns
+            for trial, recording in item.of_split("test")
+        },
     )

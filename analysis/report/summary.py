@@ -8,6 +8,11 @@ from importlib.metadata import version
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.detectors.onset_references import (
+    References,
+    decisions_of,
+    judge_by_reference,
+)
 from sliplab.analysis.report.campaign import references_of
 from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
@@ -18,7 +23,6 @@ from sliplab.protocols.presets import PAPER, at
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.schema.evaluation import (
     Evaluation,
-    Experiments,
     OtherEvaluation,
     TrainedBaseline,
     WindowIntervals,
@@ -31,7 +35,6 @@ from sliplab.storage.schema.summary import (
     Quality,
     Summary,
     Sync,
-    TrialOutcome,
 )
 from sliplab.storage.schema.sweeps import HoldoutResult
 from sliplab.storage.streams import Json
@@ -40,6 +43,8 @@ _PACKAGES = (
     "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",
     "opencv-contrib-python-headless", "scikit-learn",
 )  # fmt: skip
+Slips = Mapping[tuple[str, str], References]
+"""Slips of trials by each onset, by campaign and trial."""
 _WINDOWS = (
     "accuracy", "confusion", "precision", "recall", "baselines", "samples", "interval", "seeds",
     "reliability", "calibration", "by_factor", "by_tenth", "no_slip", "by_trial", "work", "beside",
@@ -69,7 +74,9 @@ def make_summary(sources: Sources) -> Summary:
         StoreError: another program's result is of another shape.
     """
     campaigns, evaluation = sources.campaigns, sources.evaluation
-    judged = judged_part(campaigns, evaluation, sources.window_intervals, sources.baselines)
+    judged = judged_part(
+        campaigns, evaluation, sources.window_intervals, sources.baselines, sources.references
+    )
     holdout = None
     if "holdout" in sources.programs:
         kept = parse_program("holdout", HoldoutResult, sources.programs["holdout"])
@@ -77,7 +84,10 @@ def make_summary(sources: Sources) -> Summary:
     return Summary.model_validate({
         "simulated": sources.store.simulated,
         **judged,
-        "networks": {name: _network(campaigns, of) for name, of in sources.networks.items()},
+        "networks": {
+            name: _network(campaigns, of, sources.references)
+            for name, of in sources.networks.items()
+        },
         "paper": _paper(sources.settings, campaigns),
         "references": references_of(sources.store, campaigns),
         "labels": {
@@ -116,10 +126,10 @@ def judged_part(
     evaluation: Evaluation,
     spans: WindowIntervals | None,
     baselines: Mapping[str, TrainedBaseline],
+    references: Slips,
 ) -> dict[str, Any]:
     """Return `kinematic`, `gravity`, `disturbance` and `trials` of an evaluation."""
-    trials = tuple(trial_outcome(row) for row in evaluation.trials)
-    judged = _judged(campaigns, trials, evaluation.experiments)
+    judged = _judged(campaigns, evaluation, references)
     windows = evaluation.windows.to_json()
     kinematic = {
         **{name: windows[name] for name in _WINDOWS},
@@ -127,28 +137,31 @@ def judged_part(
         "window_intervals": {} if spans is None else spans.to_json(),
         **judged["kinematic"],
     }
+    trials = tuple(trial_outcome(row) for row in evaluation.trials)
     return {**judged, "kinematic": kinematic, "trials": trials}
 
 
 def _judged(
-    campaigns: Sequence[Collected], trials: Sequence[TrialOutcome], experiments: Experiments
+    campaigns: Sequence[Collected], evaluation: Evaluation | OtherEvaluation, references: Slips
 ) -> dict[str, Json]:
     """Return each experiment's figures with its trials' outcomes, and how sure they are."""
     found = {}
-    for name, figures in experiments.items():
-        ours = [row for row in trials if row.experiment == name]
+    for name, figures in evaluation.experiments.items():
+        rows = [row for row in evaluation.trials if row.experiment == name]
+        ours = [trial_outcome(row) for row in rows]
+        decided = decisions_of(rows, references, evaluation.detection)
         found[name] = {
             **figures.to_json(),
             "accounted": account(campaigns, ours, name),
             "intervals": trial_intervals(ours),
+            "by_reference": judge_by_reference(decided),
         }
     return found
 
 
-def _network(campaigns: Sequence[Collected], found: OtherEvaluation) -> Json:
+def _network(campaigns: Sequence[Collected], found: OtherEvaluation, references: Slips) -> Json:
     """Return another network's figures, under the keys that the store's own have."""
-    trials = [trial_outcome(row) for row in found.trials]
-    judged = _judged(campaigns, trials, found.experiments)
+    judged = _judged(campaigns, found, references)
     return {
         **{key: getattr(found, key) for key in ("title", "preset", "seed", "engine", "exact")},
         "detection": plain_rules(found.detection),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import PlainSerializer
+from pydantic import Field, PlainSerializer
 
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
@@ -405,6 +405,29 @@ class Rate(Part):
     high: Number
 
 
+class OnsetFigures(Part):
+    """Decisions on trials by one reference onset, which need not be the label's."""
+
+    trials: Int
+    """Trials with both onsets by this reference."""
+    lacking: Int
+    """Trials without; they are in no other figure."""
+    latency_ms: LatencyByOnset
+    median_incipient_ms: tuple[Number, Number] | None
+    """95 % interval of the median incipient latency; null where so few trials bound nothing."""
+    median_gross_ms: tuple[Number, Number] | None
+    false_early_rate: Rate | None
+    """Of incipient detections; null without trials."""
+    early_by_paper: Int
+    """Incipient detections that are false early by the paper's onset, in trials with both."""
+    not_before: Int
+    """Of these, the ones at this reference's onset or after it."""
+    width_ms: Number | None
+    """Median width of the incipient onset's 95 % interval; null where none is stated."""
+    unsure: Int
+    """Incipient detections that are false early by one end of that interval alone."""
+
+
 class DetectorTrials(Part):
     """A detector over some trials."""
 
@@ -436,6 +459,9 @@ class DetectorRate(Part):
     levels: DetectorLevels
     validation: DetectorTrials
     test: DetectorTrials
+    by_reference: dict[str, OnsetFigures] = Field(default_factory=dict)
+    """Test trials by `paper`, `change_point` and, only where simulated, `true`; empty in older
+    evaluations."""
 
 
 class CurvePoint(Part):

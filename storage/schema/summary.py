@@ -27,6 +27,7 @@ from sliplab.storage.schema.evaluation import (
     LeadShare,
     MarkerClassifier,
     NoSlip,
+    OnsetFigures,
     RuleErrors,
     SampleCounts,
     Seeds,
@@ -93,6 +94,8 @@ class Experiment(ExperimentScores):
 
     accounted: Accounts
     intervals: TrialIntervals
+    by_reference: dict[str, OnsetFigures] = Field(default_factory=dict)
+    """By `paper`, `change_point` and, only where simulated, `true`."""
 
 
 class NetworkWindows(Experiment):
