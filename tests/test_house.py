@@ -14,17 +14,20 @@ SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglo
 
 def test_only_error_reports_read_the_simulations_truth() -> None:
     """Stored by the session, handed on by the recording, read where label errors are reckoned."""
-    readers = {
-        path.relative_to(ROOT).as_posix()
-        for path in SOURCES
-        if "simulation_truth" in path.read_text()
-    }
-    assert readers == {
+
+    def named_in(name: str) -> set[str]:
+        return {p.relative_to(ROOT).as_posix() for p in SOURCES if name in p.read_text()}
+
+    assert named_in("simulation_truth") == {
         "flows/collecting/session.py",
         "storage/trials/recording.py",
         "storage/schema/trial.py",
         "analysis/labels/label_errors.py",
         "flows/ui/view.py",  # drawn beside the label, and called simulated
+    }
+    assert named_in("true_onset_ns") == {
+        "analysis/labels/label_errors.py",
+        "analysis/detectors/onset_references.py",  # judges decisions that are made
     }
 
 

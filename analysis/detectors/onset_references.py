@@ -23,7 +23,7 @@ from sliplab.analysis.detectors.latency import (
     summarise_latency,
 )
 from sliplab.analysis.detectors.smoothing_rule import Found
-from sliplab.analysis.labels.label_errors import true_ns
+from sliplab.analysis.labels.label_errors import true_onset_ns
 from sliplab.analysis.metrics.intervals import exact_interval, interval
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import OnsetFigures, Rate, TrialScore
@@ -81,7 +81,7 @@ def references_of(recording: Recording, label: TrialLabel) -> References:
         if slip is not None:
             interval_ns = _interval(label, slip) if name == "change_point" else None
             found[name] = OnsetReference(slip, interval_ns)
-    incipient, gross = (true_ns(recording, label, "change_point", kind) for kind in KINDS)
+    incipient, gross = (true_onset_ns(recording, label, "change_point", kind) for kind in KINDS)
     if (slip := slip_of(incipient, gross, label.end_ns)) is not None:
         found["true"] = OnsetReference(slip)
     return found

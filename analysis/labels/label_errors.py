@@ -186,10 +186,10 @@ def _cases(
                 continue
             for rule in _TRUTH:
                 for kind in KINDS:
-                    yield rule, kind, label, true_ns(recording, label, rule, kind)
+                    yield rule, kind, label, true_onset_ns(recording, label, rule, kind)
 
 
-def true_ns(recording: Recording, label: TrialLabel, rule: Rule, kind: Kind) -> int | None:
+def true_onset_ns(recording: Recording, label: TrialLabel, rule: Rule, kind: Kind) -> int | None:
     """Return the time that is true of a rule's onset in a simulated trial; None where unknown.
 
     Args:

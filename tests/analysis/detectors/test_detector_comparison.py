@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from sliplab.analysis.detectors.detector_comparison import Parts, compare, thinned
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.onset_references import OnsetReference, References
 from sliplab.protocols.settings import Comparison, Detection, Windows
 from sliplab.storage.schema.evaluation import DetectorComparison, PartTrials
 
@@ -97,6 +99,32 @@ def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparis
             assert (a.levels, a.choice, a.validation) == (
                 b.levels, b.choice, b.validation
             )  # fmt: skip
+
+
+def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> None:
+    def seen(every: list[Labelled]) -> list[Labelled]:
+        return [replace(t, references=references(t.slip)) for t in every]
+
+    def references(slip: TrueSlip) -> References:
+        earlier = replace(slip, incipient_ns=slip.incipient_ns - 300 * MS)
+        return {"paper": OnsetReference(slip), "true": OnsetReference(earlier)}
+
+    of = parts()
+    found = compare(
+        Parts(seen(of.train), seen(of.validation), seen(of.test)), WINDOWS, SETTINGS, 10,
+        WINDOWS.steps,
+    )  # fmt: skip
+    assert found is not None
+    for mine, theirs in zip(found.detectors, compared.detectors, strict=True):
+        assert mine.curve == theirs.curve
+        for a, b in zip(mine.rates, theirs.rates, strict=True):
+            assert a.model_copy(update={"by_reference": {}}) == b
+            assert a.by_reference["paper"].latency_ms == a.test.latency_ms
+            late, label = (a.by_reference[n].latency_ms.incipient for n in ("true", "paper"))
+            assert late.false_early <= label.false_early
+            if label.n == late.n == 10:
+                assert late.median == pytest.approx(label.median + 300)
+            assert a.by_reference["change_point"].lacking == 10
 
 
 def test_one_stride_is_compared_once() -> None:
