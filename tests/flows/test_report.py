@@ -333,6 +333,27 @@ def test_an_evaluation_of_another_version_is_refused_by_name(store: Store, tmp_p
         report(other, collected(other))
 
 
+def test_an_evaluation_without_figures_by_each_onset_is_shown(store: Store, tmp_path: Path) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    older = Store.open(tmp_path / "store")
+    path = older.folder / "derived" / "evaluation" / "evaluation.json"
+    kept = read_json(path)
+    for entry in (kept["detectors"] or {"detectors": []})["detectors"]:
+        for rate in entry["rates"]:
+            del rate["by_reference"]
+    write_json(path, kept)
+    report(older, collected(older))
+    summary = read_summary(older)
+    for entry in summary.detectors.detectors if summary.detectors else ():
+        assert all(rate.by_reference == {} for rate in entry.rates)
+    # decisions of the network's rule stand in every evaluation
+    own = summary.kinematic.by_reference
+    assert list(own) == ["change_point", "paper", "true"]
+    assert all(each.trials + each.lacking == 2 for each in own.values())
+    assert own["paper"].latency_ms == summary.kinematic.latency_ms
+    assert "The same decisions by each onset" in page(older)
+
+
 def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
     rows = [
         ReferenceTrial(trial=str(k), place=1 + 10 * k, hold_events_per_s=1000.0 + 2 * k,
