@@ -472,7 +472,7 @@ def _locked(residuals: Floats, resolution: float) -> float:
     return 0.5 * resolution * float(np.exp(-2 * np.pi**2 * shaken**2))
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=16)
 def _draws(n: int) -> Floats:
     """Return normal numbers, the same at every call, (draws, n)."""
     return np.random.default_rng(n).standard_normal((_DRAWS, n))
