@@ -95,16 +95,18 @@ class AbbArm(ThreadedArm):
     def connect(self) -> None:
         """Connect to the web services, start the pose stream, and check that their poses agree.
 
-        A connection that is open already is kept if the controller answers. Takes at most
-        (15 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + 3 `STATUS_S`.
+        A connection that is open already is kept if the controller answers; if not, it is closed as
+        by `close` first. Takes at most (15 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` +
+        `STATUS_S` and the time of `close`.
 
         Raises:
-            ArmFault: no connection, no poses, no watchdog, or the arm is not ready to move.
+            ArmFault: no connection, no poses, no watchdog, the arm is not ready to move, or the one
+                that was lost while it may move is not confirmed at rest.
         """
         if self._lost is None:
             if self._answers():
                 return
-            self._release()  # lost, and not noticed yet
+            self.close()  # lost, and not noticed yet: the arm may still be on its way
         try:
             self._open()
         except WebError as error:

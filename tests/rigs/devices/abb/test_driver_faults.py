@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import time
@@ -62,6 +63,34 @@ def send(sender: str, to: str, data: bytes) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((sender, 0))
         link.sendto(data, (to, EGM_PORT))
+
+
+# -- connecting --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
+def test_connecting_again_finds_a_loss_that_nobody_noticed(abb_pair: MakeAbb, kind: Kind) -> None:
+    arm, robot = abb_pair()
+    arm.connect()  # one that answers is kept
+    assert arm.state() is ArmState.READY
+    robot.inject(kind)
+    with pytest.raises(ArmFault):
+        arm.connect()
+    assert arm.state() is ArmState.DISCONNECTED
+    robot.restore()
+    reconnect(arm)
+    assert arm.state() is ArmState.READY
+
+
+def test_connecting_again_stops_an_arm_that_was_lost_on_its_way(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair(arm={"watchdog_s": 1.0})
+    sliding(arm, robot)
+    robot.inject(Kind.SILENCE)
+    with contextlib.suppress(ArmFault):  # where no pose confirms that its watchdog stopped it
+        arm.connect()
+    until(lambda: not robot.moving(), LOST_S)
+    assert robot.watchdog_stops == 1
+    assert arm.state() is ArmState.DISCONNECTED
 
 
 # -- stopping ------------------------------------------------------------------------------

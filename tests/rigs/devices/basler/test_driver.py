@@ -238,3 +238,22 @@ def test_close_may_come_at_any_time_and_twice() -> None:
     camera.start()
     camera.close()
     camera.close()
+
+
+def test_a_closed_camera_gives_its_descriptors_back_though_an_error_keeps_it() -> None:
+    def descriptors() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    BaslerCamera(BaslerSettings(**FREE)).close()  # what pylon opens once and keeps
+    before = descriptors()
+    kept: list[RigError] = []
+    for _ in range(3):
+        camera = BaslerCamera(BaslerSettings(**FREE))
+        camera.start()
+        with pytest.raises(RigError, match="already grabbing") as refused:
+            camera.start()
+        kept.append(refused.value)  # its traceback refers to the camera
+        camera.close()
+    assert descriptors() <= before + 2
+    with pytest.raises(RigError, match="is closed; open it again"):
+        camera.health()
