@@ -19,6 +19,7 @@ from sliplab.flows.planning.schema import file_schema
 from sliplab.flows.study import Outcome
 from sliplab.flows.twin import gap
 from sliplab.flows.twin.drawn_rigs import read_samples, samples_file, write_samples
+from sliplab.flows.twin.worlds import touch_depth_mm
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.errors import StoreError
@@ -119,19 +120,23 @@ def test_each_network_has_the_scores_of_its_evaluation(
 
 def test_trials_are_taken_on_the_rig_that_is_named(found: TwinGap, wanted: gap.Gap) -> None:
     training = {trial.id for trial in wanted.plan if trial.split != "test"}
-    frictions, taken = {}, {}
+    frictions, taken, touched = {}, {}, {}
     for it in found.networks[1:]:
         campaigns = collected(Store.open(wanted.out / it.trained_on))
         assert it.rigs == len(campaigns)
         taken[it.trained_on] = [{trial.id for trial, _ in item.trials} for item in campaigns]
-        frictions[it.trained_on] = [
-            load_rig_file(item.campaign.folder / "rig.yaml", stored=True)[0].scene.scene.friction
-            for item in campaigns
+        rigs = [
+            load_rig_file(item.campaign.folder / "rig.yaml", stored=True)[0] for item in campaigns
         ]
+        frictions[it.trained_on] = [rig.scene.scene.friction for rig in rigs]
+        touched[it.trained_on] = [rig.calibration.touch_depth for rig in rigs]
     assumed = load_rig_file(Path("rehearsal"))[0].scene.scene.friction
     assert frictions["assumed"] == [assumed]
     assert [it.kinetic for it in frictions["twin"]] == [0.75]
     assert sorted(it.kinetic for it in frictions["drawn"]) == pytest.approx([0.7, 0.8])
+    for number, depth in enumerate(touched["drawn"], 1):  # the surface is known here
+        file = wanted.out / f"drawn-{number}.yaml"
+        assert depth == pytest.approx(touch_depth_mm(load_rig_file(file)[0]), abs=0.001)
     assert taken["twin"] == taken["assumed"] == [training]
     assert set.union(*taken["drawn"]) == training
     assert sum(map(len, taken["drawn"])) == len(training)
