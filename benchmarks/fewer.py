@@ -17,7 +17,7 @@ Campaigns look after every block of `order: shuffled` (288 trials), or after eve
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -234,7 +234,13 @@ def lines(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 def rows_of(worlds: int, seed: int, adaptive: int, batch: int, cores: int) -> list[dict[str, Any]]:
     """Do all worlds."""
-    one = partial(world_row, seed=seed, adaptive=adaptive, batch=batch)
+    return in_worlds(partial(world_row, seed=seed, adaptive=adaptive, batch=batch), worlds, cores)
+
+
+def in_worlds(
+    one: Callable[[int], dict[str, Any]], worlds: int, cores: int
+) -> list[dict[str, Any]]:
+    """Do the same in each world, by number."""
     with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
         return list(pool.map(one, range(worlds)))
 

@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +26,22 @@ import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
-from benchmarks.fewer import BATCH, F64, ORDERS, ROOT, Setting, campaign, plan_of, quantile
+from benchmarks.fewer import (
+    BATCH,
+    F64,
+    ORDERS,
+    ROOT,
+    Setting,
+    campaign,
+    in_worlds,
+    plan_of,
+    quantile,
+)
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.expectation import coded, expectation
 from sliplab.analysis.claims.power import SHARES, Drawing
-from sliplab.analysis.claims.resampling import Axis, Pilot
-from sliplab.analysis.claims.simulated import course
+from sliplab.analysis.claims.resampling import Pilot, shared_axes
 from sliplab.analysis.claims.trial_figures import Judge, trial_figures
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols import Plan
@@ -160,19 +168,25 @@ def _wrong(claim: dict[str, Any], call: Any, y: F64) -> bool:
 
 
 def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str, Any]:
-    """Foretell all claims in one world, by a pilot and by other campaigns in it."""
+    """Foretell all claims in one world, by a pilot and by other campaigns in it.
+
+    Trials after which a claim is called; one that never is counts as called by the last of them.
+    """
     row: dict[str, Any] = {}
     with threadpool_limits(1):
         for title, (experiment, claim) in CLAIMS.items():
             grid, y = figures_of(number, seed, title)
-            pilot = _pilot(grid, y[-1], claim["figure"], np.random.default_rng([seed, number]))
+            figure, total = claim["figure"], len(grid.trials)
+            setting = setting_of(number, seed, experiment)
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
-                plan = plan_of(order, [claim], setting_of(number, seed, experiment))
+                plan = plan_of(order, [claim], setting)
                 own = _places(grid, Grid.of(plan))
-                took = [_trials(plan, {claim["figure"]: each[own]}) for each in y[:-1]]
+                calls = [campaign(order, [claim], {figure: each[own]}, setting) for each in y[:-1]]
+                took = [total if call is None else call.trials for (call,) in calls]
+                pilot = _pilot(plan, grid, y[-1], figure, np.random.default_rng([seed, number]))
                 drawing = Drawing(plan, pilot, seed)
-                foretold = [drawing.campaign(k).called[0] or len(own) for k in range(draws)]
+                foretold = [drawing.campaign(k).called[0] or total for k in range(draws)]
                 row[title][order] = [
                     took[0], float(np.median(took[1:])),
                     *(float(n) for n in np.quantile(foretold, SHARES)),
@@ -180,78 +194,54 @@ def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str,
     return row
 
 
-def _pilot(grid: Grid, y: F64, figure: str, rng: np.random.Generator) -> Pilot:
-    """Return a twelfth or so of a grid's trials, `PILOT` of them, as a pilot."""
-    taken = rng.choice(len(grid.trials), min(PILOT, len(grid.trials) // 3), replace=False)
+def _pilot(plan: Plan, grid: Grid, y: F64, figure: str, rng: np.random.Generator) -> Pilot:
+    """Return `PILOT` of a grid's trials as a pilot, or a third of them where that is less."""
+    count = len(grid.trials)
+    taken = rng.choice(count, min(PILOT, count // 3), replace=False)
     trials = [grid.trials[k] for k in taken]
     conditions = [dict(trial.condition) for trial in trials]
-    levels: dict[str, list[Any]] = {}
-    for condition in conditions:
-        for name, level in condition.items():
-            levels.setdefault(name, []).append(level)
-    axes = tuple(
-        Axis(name, tuple(dict.fromkeys(sorted(each))), name == "direction")
-        for name, each in levels.items()
-    )
+    axes, _ = shared_axes(plan, conditions)
     blocks = np.array([trial.block for trial in trials], np.int64)
     return Pilot(axes, tuple(conditions), blocks, {figure: y[taken]})
 
 
-def _trials(plan: Plan, values: dict[str, F64]) -> int:
-    """Return after how many trials a plan's only claim is called, all if it is not."""
-    grid = Grid.of(plan)
-    went = course(plan, grid, values)
-    look = went.claims[0].look
-    return len(grid.trials) if look is None else int(went.evidence.looks[look])
+def by_claim(rows: Sequence[dict[str, Any]]) -> Iterator[tuple[str, list[Any]]]:
+    """Yield the first cells of a line of a table, and what was found in each world."""
+    for title in CLAIMS:
+        for order in ORDERS:
+            found = [row[title][order] for row in rows if order in row[title]]
+            if found:
+                yield f"| {title} | {order} |", found
 
 
 def print_forecasts(asked: argparse.Namespace) -> None:
     """Print the table of forecasts."""
     one = partial(forecast_row, seed=asked.seed, adaptive=asked.adaptive, draws=asked.draws)
-    with ProcessPoolExecutor(asked.cores, get_context("spawn")) as pool:
-        rows = list(pool.map(one, range(asked.worlds)))
     print("| claim | order | within 1.3, by a pilot | by the world itself | 80 % range holds |")
     print("| --- | --- | --- | --- | --- |")
-    for title in CLAIMS:
-        for order in ORDERS:
-            found = np.array([row[title][order] for row in rows if order in row[title]])
-            if not len(found):
-                continue
-            took, known, low, median, high = found.T
-            close = [
-                int((np.abs(np.log(n / took)) <= np.log(FACTOR)).sum()) for n in (median, known)
-            ]
-            holds = int(((low <= took) & (took <= high)).sum())
-            count = len(found)
-            print(
-                f"| {title} | {order} | {close[0]} of {count} | {close[1]} of {count} "
-                f"| {holds} of {count} |"
-            )
+    for cells, found in by_claim(in_worlds(one, asked.worlds, asked.cores)):
+        took, known, low, median, high = np.array(found).T
+        close = [int((np.abs(np.log(n / took)) <= np.log(FACTOR)).sum()) for n in (median, known)]
+        holds = int(((low <= took) & (took <= high)).sum())
+        print(cells, " ".join(f"{n} of {len(found)} |" for n in (*close, holds)))
 
 
 def print_claims(asked: argparse.Namespace) -> None:
     """Print the table of all claims."""
     one = partial(world_row, seed=asked.seed, adaptive=asked.adaptive)
-    with ProcessPoolExecutor(asked.cores, get_context("spawn")) as pool:
-        rows = list(pool.map(one, range(asked.worlds)))
     print("| claim | order | called | wrongly (95 %) | median trials | of the grid |")
     print("| --- | --- | --- | --- | --- | --- |")
-    for title in CLAIMS:
-        for order in ORDERS:
-            found = [row[title][order] for row in rows if order in row[title]]
-            if not found:
-                continue
-            wrong = sum(off for *_, off in found)
-            low, high = exact_interval(wrong, len(found))
-            size = found[0][0]
-            trials = float(np.median([size if n is None else n for _, n, _ in found]))
-            called = sum(n is not None for _, n, _ in found)
-            span = f"{100 * low:.1f} to {100 * high:.1f}"
-            print(
-                f"| {title} | {order} | {called} of {len(found)} "
-                f"| {100 * wrong / len(found):.1f} % ({span}) | {trials:.0f} of {size} "
-                f"| {100 * trials / size:.0f} % |"
-            )
+    for cells, found in by_claim(in_worlds(one, asked.worlds, asked.cores)):
+        wrong = sum(off for *_, off in found)
+        low, high = exact_interval(wrong, len(found))
+        size = found[0][0]
+        trials = float(np.median([size if n is None else n for _, n, _ in found]))
+        called = sum(n is not None for _, n, _ in found)
+        span = f"{100 * low:.1f} to {100 * high:.1f}"
+        print(
+            f"{cells} {called} of {len(found)} | {100 * wrong / len(found):.1f} % ({span}) "
+            f"| {trials:.0f} of {size} | {100 * trials / size:.0f} % |"
+        )
 
 
 def main() -> None:

@@ -258,11 +258,8 @@ def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
     """
     plan, claims = asked.plan, claims_of(asked.plan).claims
     conditions = [dict(trial.condition) for _, trial, _ in asked.pilot]
-    collection = plan.protocol.collection
-    factors = collection.all_factors
-    directions = {ref.factor for key, ref in collection.bindings() if key.endswith(".direction")}
     try:
-        axes, notes = shared_axes(conditions, factors, plan.enabled, claims, directions)
+        axes, notes = shared_axes(plan, conditions)
     except KeyedError as error:
         raise InputError(plan.file, error.key, error.value, str(error)) from None
     work = [asked.judge.work(recording, item.name) for item, _, recording in asked.pilot]

@@ -12,7 +12,7 @@ and Young 1987, The bootstrap: to smooth or not to smooth?).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +21,7 @@ import numpy as np
 from sliplab.analysis.claims.evidence import I64, Grid
 from sliplab.analysis.claims.expectation import expectation
 from sliplab.analysis.claims.sequences import F64
-from sliplab.protocols.claims import Claim
+from sliplab.protocols import Plan
 from sliplab.protocols.factors import Factor, Level
 from sliplab.protocols.yaml_file import KeyedError
 
@@ -210,26 +210,22 @@ def _block_effect(off: F64, blocks: I64) -> tuple[float, float]:
     return variance / (variance + inside), float(np.sqrt(variance))
 
 
-def shared_axes(
-    conditions: Sequence[Condition],
-    factors: Mapping[str, Factor],
-    levels: Mapping[str, Sequence[Level]],
-    claims: Sequence[Claim],
-    directions: Collection[str] = (),
-) -> tuple[tuple[Axis, ...], list[str]]:
+def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis, ...], list[str]]:
     """Return the factors that a pilot and a plan share, and what the pilot does not tell of others.
 
     Args:
-        conditions: of the pilot's trials. factors, levels: of the plan; levels that it takes.
-        directions: factors that are the direction of a motion.
+        conditions: of the pilot's trials.
 
     Raises:
         KeyedError: a level lies outside of the pilot's, or is compared by a claim and unknown.
     """
     axes: list[Axis] = []
     notes: list[str] = []
+    collection, levels = plan.protocol.collection, plan.enabled
+    claims = () if collection.stopping is None else collection.stopping.claims
     compared = {claim.between.factor for claim in claims if claim.between is not None}
-    for name, factor in factors.items():
+    directions = {ref.factor for key, ref in collection.bindings() if key.endswith(".direction")}
+    for name, factor in collection.all_factors.items():
         if not all(name in condition for condition in conditions):
             if name in compared:
                 raise KeyedError(

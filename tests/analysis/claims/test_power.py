@@ -42,9 +42,7 @@ def plan_of(claims: list[dict[str, Any]], repetitions: int = 60, **collection: A
 def pilot_of(plan: Plan, depths: list[Decimal], values: dict[str, F64]) -> Pilot:
     """Trials at these depths, all in one block."""
     conditions = [{"depth": depth} for depth in depths]
-    axes, _ = shared_axes(
-        conditions, plan.protocol.collection.all_factors, plan.enabled, claims_of(plan).claims
-    )
+    axes, _ = shared_axes(plan, conditions)
     return Pilot(axes, tuple(conditions), np.zeros(len(depths), np.int64), values)
 
 
@@ -184,9 +182,8 @@ def test_effects_of_factors_and_of_blocks_are_kept() -> None:
 
 def test_levels_between_are_said_and_those_outside_are_refused() -> None:
     plan = plan_of([MEDIAN])
-    factors = plan.protocol.collection.all_factors
     few: list[dict[str, Any]] = [{"depth": DEPTHS[0]}, {"depth": DEPTHS[2]}]
-    axes, notes = shared_axes(few, factors, plan.enabled, ())
+    axes, notes = shared_axes(plan, few)
     assert any("lacks depth 2.8 mm" in note for note in notes)
     (depth,) = axes
     assert depth.weights(DEPTHS[1], np.random.default_rng(0)) == pytest.approx([0.6, 0.4])
@@ -194,7 +191,7 @@ def test_levels_between_are_said_and_those_outside_are_refused() -> None:
     with pytest.raises(
         KeyedError, match=r"outside of the pilot's levels, 2\.4 mm, 2\.8 mm"
     ) as error:
-        shared_axes(outside, factors, plan.enabled, ())
+        shared_axes(plan, outside)
     assert (error.value.key, error.value.value) == ("collection.factors.depth", "3.4 mm")
 
 
