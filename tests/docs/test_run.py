@@ -24,8 +24,10 @@ ORDER = (
     "export", "import", "push", "pull", "skip", "again",
 )  # fmt: skip
 """Cheap pages, in an order in which each finds its inputs."""
-ELSEWHERE = ("--rig loopback", "--dask", "s3://", "--follow", "KIND", "lab-pickles", "--help")
-"""Needs a rig in real time, other machines or a running campaign, or stands for a word."""
+ELSEWHERE = (
+    "--rig loopback", "--dask", "s3://", "--follow", "--pilot", "KIND", "lab-pickles", "--help",
+)  # fmt: skip
+"""Needs a rig in real time, other machines, a running campaign or claims, or stands for a word."""
 
 ADAPTER = """adapter: 1
 name: touches

@@ -56,7 +56,7 @@ def read_protocol(box: Path, name: str, data: bytes) -> None:
     from sliplab.protocols.plan import load_plan
 
     plan = load_plan(_written(box, "protocol.yaml", data))
-    json.dumps(plan_json(plan, None, None), allow_nan=False)
+    json.dumps(plan_json(plan, None, None, None), allow_nan=False)
     plan.warnings()
 
 
