@@ -225,7 +225,7 @@ class Detection(StrictModel):
     """The winner must exceed every other class by at least this many mean spikes. By default two,
     as in the paper, for each of a class's ``network.outputs_per_class`` neurons."""
     false_early_ms: float = Field(default=30.0, ge=0, le=1e6)
-    """A detection earlier than the true onset by more than this is false."""
+    """A detection earlier than the label's onset by more than this is false."""
     stride_ms: int | None = Field(default=None, ge=1, le=1000)
     """From one window's begin to the next one's; by default a window's length, so that they
     follow each other. Shorter ones overlap, and `smoothing` of them then span less time."""

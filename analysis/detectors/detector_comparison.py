@@ -55,7 +55,7 @@ from sliplab.storage.schema.evaluation import (
 
 @dataclass(frozen=True)
 class Judged:
-    """A trial's evidence with its true onsets, and those by other references."""
+    """A trial's evidence with its label's onsets, and those by other references."""
 
     evidence: Evidence
     slip: TrueSlip
@@ -112,7 +112,7 @@ def _highest(values: Any, evidence: Evidence, start: int, before_ns: int) -> flo
 
 
 def outcomes(trials: Sequence[Judged], levels: Levels, false_early_ns: int) -> list[TrialLatency]:
-    """Each trial's detections against its true onsets."""
+    """Each trial's detections against its label's onsets."""
     return [score_trial(decide(t.evidence, levels), t.slip, false_early_ns) for t in trials]
 
 

@@ -76,7 +76,7 @@ def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:
 
     Args:
         found_ns: an integer or an array of them, `NEVER` where nothing was detected; likewise:
-        onset_ns: true onset.
+        onset_ns: by the label.
         tolerance_ns: of a detection before it.
     """
     return found_ns < onset_ns - tolerance_ns
@@ -98,7 +98,7 @@ def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> Trial
     Args:
         detections: what the detector said.
         slip: what is true, on the same time line.
-        false_early_ns: a detection earlier than the true onset by MORE than this is false.
+        false_early_ns: a detection earlier than the label's onset by MORE than this is false.
 
     Raises:
         ValueError: a negative tolerance.

@@ -80,7 +80,7 @@ class Figures:
     Attributes:
         mean_ms, p95_ms: incipient latency of counted detections; None without one.
         gross_mean_ms: the same of gross slip.
-        lead_min_ms: shortest lead of gross slip's true onset over a counted detection.
+        lead_min_ms: shortest lead of gross slip's labelled onset over a counted detection.
         missed, missed_gross: shares of trials without a detection.
         late, late_gross: shares of trials whose detection came after the event.
         false_early, false_early_gross: shares of trials whose detection came too early.
@@ -147,7 +147,7 @@ def _first(lead: F64, margin: float, start: int) -> int | None:
 
 
 def score(found: I64, trials: Trials) -> Figures:
-    """One pair's detections int64 (n, 2) against the true onsets of n trials, n at least 1."""
+    """One pair's detections int64 (n, 2) against the labels of n trials, n at least 1."""
     out = trials.uncounted(found)
     counted = ~(out.false_early | out.missed | out.late)
     incipient, gross = (found[:, k][counted[:, k]] for k in (0, 1))

@@ -26,8 +26,8 @@ from sliplab.storage.schema.summary import (
 
 AXES = {
     "duration_ms": ("incipient slip lasts (ms)", GREEN, ""),
-    "latency_incipient_ms": ("incipient latency (ms)", ORANGE, "true onset"),
-    "latency_gross_ms": ("gross latency (ms)", RED, "true onset"),
+    "latency_incipient_ms": ("incipient latency (ms)", ORANGE, "labelled onset"),
+    "latency_gross_ms": ("gross latency (ms)", RED, "labelled onset"),
     "lead_ms": ("lead before gross slip (ms)", BLUE, "gross slip"),
 }
 NAMES = {

@@ -18,8 +18,8 @@ WORDS = {
 }
 _COLUMNS = (
     "decided by", "onset", "trials (lacking)", "incipient, median (95 %) (ms)",
-    "false early (95 %)", "missed, late", "false early by 2 pixels, not before this onset",
-    "gross, median (95 %) (ms)", "gross: false early; missed, late",
+    "false early (95 %)", "missed, late", "early by 2 pixels, not before this",
+    "gross, median (ms); false early, missed, late",
 )  # fmt: skip
 
 
@@ -98,8 +98,7 @@ def _cells(name: str, figures: OnsetFigures) -> list[str]:
         early,
         f"{incipient.missed}, {incipient.late}",
         "–" if name == "paper" else of_paper,
-        _median(gross, figures.median_gross_ms),
-        f"{gross.false_early}; {gross.missed}, {gross.late}",
+        f"{number(gross.median, 0)}; {gross.false_early}, {gross.missed}, {gross.late}",
     ]
 
 

@@ -55,7 +55,7 @@ class Example:
         return ", ".join(f"{name} {text}" for name, text in self.row.condition.items())
 
     def onsets_s(self) -> list[float | None]:
-        """Return both true onsets, seconds since the recording began."""
+        """Return both onsets of the label, seconds since the recording began."""
         return [self.seconds(self.row.incipient_ns), self.seconds(self.row.gross_ns)]
 
     def seconds(self, time_ns: int | None) -> float | None:

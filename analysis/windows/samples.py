@@ -65,7 +65,7 @@ def choose_windows(
 
     Args:
         start_ns, end_ns: the recording, on the trial's time line, ns.
-        incipient_ns, gross_ns: the true onsets, ns.
+        incipient_ns, gross_ns: the label's onsets, ns.
         window_ns: a window's length.
         per_class: number of windows of each class.
         seed: of the random windows (PCG64).

@@ -237,11 +237,11 @@ class OtherWindowScores(Classification):
 
 
 class TrialLatency(Part):
-    """One trial's detections against its true onsets."""
+    """One trial's detections against its label's onsets."""
 
     latency_incipient_ms: Number | None
-    """Detection minus true onset; negative down to the tolerance where it came early; null where
-    missed, false early or late."""
+    """Detection minus the label's onset; negative down to the tolerance where it came early; null
+    where missed, false early or late."""
     latency_gross_ms: Number | None
     lead_ms: Number | None
     """True gross onset minus incipient detection, above zero; null where the incipient detection is
@@ -253,7 +253,7 @@ class TrialLatency(Part):
     """There was no detection."""
     missed_gross: Bool
     false_early_incipient: Bool
-    """The detection came before the true onset by more than the tolerance."""
+    """The detection came before the label's onset by more than the tolerance."""
     false_early_gross: Bool
 
     @property
@@ -279,7 +279,7 @@ class TrialScore(Part):
     condition: dict[str, str]
     """Levels by factor, with their units."""
     incipient_ns: Int | None
-    """The true onset; null where the label has none."""
+    """By the label; null where it has none."""
     gross_ns: Int | None
     end_ns: Int | None
     """End of the slip; null where an onset is missing."""

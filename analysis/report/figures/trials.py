@@ -124,7 +124,7 @@ def outputs(
             for found, colour in zip(detected_s, (ORANGE, RED), strict=True):
                 if found is not None:
                     panel.axvline(found, color=colour, lw=1.2, ls=":")
-        axes[0].plot([], [], color="black", lw=1.4, label="true onset")
+        axes[0].plot([], [], color="black", lw=1.4, label="labelled onset")
         axes[0].plot([], [], color="black", lw=1.2, ls=":", label="detected")
         handles, titles = axes[0].get_legend_handles_labels()
         figure.legend(handles, titles, loc="outside lower center", ncols=5, fontsize=8)
