@@ -33,14 +33,15 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests of a file, and all that use the small study, in one worker.
+    """Keep the tests of a file, and all files that use the small study, in one worker.
 
     What they share is made once then. Tests in real time name their groups themselves.
     """
+    shared = {item.path for item in items if "ran" in getattr(item, "fixturenames", ())}
     for item in items:
         if item.get_closest_marker("realtime") is None:
-            shared = "ran" in getattr(item, "fixturenames", ())
-            item.add_marker(pytest.mark.xdist_group("ran" if shared else str(item.path)))
+            group = "ran" if item.path in shared else str(item.path)
+            item.add_marker(pytest.mark.xdist_group(group))
 
 
 def pytest_collection_finish() -> None:

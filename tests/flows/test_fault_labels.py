@@ -94,6 +94,7 @@ def test_without_the_centre_gross_slip_is_unknown(
     assert abs(error) <= 30
 
 
+@pytest.mark.long
 def test_a_marker_hidden_on_video_is_not_taken_for_another(
     tmp_path: Path, sound: tuple[Label, Recording]
 ) -> None:

@@ -26,6 +26,8 @@ from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.conftest import shape_of
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:

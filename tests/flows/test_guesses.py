@@ -31,6 +31,8 @@ from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.conftest import shape_of
 
+pytestmark = pytest.mark.long
+
 Json = dict[str, Any]
 GUESS = "event_camera.contrast"
 

@@ -78,7 +78,7 @@ def errors_ms(found: Label, recording: Recording) -> list[float]:
     return [(a - b) / 1e6 for a, b in pairs]
 
 
-@pytest.mark.parametrize("make", [kinematic, gravity])
+@pytest.mark.parametrize("make", [kinematic, pytest.param(gravity, marks=pytest.mark.long)])
 def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
     data = make()
     recordings, labels, expected = [], [], []
@@ -129,6 +129,7 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         assert found.onsets.gross_ns < found.end_ns < recording.step("retract")[1]
 
 
+@pytest.mark.long
 def test_mild_reflections_leave_the_labels_right(tmp_path: Path) -> None:
     data = kinematic()
     recording, _ = take(tmp_path / "r", data, reflections={"count": 8, "level": 10})

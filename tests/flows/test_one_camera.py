@@ -72,7 +72,7 @@ def taken(studied: Callable[[str], tuple[Store, Outcome]], tmp_path: Path) -> Ta
     return copied
 
 
-@pytest.mark.parametrize("camera", ["events", "frames"])
+@pytest.mark.parametrize("camera", [pytest.param("events", marks=pytest.mark.long), "frames"])
 def test_a_study_with_one_camera_runs_to_its_report(
     camera: str, studied: Callable[[str], tuple[Store, Outcome]]
 ) -> None:
@@ -138,6 +138,7 @@ def test_a_study_with_one_camera_runs_to_its_report(
     assert "spiking network and its detectors" in page or camera == "events"
 
 
+@pytest.mark.long
 def test_training_and_evaluation_repeat_and_say_what_is_stale(taken: Take) -> None:
     """The same bytes and figures from the same seed; nothing is made twice."""
     store = taken("frames")
@@ -174,6 +175,7 @@ def test_training_and_evaluation_repeat_and_say_what_is_stale(taken: Take) -> No
     assert {rule.choose for rule in summary.detection.values()} == {"protocol"}
 
 
+@pytest.mark.long
 def test_a_report_on_events_says_which_steps_are_still_to_do(taken: Take) -> None:
     store = taken("events")
     campaigns = collected(store)
@@ -215,6 +217,7 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     assert "time to the first slip" in page
 
 
+@pytest.mark.long
 def test_the_report_is_made_again_only_when_something_changed(
     studied: Callable[[str], tuple[Store, Outcome]],
 ) -> None:

@@ -98,6 +98,7 @@ def test_the_preset_by_itself_is_the_network_that_stood_beside(
     assert (said["preset"], said["differences"]) == ("paper", [])
 
 
+@pytest.mark.long
 def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
     store: Store, tmp_path: Path
 ) -> None:

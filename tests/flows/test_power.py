@@ -107,6 +107,7 @@ def test_a_network_is_not_asked_about_trials_that_trained_it(
     assert any("no learning curve: it takes 8 training" in note for note in found["notes"])
 
 
+@pytest.mark.long
 def test_a_learning_curve_is_trained_once(
     ran: Ran, protocol: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
+import pytest
 import yaml
 
 from sliplab.analysis.campaigns import Collected, collected
@@ -146,6 +147,7 @@ def filmed(recording: Recording, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_our_own_rules_label_the_frames_of_another_lab(tmp_path: Path) -> None:
     data = kinematic()
     recording, _ = take(tmp_path / "here", data, level="video")

@@ -265,6 +265,7 @@ def detector() -> Json:
     return {"simulated": True, "rows": rows}
 
 
+@pytest.mark.long
 def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) -> None:
     shutil.copytree(store.folder, tmp_path / "store")
     other = Store.open(tmp_path / "store")

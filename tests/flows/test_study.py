@@ -58,6 +58,7 @@ def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[RunRequest], Out
         assert errors[kind]["median_abs"] <= 10.0
 
 
+@pytest.mark.long
 def test_labels_of_tracks_are_checked_with_video(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path
 ) -> None:
@@ -218,6 +219,7 @@ def test_no_window_of_a_test_trial_is_near_a_training_window(
     assert len(set.union(*found.values())) == 6
 
 
+@pytest.mark.long
 def test_other_methods_are_kept_and_the_report_tells_of_them(
     ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -285,6 +287,7 @@ def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outc
     assert "were chosen by" not in text
 
 
+@pytest.mark.long
 def test_smoothing_can_be_chosen_and_windows_can_overlap(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path
 ) -> None:
@@ -326,6 +329,7 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
     study(ran[0])  # back to what the other tests know
 
 
+@pytest.mark.long
 def test_a_margin_by_option_is_not_kept(ran: tuple[list[RunRequest], Outcome]) -> None:
     store = store_of(ran)
     campaigns = collected(store)

@@ -91,7 +91,13 @@ def first_stamps(recording: Recording) -> dict[str, ClockMap]:
     return {device: ClockMap.line(start, zero) for device, start in begin.items()}
 
 
-@pytest.mark.parametrize("timing", TIMINGS.values(), ids=TIMINGS)
+@pytest.mark.parametrize(
+    "timing",
+    [
+        pytest.param(timing, id=name, marks=pytest.mark.long if number else ())
+        for number, (name, timing) in enumerate(TIMINGS.items())
+    ],
+)
 def test_every_accepted_trial_agrees_with_the_truth(
     tmp_path: Path, timing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -120,6 +120,7 @@ def test_the_page_stands_alone_and_says_simulated(result: Any) -> None:
     assert sorted(item.name for item in folder.iterdir()) == [tradeoff.PAGE, tradeoff.NUMBERS]
 
 
+@pytest.mark.long
 def test_a_falling_plate_is_measured_at_its_own_step(
     tmp_path: Path, rig_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

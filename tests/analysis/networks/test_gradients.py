@@ -89,6 +89,7 @@ def test_all_ways_count_the_same_spikes_and_agree_on_gradients(way: Way) -> None
         assert gradient.abs().max() > 0, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", WAYS)
 def test_the_same_batch_gives_the_same_bits(way: Way) -> None:
     rows = np.arange(9)

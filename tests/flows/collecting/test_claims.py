@@ -98,6 +98,7 @@ def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(tmp_path: Path) ->
     assert len(record_of(more).looks) == 8
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_a_thread")
 def test_least_and_most_bound_the_trials(tmp_path: Path) -> None:
     late = request(tmp_path / "a", [SURE], stopping={"least": 18})
@@ -130,6 +131,7 @@ def test_cut_anywhere_an_adaptive_campaign_goes_on_with_the_same_trial(tmp_path:
     assert checksums[0] == checksums[1]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_a_thread")
 def test_a_chosen_trial_is_the_grids_own(tmp_path: Path) -> None:
     options = {"order": "adaptive", "choice": {"batch": 4, "start": 3}}

@@ -38,6 +38,7 @@ def over_skins() -> dict[str, Any]:
     return data
 
 
+@pytest.mark.long
 def test_skins_and_temperatures_go_through_every_step(tmp_path: Path) -> None:
     protocol, store = write(tmp_path / "skins.yaml", over_skins()), tmp_path / "store"
     rig = ROOT / "rigs" / "rehearsal.yaml"

@@ -193,6 +193,7 @@ def test_an_arm_that_rests_between_pieces_is_refused_a_twist_beforehand(tmp_path
         make_request(protocol, rig, tmp_path / "store")
 
 
+@pytest.mark.long
 def test_a_network_is_trained_and_judged_on_twists(tmp_path: Path) -> None:
     """One twist to learn from, two to judge by."""
     data = twists(-40, 35, 40)

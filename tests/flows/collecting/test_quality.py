@@ -62,6 +62,7 @@ def test_a_plate_that_slips_in_the_hold_fails_its_gate(tmp_path: Path) -> None:
     assert 0.5 * most < gates["hold_slip_px"].value <= most
 
 
+@pytest.mark.long
 def test_without_its_gate_or_with_a_video_the_label_doubts_the_trial(tmp_path: Path) -> None:
     data = heavy("3.4 mm")
     with_video = take(tmp_path / "video", data, "video")

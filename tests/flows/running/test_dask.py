@@ -134,6 +134,7 @@ def square_or_die(job: tuple[int, str]) -> int:
     return number**2
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::ResourceWarning:distributed")
 def test_a_worker_that_dies_is_replaced(tmp_path: Path, cluster: Cluster) -> None:
     jobs = [(number, str(tmp_path / "died")) for number in range(24)]

@@ -151,6 +151,7 @@ def test_a_campaign_goes_on_without_its_server(lose: Callable[[int], None], tmp_
     assert all(state == "COMPLETED" for _, state in states(database))
 
 
+@pytest.mark.long
 def test_ctrl_c_acts_while_the_server_stands_still(tmp_path: Path) -> None:
     with collecting(tmp_path) as running:
         running.begun()
@@ -265,6 +266,7 @@ def test_closed_standard_streams_do_not_matter(closed: str, tmp_path: Path) -> N
     assert states(store / ".prefect" / "prefect.db") == [("collect", "COMPLETED")]
 
 
+@pytest.mark.long
 def test_a_limit_on_the_size_of_files_is_named(tmp_path: Path) -> None:
     began = time.monotonic()
     protocol = write(tmp_path / "p.yaml", tiny())

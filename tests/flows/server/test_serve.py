@@ -99,6 +99,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
     assert (limit.limit, limit.active_slots) == (1, 0)
 
 
+@pytest.mark.long
 def test_claims_end_a_collection_of_the_service_too(service: Service, tmp_path: Path) -> None:
     from sliplab.flows.server.deployments import collect
 

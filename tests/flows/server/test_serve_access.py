@@ -268,6 +268,7 @@ def test_a_password_that_others_could_know_is_made_anew(before: str, tmp_path: P
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
+@pytest.mark.long
 def test_a_service_that_is_ended_at_once_ends(tmp_path: Path) -> None:
     rig = ROOT / "rigs" / "rehearsal.yaml"
     with serving(tmp_path / "store", rig, "short", None, tmp_path / "serve.log") as page:

@@ -29,6 +29,8 @@ from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.flows.conftest import tiny, tiny_gravity, write
 
+pytestmark = pytest.mark.long
+
 FRICTION, NOISE = "scene.friction.kinetic", "event_camera.noise_hz"
 SAMPLES = np.array([[0.7, 0.02], [0.8, 0.03]])
 DRAWN = len(SAMPLES)

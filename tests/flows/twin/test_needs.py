@@ -21,6 +21,8 @@ from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.schema.twin import CheapestScene, EffectNeed
 from tests.flows.conftest import tiny, write
 
+pytestmark = pytest.mark.long
+
 WORLDS, TRIALS = 5, 6
 STILL = {"arm": {"vibration_um": 0.0}}
 TREMBLING, ROUGH = "vibration of the arm", "friction that varies along a path"

@@ -49,6 +49,7 @@ def test_the_surface_is_found_wherever_the_plane_is_assumed(wrong_mm: float, way
     assert rig.arm.state() is ArmState.READY
 
 
+@pytest.mark.long
 def test_both_ways_agree_with_each_other_and_with_the_truth() -> None:
     rig = make_rig(**TRACKS)
     events, markers = (

@@ -73,6 +73,7 @@ def hold_still(plan: Plan, trial: Trial) -> dict[str, Any]:
     return held
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", HEAVY)
 def test_the_heaviest_trials_of_shipped_protocols_hold_still(name: str) -> None:
     plan = load_plan(ROOT / "protocols" / f"{name}.yaml")

@@ -79,6 +79,7 @@ def both(
     return np.concatenate(alone, axis=1), together
 
 
+@pytest.mark.long
 @settings(max_examples=120, deadline=None)
 @given(
     seed=st.integers(0, 500),
@@ -129,6 +130,7 @@ def test_tips_that_share_a_block_are_as_alone(
     assert np.all(np.isfinite(np.delete(together, np.s_[13], axis=2)))
 
 
+@pytest.mark.long
 def test_the_scenes_of_that_test_have_every_kind_of_step() -> None:
     corners = [(0, 0, -0.3), (0, 0, 3.2), (6, 0, 3.2), (6, 5, 2.0), (4, 1, 3.4), (4, 1, 0.2)]
     springs = make_springs(

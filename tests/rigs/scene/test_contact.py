@@ -82,6 +82,7 @@ def test_slip_runs_from_the_outer_layer_to_the_centre(
     assert middle.max() < centre.min()
 
 
+@pytest.mark.long
 def test_reversal_slips_back_only_after_twice_the_slip_displacement() -> None:
     skin = ideal_skin()
     springs = springs_of(skin, level=1)

@@ -130,6 +130,7 @@ def narrowest_s() -> float:
     return (found.high_ns - found.low_ns) * 1e-9
 
 
+@pytest.mark.long
 def test_onsets_on_rough_friction_are_off_by_far_less_than_a_label_can_tell() -> None:
     # the draw of 20 with the largest error, which has no order in the step
     springs = rough.springs_of(rough.skin_of(18), 0.05, 0.5, 3, seed=20)
