@@ -29,6 +29,7 @@ from sliplab.protocols.factors import (
     in_canonical_units,
     unknown_factor,
 )
+from sliplab.protocols.nuisances import Nuisances
 from sliplab.protocols.phases import Phase
 from sliplab.protocols.quantity import FactorRef
 from sliplab.protocols.settings import AnalysisSettings
@@ -102,6 +103,7 @@ class Collection(StrictModel):
     plate: PlateSetup | None = None
     motion: tuple[Phase, ...] = Field(json_schema_extra=_or_template)
     """The phases of a trial in order; or a template and its parameters."""
+    nuisances: Nuisances | None = None
     recording: Recording
     limits: Limits
     gates: Gates = Gates()
@@ -183,10 +185,11 @@ class Collection(StrictModel):
         return self
 
     def bindings(self) -> list[tuple[str, FactorRef]]:
-        """Each ``$name`` of motion and plate, with the key at which it occurs."""
+        """Each ``$name`` of motion, plate and nuisances, with the key at which it occurs."""
         return [
             *_references_in(self.motion, "collection.motion"),
             *_references_in(self.plate, "collection.plate"),
+            *_references_in(self.nuisances, "collection.nuisances"),
         ]
 
     @property

@@ -15,6 +15,15 @@ from typing import Any
 
 from sliplab.protocols.factors import Level
 from sliplab.protocols.model import Collection, Protocol
+from sliplab.protocols.nuisances import (
+    MIX,
+    QUIET_S,
+    AnyNuisance,
+    ArmMotion,
+    Nuisances,
+    Regrasp,
+    Rotation,
+)
 from sliplab.protocols.phases import (
     Approach,
     Hold,
@@ -33,6 +42,7 @@ from sliplab.protocols.quantity import FactorRef, canonical, check_least
 from sliplab.protocols.yaml_file import KeyedError
 
 Condition = Mapping[str, Level]
+_ByArm = ArmMotion | Rotation | Regrasp
 UNTWIST_DEG_S = 20.0
 """Speed at which a sensor that was twisted turns back, clear of the plate."""
 
@@ -64,6 +74,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
         start_xy = (-half[0], -half[1])
     steps: list[Step] = []
     at = home
+    nuisances = () if collection.nuisances is None else collection.nuisances.in_trial(condition)
     for index, phase in enumerate(motion):
         recorded = holds[-1] <= index <= acting[-1]
         if isinstance(phase, Approach):
@@ -79,7 +90,11 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             settle = _value(phase.settle, condition)
             if settle:
                 steps.append(Dwell("settle", settle, recorded and index > holds[-1]))
-            steps.append(Dwell("hold", _value(phase.duration, condition), recorded))
+            seconds = _value(phase.duration, condition)
+            if index == holds[-1]:
+                steps += _disturbed_hold(seconds, at, nuisances)
+            else:
+                steps.append(Dwell("hold", seconds, recorded))
         elif isinstance(phase, Slide):
             half = _half_slide(phase, condition)
             at = replace(at, x_mm=at.x_mm + 2 * half[0], y_mm=at.y_mm + 2 * half[1])
@@ -109,7 +124,42 @@ def build_program(collection: Collection, condition: Condition) -> Program:
                 steps.append(Twist("untwist", at, UNTWIST_DEG_S))
             at = Position(0.0, 0.0, home.depth_mm)
             steps.append(Move("return", at, _value(phase.speed, condition)))
-    return Program(home, tuple(steps))
+    return Program(home, tuple(steps), nuisances)
+
+
+def _disturbed_hold(
+    seconds: float, at: Position, nuisances: tuple[AnyNuisance, ...]
+) -> Iterator[Step]:
+    """The recorded hold, in which the arm makes the motions of nuisances and comes back each time.
+
+    It stands still for as long as without them; the last `QUIET_S` seconds are undisturbed.
+    """
+    due = sorted(
+        (number * float(each.every), order)
+        for order, each in enumerate(nuisances) if isinstance(each, _ByArm)
+        for number in range(1, int(max(seconds - QUIET_S, 0.0) / float(each.every)) + 1)
+    )  # fmt: skip
+    past = 0.0
+    for moment, order in due:
+        if moment > past:
+            yield Dwell("hold", moment - past, True)
+        past = moment
+        yield from _there_and_back(nuisances[order], at)
+    yield Dwell("hold", seconds - past, True)
+
+
+def _there_and_back(nuisance: AnyNuisance, at: Position) -> Iterator[Step]:
+    if isinstance(nuisance, Rotation):
+        turned = replace(at, twist_deg=at.twist_deg + float(nuisance.angle))
+        for to in (turned, at):
+            yield Twist("nuisance", to, float(nuisance.speed), True)
+    elif isinstance(nuisance, ArmMotion | Regrasp):
+        distance = float(nuisance.distance)
+        away = replace(at, x_mm=at.x_mm + distance)
+        if isinstance(nuisance, Regrasp):
+            away = replace(at, depth_mm=at.depth_mm - distance)
+        for to in (away, at):
+            yield Move("nuisance", to, float(nuisance.speed), True)
 
 
 def _place(phase: Travel, at: Position, condition: Condition) -> Position:
@@ -200,6 +250,8 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
                 )
 
     _check_levels(collection, written)
+    if collection.nuisances is not None:
+        _check_nuisances(collection.nuisances, levels, limits)
     for index, phase in enumerate(collection.motion):
         base = f"collection.motion[{index}]"
         if isinstance(phase, TwistPhase):
@@ -298,12 +350,38 @@ def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> N
             )
 
 
+def _check_nuisances(nuisances: Nuisances, levels: Levels, limits: Any) -> None:
+    """Hold names and the arm's speeds against what is known, and the limits; see `path_fault`."""
+    base, known = "collection.nuisances", nuisances.known
+    for name, where in levels(nuisances.apply, f"{base}.apply"):
+        nuisances.check_name(name, where)
+        for element in known if name == MIX else {name} & known.keys():
+            nuisance, key = known[element], f"{base}.elements.{element}.speed"
+            if isinstance(nuisance, Rotation):
+                if limits.twist is None or limits.twist_speed is None:
+                    missing = "twist" if limits.twist is None else "twist_speed"
+                    text = f"is needed: the nuisance '{element}' turns the sensor"
+                    raise KeyedError(f"collection.limits.{missing}", None, text)
+                most, limit, unit = limits.twist_speed, "twist_speed", "deg/s"
+            elif isinstance(nuisance, ArmMotion | Regrasp):
+                most, limit, unit = limits.speed, "speed", "mm/s"
+            else:
+                continue
+            if nuisance.speed > most:
+                raise KeyedError(
+                    key,
+                    f"{canonical(nuisance.speed)} {unit}",
+                    f"exceeds collection.limits.{limit} = {canonical(most)} {unit}",
+                )
+
+
 def path_fault(collection: Collection, program: Program) -> str | None:
     """Return how a program with moves breaks the limits on its way; None if it does not.
 
     Phases other than a move are held against the limits one by one, which names the level.
     """
-    if any(isinstance(phase, Travel | TwistPhase) for phase in collection.motion):
+    moves = any(isinstance(phase, Travel | TwistPhase) for phase in collection.motion)
+    if moves or program.nuisances:
         most = float(collection.limits.twist or 0)
         for step in program.steps:
             if isinstance(step, Twist) and abs(step.to.twist_deg) > most + 1e-9:

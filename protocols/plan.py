@@ -23,6 +23,7 @@ from sliplab.protocols.factors import Level, unknown_factor
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits, path_fault
+from sliplab.protocols.nuisances import requests
 from sliplab.protocols.program import Dwell, Program
 from sliplab.protocols.quantity import FactorRef, canonical, parse, to_decimal
 from sliplab.protocols.shipped import protocol_path
@@ -209,17 +210,25 @@ class Plan:
         return Task("rezero", False, "touch off to find depth zero", "", slot)
 
     def changeovers(self, before: Trial | None, trial: Trial) -> tuple[Task, ...]:
-        """List the changes that a person must make between two trials (or before the first)."""
+        """List what a person must change or do between two trials (or before the first)."""
         past = dict(before.condition) if before is not None else {}
         plate = self.protocol.collection.plate
         mass = plate.mass if plate is not None else None
         tasks = []
+        nuisances = self.protocol.collection.nuisances
+        disturbing = set() if nuisances is None else {str(nuisances.apply), str(nuisances.strength)}
         for name, level in trial.condition:
             factor = self.protocol.collection.all_factors[name]
+            if f"${name}" in disturbing:
+                continue  # what is to be done follows below
             if factor.changeover == "person" and past.get(name) != level:
                 text = factor.text(level)
                 prompt, mounts = f"set {name} to {text}", str(mass) == f"${name}"
                 tasks.append(Task("changeover", True, prompt, text, trial.block, mounts))
+        wanted = requests(self.program(trial).nuisances)
+        if wanted != ("" if before is None else requests(self.program(before).nuisances)):
+            prompt = f"from now on: {wanted or 'leave the rig alone again'}"
+            tasks.append(Task("changeover", True, prompt, "ready", trial.block))
         return tuple(tasks)
 
     def stretches(self) -> list[tuple[int, int]]:
@@ -279,7 +288,7 @@ class Plan:
     def collection_data(self) -> dict[str, Any]:
         """The `collection:` section as JSON data, defaults written out."""
         data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
-        for key in ("context", "stopping", "choice"):
+        for key in ("context", "stopping", "choice", "nuisances"):
             if not data[key]:  # as in protocols from before it came
                 data.pop(key)
         for name in ("twist", "twist_speed"):

@@ -9,8 +9,11 @@ program is the same on every rig.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from sliplab.protocols.nuisances import AnyNuisance
 
 ACTING = ("slide", "retract", "twist", "move")
 """Phases of a program in which the sensor moves in contact and slip is looked for."""
@@ -98,10 +101,15 @@ Step = Move | Twist | Dwell | PlateStep
 
 @dataclass(frozen=True)
 class Program:
-    """The steps of one trial in order; the arm begins and ends at `home`."""
+    """The steps of one trial in order; the arm begins and ends at `home`.
+
+    Attributes:
+        nuisances: what disturbs the trial besides the steps.
+    """
 
     home: Position
     steps: tuple[Step, ...]
+    nuisances: tuple[AnyNuisance, ...] = field(default=(), repr=False)
 
     def seconds(self, *, recorded_only: bool = False) -> float:
         """Planned duration, without the arm's ramps."""

@@ -246,6 +246,8 @@ PositiveSeconds: Any = _quantity("s", "0", True, ref=False)
 PositivePixels: Any = _quantity("px", "0", True, ref=False)
 PositiveNewtons: Any = _quantity("N", "0", True, ref=False)
 PositivePercent: Any = _quantity("percent", "0", True, ref=False)
+PositiveHertz: Any = _quantity("Hz", "0", True, ref=False)
+PositiveCelsius: Any = _quantity("degC", "0", True, ref=False)
 # The same, or a factor's name after a dollar sign.
 MillimetresOrRef: Any = _quantity("mm", "0", True, ref=True)
 AnyMillimetresOrRef: Any = _quantity("mm", None, False, ref=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.timing import ForceTiming
 from sliplab.rigs.core.arm_settings import BaseArmSettings, PlaneSettings
 from sliplab.rigs.core.capabilities import (
@@ -62,9 +63,9 @@ class _MockSimulation:
     def __init__(self, devices: MockDevices) -> None:
         self._devices = devices
 
-    def begin_trial(self, seed: int) -> None:
+    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Draw what varies by trial from `seed`."""
-        self._devices.begin_trial(seed)
+        self._devices.begin_trial(seed, nuisances)
 
     def sink(self, sink: Sink) -> Sink:
         """Return the sink of the recording in this world."""

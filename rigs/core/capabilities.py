@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Literal, NotRequired, Protocol, TypedDict, runtime_checkable
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Code, ForceGrade
 from sliplab.storage.streams import (
@@ -406,8 +407,12 @@ class Truth(TrueOnsets):
 class Simulation(Protocol):
     """The world behind a simulated rig; a real rig has none."""
 
-    def begin_trial(self, seed: int) -> None:
-        """Reset the world, and draw everything that varies by trial from `seed`."""
+    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
+        """Reset the world, and draw everything that varies by trial from `seed`.
+
+        Args:
+            nuisances: what disturbs the trial, besides the arm's motions.
+        """
 
     def sink(self, sink: Sink) -> Sink:
         """Wrap `sink` in this world's storage faults, such as a full disk."""

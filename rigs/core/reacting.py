@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 from sliplab.protocols.program import ACTING, Move, Position, Program, Step
 from sliplab.rigs.core.capabilities import ArmFault
 from sliplab.rigs.core.force_watch import Course
-from sliplab.rigs.core.rig import Rig, arm_fault
+from sliplab.rigs.core.rig import Rig, arm_fault, nuisances_of
 from sliplab.storage.streams import Sink
 
 REST_S = 2.0
@@ -89,7 +89,7 @@ def run_watched(
     """
     reaction: Reaction | None = None
     with rig.safely(program.home):
-        rig.begin_trial(program.home, seed)
+        rig.begin_trial(program.home, seed, nuisances_of(program))
         course, streaming = Course(program.home), False
         for index, planned in enumerate(program.steps):
             step = course.step(planned)

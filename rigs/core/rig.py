@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sliplab.protocols.motion import UNTWIST_DEG_S
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import (
     ACTING,
     Move,
@@ -250,7 +251,7 @@ class Rig:
         with self.safely(program.home):
             if frame_px is not None:
                 self.frames.set_region(*frame_px)
-            self.begin_trial(program.home, seed)
+            self.begin_trial(program.home, seed, nuisances_of(program))
             if self.simulation is not None:
                 sink = self.simulation.sink(sink)
             if self.force is not None:
@@ -582,7 +583,9 @@ class Rig:
         for device in self._reading:
             device.drain(sink)
 
-    def begin_trial(self, home: Position, seed: int) -> None:
+    def begin_trial(
+        self, home: Position, seed: int, nuisances: TrialNuisances | None = None
+    ) -> None:
         """Move to the start position, then let the simulation draw its random values.
 
         The sensor is clear of the plate there, so a force sensor is zeroed.
@@ -594,7 +597,7 @@ class Rig:
             self._twisted = False
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:
-            self.simulation.begin_trial(seed)
+            self.simulation.begin_trial(seed, nuisances)
         if self.force is not None and self.force.zeroing == "trial":
             self.force.zero()
         for device in self.further:
@@ -694,6 +697,13 @@ class Rig:
         except BaseException:
             self._stop_arm()
             raise
+
+
+def nuisances_of(program: Program) -> TrialNuisances | None:
+    """Return what disturbs a trial, for the world behind a simulated rig; None if nothing does."""
+    if not program.nuisances:
+        return None
+    return TrialNuisances(program.nuisances, program.seconds(recorded_only=True))
 
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:

@@ -18,6 +18,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import RigError, Truth
@@ -129,9 +130,9 @@ class Loopback:
 
     # -- Simulation ------------------------------------------------------------------------
 
-    def begin_trial(self, seed: int) -> None:
+    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Draw everything that varies by trial from `seed`. Raises RigError."""
-        self._ask("begin_trial", seed)
+        self._ask("begin_trial", seed, nuisances)
 
     def sink(self, sink: Sink) -> Sink:
         """Return `sink` itself, because the disk is real."""

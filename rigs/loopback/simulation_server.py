@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, Truth
@@ -253,7 +254,7 @@ class SimulationServer:
 
     # -- Simulation ------------------------------------------------------------------------
 
-    def begin_trial(self, seed: int) -> None:
+    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Draw everything that varies by trial from `seed`, with the skin at rest.
 
         Raises:
@@ -264,7 +265,7 @@ class SimulationServer:
             self.turn()
             if not self._path.moving(self.world.now_ns) or time.monotonic() > end:
                 break
-        self.world.begin_trial(seed)
+        self.world.begin_trial(seed, nuisances)
         self._path.begin(self.world.past_ns)
         self._start_events()
         if self._force is not None:

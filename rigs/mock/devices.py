@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.timing import FrameGrade, StreamTiming, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
@@ -110,9 +111,9 @@ class MockDevices:
     further: Mapping[str, FurtherDevice] = field(default_factory=dict)
     """Further devices by the names of their streams."""
 
-    def begin_trial(self, seed: int) -> None:
-        """Make the trial depend only on `seed` and the program; see `World.begin_trial`."""
-        self.world.begin_trial(seed)
+    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
+        """Make the trial depend only on these and the program; see `World.begin_trial`."""
+        self.world.begin_trial(seed, nuisances)
 
     def sink(self, sink: Sink) -> Sink:
         """Wrap `sink` in this world's storage faults, such as a full disk."""

@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.rigs.mock.clocks import HighestStamp
-from sliplab.rigs.mock.fault_settings import EventBurst
+from sliplab.rigs.mock.fault_settings import EventBurst, EventNoise
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.history import History
 from sliplab.rigs.mock.identity import Identity
+from sliplab.rigs.mock.nuisances import brushing
 from sliplab.rigs.mock.settings import EventCamera
 from sliplab.rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
 from sliplab.rigs.mock.world import World
@@ -25,14 +26,15 @@ U8 = npt.NDArray[np.uint8]
 Events = tuple[I64, U16, U16, U8]
 """True times ns, columns, rows and polarities, (n,) each, in order of time."""
 
-_BIN_NS = 1_000_000
+_BIN_NS, _LONG_BIN_NS = 1_000_000, 64_000_000
 
 
 class Bursts:
-    """Events of `event_burst`: Poisson in time, uniform over pixels and polarities."""
+    """Events of `event_burst` and `event_noise`: Poisson in time, uniform over their pixels."""
 
     def __init__(self, world: World, width: int, height: int) -> None:
         self._world, self._width, self._height = world, width, height
+        self._noisy: dict[tuple[int, int], I64] = {}
 
     def into(self, events: Events, begin_ns: int, end_ns: int, scans: Scans) -> Events:
         """Merge the burst's events into `events` of the interval `begin_ns` (excluded) to `end_ns`.
@@ -40,7 +42,7 @@ class Bursts:
         Args:
             scans: scans of the read-out; the burst's events also carry the times of its columns.
         """
-        if not self._world.faults.of(EventBurst):
+        if not (self._world.faults.of(EventBurst) or self._world.faults.of(EventNoise)):
             return events
         burst = self.between(begin_ns, end_ns, scans)
         return _merge([events, burst]) if len(burst[0]) else events
@@ -49,12 +51,16 @@ class Bursts:
         """Return only the burst's events, independent of how the interval is divided."""
         # a scan is delivered when its last column has been read
         begin_ns, end_ns = begin_ns - scans.reading_ns, end_ns - scans.reading_ns
-        parts = [_none()]
-        for index, (fault, first_ns, last_ns) in enumerate(self._world.faults.spans(EventBurst)):
+        faults, parts = self._world.faults, [_none()]
+        both = (*enumerate(faults.spans(EventBurst)), *enumerate(faults.spans(EventNoise)))
+        for index, (fault, first_ns, last_ns) in both:
             low, high = max(begin_ns - scans.period_ns, first_ns), min(end_ns, last_ns)
-            mean = fault.million_per_s * 1e6 * _BIN_NS * 1e-9
-            for number in range(low // _BIN_NS, high // _BIN_NS + 1 if high >= low else 0):
-                t_ns, x, y, p = self._bin(index, number, mean)
+            bin_ns = _BIN_NS if isinstance(fault, EventBurst) else _LONG_BIN_NS
+            for number in range(low // bin_ns, high // bin_ns + 1 if high >= low else 0):
+                if isinstance(fault, EventBurst):
+                    t_ns, x, y, p = self._burst(fault, index, number)
+                else:
+                    t_ns, x, y, p = self._noise(fault, index, number)
                 kept = (t_ns >= first_ns) & (t_ns < last_ns)
                 if scans.period_ns:
                     t_ns = scans.begin(t_ns)
@@ -63,9 +69,9 @@ class Bursts:
                 parts.append((scans.stamp(t_ns, x), x, y, p))
         return _merge(parts)
 
-    def _bin(self, index: int, number: int, mean: float) -> Events:
+    def _burst(self, fault: EventBurst, index: int, number: int) -> Events:
         rng = generator(self._world.seed, "event burst", index, number)
-        count = int(rng.poisson(mean))
+        count = int(rng.poisson(fault.million_per_s * 1e6 * _BIN_NS * 1e-9))
         t_ns = number * _BIN_NS + rng.integers(0, _BIN_NS, count)
         return (
             t_ns,
@@ -73,6 +79,22 @@ class Bursts:
             rng.integers(0, self._height, count).astype(np.uint16),
             rng.integers(0, 2, count).astype(np.uint8),
         )
+
+    def _noise(self, fault: EventNoise, index: int, number: int) -> Events:
+        rng = generator(self._world.seed, "event noise", index, number)
+        size = self._width * self._height
+        pixels = min(fault.pixels or size, size)
+        count = int(rng.poisson(fault.hz * pixels * _LONG_BIN_NS * 1e-9))
+        t_ns = number * _LONG_BIN_NS + rng.integers(0, _LONG_BIN_NS, count)
+        place = rng.integers(0, pixels, count)
+        if fault.pixels is not None:  # the camera's own, whatever the trial
+            if (index, pixels) not in self._noisy:
+                drawn = generator(self._world.settings.seed, "noisy pixels", index)
+                self._noisy[index, pixels] = drawn.choice(size, pixels, replace=False)
+            place = self._noisy[index, pixels][place]
+        y, x = np.divmod(place, self._width)
+        polarity = rng.random(count) < fault.positive
+        return t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.uint8)
 
 
 def _merge(parts: list[Events]) -> Events:
@@ -95,7 +117,7 @@ class MockEventCamera:
     `stop`, the remaining events can still be read.
 
     Args:
-        own: of a further camera, whose events no fault changes; the rig's first one by default.
+        own: of a further camera, to whose stream no fault happens; the rig's first one by default.
 
     Attributes:
         clock: true time to the camera's, in the running trial.
@@ -172,15 +194,24 @@ class MockEventCamera:
         return EventChunk(x, y, p, self._stamps.of(stamps))
 
     def _on_skin(self, t_ns: I64, loads: F64) -> F64:
-        """Loads in the sensor's own axes, which turn with it, from those in the plate's."""
-        turn = self._world.turn_at(t_ns)
-        if not turn.any():
-            return loads
-        cosine, sine = np.cos(turn)[:, None], np.sin(turn)[:, None]
-        turned = loads.copy()
-        turned[:, 0::3] = cosine * loads[:, 0::3] + sine * loads[:, 1::3]
-        turned[:, 1::3] = cosine * loads[:, 1::3] - sine * loads[:, 0::3]
-        return turned
+        """Loads in the sensor's own axes, which turn with it, from those in the plate's.
+
+        What brushes over the skin adds to them.
+        """
+        world = self._world
+        turn = world.turn_at(t_ns)
+        if turn.any():
+            cosine, sine = np.cos(turn)[:, None], np.sin(turn)[:, None]
+            turned = loads.copy()
+            turned[:, 0::3] = cosine * loads[:, 0::3] + sine * loads[:, 1::3]
+            turned[:, 1::3] = cosine * loads[:, 1::3] - sine * loads[:, 0::3]
+            loads = turned
+        brushed = brushing(world.faults, world.skin.layout_mm, world.seed, t_ns)
+        if brushed is not None:
+            loads = loads.copy()
+            loads[:, 0::3] += brushed[:, :, 0]
+            loads[:, 1::3] += brushed[:, :, 1]
+        return loads
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses since the last call, camera clock in ns."""

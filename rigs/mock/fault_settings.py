@@ -231,6 +231,70 @@ class MainsLight(_TimedFault):
     """Of the light, which is twice that of the mains."""
 
 
+class Knock(_TimedFault):
+    """The sensor rings against the plate after a knock, which the reported poses do not show.
+
+    The displacement is um exp(-0.05 w t) sin(w t) with w = 2 pi hz, t from `at_s` on, in a
+    direction that belongs to the trial.
+    """
+
+    kind: Literal["knock"]
+    um: Annotated[float, Field(gt=0, le=10_000)] = 50.0
+    """Amplitude."""
+    hz: Annotated[float, Field(ge=1, le=250)] = 30.0
+    """Frequency of the oscillation."""
+
+
+class Shaking(_TimedFault):
+    """The sensor shakes against the plate to the trial's end, which the poses do not show.
+
+    The frequency f rises from `low_hz` to `high_hz` in `sweep_s`, by equal factors in equal times,
+    and begins again. The amplitude is mm_s / (2 pi f); the direction belongs to the trial.
+    """
+
+    kind: Literal["shaking"]
+    at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    mm_s: Annotated[float, Field(gt=0, le=100)] = 0.5
+    """Peak speed."""
+    low_hz: Annotated[float, Field(ge=0.1, le=250)] = 1.0
+    high_hz: Annotated[float, Field(ge=0.1, le=250)] = 200.0
+    sweep_s: Seconds = 10.0
+
+    @model_validator(mode="after")
+    def _rises(self) -> Shaking:
+        if self.high_hz <= self.low_hz:
+            raise ValueError(f"high_hz must be over low_hz = {self.low_hz:g}")
+        return self
+
+
+class EventNoise(_TimedFault):
+    """More noise events of a steady rate to the trial's end, of all pixels or some."""
+
+    kind: Literal["event_noise"]
+    at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    hz: Annotated[float, Field(gt=0, le=10_000)] = 0.05
+    """Mean rate of each of these pixels."""
+    pixels: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """Number of them, drawn by the rig's seed; all if left out."""
+    positive: Annotated[float, Field(ge=0, le=1)] = 0.75
+    """Share of positive events."""
+
+
+class SkinBrushed(_TimedFault):
+    """An object brushes over the skin: a side force that passes over the papillae.
+
+    On a papilla at s along the way it is newtons exp(-(v t - s)^2 / (2 width_mm^2)). The event
+    camera sees the bend; friction holds the tips, and the outside camera sees nothing.
+    """
+
+    kind: Literal["skin_brushed"]
+    newtons: Annotated[float, Field(gt=0, le=10)] = 0.05
+    mm_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    width_mm: Annotated[float, Field(gt=0, le=100)] = 2.0
+    direction_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    """Of the way on the skin; if left out, it belongs to the trial."""
+
+
 class ArmRamp(_Fault):
     """The arm speeds up and brakes gently in every straight move that begins or ends in contact."""
 
@@ -285,6 +349,10 @@ AnyFault = (
     | SkinWear
     | PlateSpot
     | MainsLight
+    | Knock
+    | Shaking
+    | EventNoise
+    | SkinBrushed
     | ArmRamp
     | DiskFull
     | DeviceGone

@@ -56,6 +56,8 @@ class Physics:
         sensor_at: Callable[[I64], F64],
         torn: Callable[[], Sequence[tuple[int, int]]] = tuple,
         spots: F64 | None = None,
+        *,
+        fine: bool = False,
     ) -> None:
         """Put the skin at rest on the plate.
 
@@ -63,10 +65,11 @@ class Physics:
             sensor_at: maps times (k,) to x, y, depth (mm) and slopes of depth, (k, 5).
             torn: papillae that tear off, with known true times, ns.
             spots: of `rigs.scene.springs.Springs`; left out, the plate is clean.
+            fine: a row every millisecond at all times, since the sensor is shaken.
         """
         self._settings, self._sensor_at, self._torn = settings, sensor_at, torn
         self._off: set[int] = set()
-        self.step_ns = settings.scene.step_ms * 1_000_000
+        self.step_ns = FINE_NS if fine else settings.scene.step_ms * 1_000_000
         self.springs = springs_of(settings, skin, seed)
         if spots is not None:
             self.springs = replace(self.springs, spots=spots)

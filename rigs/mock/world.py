@@ -15,12 +15,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.mock.clocks import TrialClocks, own_clock, shifted, trial_clocks, with_faults
 from sliplab.rigs.mock.fault_settings import PlateStuck
 from sliplab.rigs.mock.faults import FaultBook
 from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.nuisances import Shake, faults_of
 from sliplab.rigs.mock.path import SENSOR, ArmPath, ContactPlane, Deviation, Leg
 from sliplab.rigs.mock.physics import Physics
 from sliplab.rigs.mock.settings import MockSettings, skin_of
@@ -79,10 +81,13 @@ class World:
         self.slid_mm = np.zeros(len(self.skin))
         self._prepare(settings.seed)
 
-    def begin_trial(self, seed: int) -> None:
+    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Reset with the randomness of `seed`: skin at rest, true time 0, devices stopped.
 
         The arm stays where it is and keeps a protective stop; the mounted mass stays too.
+
+        Args:
+            nuisances: what disturbs the trial.
 
         Raises:
             RigError: the arm is moving.
@@ -95,14 +100,17 @@ class World:
         self.past_ns += self.now_ns
         self.now_ns = 0
         self.trials += 1
-        self._prepare(seed)
+        self._prepare(seed, nuisances)
         for callback in self.on_begin:
             callback()
 
-    def _prepare(self, seed: int) -> None:
+    def _prepare(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         settings = self.settings
         self.seed = seed
-        self.faults = FaultBook(settings.faults, self.trials)
+        faults = settings.faults
+        if nuisances is not None:
+            faults += tuple(faults_of(nuisances, settings.event_camera, seed))
+        self.faults = FaultBook(faults, self.trials)
         clocks = trial_clocks(
             settings.clocks, settings.seed, settings.seed if self._run_on else seed
         )
@@ -116,9 +124,10 @@ class World:
         self._vibration = Vibration(
             settings.arm.vibration_um, settings.arm.vibration_hz, settings.seed, seed
         )
+        self._shake = Shake(self.faults, seed)
         self.physics = Physics(
             settings, self.faults.grips(self.skin, self.slid_mm), seed, self._sensor_at,
-            self.faults.torn, self.faults.spots(),
+            self.faults.torn, self.faults.spots(), fine=bool(self._shake),
         )  # fmt: skip
         self.plate_marked = False
 
@@ -135,6 +144,8 @@ class World:
         if self._vibration:
             strength = self.path.tremor(t_ns)[:, None]
             sensor[:, :3] += strength * self._vibration.at(t_ns)
+        if self._shake:
+            sensor[:, :3] += self._shake.at(t_ns)
         return sensor
 
     def turn_at(self, t_ns: I64) -> F64:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import FrameCamera as FrameSettings
@@ -51,12 +52,13 @@ def go(
 def slide(
     devices: MockDevices, seed: int, *, chunk_s: float = 0.5, distance: float = 4.0,
     speed: float = 2.0, depth: float = 2.6, rest_s: float = 0.4,
+    nuisances: TrialNuisances | None = None,
 ) -> Trial:  # fmt: skip
     """Press, hold, slide; streams are read every `chunk_s` seconds, whatever the motion does."""
     clock, arm, world = devices.clock, devices.arm, devices.world
     arm.connect()
     go(devices, 0, 0, -2, 50.0, 0.05, lambda: None)
-    devices.begin_trial(seed)
+    devices.begin_trial(seed, nuisances)
     go(devices, 0, 0, depth, 4.0, 0.05, lambda: None)
     clock.wait(0.5)
     devices.frames.set_region(180, 180)

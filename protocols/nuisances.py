@@ -1,0 +1,337 @@
+"""Nuisances: what looks like slip and is none, as named elements of a protocol.
+
+    collection:
+      factors:
+        nuisance: {values: [none, tap_table, vibration, mix]}
+        strength: {unit: percent, values: [50, 100, 200]}
+      nuisances: {apply: $nuisance, strength: $strength}
+
+A simulated rig produces each by physics (`sliplab.rigs.mock.nuisances`). On a real rig the arm
+makes its own motions, which lie in the hold, and a person is asked for the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, field_validator
+
+from sliplab.protocols.quantity import (
+    REF_SCHEMA,
+    FactorRef,
+    PercentOrRef,
+    PositiveCelsius,
+    PositiveDegrees,
+    PositiveDegreesPerSecond,
+    PositiveHertz,
+    PositiveMillimetres,
+    PositiveNewtons,
+    PositivePercent,
+    PositiveSeconds,
+    PositiveSpeed,
+    canonical,
+)
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
+
+NONE, MIX = "none", "mix"
+"""Levels that apply no nuisance, and all of them at once."""
+QUIET_S = 2.0
+"""End of the hold in which the arm stands still: labels count from there."""
+
+
+class _Nuisance(StrictModel):
+    scales: ClassVar[str]
+    """The field that is proportional to the strength."""
+    by_arm: ClassVar[bool] = False
+    """The arm makes it, in the hold."""
+
+    @property
+    def request(self) -> str:
+        """What a person is asked to do at a real rig; empty if the arm does it."""
+        return ""
+
+    def scaled(self, share: Decimal) -> Any:
+        """Return the same at another strength, 1 for its own."""
+        return self.model_copy(update={self.scales: getattr(self, self.scales) * share})
+
+
+class Tap(_Nuisance):
+    """A knock on the arm or on the table, after which the sensor rings against the plate."""
+
+    scales = "distance"
+    kind: Literal["tap"]
+    on: Literal["arm", "table"]
+    distance: PositiveMillimetres
+    """Amplitude of the damped oscillation."""
+    ring: PositiveHertz
+    """Its frequency."""
+    every: PositiveSeconds = Decimal(2)
+    """Mean time from one to the next."""
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return (
+            f"knock on the {self.on} about every {canonical(self.every)} s, so that it moves by "
+            f"{_um(self.distance)}"
+        )
+
+
+class Vibration(_Nuisance):
+    """The sensor shakes against the plate, its frequency rising evenly in octaves, over and over.
+
+    Its peak speed is the same at every frequency f, so the amplitude is speed / (2 pi f).
+    """
+
+    scales = "speed"
+    kind: Literal["vibration"]
+    speed: PositiveSpeed
+    """Peak speed."""
+    low: PositiveHertz = Decimal(1)
+    high: PositiveHertz = Decimal(200)
+    sweep: PositiveSeconds = Decimal(10)
+    """Time from `low` to `high`."""
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return (
+            f"shake the table by a sweep from {canonical(self.low)} to {canonical(self.high)} Hz "
+            f"in {canonical(self.sweep)} s, peak speed {canonical(self.speed)} mm/s"
+        )
+
+
+class ArmMotion(_Nuisance):
+    """The arm starts and stops: a short way along the plate's x, and back."""
+
+    scales = "distance"
+    by_arm = True
+    kind: Literal["arm_motion"]
+    distance: PositiveMillimetres
+    speed: PositiveSpeed = Decimal(5)
+    every: PositiveSeconds = Decimal(2)
+
+
+class Rotation(_Nuisance):
+    """The arm turns the sensor about the plate's normal, and back."""
+
+    scales = "angle"
+    by_arm = True
+    kind: Literal["rotation"]
+    angle: PositiveDegrees
+    speed: PositiveDegreesPerSecond = Decimal(5)
+    every: PositiveSeconds = Decimal(3)
+
+
+class Regrasp(_Nuisance):
+    """The arm lets go a little, and presses again."""
+
+    scales = "distance"
+    by_arm = True
+    kind: Literal["regrasp"]
+    distance: PositiveMillimetres
+    speed: PositiveSpeed = Decimal(2)
+    every: PositiveSeconds = Decimal(3)
+
+
+class Flicker(_Nuisance):
+    """Lamps on the mains, whose light gets into the sensor."""
+
+    scales = "share"
+    kind: Literal["flicker"]
+    share: PositivePercent
+    """Amplitude of the intensity over its mean."""
+    frequency: PositiveHertz = Decimal(100)
+    """Twice that of the mains."""
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return (
+            f"light the sensor by a lamp that flickers at {canonical(self.frequency)} Hz by "
+            f"{canonical(self.share)} %"
+        )
+
+
+class Brush(_Nuisance):
+    """Another object brushes over the papillae from the side, one after the other."""
+
+    scales = "force"
+    kind: Literal["brush"]
+    force: PositiveNewtons
+    """Largest side force on a papilla."""
+    speed: PositiveSpeed = Decimal(20)
+    width: PositiveMillimetres = Decimal(2)
+    """Standard deviation of the force along its way."""
+    every: PositiveSeconds = Decimal(3)
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return (
+            f"brush over the skin's rim about every {canonical(self.every)} s with "
+            f"{canonical(self.force)} N"
+        )
+
+
+class LostPackets(_Nuisance):
+    """Packets of the event camera that get lost, events and sync pulses with them."""
+
+    scales = "duration"
+    kind: Literal["lost_packets"]
+    duration: PositiveSeconds
+    """What one packet holds."""
+    every: PositiveSeconds = Decimal("0.5")
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return "load the event camera's link so that packets get lost"
+
+
+class HotPixels(_Nuisance):
+    """More pixels that send events without a change of light."""
+
+    scales = "rate"
+    kind: Literal["hot_pixels"]
+    pixels: Annotated[int, Field(ge=1, le=1_000_000)]
+    rate: PositiveHertz
+    """Mean rate of events of each."""
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return "raise the event camera's bias until more hot pixels appear"
+
+
+class Warmth(_Nuisance):
+    """A warmer event camera, whose noise doubles with every 8 degC."""
+
+    scales = "rise"
+    kind: Literal["warmth"]
+    rise: PositiveCelsius
+
+    @property
+    def request(self) -> str:
+        """See `_Nuisance`."""
+        return f"warm the event camera by {canonical(self.rise)} degC"
+
+
+AnyNuisance = (
+    Tap
+    | Vibration
+    | ArmMotion
+    | Rotation
+    | Regrasp
+    | Flicker
+    | Brush
+    | LostPackets
+    | HotPixels
+    | Warmth
+)
+Nuisance = Annotated[AnyNuisance, Field(discriminator="kind")]
+register_tags(
+    "tap", "vibration", "arm_motion", "rotation", "regrasp", "flicker", "brush", "lost_packets",
+    "hot_pixels", "warmth",
+)  # fmt: skip
+
+SHIPPED: dict[str, AnyNuisance] = {
+    "tap_table": Tap(kind="tap", on="table", distance="20 um", ring="60 Hz"),
+    "tap_arm": Tap(kind="tap", on="arm", distance="100 um", ring="15 Hz"),
+    "vibration": Vibration(kind="vibration", speed="0.5 mm/s"),
+    "arm_motion": ArmMotion(kind="arm_motion", distance="30 um"),
+    "rotation": Rotation(kind="rotation", angle="0.2 deg"),
+    "regrasp": Regrasp(kind="regrasp", distance="300 um"),
+    "flicker": Flicker(kind="flicker", share="3 %"),
+    "brush": Brush(kind="brush", force="0.05 N"),
+    "lost_packets": LostPackets(kind="lost_packets", duration="10 ms"),
+    "hot_pixels": HotPixels(kind="hot_pixels", pixels=50, rate="10 Hz"),
+    "warm_camera": Warmth(kind="warmth", rise="20 degC"),
+}
+"""Nuisances that every protocol knows. Their sizes are estimates: no source gives them."""
+
+
+def _word(raw: object) -> object:
+    if isinstance(raw, str) and raw.startswith("$"):
+        return FactorRef(raw[1:])
+    return raw
+
+
+WordField = Annotated[
+    str | FactorRef,
+    BeforeValidator(_word),
+    PlainSerializer(str),
+    WithJsonSchema({"anyOf": [{"type": "string"}, REF_SCHEMA]}),
+]
+
+
+class Nuisances(StrictModel):
+    """The `nuisances:` section: which apply in a trial, and how strong."""
+
+    apply: WordField
+    """A name below or of those that ship, `none`, or `mix`: all of them at once; or a factor with
+    these as levels."""
+    strength: PercentOrRef = Decimal(100)
+    """Of the sizes of the elements."""
+    elements: dict[str, Nuisance] = Field(default_factory=dict)
+    """Nuisances of this protocol by name; one that ships is replaced by its name."""
+
+    @field_validator("elements")
+    @classmethod
+    def _own_names(cls, elements: dict[str, Nuisance]) -> dict[str, Nuisance]:
+        for name in elements:
+            if name in {NONE, MIX}:
+                raise ValueError(f"cannot be named '{name}', which stands for itself")
+        return elements
+
+    @property
+    def known(self) -> dict[str, AnyNuisance]:
+        """All elements by name."""
+        return {**SHIPPED, **self.elements}
+
+    def check_name(self, name: object, key: str) -> None:
+        """Hold a level against the names.
+
+        Raises:
+            KeyedError: it is none of them.
+        """
+        names = [NONE, MIX, *self.known]
+        if name not in names:
+            raise KeyedError(key, name, f"must be one of {', '.join(names)}")
+
+    def in_trial(self, condition: Mapping[str, Any]) -> tuple[AnyNuisance, ...]:
+        """The nuisances of a trial with this condition, at its strength."""
+
+        def of(field: Any) -> Any:
+            return condition[field.factor] if isinstance(field, FactorRef) else field
+
+        name, share = of(self.apply), of(self.strength) / 100
+        if name == NONE or not share:
+            return ()
+        found = self.known.values() if name == MIX else (self.known[name],)
+        return tuple(each.scaled(share) for each in found)
+
+
+@dataclass(frozen=True)
+class TrialNuisances:
+    """The nuisances of one trial.
+
+    Attributes:
+        elements: at the trial's strength.
+        seconds: planned duration of the recording.
+    """
+
+    elements: tuple[AnyNuisance, ...]
+    seconds: float
+
+
+def requests(elements: tuple[AnyNuisance, ...]) -> str:
+    """What a person is asked for; empty if the arm does it all."""
+    return "; ".join(each.request for each in elements if each.request)
+
+
+def _um(mm: Decimal) -> str:
+    return f"{canonical(mm * 1000)} um"
