@@ -94,6 +94,11 @@ class Collected:
             return self.recorded.adapter.analysis
         return self.plan.protocol.analysis
 
+    @property
+    def disturbed(self) -> bool:
+        """True for a campaign with nuisances."""
+        return self.recorded is None and self.plan.protocol.collection.nuisances is not None
+
     def describe(self, trial: Trial) -> dict[str, str]:
         """Return a trial's condition as text with units, by factor."""
         return self.planned.describe(trial)
@@ -151,6 +156,8 @@ def _recorded_trial(recording: Recording) -> RecordedTrial:
 def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
     """The campaigns of a store, or those named.
 
+    Campaigns with nuisances are left out unless they are named, or another one trains with them.
+
     Raises:
         StoreError: the store holds no campaign.
         InputError: a name that the store does not have.
@@ -174,8 +181,13 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
                 name,
                 f"is not in {store.folder}; there are {', '.join(campaigns)}",
             )
-    names = names or [name for name in campaigns if name not in imported]
-    return [Collected(campaigns[name]) for name in names]
+    found = [Collected(campaigns[name]) for name in names or campaigns if name not in imported]
+    if names:
+        return found
+    plain = [item for item in found if not item.disturbed]
+    if not plain or any(item.settings.training.nuisances for item in plain):
+        return sorted(found, key=lambda item: item.disturbed)  # the others' settings count
+    return plain
 
 
 def missing_stream(campaigns: list[Collected]) -> str | None:

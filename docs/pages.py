@@ -57,6 +57,10 @@ _DOCUMENTS = {
         "`FOLDER/gap.json`: networks trained on a twin and tested on its rig "
         "([Twins](../twin.md#trained-on-the-twin-tested-on-the-rig)).",
     ),
+    "stress": (
+        "Nuisances",
+        "`stress/stress.json`: detectors under nuisances ([Nuisances](../stress.md)).",
+    ),
     "power": (
         "The trials that claims need",
         "`report/power.json`: after how many trials claims are called in campaigns that were drawn "

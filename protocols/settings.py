@@ -96,6 +96,11 @@ class Samples(StrictModel):
     """Windows per class and trial."""
 
     per_class: int = Field(default=50, ge=1, le=10_000)
+    no_slip: Literal["last", "spread"] = Field(
+        default="last", exclude_if=lambda value: value == "last"
+    )
+    """Windows without slip: the last ones before it begins, as in the paper; or random ones of all
+    that was recorded before."""
 
 
 class Split(StrictModel):
@@ -173,6 +178,8 @@ class Training(StrictModel):
     patience: int = Field(default=5, ge=1, le=10_000)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[Seed, ...] = (0,)
+    nuisances: bool = Field(default=False, exclude_if=lambda value: not value)
+    """Train with the training trials of campaigns with nuisances, too (docs/stress.md)."""
     device: str = Field(
         default="cpu",
         json_schema_extra={"pattern": _DEVICE, "patternErrorMessage": f"must be {_DEVICES}"},

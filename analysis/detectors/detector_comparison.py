@@ -197,6 +197,48 @@ def thinned(trial: Labelled, every: int) -> Labelled:
     return replace(trial, predictions=kept)
 
 
+@dataclass(frozen=True)
+class Tuned:
+    """A detector with the levels that validation trials set."""
+
+    name: str
+    detector: Detector
+    levels: Levels
+
+
+def tuned(
+    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int, rate: float
+) -> list[Tuned]:
+    """Fit every detector at the finer stride, at a rate of false early validation trials.
+
+    Args:
+        windows, settings, fine_ms, most: see `compare`. rate: share of the trials.
+    """
+    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
+    tolerance = round(settings.false_early_ms * 1e6)
+    allowed = allowed_early(rate, len(parts.validation))
+    found = []
+    for name, choices in _detectors(learned, windows, settings, fine_ms).items():
+        judged = {key: judge(detector, parts.validation) for key, detector in choices.items()}
+        key, levels = _quickest(judged, allowed, tolerance)
+        found.append(Tuned(name, choices[key], levels))
+    return found
+
+
+def _quickest(
+    judged: Mapping[int, Sequence[Judged]], allowed: int, tolerance: int
+) -> tuple[int, Levels]:
+    """Of several choices of a detector the one that validation trials find quickest."""
+    ranked = []
+    for key, validation in judged.items():
+        levels = set_levels(validation, allowed, tolerance)
+        scored = outcomes(validation, levels, tolerance)
+        ranked.append((*merit(scored), key, levels))
+    # keys differ, so levels are never compared
+    _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
+    return key, levels
+
+
 def _detectors(
     learned: Learned, windows: Windows, settings: Detection, stride_ms: int
 ) -> dict[str, dict[int, Detector]]:
@@ -254,14 +296,9 @@ class _Best:
 def _best(
     judged: Mapping[int, tuple[list[Judged], list[Judged]]], allowed: int, tolerance: int
 ) -> _Best:
-    """One detector at one rate; of several the one that validation trials find quickest."""
-    ranked = []
-    for key, (validation, _) in judged.items():
-        levels = set_levels(validation, allowed, tolerance)
-        scored = outcomes(validation, levels, tolerance)
-        ranked.append((*merit(scored), key, levels))
-    # keys differ, so levels are never compared
-    _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
+    """One detector at one rate."""
+    validations = {key: validation for key, (validation, _) in judged.items()}
+    key, levels = _quickest(validations, allowed, tolerance)
     of_validation, of_test = (
         _summary(trials, outcomes(trials, levels, tolerance), levels) for trials in judged[key]
     )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.detectors.detector_comparison import Parts, compare
+from sliplab.analysis.detectors.detector_comparison import Parts, Tuned, compare, tuned
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.onset_references import References, references_of
@@ -89,6 +89,21 @@ class DetectorWork:
             counted = [_counted(store, trial) for trial in trials]
             found[name] = choose_smoothing(counted, settings, settings.choose)
         return found
+
+    def tune(self, store: Store, settings: AnalysisSettings, detection: Detection) -> list[Tuned]:
+        """Return detectors at the middle of the rates that are compared; none without a comparison.
+
+        Args:
+            settings: windows and strides; detection: the paper's rule.
+        """
+        fine, asked = settings.fine_stride_ms, detection.compare
+        parts = _parts(store, self.compared)
+        if parts is None or fine is None or asked is None:
+            return []
+        if not (parts.train and parts.validation):
+            return []
+        rate = asked.rates[len(asked.rates) // 2]
+        return tuned(parts, settings.windows, detection, fine, settings.most_spikes, rate)
 
     def compare(
         self, store: Store, settings: AnalysisSettings, detection: Detection

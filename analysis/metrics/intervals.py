@@ -7,7 +7,8 @@ medians and percentiles the ranks of the values, and counts the exact binomial o
 the same trials each trial's difference is taken, so that what they have in common drops out.
 
 Sources: Student 1908; Welch 1947; Korn and Graubard 1998 (shares of clusters, on log odds); Hutson
-1999 (quantiles, by ranks between whole ones); Clopper and Pearson 1934; Efron 1979 (the bootstrap).
+1999 (quantiles, by ranks between whole ones); Clopper and Pearson 1934; Garwood 1936 (counts in a
+time); Efron 1979 (the bootstrap).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
-from scipy.special import betainc, betaincinv, expit, logit
+from scipy.special import betainc, betaincinv, expit, gammaincinv, logit
 from scipy.stats import t as student
 
 FloatArray = npt.NDArray[np.float64]
@@ -117,6 +118,12 @@ def exact_interval(count: int, trials: int) -> Span:
     low = float(betaincinv(count, trials - count + 1, _TAIL)) if count > 0 else 0.0
     high = float(betaincinv(count + 1, trials - count, 1 - _TAIL)) if count < trials else 1.0
     return low, high
+
+
+def poisson_interval(count: int) -> Span:
+    """Garwood's exact interval of the expected number of events of which `count` were seen."""
+    low = float(gammaincinv(count, _TAIL)) if count > 0 else 0.0
+    return low, float(gammaincinv(count + 1, 1 - _TAIL))
 
 
 def difference(

@@ -156,6 +156,7 @@ def trial_samples(
         windows.length_ms * 1_000_000,
         samples.per_class,
         seed,
+        samples.no_slip,
     )
     starts = np.concatenate([chosen[key] for key in sorted(chosen)])
     classes = np.concatenate([np.full(len(chosen[key]), key, np.int64) for key in sorted(chosen)])

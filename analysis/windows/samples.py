@@ -8,6 +8,8 @@ and a seed, so that a data set can be reproduced from its protocol alone.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,10 +55,12 @@ def choose_windows(
     window_ns: int,
     per_class: int,
     seed: int,
+    no_slip: Literal["last", "spread"] = "last",
 ) -> dict[int, NDArray[np.int64]]:
     """The windows of one trial that become samples, by class.
 
-    No slip: `per_class` consecutive windows, the last of which ends at the incipient onset. Gross:
+    No slip: `per_class` consecutive windows, the last of which ends at the incipient onset; or, if
+    they are to be spread, non-overlapping random ones before it where they fit. Gross:
     `per_class` consecutive ones from the gross onset on. Incipient: `per_class` non-overlapping
     random ones between the onsets where they fit, otherwise all consecutive ones from the incipient
     onset on. A recording that is too short gives fewer, and the lengths say how many. What an
@@ -69,6 +73,7 @@ def choose_windows(
         window_ns: a window's length.
         per_class: number of windows of each class.
         seed: of the random windows (PCG64).
+        no_slip: as in `protocols.settings.Samples`.
 
     Returns:
         class (0 no slip, 1 incipient, 2 gross) to (n,) int64 starts in ns, ascending, n at most
@@ -92,20 +97,25 @@ def choose_windows(
             f"onsets {incipient_ns} and {gross_ns} must lie in order inside the recording "
             f"[{start_ns}, {end_ns}]"
         )
-    before = min(per_class, (incipient_ns - start_ns) // window_ns)
-    chosen[NO_SLIP] = _run(incipient_ns - before * window_ns, before, window_ns)
-    if gross_ns is None:
-        return chosen
-    after = min(per_class, (end_ns - gross_ns) // window_ns)
-    chosen[GROSS] = _run(gross_ns, after, window_ns)
-    spare = gross_ns - incipient_ns - per_class * window_ns
-    if spare < 0:
-        chosen[INCIPIENT] = consecutive_windows(incipient_ns, gross_ns, window_ns)
-    else:
+    rng = np.random.Generator(np.random.PCG64(seed))
+
+    def spread(begin_ns: int, until_ns: int) -> NDArray[np.int64]:
+        spare = until_ns - begin_ns - per_class * window_ns
+        if spare < 0:
+            return consecutive_windows(begin_ns, until_ns, window_ns)
         # sorted places in what the windows leave free, each pushed on by the windows before it
-        rng = np.random.Generator(np.random.PCG64(seed))
         free = np.sort(rng.integers(0, spare, per_class, dtype=np.int64, endpoint=True))
-        chosen[INCIPIENT] = free + _run(incipient_ns, per_class, window_ns)
+        return free + _run(begin_ns, per_class, window_ns)
+
+    if gross_ns is not None:
+        after = min(per_class, (end_ns - gross_ns) // window_ns)
+        chosen[GROSS] = _run(gross_ns, after, window_ns)
+        chosen[INCIPIENT] = spread(incipient_ns, gross_ns)
+    if no_slip == "spread":
+        chosen[NO_SLIP] = spread(start_ns, incipient_ns)
+    else:
+        before = min(per_class, (incipient_ns - start_ns) // window_ns)
+        chosen[NO_SLIP] = _run(incipient_ns - before * window_ns, before, window_ns)
     return chosen
 
 

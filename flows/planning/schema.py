@@ -29,13 +29,14 @@ from sliplab.storage.schema.drift import DriftFit
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.power import PowerRecord
+from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.schema.twin import TwinFit, TwinGap
 
 Kind = Literal[
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin", "drift", "gap", "power",
+    "classes-summary", "twin", "drift", "gap", "power", "stress",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
@@ -50,6 +51,7 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "drift": DriftFit,
     "gap": TwinGap,
     "power": PowerRecord,
+    "stress": StressRecord,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
@@ -62,6 +64,7 @@ TITLES: dict[Kind, str] = {
     "drift": "The drift of a campaign's reference trials, by SlipLab",
     "gap": "Networks of a twin, tested on the rig that it imitates, by SlipLab",
     "power": "Trials that claims need, by SlipLab",
+    "stress": "Detectors under nuisances, by SlipLab",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

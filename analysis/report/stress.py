@@ -1,0 +1,87 @@
+"""The page of detectors under nuisances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sliplab.analysis.report.figures import stress as figures
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
+from sliplab.analysis.stress import ALL
+from sliplab.storage.schema.evaluation import Rate
+from sliplab.storage.schema.stress import StressDetector, StressFigures, StressRecord
+
+COLUMNS = (
+    "detector", "clean trials (95 %)", "false alarms an hour (95 %)", "missed slips",
+    "latency, median (ms)", "from physical onset (ms)",
+)  # fmt: skip
+
+
+def title(detector: StressDetector) -> str:
+    """Return a detector's name for people."""
+    return f"{detector.network}: {detector.rule}, {detector.stride_ms} ms"
+
+
+def cells(name: str, it: StressFigures) -> list[str]:
+    """Return figures as cells, see `COLUMNS`."""
+    return [
+        name, _span(it.clean), _hourly(it.per_hour), f"{it.missed} of {it.trials}",
+        number(it.latency_ms, 0), number(it.latency_true_ms, 0),
+    ]  # fmt: skip
+
+
+def of(detector: StressDetector, nuisance: str, strength: float | None = None) -> StressFigures:
+    """Return a detector's figures under one nuisance.
+
+    Raises:
+        StopIteration: there are none.
+    """
+    return next(it for it in detector.figures if (it.nuisance, it.strength) == (nuisance, strength))
+
+
+def nuisances(record: StressRecord) -> list[str]:
+    """Return names of nuisances in the order of the figures."""
+    found = dict.fromkeys(it.nuisance for it in record.detectors[0].figures)
+    return [name for name in found if name != ALL]
+
+
+def render(record: StressRecord) -> str:
+    """Return the page as text."""
+    simulated, names = record.simulated, nuisances(record)
+    titled = [(title(detector), detector) for detector in record.detectors]
+    networks = dict.fromkeys(it.network for it in record.accuracy)
+    rows = {name: [it for it in record.accuracy if it.network == name] for name in networks}
+    best = record.detectors[0]
+    return render_page(
+        "stress.html",
+        simulated=simulated,
+        record=record,
+        detectors=Table(COLUMNS, [cells(name, of(it, ALL)) for name, it in titled]),
+        clean=Figure(figures.clean_trials(titled, names, simulated=simulated)),
+        best=titled[0][0],
+        by_nuisance=Table(
+            ("nuisance", *COLUMNS[1:]), [cells(name, of(best, name)) for name in names]
+        ),
+        accuracy=Figure(figures.by_strength(rows, names, simulated=simulated)),
+        accuracies=Table(("nuisance", *rows), _accuracies(record, names, list(rows))),
+    )
+
+
+def _accuracies(
+    record: StressRecord, names: Sequence[str], networks: Sequence[str]
+) -> list[list[str]]:
+    found = {(it.network, it.nuisance): it.strict for it in record.accuracy if it.strength is None}
+    return [
+        [name, *(_span(found.get((network, name))) for network in networks)]
+        for name in [ALL, *names]
+    ]
+
+
+def _span(rate: Rate | None) -> str:
+    if rate is None:
+        return "–"
+    low, high = (percent(value).removesuffix(" %") for value in (rate.low, rate.high))
+    return f"{percent(rate.value)} ({low} to {high})"
+
+
+def _hourly(rate: Rate) -> str:
+    return f"{rate.value:.1f} ({rate.low:.1f} to {rate.high:.1f})"

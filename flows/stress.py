@@ -1,0 +1,261 @@
+"""`sliplab stress`: a store's detectors under nuisances.
+
+The trials of a protocol with nuisances are taken and labelled in a folder of their own, on the rig
+of the store's slides or another. The store's networks and the detectors that its training and
+validation trials set are then judged by them; nothing is chosen by these trials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sliplab.analysis import stress
+from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.detectors.detector_comparison import Tuned
+from sliplab.analysis.detectors.detectors import Levels, Predictions, Smoothing
+from sliplab.analysis.detectors.latency import true_slip
+from sliplab.analysis.detectors.onset_references import references_of
+from sliplab.analysis.detectors.predictions import (
+    PredictionRequest,
+    predict_trials,
+    prediction_request,
+)
+from sliplab.analysis.evaluation.detectors import detector_work
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.models import (
+    Model,
+    choose_model,
+    comparison_models,
+    rules_of,
+    training_settings,
+    wanted_models,
+)
+from sliplab.analysis.report import stress as page
+from sliplab.analysis.stress import StressTrial
+from sliplab.analysis.windows.dataset import recorded_span
+from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.flows.judge_network import spike_keeper
+from sliplab.flows.other_rig import retake
+from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.protocols import InputError, Plan, Trial
+from sliplab.protocols.quantity import FactorRef
+from sliplab.protocols.settings import Detection
+from sliplab.storage.files import make_folder, write_json, write_text
+from sliplab.storage.schema.evaluation import Rate
+from sliplab.storage.schema.stress import StressAccuracy, StressDetector, StressRecord
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
+
+NAME = "stress"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for, checked before anything moves.
+
+    Attributes:
+        store, campaigns: that trained the networks. taken: request of the trials with nuisances.
+        out: folder of the page and its numbers.
+    """
+
+    store: Store
+    campaigns: list[Collected]
+    taken: RunRequest
+    out: Path
+
+
+def request(
+    store: Store, campaigns: list[Collected], protocol: Path, rig: Path | None, out: Path | None
+) -> Request:
+    """Check what is asked for.
+
+    Args:
+        rig: left out, that of the store's slides, if it is simulated.
+        out: left out, a folder of the store.
+
+    Raises:
+        InputError: the protocol has no nuisances or other windows, or a real rig is not named.
+        StoreError: nothing was trained yet.
+    """
+    item = training_campaigns(campaigns)[0]
+    choose_model(wanted_models(store, campaigns))
+    if rig is None:
+        if not item.info.get("simulated"):
+            text = f"is needed: the slides of '{item.name}' were collected on a real rig"
+            raise InputError("--rig", "", None, text)
+        rig = item.campaign.folder / "rig.yaml"
+    out = store.folder / NAME if out is None else out
+    taken = make_request(protocol, rig, out / "store", campaign=NAME, claims="ignore")
+    collection = taken.plan.protocol.collection
+    if collection.nuisances is None:
+        text = f"has none in {protocol}; a protocol with nuisances is needed (docs/stress.md)"
+        raise InputError("--protocol", "collection.nuisances", None, text)
+    if collection.experiment != "kinematic":
+        raise InputError("--protocol", "collection.experiment", collection.experiment,
+                         "must be kinematic: slips are judged by slides")  # fmt: skip
+    if taken.plan.protocol.analysis.windows != item.settings.windows:
+        text = f"must be those of the campaign '{item.name}', on which the networks were trained"
+        raise InputError("--protocol", "analysis.windows", str(protocol), text)
+    return Request(store, campaigns, taken, out)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A network with the detectors that read it, and its predictions on the trials."""
+
+    title: str
+    detectors: list[Tuned]
+    stride_ms: int
+    model: Model
+
+
+def measure_stress(asked: Request) -> StressRecord:
+    """Take, label and judge what is missing; write the page and the numbers.
+
+    Raises:
+        StoreError: no trial has both onsets.
+    """
+    make_folder(asked.out)
+    disturbed, (campaign,) = retake([asked.taken])
+    labels = Labels(disturbed)
+    trials = [
+        (trial, recording, found)
+        for trial, recording in campaign.of_split("test")
+        if (found := _stress_trial(asked.taken.plan, trial, recording, labels, campaign))
+    ]
+    if not trials:
+        raise StoreError(f"{disturbed.folder}: no test trial has both onsets of slip")
+    detectors: list[StressDetector] = []
+    accuracy: list[StressAccuracy] = []
+    networks_seen: set[str] = set()
+    for judged in networks(asked):
+        title, stride = judged.title, judged.stride_ms
+        known = _predicted(disturbed, campaign, trials, judged.model, stride)
+        tolerance = round(campaign.settings.detection.false_early_ms * 1e6)
+        for tuned in judged.detectors:
+            rows = [
+                (it, stress.outcome(stress.alarms(tuned.detector, tuned.levels.incipient, p),
+                                    it.slip, tolerance))
+                for it, p in known
+            ]  # fmt: skip
+            detectors.append(stress.stressed(title, tuned.name, stride, rows))
+        if title not in networks_seen:
+            accuracy += _accuracy(title, judged.model, labels, campaign, trials)
+        networks_seen.add(title)
+    first = trials[0][1].record
+    record = StressRecord(
+        simulated=first.simulated,
+        campaign=training_campaigns(asked.campaigns)[0].name,
+        rig=campaign.info["rig"],
+        protocol=asked.taken.plan.protocol.name,
+        trials=len(trials),
+        hold_h=detectors[0].figures[0].hold_h,
+        detectors=stress.ordered(detectors),
+        accuracy=tuple(accuracy),
+    )
+    write_json(asked.out / f"{NAME}.json", record.to_json())
+    write_text(asked.out / f"{NAME}.html", page.render(record))
+    return record
+
+
+def networks(asked: Request) -> Iterator[Judged]:
+    """Yield the store's own network with every detector, then the networks that `also` names.
+
+    Their levels are set by validation trials of the store.
+
+    Raises:
+        StoreError: a network is missing or stale.
+    """
+    store, campaigns = asked.store, asked.campaigns
+    model, settings = choose_model(wanted_models(store, campaigns)), training_settings(campaigns)
+    rules = rules_of(campaigns, settings.network.outputs_per_class)
+    rule = rules[training_campaigns(campaigns)[0].name]
+    yield Judged("own", [_paper(rule)], settings.stride_ms, model)
+    work = detector_work(Labels(store), campaigns, rules, model.key)
+    if work.compared is not None and settings.fine_stride_ms is not None:
+        keep = spike_keeper(store, None)
+        predict_trials(store, model.path, settings.windows, work.requests, keep)
+        tuned = work.tune(store, settings, rule)
+        yield Judged("own", tuned, settings.fine_stride_ms, model)
+    for other in comparison_models(store, campaigns):
+        if not other.fresh:
+            raise StoreError(f"{other.path}: is missing or stale; run `sliplab train` first")
+        theirs = other.settings
+        yield Judged(
+            f"preset: {theirs.preset}", [_paper(theirs.detection)], theirs.stride_ms, other
+        )
+
+
+def _paper(rule: Detection) -> Tuned:
+    """The protocol's rule as a detector: its level is the margin, which is enough."""
+    level = float(np.nextafter(rule.margin, -np.inf))
+    return Tuned(f"rule, {rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
+
+
+def _stress_trial(
+    plan: Plan, trial: Trial, recording: Recording, labels: Labels, campaign: Collected
+) -> StressTrial | None:
+    """A trial with its nuisance and onsets; None where the label lacks one."""
+    label = labels.read(campaign, recording)
+    slip = true_slip(label)
+    section = plan.protocol.collection.nuisances
+    if slip is None or section is None:
+        return None
+    condition = dict(trial.condition)
+    name, strength = (
+        condition[field.factor] if isinstance(field, FactorRef) else field
+        for field in (section.apply, section.strength)
+    )
+    true = references_of(recording, label).get("true")
+    return StressTrial(
+        str(name), float(strength), recorded_span(recording)[0], slip,
+        None if true is None else true.slip.incipient_ns,
+    )  # fmt: skip
+
+
+Trials = list[tuple[Trial, Recording, StressTrial]]
+
+
+def _predicted(
+    disturbed: Store, campaign: Collected, trials: Trials, model: Model, stride_ms: int
+) -> list[tuple[StressTrial, Predictions]]:
+    """Spikes of a network in all windows of the trials."""
+    windows = model.settings.windows
+    wanted: list[tuple[StressTrial, PredictionRequest]] = [
+        (it, prediction_request(campaign.name, recording, model.key, windows, stride_ms))
+        for _, recording, it in trials
+    ]
+    keep = spike_keeper(disturbed, None)
+    predict_trials(disturbed, model.path, windows, [each for _, each in wanted], keep)
+    found = []
+    for it, each in wanted:
+        arrays = Derived.of(disturbed, each.step, each.campaign).arrays(each.recording.folder.name)
+        found.append((it, Predictions(arrays["counts"], arrays["events"], arrays["end_ns"])))
+    return found
+
+
+def _accuracy(
+    title: str, model: Model, labels: Labels, campaign: Collected, trials: Trials
+) -> Iterator[StressAccuracy]:
+    """Strict accuracy of a network by nuisance and strength, with intervals over trials."""
+    samples = load_samples(labels, [campaign], "test")
+    counts = training.predict_counts(model_file.load(model.path), samples.windows)
+    hits = window_groups.strict_hits(counts, samples.y)
+    place = {name: k for k, (_, name) in enumerate(samples.trials)}
+    for name, strength, belongs in stress.groups(it for _, _, it in trials):
+        ours = [place[trial.id] for trial, _, it in trials if belongs(it)]
+        there = np.isin(samples.trial, ours)
+        found = window_groups.share(hits[there], samples.trial[there])
+        strict = None
+        if found.share is not None and found.low is not None and found.high is not None:
+            strict = Rate(value=found.share, low=found.low, high=found.high)
+        yield StressAccuracy(
+            network=title, nuisance=name, strength=strength, windows=int(there.sum()), strict=strict
+        )

@@ -1,0 +1,62 @@
+"""Detectors under nuisances: `stress.json`."""
+
+from __future__ import annotations
+
+from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+from sliplab.storage.schema.evaluation import Rate
+
+
+class StressFigures(Part):
+    """A detector on the trials of one nuisance at one strength."""
+
+    nuisance: str
+    """`all`: every trial."""
+    strength: Number | None
+    """Percent of the protocol's sizes; null: of all strengths."""
+    trials: Int
+    hold_h: Number
+    """Time in which the sensor held without slip, h."""
+    false_alarms: Int
+    per_hour: Rate
+    """False alarms per hour of holding, with the exact Poisson interval."""
+    clean: Rate
+    """Share of the trials without a false alarm whose slip was detected before it was gross."""
+    missed: Int
+    """Slips that were not detected before they were gross."""
+    latency_ms: Number | None
+    """Median from the label's onset to the detection; null: nothing detected."""
+    latency_true_ms: Number | None
+    """The same from the physical onset; null where none is known."""
+
+
+class StressDetector(Part):
+    """A detector; `figures` begin with those of all trials."""
+
+    network: str
+    rule: str
+    stride_ms: Int
+    figures: tuple[StressFigures, ...]
+
+
+class StressAccuracy(Part):
+    """Strict accuracy of a network on the sample windows of one nuisance at one strength."""
+
+    network: str
+    nuisance: str
+    strength: Number | None
+    windows: Int
+    strict: Rate | None
+    """With an interval over trials; null without windows."""
+
+
+class StressRecord(Document):
+    """All detectors of a store under nuisances, the best first."""
+
+    simulated: Bool
+    campaign: str
+    rig: str
+    protocol: str
+    trials: Int
+    hold_h: Number
+    detectors: tuple[StressDetector, ...]
+    accuracy: tuple[StressAccuracy, ...]
