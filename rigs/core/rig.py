@@ -271,7 +271,8 @@ class Rig:
                 times = self.take_step(index, step, began, sink if recording else None)
                 steps.append((times, step.recorded))
                 course.taken(step, self.position)
-                if step.recorded:
+                # a nuisance is over before it has a speed, and is no path that was asked for
+                if step.recorded and step.phase != "nuisance":
                     speed = step.speed_mm_s if isinstance(step, Move) else 0.0
                     path.append(self._segment(times, began, course.at, speed))
             truth = None
