@@ -156,6 +156,7 @@ def measure_stress(asked: Request) -> StressRecord:
         rig=campaign.info["rig"],
         protocol=asked.taken.plan.protocol.name,
         trials=len(trials),
+        without_onsets=sum(1 for _ in campaign.of_split("test")) - len(trials),
         hold_h=detectors[0].figures[0].hold_h,
         detectors=stress.ordered(detectors),
         accuracy=tuple(accuracy),

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
+from sliplab.protocols.nuisances import Flicker
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move, Twist
 from sliplab.protocols.quantity import (
@@ -512,6 +513,7 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     _check_exposure(rig, plan, file)
     _check_force(rig, plan)
     _check_twist(rig, plan, file)
+    _check_flicker(rig, plan, file)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")
@@ -554,6 +556,21 @@ def _check_twist(rig: RigFile, plan: Plan, file: str) -> None:
                 driver.name,
                 f"cannot turn the tool evenly on the spot, and trial {trial.id} of {plan.file} "
                 "does; use another driver, such as 'abb'",
+            )
+
+
+def _check_flicker(rig: RigFile, plan: Plan, file: str) -> None:
+    """Check that simulated pixels can see a flickering light, if the plan has one."""
+    if not rig.simulated or rig.scene.event_camera.cutoff_hz == 0:
+        return
+    for trial in plan:
+        if any(isinstance(each, Flicker) for each in plan.program(trial).nuisances):
+            raise InputError(
+                file,
+                "mock.event_camera.cutoff_hz",
+                rig.scene.event_camera.cutoff_hz,
+                f"must be 0 for the flicker of trial {trial.id} of {plan.file}: behind a low pass "
+                "it is not computed",
             )
 
 

@@ -57,6 +57,8 @@ class StressRecord(Document):
     rig: str
     protocol: str
     trials: Int
+    without_onsets: Int
+    """Trials besides, whose label lacks an onset of slip; nothing is judged by them."""
     hold_h: Number
     detectors: tuple[StressDetector, ...]
     accuracy: tuple[StressAccuracy, ...]

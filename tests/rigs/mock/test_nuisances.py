@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sliplab.protocols import InputError, load_plan
 from sliplab.protocols.nuisances import SHIPPED, TrialNuisances
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.fault_settings import Knock, Shaking, SkinBrushed
 from sliplab.rigs.mock.faults import FaultBook
 from sliplab.rigs.mock.nuisances import DAMPING, Shake, brushing, faults_of, swept
+from sliplab.rigs.rig_file import check_plan, load_rig_file
 from tests.rigs.mock.driving import SMALL, Trial, same, slide, with_faults
 
 SECOND = 1_000_000_000
@@ -129,3 +132,12 @@ def test_warmth_multiplies_the_noise() -> None:
         counts.append(len(devices.events.read().t_us))
     hot = 4 * SMALL.event_camera.hot_pixels * SMALL.event_camera.hot_hz
     assert (counts[1] - hot) / (counts[0] - hot) == pytest.approx(2**2.5, rel=0.25)
+
+
+def test_flicker_behind_a_low_pass_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "slow.yaml").write_text(
+        "extends: rehearsal\nname: slow\nmock: {event_camera: {cutoff_hz: 300}}\n"
+    )
+    rig, _ = load_rig_file(tmp_path / "slow.yaml")
+    with pytest.raises(InputError, match=r"mock.event_camera.cutoff_hz = 300.*must be 0 for the"):
+        check_plan(rig, load_plan(Path("nuisances")), "slow.yaml")
