@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -114,16 +115,15 @@ def groups(
 ) -> list[tuple[str, float | None, Callable[[StressTrial], bool]]]:
     """Nuisances and strengths in order: all, all strengths of each, each strength of each."""
     there = list(dict.fromkeys((t.nuisance, t.strength) for t in trials))
-    found: list[tuple[str, float | None, Callable[[StressTrial], bool]]] = [
-        (ALL, None, lambda trial: True)
-    ]
+    found: list[tuple[str, float | None]] = [(ALL, None)]
     for name in dict.fromkeys(name for name, _ in there):
-        found.append((name, None, lambda trial, name=name: trial.nuisance == name))
-        found += [
-            (name, s, lambda trial, key=(name, s): (trial.nuisance, trial.strength) == key)
-            for s in sorted({strength for other, strength in there if other == name})
-        ]
-    return found
+        found.append((name, None))
+        found += [(name, s) for s in sorted({s for other, s in there if other == name})]
+    return [(name, strength, partial(_belongs, name, strength)) for name, strength in found]
+
+
+def _belongs(nuisance: str, strength: float | None, trial: StressTrial) -> bool:
+    return nuisance in {ALL, trial.nuisance} and strength in {None, trial.strength}
 
 
 def stressed(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 
@@ -42,7 +45,8 @@ class Bursts:
         Args:
             scans: scans of the read-out; the burst's events also carry the times of its columns.
         """
-        if not (self._world.faults.of(EventBurst) or self._world.faults.of(EventNoise)):
+        faults = self._world.faults
+        if not (faults.of(EventBurst) or faults.of(EventNoise)):
             return events
         burst = self.between(begin_ns, end_ns, scans)
         return _merge([events, burst]) if len(burst[0]) else events
@@ -52,15 +56,15 @@ class Bursts:
         # a scan is delivered when its last column has been read
         begin_ns, end_ns = begin_ns - scans.reading_ns, end_ns - scans.reading_ns
         faults, parts = self._world.faults, [_none()]
-        both = (*enumerate(faults.spans(EventBurst)), *enumerate(faults.spans(EventNoise)))
-        for index, (fault, first_ns, last_ns) in both:
+        sources: list[tuple[int, int, int, Callable[[int], Events]]] = []
+        for index, (burst, first_ns, last_ns) in enumerate(faults.spans(EventBurst)):
+            sources.append((first_ns, last_ns, _BIN_NS, partial(self._burst, burst, index)))
+        for index, (noise, first_ns, last_ns) in enumerate(faults.spans(EventNoise)):
+            sources.append((first_ns, last_ns, _LONG_BIN_NS, partial(self._noise, noise, index)))
+        for first_ns, last_ns, bin_ns, events_of in sources:
             low, high = max(begin_ns - scans.period_ns, first_ns), min(end_ns, last_ns)
-            bin_ns = _BIN_NS if isinstance(fault, EventBurst) else _LONG_BIN_NS
             for number in range(low // bin_ns, high // bin_ns + 1 if high >= low else 0):
-                if isinstance(fault, EventBurst):
-                    t_ns, x, y, p = self._burst(fault, index, number)
-                else:
-                    t_ns, x, y, p = self._noise(fault, index, number)
+                t_ns, x, y, p = events_of(number)
                 kept = (t_ns >= first_ns) & (t_ns < last_ns)
                 if scans.period_ns:
                     t_ns = scans.begin(t_ns)

@@ -126,9 +126,8 @@ class Shake:
             ringing = knock.um * 1e-3 * np.exp(-DAMPING * turned) * np.sin(turned)
             moved += ringing[:, None] * self._direction("knock", index)
         for index, (shaking, begin, _) in enumerate(self._faults.spans(Shaking)):
-            moved += swept(shaking, (t_ns - begin) * 1e-9)[:, None] * self._direction(
-                "shaking", index
-            )
+            seconds = np.asarray((t_ns - begin) * 1e-9, np.float64)
+            moved += swept(shaking, seconds)[:, None] * self._direction("shaking", index)
         return moved
 
     def _direction(self, purpose: str, index: int) -> F64:

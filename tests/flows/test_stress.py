@@ -61,16 +61,18 @@ def made(store: Store, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
 def test_every_detector_has_every_trial(made: tuple[Path, StressRecord]) -> None:
     _, record = made
     assert record.simulated
-    assert (record.trials, record.without_onsets) == (4, 0)
+    # under all nuisances at once a label may be in doubt
+    assert record.trials + record.without_onsets == 4
+    assert record.trials >= 3
     for detector in record.detectors:
         over_all, *parts = detector.figures
-        assert over_all.trials == 4
+        assert over_all.trials == record.trials
         single = [it for it in parts if it.strength is not None]
-        assert sum(it.trials for it in single) == 4
+        assert sum(it.trials for it in single) == record.trials
         assert sum(it.false_alarms for it in single) == over_all.false_alarms
         assert over_all.hold_h == pytest.approx(sum(it.hold_h for it in single))
         # holds of 5 and 6 s, and what passes until something slips
-        assert 22 / 3600 < over_all.hold_h < 40 / 3600
+        assert 5.0 < 3600 * over_all.hold_h / record.trials < 10.0
     clean = [it.figures[0].clean.value for it in record.detectors]
     assert clean == sorted(clean, reverse=True)
     rules = [it.rule for it in record.detectors]
