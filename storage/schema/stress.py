@@ -58,7 +58,7 @@ class StressRecord(Document):
     protocol: str
     trials: Int
     without_onsets: Int
-    """Trials besides, whose label lacks an onset of slip; nothing is judged by them."""
+    """Trials besides, whose label lacks the incipient onset; nothing is judged by them."""
     hold_h: Number
     detectors: tuple[StressDetector, ...]
     accuracy: tuple[StressAccuracy, ...]

@@ -14,6 +14,9 @@ from sliplab.protocols.program import Dwell, Move, Twist
 from tests.conftest import ROOT
 
 
+FAR = {"kind": "arm_motion", "distance": "8 mm", "speed": "20 mm/s"}
+
+
 def edited(folder: Path, change: dict[str, Any] | None = None, **limits: str | None) -> Plan:
     """The shipped protocol with other nuisances or limits; None leaves a limit out."""
     data = yaml.safe_load((ROOT / "protocols/nuisances.yaml").read_text())
@@ -55,14 +58,14 @@ def test_the_arm_moves_in_the_hold_and_comes_back(name: str, step: type) -> None
     steps = plan.program(under(plan, name)).steps
     still = plan.program(under(plan, NONE)).steps
     made = [(k, each) for k, each in enumerate(steps) if each.phase == "nuisance"]
-    count = int((30 - QUIET_S) / float(SHIPPED[name].every))
+    count = int((36 - QUIET_S) / float(SHIPPED[name].every))
     assert len(made) == 2 * count
     assert all(isinstance(each, step) and each.recorded for _, each in made)
     pressed = next(each.to for each in steps if isinstance(each, Move) and each.phase == "press")
     assert [each.to == pressed for _, each in made] == [False, True] * count
     # all else is as without nuisances, and labels count from an undisturbed hold
     holds = [each for each in steps if isinstance(each, Dwell) and each.phase == "hold"]
-    assert sum(each.seconds for each in holds) == pytest.approx(30, abs=1e-9)
+    assert sum(each.seconds for each in holds) == pytest.approx(36, abs=1e-9)
     assert holds[-1].seconds >= QUIET_S
     others = [each for each in steps if each.phase not in {"hold", "nuisance"}]
     assert others == [each for each in still if each.phase != "hold"]
@@ -78,10 +81,13 @@ def test_a_person_is_asked_once_and_told_when_it_ends() -> None:
     first = {dict(trial.condition)["nuisance"]: trial for trial in reversed(plan.trials)}
     tapping = [asked.get(t.index) for t in plan if dict(t.condition)["nuisance"] == "tap_table"]
     assert tapping == [
-        "from now on: knock on the table about every 2 s, so that it moves by 10 um", None,
-        "from now on: knock on the table about every 2 s, so that it moves by 20 um", None,
-        "from now on: knock on the table about every 2 s, so that it moves by 40 um", None,
-    ]  # fmt: skip
+        said
+        for um in (10, 20, 40)
+        for said in (
+            f"from now on: knock on the table about every 2 s, so that it moves by {um} um",
+            *[None] * 3,
+        )
+    ]
     assert first["none"].index not in asked  # nothing has been asked for yet
     assert asked[first["arm_motion"].index] == "from now on: leave the rig alone again"
     assert first["rotation"].index not in asked
@@ -98,7 +104,15 @@ def test_a_person_is_asked_once_and_told_when_it_ends() -> None:
         ({}, {"twist": None}, r"limits.twist: is needed.*'rotation' turns the sensor"),
         ({}, {"twist": "0.3 deg"}, r"twist of 0.4 deg, over collection.limits.twist = 0.3 deg"),
         ({}, {"twist_speed": "4 deg/s"}, r"5 deg/s.*limits.twist_speed = 4 deg/s"),
-        ({"elements": {"arm_motion": {"kind": "arm_motion", "distance": "6 mm"}}}, {}, "reaches x"),
+        (
+            {
+                "elements": {
+                    "arm_motion": {"kind": "arm_motion", "distance": "8 mm", "speed": "20 mm/s"}
+                }
+            },
+            {},
+            "reaches x",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(
