@@ -13,7 +13,6 @@ from sliplab.protocols.nuisances import MIX, NONE, QUIET_S, SHIPPED
 from sliplab.protocols.program import Dwell, Move, Twist
 from tests.conftest import ROOT
 
-
 FAR = {"kind": "arm_motion", "distance": "8 mm", "speed": "20 mm/s"}
 
 
