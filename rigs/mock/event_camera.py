@@ -46,7 +46,7 @@ class Bursts:
             scans: scans of the read-out; the burst's events also carry the times of its columns.
         """
         faults = self._world.faults
-        if not (faults.of(EventBurst) or faults.of(EventNoise)):
+        if not faults.of(EventBurst) and not faults.of(EventNoise):
             return events
         burst = self.between(begin_ns, end_ns, scans)
         return _merge([events, burst]) if len(burst[0]) else events
