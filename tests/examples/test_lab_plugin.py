@@ -13,6 +13,7 @@ from tests.examples.conftest import Lab, checkout
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
 
+@pytest.mark.long
 def test_a_package_outside_the_checkout_runs_a_campaign(tmp_path: Path) -> None:
     before = checkout()
     sliplab = Lab(tmp_path, "lab-plugin")

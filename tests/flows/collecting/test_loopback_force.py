@@ -167,6 +167,7 @@ def test_a_load_beyond_the_range_is_a_protective_stop(tmp_path: Path) -> None:
         assert campaign.committed() == set()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "sensor", ["run_request", pytest.param("by_the_arm", marks=pytest.mark.long)]
 )

@@ -38,6 +38,7 @@ def two_event_cameras(folder: Path) -> Path:
     return write(folder / "rig.yaml", data)
 
 
+@pytest.mark.long
 def test_two_event_cameras_are_recorded_on_one_time_line(tmp_path: Path) -> None:
     run_request = request_in(tmp_path / "live", quick(), two_event_cameras(tmp_path))
     with stage_of(run_request.rig) as stage:

@@ -111,6 +111,7 @@ def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
     assert np.abs(moved).max() < 0.02  # noise of the poses alone
 
 
+@pytest.mark.long
 @pytest.mark.realtime
 @pytest.mark.xdist_group("scene")
 def test_a_twist_of_a_ur_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
