@@ -78,11 +78,12 @@ def by_strength(
                 axes.plot(x, y[:, 0], "o-", color=colour, ms=3, lw=1.2, label=network)
                 axes.fill_between(x, y[:, 1], y[:, 2], color=colour, alpha=0.15, lw=0)
             axes.set_title(name, fontsize=8)
+            axes.tick_params(labelbottom=True, labelsize=7.5)
             axes.set_ylim(0, 102)
         for axes in list(grid.flat)[len(names) :]:
             axes.set_axis_off()
         figure.supxlabel("strength (%)", fontsize=9)
         figure.supylabel("strict accuracy (%)", fontsize=9)
         handles, titles = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, titles, loc="outside lower center", ncols=4, fontsize=8)
+        figure.legend(handles, titles, loc="outside upper left", ncols=4, fontsize=8)
         return svg_text(figure, simulated)
