@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
@@ -22,6 +22,7 @@ from sliplab.analysis.detectors.live import (
     counting_of,
 )
 from sliplab.analysis.networks import training
+from sliplab.flows.detecting.network_process import PATIENT_S, NetworkLost, NetworkProcess
 from sliplab.flows.detecting.request import DetectRequest
 from sliplab.flows.detecting.sink import DetectNumbers, DetectSink
 from sliplab.flows.running import stopping
@@ -40,6 +41,25 @@ RATE_HZ = 100
 FOREVER_S = 1e9
 
 
+class ReactionMs(TypedDict):
+    """Parts of the time from slip to the end of the reflex, ms, and their sum.
+
+    Attributes:
+        window: span of the events that the decision rests on; slip may begin anywhere in it.
+        sensor: from its end until the events were read.
+        network: from there to the decision, in real time.
+        command: until arm and gripper had their commands.
+        actuator: until arm and fingers were at rest.
+    """
+
+    window: float
+    sensor: float
+    network: float
+    command: float
+    actuator: float
+    total: float
+
+
 class ReflexJson(TypedDict):
     """A reflex in a detection's summary, with the fields of `Reaction` where it was done."""
 
@@ -49,6 +69,9 @@ class ReflexJson(TypedDict):
     stop_ms: NotRequired[float]
     stopped_mm: NotRequired[tuple[float, float, float]]
     depth_mm: NotRequired[float]
+    closed_mm: NotRequired[float]
+    stalled: NotRequired[bool]
+    reaction_ms: NotRequired[ReactionMs]
 
 
 class ModelFile(TypedDict):
@@ -88,17 +111,19 @@ def detect(
 
     Args:
         out: a file of JSON lines, one a decision, that is written while it runs.
-        counting: the network, instead of the model's by the event-driven kernels in one thread.
+        counting: the network, instead of the model's by the event-driven kernels in one thread:
+            in a process of its own where the request has a safe state.
         build: makes the rig.
 
     Raises:
         InputError: there is no folder for `out`.
         RigError: a device failed; the arm is stopped.
+        SafeState: slip could not be detected any more; the arm stays in contact.
         StopRequested, KeyboardInterrupt: somebody stopped a motion.
     """
     training.limit_threads(1)
-    counting = counting or counting_of(request.fitted)
     with ExitStack() as done:
+        counting = counting or done.enter_context(_counting(request))
         write = done.enter_context(_lines(out))
         done.enter_context(held(request.rig))
         done.enter_context(stopping.signals())
@@ -115,7 +140,7 @@ def detect(
             write(timed)
             view.on_decision(timed)
 
-        sink = DetectSink(detector, rig.clock, on_decision, view.poll)
+        sink = DetectSink(detector, rig.clock, on_decision, view.poll, request.timeouts)
         rig.connect()
         reaction, interrupted = None, False
         try:
@@ -125,6 +150,8 @@ def detect(
                 reaction = _move(request, rig, sink)
         except ClockFellBack as error:
             raise RigError("event camera", str(error)) from None
+        except NetworkLost as error:
+            raise RigError("network", str(error)) from None
     return _summary(request, sink, reaction, interrupted)
 
 
@@ -177,7 +204,23 @@ def _move(request: DetectRequest, rig: Rig, sink: DetectSink) -> Reaction | None
         hash_integer(trial.seed, 0),  # a simulated trial is the one that `collect` takes first
         collection.recording.sync_rate,
         request.reflex,
+        request.safe,
     )
+
+
+@contextmanager
+def _counting(request: DetectRequest) -> Iterator[Counting]:
+    """Yield the model's network; in a process of its own where there is a safe state to go to."""
+    if request.timeouts is None:
+        yield counting_of(request.fitted)
+        return
+    answer_s = PATIENT_S if request.rig.in_virtual_time else request.timeouts.decision_ns / 1e9
+    try:
+        network = NetworkProcess(request.model, answer_s)
+    except NetworkLost as error:
+        raise RigError("network", str(error)) from None
+    with closing(network):
+        yield network
 
 
 @contextmanager
@@ -204,6 +247,21 @@ def _title(request: DetectRequest) -> str:
     return f"detect on {request.rig.name} ({mode}), model {request.model.name}"
 
 
+def reaction_ms(reaction: Reaction) -> ReactionMs:
+    """Return the parts of a reaction's time; it was triggered by a `DetectSink`."""
+    seen = reaction.evidence
+    assert seen is not None
+    command, actuator = reaction.command_ms, reaction.actuator_ms
+    return {
+        "window": seen.window_ms,
+        "sensor": seen.sensor_ms,
+        "network": seen.network_ms,
+        "command": command,
+        "actuator": actuator,
+        "total": seen.window_ms + seen.sensor_ms + seen.network_ms + command + actuator,
+    }
+
+
 def _summary(
     request: DetectRequest, sink: DetectSink, reaction: Reaction | None, interrupted: bool
 ) -> DetectSummary:
@@ -217,6 +275,9 @@ def _summary(
                 "stop_ms": reaction.stop_ms,
                 "stopped_mm": reaction.stopped_mm,
                 "depth_mm": reaction.depth_mm,
+                "closed_mm": reaction.closed_mm,
+                "stalled": reaction.stalled,
+                "reaction_ms": reaction_ms(reaction),
             }
     return {
         "simulated": request.rig.simulated,

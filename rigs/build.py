@@ -117,6 +117,8 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
             further_stream(name, file.streams[name], device, taught_frame(file))
             for name, device in devices.further.items()
         ),
+        gripper=devices.gripper,
+        grip_opening_mm=0.0 if file.grip_opening_mm is None else file.grip_opening_mm,
         simulation=_MockSimulation(devices),
     )
 

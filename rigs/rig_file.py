@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from datetime import date
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,6 +35,7 @@ from sliplab.protocols.yaml_file import (
 )
 from sliplab.rigs.core.arm_settings import check_units
 from sliplab.rigs.core.calibration import Calibration, without_taught
+from sliplab.rigs.core.capabilities import GripperRange
 from sliplab.rigs.core.driver import Driver, EventCameraDriver
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.fault_settings import StreamGone
@@ -122,6 +124,22 @@ class FrameCameraSpec(StrictModel):
     """Write raw frames and encode them after the trial, where live encoding is too slow."""
 
 
+class ReflexSettings(StrictModel):
+    """What a reflex does when slip can no longer be detected (docs/reflex.md)."""
+
+    safe_state: Literal["stop", "grip"] = "stop"
+    """`stop`: the arm stops and stays in contact. `grip`: the gripper tightens too, by `grip`."""
+    grip: PositiveMillimetres | None = None
+    """Tightening of the safe state `grip`, within the limits of force and depth."""
+    force: PositiveNewtons | None = None
+    """Force at which closing fingers stall, in reflexes and in the safe state; left out, the least
+    that the gripper can be set to."""
+    stream_timeout: PositiveSeconds = Decimal("0.2")
+    """Longest time without an event or a pulse of the event camera."""
+    decision_timeout: PositiveSeconds = Decimal("0.1")
+    """Longest time from reading events to the decision on them."""
+
+
 class RigFile(StrictModel):
     """A rig file."""
 
@@ -152,6 +170,9 @@ class RigFile(StrictModel):
     """Further devices, each under the name of its stream: a second event camera, a thermometer."""
     twin: TwinRecord | None = None
     """How the simulated scene was fitted to a pilot; written by `sliplab calibrate scene`."""
+    reflex: ReflexSettings | None = None
+    """Safe state of reflexes; left out, a failure stops the arm and moves it clear, as in any
+    trial."""
 
     @field_validator("cameras")
     @classmethod
@@ -248,6 +269,32 @@ class RigFile(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _safe_state_can_be_reached(self) -> RigFile:
+        wanted, allowed = self.reflex, self.gripper_range
+        if wanted is None:
+            return self
+        if wanted.safe_state == "grip":
+            if allowed is None:
+                text = "needs a gripper, and this rig has none; write safe_state: stop"
+                raise KeyedError("reflex.safe_state", "grip", text)
+            if wanted.grip is None:
+                text = "is needed by safe_state: grip, such as 0.4 mm"
+                raise KeyedError("reflex.grip", None, text)
+        if wanted.force is not None:
+            if allowed is None:
+                text = "needs a gripper, and this rig has none; leave it out"
+                raise KeyedError("reflex.force", f"{wanted.force} N", text)
+            low, high = allowed.force_n
+            if not low <= wanted.force <= high:
+                text = f"must be from {low:g} to {high:g} N, which the gripper can be set to"
+                raise KeyedError("reflex.force", f"{wanted.force} N", text)
+        block_ms = 0 if self.mock is None else self.mock.event_camera.block_ms
+        if wanted.stream_timeout * 1000 <= block_ms:
+            text = f"must be over {block_ms} ms, the camera's blocks"
+            raise KeyedError("reflex.stream_timeout", f"{wanted.stream_timeout} s", text)
+        return self
+
+    @model_validator(mode="after")
     def _poll_is_short(self) -> RigFile:
         if self.poll > 1:
             raise KeyedError("poll", self.poll, "must be at most 1 s: a stop waits that long")
@@ -322,6 +369,23 @@ class RigFile(StrictModel):
         if self.driver == "mock":
             return self.scene.force is not None
         return self.devices is not None and self.devices.force_sensor is not None
+
+    @property
+    def gripper_range(self) -> GripperRange | None:
+        """Values that the gripper's commands may have; None without a gripper."""
+        if self.driver != "mock":
+            return None
+        made = self.scene.gripper
+        if made is None:
+            return None
+        return GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
+
+    @property
+    def grip_opening_mm(self) -> float | None:
+        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
+        if self.driver != "mock" or self.scene.gripper is None:
+            return None
+        return self.scene.gripper.opening_mm
 
     def drivers(self) -> Iterator[tuple[str, Driver[Any], Any]]:
         """Return the part in the rig, driver and settings of every device, the arm first."""

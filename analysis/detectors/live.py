@@ -269,7 +269,7 @@ class LiveDetector:
         back_us: int = BACK_US,
     ) -> None:
         self._counts, self._windows = counts, windows
-        self._rule = StepRule(detection)
+        self._rule, self._smoothing = StepRule(detection), detection.smoothing
         self._geometry = (width, height, centre_px)
         self._length_us = windows.length_ms * 1000
         self._stride_us = self._length_us if stride_us is None else stride_us
@@ -297,6 +297,11 @@ class LiveDetector:
     def origin_us(self) -> int | None:
         """Start of the first window; None before the first event or time."""
         return None if self._starts is None else self._starts(0)
+
+    @property
+    def span_us(self) -> int:
+        """Span of the windows that a decision rests on."""
+        return self._length_us + (self._smoothing - 1) * self._stride_us
 
     @property
     def open_windows(self) -> int:

@@ -33,7 +33,8 @@ def detect(
     reflex: Annotated[
         str | None,
         typer.Option(
-            "--reflex", help="Reaction to incipient slip: stop, or press:MM. Needs --protocol."
+            "--reflex",
+            help="Reaction to incipient slip: stop, press:MM or grip:MM. Needs --protocol.",
         ),
     ] = None,
     hold: Annotated[
@@ -120,6 +121,12 @@ def _shown(result: DetectSummary) -> dict[str, str | None]:
             done = (
                 f"{reflex['kind']} in the {reflex['phase']}, arm at rest after "
                 f"{reflex['stop_ms']:.1f} ms, depth {reflex['depth_mm']:.2f} mm"
+            )
+            parts = reflex["reaction_ms"]
+            found[f"reaction, ms ({clock} time, network real)"] = (
+                f"{parts['total']:.1f}: window {parts['window']:.0f}, sensor "
+                f"{parts['sensor']:.1f}, network {parts['network']:.1f}, command "
+                f"{parts['command']:.1f}, actuator {parts['actuator']:.1f}"
             )
         found["reflex"] = done
     return found

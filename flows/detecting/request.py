@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
+from sliplab.flows.detecting.sink import Timeouts
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.program import ACTING, Move, Program
 from sliplab.protocols.settings import AnalysisSettings, Detection
@@ -28,6 +29,7 @@ class DetectRequest:
     """A requested live detection, checked by `make_detect_request`.
 
     Attributes:
+        safe: reaction when slip cannot be detected any more, where a reflex is asked for.
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until somebody ends it.
     """
@@ -40,9 +42,18 @@ class DetectRequest:
     plan: Plan | None = None
     trial: Trial | None = None
     reflex: Reflex | None = None
+    safe: Reflex | None = None
     seconds: float | None = None
     stride_ms: float | None = None
     poll_s: float = POLL_S
+
+    @property
+    def timeouts(self) -> Timeouts | None:
+        """When slip counts as not detectable; None without a safe state."""
+        said = self.rig.reflex
+        if self.safe is None or said is None:
+            return None
+        return Timeouts(round(said.stream_timeout * 10**9), round(said.decision_timeout * 10**9))
 
     @property
     def simulated(self) -> str:
@@ -109,6 +120,7 @@ def make_detect_request(
         plan=plan,
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
+        safe=None if reflex is None else make_safe_state(file, plan),
     )
 
 
@@ -148,38 +160,84 @@ def choose_trial(plan: Plan, condition: str | None) -> Trial:
 
 
 def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: float) -> Reflex:
-    """Parse ``stop`` or ``press:MM``, and check it against the limits of protocol and rig.
+    """Parse ``stop``, ``press:MM`` or ``grip:MM``, and check it against protocol and rig.
 
     Raises:
-        InputError: another word, no motion that it could cut short, or a depth over a limit.
+        InputError: another word, no motion that it could cut short, no gripper, or a depth over a
+            limit.
     """
     program = plan.program(trial)
     if not any(isinstance(step, Move) and step.phase in ACTING for step in program.steps):
         raise InputError("--reflex", "", text, "the trial has no motion in contact to cut short")
-    limits = plan.protocol.collection.limits
-    deepest = min(float(limits.depth), float(file.limits.depth))
+    deepest = deepest_mm(file, plan)
     kind, _, value = text.partition(":")
     if text == "stop":
         return Reflex("stop", deepest, hold_s=hold_s)
     try:
-        press_mm = float(value.removesuffix("mm")) if kind == "press" else float("nan")
+        deeper_mm = float(value.removesuffix("mm")) if kind in ("press", "grip") else float("nan")
     except ValueError:
-        press_mm = float("nan")
-    if not 0 < press_mm < float("inf"):
-        raise InputError("--reflex", "", text, "must be 'stop' or 'press:MM', such as press:0.4")
-    # a retraction gets shallower throughout, and a continued press is cut off at the limit
+        deeper_mm = float("nan")
+    if not 0 < deeper_mm < float("inf"):
+        right = "must be 'stop', 'press:MM' or 'grip:MM', such as press:0.4"
+        raise InputError("--reflex", "", text, right)
+    # a retraction gets shallower throughout, and what goes on is cut off at the limit
     depth = _shallowest_mm(program)
-    if depth + press_mm > deepest + 1e-9:
+    if depth + deeper_mm > deepest + 1e-9:
+        limits = plan.protocol.collection.limits
         origin = "the protocol's" if deepest == float(limits.depth) else f"the rig {file.name}'s"
         raise InputError(
             "--reflex",
             "",
             text,
-            f"would reach {depth + press_mm:g} mm; {origin} limits.depth is {deepest:g} mm, and "
-            f"the trial's motion ends at {depth:g} mm: at most press:{deepest - depth:g}",
+            f"would reach {depth + deeper_mm:g} mm; {origin} limits.depth is {deepest:g} mm, and "
+            f"the trial's motion ends at {depth:g} mm: at most {kind}:{deepest - depth:g}",
         )
+    if kind == "grip":
+        return _grip(text, file, deeper_mm, deepest, hold_s)
     speeds = [s.speed_mm_s for s in program.steps if isinstance(s, Move) and s.phase == "press"]
-    return Reflex("press", deepest, press_mm, speeds[0], hold_s)
+    return Reflex("press", deepest, deeper_mm, speeds[0], hold_s=hold_s)
+
+
+def make_safe_state(file: RigFile, plan: Plan) -> Reflex | None:
+    """Return the reaction when slip cannot be detected any more, if the rig file names one."""
+    wanted = file.reflex
+    if wanted is None:
+        return None
+    deepest = deepest_mm(file, plan)
+    if wanted.safe_state == "stop":
+        return Reflex("stop", deepest)
+    assert wanted.grip is not None  # the rig file was checked
+    return _grip("", file, float(wanted.grip), deepest, 0.0)
+
+
+def deepest_mm(file: RigFile, plan: Plan) -> float:
+    """Return the largest depth that protocol and rig allow."""
+    return min(float(plan.protocol.collection.limits.depth), float(file.limits.depth))
+
+
+def _grip(text: str, file: RigFile, deeper_mm: float, deepest: float, hold_s: float) -> Reflex:
+    """Return a tightening of the gripper at its largest speed.
+
+    Raises:
+        InputError: there is no gripper, or it cannot move by so little.
+    """
+    allowed = file.gripper_range
+    if allowed is None:
+        right = f"needs a gripper, and the rig {file.name} has none: use stop or press:MM"
+        raise InputError("--reflex", "", text, right)
+    if deeper_mm < allowed.step_mm:
+        right = f"is less than the gripper's step: at least grip:{allowed.step_mm:.2g}"
+        raise InputError("--reflex", "", text, right)
+    said = None if file.reflex is None else file.reflex.force
+    force_n = allowed.force_n[0] if said is None else float(said)
+    most = file.limits.force
+    if most is not None and force_n > most:
+        right = (
+            f"closes with {force_n:g} N, and the rig {file.name}'s limits.force is {most:g} N: set "
+            "reflex.force to less, or use stop or press:MM"
+        )
+        raise InputError("--reflex", "", text, right)
+    return Reflex("grip", deepest, deeper_mm, allowed.speed_mm_s[1], force_n, hold_s)
 
 
 def _shallowest_mm(program: Program) -> float:

@@ -10,12 +10,14 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
 
 from sliplab.analysis.detectors.live import (
     UNDECIDED,
+    ClockFellBack,
     Decision,
     DecisionJson,
     FreshestArrival,
@@ -23,8 +25,9 @@ from sliplab.analysis.detectors.live import (
     TimedDecision,
 )
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
+from sliplab.flows.detecting.network_process import NetworkLost
 from sliplab.rigs.core.capabilities import Clock
-from sliplab.rigs.core.reacting import SlipDetected
+from sliplab.rigs.core.reacting import Evidence, SenseLost, SlipDetected
 from sliplab.storage.streams import EventChunk, NullSink, PulseChunk
 
 PATIENCE_US = 200_000
@@ -32,6 +35,14 @@ PATIENCE_US = 200_000
 here: events that were sent earlier must have arrived by then."""
 KEPT = 100_000
 """Latencies that are kept for the summary: the last 55 minutes of 30 ms windows."""
+
+
+@dataclass(frozen=True)
+class Timeouts:
+    """Longest times without data of the camera, and from events to a decision, rig's clock, ns."""
+
+    stream_ns: int
+    decision_ns: int
 
 
 class Times(TypedDict):
@@ -73,6 +84,7 @@ class DetectSink(NullSink):
         clock: the rig's, by which arrivals are dated.
         on_decision: called with each decision as soon as it is made.
         every_poll: called each time that the streams were read.
+        timeouts: beyond which slip cannot be detected in time; None: it is never said.
     """
 
     def __init__(
@@ -81,9 +93,13 @@ class DetectSink(NullSink):
         clock: Clock,
         on_decision: Callable[[TimedDecision], None],
         every_poll: Callable[[], None] = lambda: None,
+        timeouts: Timeouts | None = None,
     ) -> None:
-        self.detector, self.armed, self.phase = detector, False, ""
+        self.detector, self.phase = detector, ""
+        self.armed = self.guarded = False
         self._clock, self._on_decision, self._every_poll = clock, on_decision, every_poll
+        self._timeouts = timeouts
+        self._alive_ns: int | None = None
         self._camera = FreshestArrival()
         self._latency: deque[float] = deque(maxlen=KEPT)
         self._compute: deque[float] = deque(maxlen=KEPT)
@@ -100,32 +116,60 @@ class DetectSink(NullSink):
 
         Raises:
             SlipDetected: incipient slip was detected while `armed`; the whole read is reported.
+            SenseLost: the decisions came later than `timeouts` allow.
             ClockFellBack: the camera's clock is another one.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
         if len(chunk):
             self.events += len(chunk)
+            self._alive_ns = here_ns
             self._camera.observe(int(chunk.t_us.max()), here_ns)
-        self._report(self.detector.push(chunk), here_ns, began_ns)
+        self._report(self._decided(lambda: self.detector.push(chunk)), here_ns, began_ns)
 
     def add_event_pulses(self, chunk: PulseChunk) -> None:
         """Advance the detector to the camera's time, which pulses show without events.
 
         Raises:
             SlipDetected: as `add_events`.
+            SenseLost: as `add_events`; or neither events nor pulses came for too long.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
+        if len(chunk) or self._alive_ns is None:
+            self._alive_ns = here_ns
+        silent_ns = here_ns - self._alive_ns
+        if self.guarded and self._timeouts is not None and silent_ns > self._timeouts.stream_ns:
+            raise SenseLost(
+                f"event camera: neither events nor pulses for {silent_ns / 1e6:.0f} ms, and "
+                f"reflex.stream_timeout is {self._timeouts.stream_ns / 1e6:g} ms"
+            )
         if len(chunk):
             self._camera.observe(int(chunk.t_ns.max()) // 1000, here_ns)
         now_us = self._camera.camera_us(here_ns)
         if now_us is not None:
             # the first time that is known begins the windows; from then on events may be late
             late_us = 0 if self.detector.now_us is None else PATIENCE_US
-            self._report(self.detector.advance(now_us - late_us), here_ns, began_ns)
+            made = self._decided(lambda: self.detector.advance(now_us - late_us))
+            self._report(made, here_ns, began_ns)
         self._every_poll()
 
+    def _decided(self, work: Callable[[], list[Decision]]) -> list[Decision]:
+        """Return the decisions of `work`; a failing detector is a lost sense while `guarded`."""
+        try:
+            return work()
+        except (ClockFellBack, NetworkLost) as error:
+            if not self.guarded:
+                raise
+            device = "event camera" if isinstance(error, ClockFellBack) else "network"
+            raise SenseLost(f"{device}: {error}") from error
+
     def _report(self, made: list[Decision], here_ns: int, began_ns: int) -> None:
-        slip = False
+        slip: Evidence | None = None
+        late_ns = self._clock.now_ns() - here_ns if made else 0
+        if self.guarded and self._timeouts is not None and late_ns > self._timeouts.decision_ns:
+            raise SenseLost(
+                f"network: a decision took {late_ns / 1e6:.0f} ms, and reflex.decision_timeout is "
+                f"{self._timeouts.decision_ns / 1e6:g} ms"
+            )
         for decision in made:
             compute_ms = (decision.decided_ns - began_ns) / 1e6
             latency_ms = None
@@ -144,11 +188,17 @@ class DetectSink(NullSink):
             self._states[timed.state] += 1
             if decision.onset is not None:
                 self.onsets[decision.onset] = timed.as_json()
-            slip |= decision.valid_class == INCIPIENT
+            if slip is None and decision.valid_class == INCIPIENT:
+                slip = self._evidence(decision, here_ns, compute_ms)
             self._on_decision(timed)
-        if slip and self.armed:
+        if slip is not None and self.armed:
             self.armed = False
-            raise SlipDetected
+            raise SlipDetected(slip)
+
+    def _evidence(self, decision: Decision, here_ns: int, compute_ms: float) -> Evidence:
+        ended_ns = self._camera.host_ns(decision.end_us)
+        assert ended_ns is not None
+        return Evidence(self.detector.span_us / 1e3, (here_ns - ended_ns) / 1e6, compute_ms)
 
     def summary(self) -> DetectNumbers:
         """Return the numbers of events, windows, states and latencies, and the onsets."""

@@ -332,6 +332,65 @@ class ScalarSensor(Protocol):
         """Close the connection."""
 
 
+@dataclass(frozen=True)
+class GripperRange:
+    """Least and largest values that a gripper's commands may have.
+
+    Attributes:
+        step_mm: smallest step of the opening; 0 where every opening can be reached.
+    """
+
+    opening_mm: tuple[float, float]
+    speed_mm_s: tuple[float, float]
+    force_n: tuple[float, float]
+    step_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class GripperState:
+    """What a gripper reports.
+
+    Attributes:
+        moving: fingers have not come to the end of the last move.
+        stalled: they ended it at an object, or at the force limit.
+    """
+
+    opening_mm: float
+    moving: bool
+    stalled: bool
+
+
+@runtime_checkable
+class Gripper(Protocol):
+    """A gripper with parallel fingers, which press the sensor on the object as they close."""
+
+    range: GripperRange
+
+    def connect(self) -> None:
+        """Open the connection, and check that the gripper is active; bounded. Raises RigError."""
+
+    def state(self) -> GripperState:
+        """Return opening and motion. Raises RigError where it reports a fault, or no answer."""
+
+    def move(self, opening_mm: float, speed_mm_s: float, force_n: float) -> None:
+        """Start to move the fingers to an opening and return at once.
+
+        An opening between two steps is rounded to the wider one: never is more closed than asked.
+
+        Args:
+            force_n: at which closing fingers stall.
+
+        Raises:
+            RigError: a value is out of range, and nothing is sent; or no connection.
+        """
+
+    def stop(self) -> None:
+        """Stop the fingers where they are; safe to call at any time and more than once."""
+
+    def close(self) -> None:
+        """Close the connection; the fingers stay, and hold what they hold."""
+
+
 @runtime_checkable
 class Plate(Protocol):
     """The plate on its vertical slider (gravity and disturbance trials)."""

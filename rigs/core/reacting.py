@@ -1,8 +1,12 @@
-"""One trial's motion with a reflex: when slip is detected, the arm stops, or presses deeper.
+"""One trial's motion with a reflex: at slip the arm stops, presses deeper, or the gripper tightens.
 
 `Rig.run_trial` records trials; here nothing is recorded. The watcher that reads the events triggers
 the reflex by raising `SlipDetected` while the arm moves in contact. The arm is stopped before
 anything else. A failure ends as in any trial: the arm is stopped, and moved clear if healthy.
+
+Where slip can no longer be detected (no events, no network, a decision too late) the rig goes to
+its safe state: the arm stops, or the gripper tightens too, and both stay, because an arm that moves
+clear drops what it holds.
 """
 
 from __future__ import annotations
@@ -11,17 +15,44 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from sliplab.protocols.program import ACTING, Move, Position, Program, Step
-from sliplab.rigs.core.capabilities import ArmFault
+from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.rigs.core.force_watch import Course
-from sliplab.rigs.core.rig import Rig, arm_fault, nuisances_of
+from sliplab.rigs.core.rig import Rig, StaysInContact, arm_fault, nuisances_of
 from sliplab.storage.streams import Sink
 
 REST_S = 2.0
 """Timeout for a stopped arm to come to rest, s."""
+GRIPPER = "gripper"
+_SENSES = ("event camera", GRIPPER)
+"""Devices whose failure ends in the safe state; after that of another the arm moves clear."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Times of a detection, up to the decision, ms.
+
+    Attributes:
+        window_ms: span of the events that the decision rests on.
+        sensor_ms: from the end of that span until its events were read, on the rig's clock; the
+            freshest arrival counts as immediate.
+        network_ms: from then to the decision: windows, network and rule, in real time.
+    """
+
+    window_ms: float
+    sensor_ms: float
+    network_ms: float
 
 
 class SlipDetected(Exception):
     """A watcher detected slip and triggers the reflex; raised only while it is armed."""
+
+    def __init__(self, evidence: Evidence | None = None) -> None:
+        super().__init__("slip")
+        self.evidence = evidence
+
+
+class SenseLost(Exception):
+    """A watcher cannot detect slip any more; the text says why."""
 
 
 class Watcher(Sink, Protocol):
@@ -29,6 +60,8 @@ class Watcher(Sink, Protocol):
 
     armed: bool
     """True while it may raise `SlipDetected`; set by `run_watched`."""
+    guarded: bool
+    """True while it may raise `SenseLost`; set by `run_watched`."""
 
     def step(self, phase: str, acting: bool) -> None:
         """Receive the start of a step of the program."""
@@ -36,18 +69,23 @@ class Watcher(Sink, Protocol):
 
 @dataclass(frozen=True)
 class Reflex:
-    """The arm's reaction to detected slip.
+    """The rig's reaction to detected slip.
 
     Attributes:
-        kind: ``stop``; or ``press``: stop, then press deeper by `press_mm` at `speed_mm_s`.
-        deepest_mm: largest depth of a reflex.
+        kind: ``stop``: the arm stops. ``press``: it stops, then presses deeper. ``grip``: it stops,
+            and the gripper's fingers close at once.
+        deepest_mm: largest depth in contact: the arm's, and what the fingers add.
+        deeper_mm: by how much `press` and `grip` go deeper.
+        speed_mm_s: of the arm that presses, or of the fingers' opening.
+        force_n: force at which closing fingers stall.
         hold_s: time for which the arm then holds its position and the stream is monitored.
     """
 
-    kind: Literal["stop", "press"]
+    kind: Literal["stop", "press", "grip"]
     deepest_mm: float
-    press_mm: float = 0.0
+    deeper_mm: float = 0.0
     speed_mm_s: float = 1.0
+    force_n: float = 0.0
     hold_s: float = 1.0
 
 
@@ -58,18 +96,53 @@ class Reaction:
     Attributes:
         phase: the interrupted phase.
         stop_ms: time from the detection until the arm was at rest.
+        command_ms: time from the detection until arm and gripper had their commands.
+        actuator_ms: time from there until all was done: arm at rest, pressed, fingers at rest.
         stopped_mm: position at which it came to rest: x, y, depth in plate coordinates.
-        depth_mm: final depth.
+        depth_mm: final depth in contact: the arm's, and what the fingers add.
+        closed_mm: by how much the fingers closed.
+        stalled: they ended at their force.
+        evidence: times of the detection, where the watcher measures them.
     """
 
     phase: str
     stop_ms: float
+    command_ms: float
+    actuator_ms: float
     stopped_mm: tuple[float, float, float]
     depth_mm: float
+    closed_mm: float = 0.0
+    stalled: bool = False
+    evidence: Evidence | None = None
+
+
+class SafeState(StaysInContact):
+    """Slip could not be detected any more, and the rig went to its safe state.
+
+    Attributes:
+        cause: why slip could not be detected.
+        reaction: what was done.
+    """
+
+    def __init__(self, cause: str, kind: str, reaction: Reaction) -> None:
+        took_ms = reaction.command_ms + reaction.actuator_ms
+        super().__init__(
+            "reflex",
+            f"{cause}; the safe state '{kind}' was reached {took_ms:.0f} ms later in the phase "
+            f"'{reaction.phase}', and the arm stays in contact: secure the object, then move the "
+            "arm clear",
+        )
+        self.cause, self.reaction = cause, reaction
 
 
 def run_watched(
-    rig: Rig, program: Program, watcher: Watcher, seed: int, rate_hz: int, reflex: Reflex | None
+    rig: Rig,
+    program: Program,
+    watcher: Watcher,
+    seed: int,
+    rate_hz: int,
+    reflex: Reflex | None,
+    safe: Reflex | None = None,
 ) -> Reaction | None:
     """Run a program while `watcher` reads the streams of its recorded steps.
 
@@ -79,11 +152,13 @@ def run_watched(
     Args:
         seed: seed of a simulated trial's randomness.
         reflex: None to monitor slip without a reaction.
+        safe: reaction when slip can no longer be detected; None: a failure as any other.
 
     Returns:
         the outcome of the reflex; None if there was none.
 
     Raises:
+        SafeState: slip can no longer be detected.
         StopRequested: as `Rig.run_trial`.
         RigError: anything failed; the arm is stopped.
     """
@@ -95,8 +170,9 @@ def run_watched(
             step = course.step(planned)
             if step.recorded and not streaming:
                 rig.start_streams(seed, rate_hz, False, with_further=False)
-                streaming = True
+                streaming, watcher.guarded = True, safe is not None
             if streaming and not step.recorded:
+                watcher.guarded = False
                 rig.stop_streams(watcher, False)
                 streaming = False
             if reaction is not None:
@@ -105,39 +181,114 @@ def run_watched(
             watcher.step(step.phase, acting)
             watcher.armed = acting
             try:
-                rig.take_step(index, step, course.at, watcher if streaming else None)
-                course.taken(step, rig.position)
-            except SlipDetected:
-                assert reflex is not None
-                reaction = _react(rig, step.phase, reflex, watcher)
-                course.at = rig.position()
+                made = _take(rig, index, step, course.at, watcher, reflex, streaming)
+            except (SenseLost, RigError) as lost:
+                ends = isinstance(lost, RigError) and lost.device not in _SENSES
+                if ends or not streaming or safe is None:
+                    raise
+                raise _go_safe(rig, step.phase, safe, watcher, str(lost)) from lost
             finally:
                 watcher.armed = False
+            if made is None:
+                course.taken(step, rig.position)
+            else:
+                reaction, course.at = made, rig.position()
     return reaction
 
 
-def _react(rig: Rig, phase: str, reflex: Reflex, watcher: Watcher) -> Reaction:
+def _take(
+    rig: Rig,
+    index: int,
+    step: Step,
+    at: Position,
+    watcher: Watcher,
+    reflex: Reflex | None,
+    streaming: bool,
+) -> Reaction | None:
+    """Carry out a step, or as much of it as a reflex leaves, and the reflex."""
+    try:
+        rig.take_step(index, step, at, watcher if streaming else None)
+    except SlipDetected as slip:
+        assert reflex is not None
+        made = _react(rig, step.phase, reflex, watcher, watcher, slip.evidence)
+        rig.wait(reflex.hold_s, watcher)
+        return made
+    return None
+
+
+def _go_safe(rig: Rig, phase: str, safe: Reflex, watcher: Watcher, cause: str) -> SafeState:
+    """Go to the safe state; a gripper that fails leaves the arm stopped all the same."""
+    try:
+        made = _react(rig, phase, safe, watcher, None, None)
+    except RigError as fault:
+        if fault.device != GRIPPER:
+            raise
+        cause, safe = f"{cause}; {fault}", replace(safe, kind="stop")
+        made = _react(rig, phase, safe, watcher, None, None)
+    return SafeState(cause, safe.kind, made)
+
+
+def _react(
+    rig: Rig,
+    phase: str,
+    reflex: Reflex,
+    watcher: Watcher,
+    sink: Sink | None,
+    evidence: Evidence | None,
+) -> Reaction:
+    """Carry out a reflex; streams are read meanwhile where they have a sink."""
     began_ns = rig.clock.now_ns()
-    rig.arm.stop()
+
+    def passed_ms() -> float:
+        return (rig.clock.now_ns() - began_ns) / 1e6
+
     watcher.armed = False
+    rig.arm.stop()
+    closed_mm = _grip(rig, reflex) if reflex.kind == "grip" else 0.0
+    command_ms = passed_ms()
     watcher.step("reflex", False)
-    deadline = began_ns + int(REST_S * 1e9)
     while not (progress := rig.arm.progress()).done:
-        if rig.clock.now_ns() > deadline:
+        if passed_ms() > REST_S * 1e3:
             raise ArmFault("arm", f"is still moving {REST_S:g} s after the stop command")
         rig.wait(min(rig.poll_s, 0.002))
     if not progress.state.healthy:
         raise arm_fault(progress.state, phase)
-    stop_ms = (rig.clock.now_ns() - began_ns) / 1e6
-    here = at = rig.position()
+    stop_ms = passed_ms()
+    here = rig.position()
+    stalled = False
     if reflex.kind == "press":
         # measured depths scatter about the command; the limit applies all the same
-        depth = min(at.depth_mm + reflex.press_mm, reflex.deepest_mm)
-        if depth > at.depth_mm:
-            at = Position(at.x_mm, at.y_mm, depth)
-            rig.move(Move("reflex", at, reflex.speed_mm_s), here, watcher)
-    rig.wait(reflex.hold_s, watcher)
-    return Reaction(phase, stop_ms, (here.x_mm, here.y_mm, here.depth_mm), rig.position().depth_mm)
+        depth = min(here.depth_mm + reflex.deeper_mm, reflex.deepest_mm)
+        if depth > here.depth_mm:
+            deep = Position(here.x_mm, here.y_mm, depth)
+            rig.move(Move("reflex", deep, reflex.speed_mm_s), here, sink)
+    if rig.gripper is not None and closed_mm:
+        state = rig.await_fingers(rig.gripper, sink)
+        closed_mm, stalled = rig.grip_opening_mm - state.opening_mm, state.stalled
+    return Reaction(
+        phase,
+        stop_ms,
+        command_ms,
+        passed_ms() - command_ms,
+        (here.x_mm, here.y_mm, here.depth_mm),
+        rig.position().depth_mm + closed_mm,
+        closed_mm,
+        stalled,
+        evidence,
+    )
+
+
+def _grip(rig: Rig, reflex: Reflex) -> float:
+    """Start to close the fingers, and return by how much, mm; not beyond the deepest place."""
+    if rig.gripper is None:
+        raise RigError(GRIPPER, "this rig has none to tighten")
+    # the arm gets no deeper while it stops: a reflex interrupts slides and retractions only
+    room_mm = reflex.deepest_mm - rig.position().depth_mm
+    closed_mm = min(reflex.deeper_mm, room_mm)
+    if closed_mm <= 0:
+        return 0.0
+    rig.gripper.move(rig.grip_opening_mm - closed_mm, reflex.speed_mm_s, reflex.force_n)
+    return closed_mm
 
 
 def _from_current_position(step: Step, at: Position) -> Step:

@@ -35,6 +35,8 @@ from sliplab.rigs.core.capabilities import (
     EventCamera,
     ForceSensor,
     FrameCamera,
+    Gripper,
+    GripperState,
     Operator,
     Plate,
     RigError,
@@ -55,6 +57,11 @@ from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """Default time for which cameras are read after the last pulse."""
+FINGERS_S = 10.0
+"""Timeout for the fingers to end a move, s; the slowest takes 4.3 s for the whole stroke."""
+FINGERS_MM = 0.01
+"""Difference from an opening below which the fingers are left there."""
+FINGERS_POLL_S = 0.002
 FORCE = "force"
 """Name of the force sensor's stream."""
 _MOVE_GRACE_S = 10.0
@@ -64,6 +71,10 @@ _STOP_RETRIES = 10
 
 class StopRequested(Exception):
     """A stop of the rig was requested; the arm has been stopped."""
+
+
+class StaysInContact(RigError):
+    """A failure after which the arm is stopped, and must not be moved clear."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +111,9 @@ class Rig:
         force: a force/torque sensor, or None.
         force_limit_n: largest force on the plate, in any direction, before the arm is stopped.
         further: devices with streams of their own names.
+        gripper: whose fingers hold the sensor, or None.
+        grip_opening_mm: opening at which the arm's depth is the depth in contact; every trial
+            begins with it.
         simulation: the world behind a simulated rig, None on a real one.
         on_close: called last when the rig is closed.
     """
@@ -121,6 +135,8 @@ class Rig:
     force: ForceSensor | None = None
     force_limit_n: float | None = None
     further: tuple[FurtherStream, ...] = ()
+    gripper: Gripper | None = None
+    grip_opening_mm: float = 0.0
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     on_close: tuple[Callable[[], None], ...] = ()
@@ -163,7 +179,9 @@ class Rig:
 
     def _devices(self) -> list[Any]:
         """Return arm, cameras, sync box and sensors, as far as the rig has them, the arm first."""
-        found = (self.arm, self.event_camera, self.frame_camera, self.sync, self.force)
+        found = (
+            self.arm, self.event_camera, self.frame_camera, self.sync, self.force, self.gripper,
+        )  # fmt: skip
         return [*(device for device in found if device is not None), *self.further]
 
     def connect(self) -> None:
@@ -176,6 +194,8 @@ class Rig:
         self.arm.connect()
         if self.force is not None:
             self.force.connect()
+        if self.gripper is not None:
+            self.gripper.connect()
         for device in self.further:
             device.connect()
 
@@ -597,12 +617,38 @@ class Rig:
             self.twist(Twist("untwist", here, UNTWIST_DEG_S), replace(here, twist_deg=left))
             self._twisted = False
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
+        if self.gripper is not None:
+            self._open_fingers(self.gripper)
         if self.simulation is not None:
             self.simulation.begin_trial(seed, nuisances)
         if self.force is not None and self.force.zeroing == "trial":
             self.force.zero()
         for device in self.further:
             device.prepare()
+
+    def _open_fingers(self, gripper: Gripper) -> None:
+        """Move the fingers to the opening with which a trial begins, and wait for it."""
+        opening_mm, allowed = self.grip_opening_mm, gripper.range
+        state = gripper.state()
+        if state.moving or abs(state.opening_mm - opening_mm) > max(allowed.step_mm, FINGERS_MM):
+            gripper.move(opening_mm, allowed.speed_mm_s[0], allowed.force_n[0])
+            self.await_fingers(gripper)
+
+    def await_fingers(self, gripper: Gripper, sink: Sink | None = None) -> GripperState:
+        """Wait for the fingers to end their move; bounded.
+
+        Raises:
+            RigError: they still move after `FINGERS_S`, or the gripper is at fault.
+            StopRequested: as `wait`.
+        """
+        deadline = self.clock.now_ns() + round(FINGERS_S * 1e9)
+        while (state := gripper.state()).moving:
+            if self.clock.now_ns() > deadline:
+                raise RigError(
+                    "gripper", f"still moves {FINGERS_S:g} s after its command: look what holds it"
+                )
+            self.wait(min(self.poll_s, FINGERS_POLL_S), sink)
+        return state
 
     def _segment(
         self, times: StepTimes, begin: Position, end: Position, speed: float
@@ -628,7 +674,9 @@ class Rig:
             self._forces, self._reading = None, ()
             fault: RigError | None = None
             try:
-                fault = self._stop_arm() or self._retract(clear)
+                fault = self._stop_arm()
+                if fault is None and not isinstance(error, StaysInContact):
+                    fault = self._retract(clear)
             finally:
                 for device in self._devices()[1:]:
                     with suppress(Exception):
@@ -638,7 +686,8 @@ class Rig:
                 if isinstance(error, RigError) and error.device == "arm":
                     fault = ArmFault("arm", f"{_text(error)}. It {_text(fault)}")
                 raise self._with_plate_warning(fault) from error
-            if self._plate_uncaught and isinstance(error, RigError):
+            uncaught = self._plate_uncaught and not isinstance(error, StaysInContact)
+            if uncaught and isinstance(error, RigError):
                 raise self._with_plate_warning(error) from error
             raise
 

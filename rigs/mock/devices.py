@@ -13,10 +13,11 @@ from sliplab.protocols.timing import FrameGrade, StreamTiming, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull, StreamGone
+from sliplab.rigs.mock.fault_settings import CabledDevice, DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.further_settings import Further, FurtherEventCamera, FurtherFrameCamera
+from sliplab.rigs.mock.gripper import MockGripper
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator, VirtualClock
 from sliplab.rigs.mock.settings import EventCamera, ForceSensor, FrameCamera, MockSettings
@@ -53,7 +54,7 @@ class Guarded:
         return call
 
 
-def on_cable(device: T, name: Device, world: World) -> T:
+def on_cable(device: T, name: CabledDevice, world: World) -> T:
     """Wrap `device` so that calls fail while a fault disconnects it; unchanged without faults."""
     if not any(isinstance(f, DeviceGone) and f.device == name for f in world.settings.faults):
         return device
@@ -108,6 +109,7 @@ class MockDevices:
     world: World
     timing: Timing
     force: MockForceSensor | None = None
+    gripper: MockGripper | None = None
     further: Mapping[str, FurtherDevice] = field(default_factory=dict)
     """Further devices by the names of their streams."""
 
@@ -166,6 +168,9 @@ def build_mock(
     force = None
     if settings.force is not None:
         force = on_cable(MockForceSensor(world, settings.force), "force_sensor", world)
+    gripper = None
+    if settings.gripper is not None:
+        gripper = on_cable(MockGripper(world, settings.gripper), "gripper", world)
     return MockDevices(
         clock=VirtualClock(world),
         arm=on_cable(arm, "arm", world),
@@ -177,6 +182,7 @@ def build_mock(
         world=world,
         timing=timing,
         force=force,
+        gripper=gripper,
         further={
             name: on_stream_cable(_further(name, *one, world, sync), name, world)
             for name, one in (further or {}).items()

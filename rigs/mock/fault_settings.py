@@ -18,6 +18,7 @@ Papilla = Annotated[int, Field(ge=0, le=10_000)]
 Factor = Annotated[float, Field(gt=0, le=10)]
 PlateMm = Annotated[float, Field(ge=-1000, le=1000)]
 Device = Literal["arm", "event_camera", "frame_camera", "sync_box", "force_sensor"]
+CabledDevice = Literal["arm", "event_camera", "frame_camera", "sync_box", "force_sensor", "gripper"]
 RestartDevice = Literal["arm", "event_camera", "frame_camera"]
 PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
@@ -313,7 +314,7 @@ class DeviceGone(_TimedFault):
     """A device loses its power or its cable; every call fails."""
 
     kind: Literal["device_gone"]
-    device: Device
+    device: CabledDevice
     seconds: Seconds | None = None
     """Time until it answers again, permanent if left out. It returns switched on and idle."""
 

@@ -18,6 +18,7 @@ from sliplab.rigs.mock.fault_settings import (
     AnyFault,
     ArmProtectiveStop,
     ArmRamp,
+    CabledDevice,
     Device,
     DeviceGone,
     EventGap,
@@ -182,7 +183,7 @@ class FaultBook:
 
     # -- any device ------------------------------------------------------------------------
 
-    def gone(self, device: Device, now_ns: int) -> bool:
+    def gone(self, device: CabledDevice, now_ns: int) -> bool:
         """Return whether `device` has lost its power or its cable."""
         return any(
             fault.device == device and begin <= now_ns < end

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.program import PlateAction
+from sliplab.rigs.core.finger_motion import FingerMotion
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.history import History
 from sliplab.rigs.mock.settings import MockSettings
@@ -56,6 +57,7 @@ class Physics:
         sensor_at: Callable[[I64], F64],
         torn: Callable[[], Sequence[tuple[int, int]]] = tuple,
         spots: F64 | None = None,
+        fingers: FingerMotion | None = None,
         *,
         fine: bool = False,
     ) -> None:
@@ -65,9 +67,11 @@ class Physics:
             sensor_at: maps times (k,) to x, y, depth (mm) and slopes of depth, (k, 5).
             torn: papillae that tear off, with known true times, ns.
             spots: of `rigs.scene.springs.Springs`; left out, the plate is clean.
+            fingers: of a gripper, which stall where the normal force reaches their limit.
             fine: a row every millisecond at all times, since the sensor is shaken.
         """
         self._settings, self._sensor_at, self._torn = settings, sensor_at, torn
+        self._fingers = fingers
         self._off: set[int] = set()
         self.step_ns = FINE_NS if fine else settings.scene.step_ms * 1_000_000
         self.springs = springs_of(settings, skin, seed)
@@ -95,7 +99,7 @@ class Physics:
                 break
             last = min(last, first + (_CHUNK - 1) * step, self._tear_off(first, step))
             times = np.arange(first, last + 1, step, dtype=np.int64)
-            self._advance_over(np.concatenate([[self.track.end_ns], times]))
+            self._advance_by(np.concatenate([[self.track.end_ns], times]))
         if self.track.end_ns - self.track.begin_ns > 2 * KEPT_NS:
             self.track.forget(self.track.end_ns - KEPT_NS)
         return self.track.end_ns
@@ -118,7 +122,35 @@ class Physics:
         self.advance(now_ns)
         behind = np.arange(self.track.end_ns, now_ns + 1, FINE_NS, dtype=np.int64)
         if len(behind) > 1:
-            self._advance_over(behind)
+            self._advance_by(behind)
+
+    def _advance_by(self, t_ns: I64) -> None:
+        """Compute the rows after the last one, which is the first of `t_ns`."""
+        while len(t_ns) > 1 and self._stalls(int(t_ns[0]), int(t_ns[1]), int(t_ns[-1])):
+            self._advance_over(t_ns[:2])
+            t_ns = t_ns[1:]
+            if self.track.end_ns != t_ns[0]:  # the plate met its stop on the way
+                return
+        if len(t_ns) > 1:
+            self._advance_over(t_ns)
+
+    def _stalls(self, now_ns: int, next_ns: int, last_ns: int) -> bool:
+        """Stall fingers that would pass their force by `next_ns`; return whether they may later.
+
+        The force rises with depth by the stiffness of all tips, unrelaxed, at most.
+        """
+        fingers = self._fingers
+        force_n = None if fingers is None else fingers.closing_force_n(now_ns, last_ns)
+        if fingers is None or force_n is None:
+            return False
+        if fingers.closing_force_n(now_ns, next_ns) is not None:
+            depth = self._sensor_at(np.array([now_ns, next_ns], np.int64))[:, 2]
+            stiffness = float(self.springs.normal.sum()) * (1.0 + self.springs.law.maxwell)
+            rise_n = stiffness * float(depth[1] - depth[0])
+            left_n = max(force_n - float(self.tips.normal.sum()), 0.0)
+            if rise_n > left_n:
+                fingers.stall(now_ns + int(left_n / rise_n * (next_ns - now_ns)))
+        return True
 
     def _advance_over(self, t_ns: I64) -> None:
         count = len(t_ns) - 1

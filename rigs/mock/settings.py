@@ -336,6 +336,38 @@ class ForceSensor(StrictModel):
     """When the present reading becomes zero."""
 
 
+class Gripper(StrictModel):
+    """Fingers that press the sensor deeper into contact as they close.
+
+    The defaults are those of an adaptive parallel gripper with a stroke of 85 mm, as its maker
+    states them, but for acceleration and reaction, which are assumed; none was measured.
+    """
+
+    opening_mm: Positive = 40.0
+    """Opening at which the arm's depth is the depth in contact."""
+    range_mm: tuple[NonNegative, Positive] = (0.0, 85.0)
+    """Least and largest opening."""
+    speed_mm_s: tuple[Positive, Positive] = (20.0, 150.0)
+    """Least and largest speed of the opening."""
+    force_n: tuple[Positive, Positive] = (20.0, 235.0)
+    """Least and largest force at which closing fingers stall: normal force on the plate."""
+    acceleration_mm_s2: Positive = 1000.0
+    reaction_us: Annotated[int, Field(ge=0, le=1_000_000)] = 8000
+    """From a command to the beginning of its motion."""
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Gripper:
+        for name in ("range_mm", "speed_mm_s", "force_n"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise KeyedError(f"mock.gripper.{name}", [low, high], "must rise")
+        low, high = self.range_mm
+        if not low < self.opening_mm <= high:
+            text = f"must be above {low:g} and at most {high:g}, as range_mm says"
+            raise KeyedError("mock.gripper.opening_mm", self.opening_mm, text)
+        return self
+
+
 class Clocks(StrictModel):
     """Errors of the devices' clocks. Drifts are a property of the rig."""
 
@@ -380,6 +412,8 @@ class MockSettings(StrictModel):
     arm: Arm = Arm()
     force: ForceSensor | None = None
     """Left out, the rig has no force sensor; `{}` is one with its defaults."""
+    gripper: Gripper | None = None
+    """Left out, the rig has no gripper; `{}` is one with its defaults."""
     clocks: Clocks = Clocks()
     faults: tuple[Fault, ...] = ()
     """Faults to inject; docs/faults.md lists the kinds."""

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.finger_motion import FingerMotion
 from sliplab.rigs.mock.clocks import TrialClocks, own_clock, shifted, trial_clocks, with_faults
 from sliplab.rigs.mock.fault_settings import PlateStuck
 from sliplab.rigs.mock.faults import FaultBook
@@ -48,6 +49,14 @@ def start_pose(settings: MockSettings) -> Pose:
     return start
 
 
+def fingers_of(settings: MockSettings) -> FingerMotion | None:
+    """Return the fingers of a simulated rig at rest, if it has a gripper."""
+    made = settings.gripper
+    if made is None:
+        return None
+    return FingerMotion(made.opening_mm, made.reaction_us * 1000, made.acceleration_mm_s2)
+
+
 class World:
     """The simulated world, which only simulated devices access.
 
@@ -57,6 +66,7 @@ class World:
         trials: number of calls of `begin_trial`.
         slid_mm: path that each tip slid in earlier trials, (n,).
         board: position of a printed board in front of the outside camera; None if there is none.
+        fingers: opening of the gripper that holds the sensor; None without one.
         plate_marked: True once the sliding plate with its ArUco marker is used.
 
     Args:
@@ -76,6 +86,7 @@ class World:
         self.trials = 0
         self.board: BoardPlace | None = None
         self.path = path or ArmPath(self.plane, start_pose(settings))
+        self.fingers = fingers_of(settings)
         self.arm_state = ArmState.READY
         self.on_begin: list[Callable[[], None]] = []
         self.slid_mm = np.zeros(len(self.skin))
@@ -95,6 +106,8 @@ class World:
         self.advance()
         if self.path.moving(self.now_ns):
             raise RigError("arm", "is still moving: a trial begins with the arm at rest")
+        if self.fingers is not None:
+            self.fingers.restart(self.now_ns)
         self.slid_mm += self.physics.tips.path
         self.path.restart(self.now_ns)
         self.past_ns += self.now_ns
@@ -127,7 +140,7 @@ class World:
         self._shake = Shake(self.faults, seed)
         self.physics = Physics(
             settings, self.faults.grips(self.skin, self.slid_mm), seed, self._sensor_at,
-            self.faults.torn, self.faults.spots(), fine=bool(self._shake),
+            self.faults.torn, self.faults.spots(), self.fingers, fine=bool(self._shake),
         )  # fmt: skip
         self.plate_marked = False
 
@@ -141,12 +154,21 @@ class World:
         sensor[:, 5] -= self._straight_rad
         if not sensor[:, 5].any():
             sensor = np.ascontiguousarray(sensor[:, :5])
+        if self.fingers is not None:
+            sensor[:, 2] += self.closed_mm(t_ns)
         if self._vibration:
             strength = self.path.tremor(t_ns)[:, None]
             sensor[:, :3] += strength * self._vibration.at(t_ns)
         if self._shake:
             sensor[:, :3] += self._shake.at(t_ns)
         return sensor
+
+    def closed_mm(self, t_ns: I64) -> F64:
+        """By how much the fingers add to the arm's depth at increasing times, mm, (n,)."""
+        gripper = self.settings.gripper
+        if self.fingers is None or gripper is None:
+            return np.zeros(len(t_ns))
+        return gripper.opening_mm - self.fingers.opening_mm(t_ns)
 
     def turn_at(self, t_ns: I64) -> F64:
         """Angle of the sensor about the plate's normal since the trial began, rad, (k,)."""

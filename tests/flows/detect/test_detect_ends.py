@@ -127,8 +127,15 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
             {"protocol": 1, "trial": "", "seconds": 3.0},
             "--seconds = 3.0: applies only without --protocol",
         ),
-        ({"protocol": 1, "trial": "", "reflex": "jump"}, "must be 'stop' or 'press:MM'"),
-        ({"protocol": 1, "trial": "", "reflex": "press:-1"}, "must be 'stop' or 'press:MM'"),
+        ({"protocol": 1, "trial": "", "reflex": "jump"}, "must be 'stop', 'press:MM' or 'grip:MM'"),
+        (
+            {"protocol": 1, "trial": "", "reflex": "press:-1"},
+            "must be 'stop', 'press:MM' or 'grip:MM'",
+        ),
+        (
+            {"protocol": 1, "trial": "", "reflex": "grip:0.4"},
+            "needs a gripper, and the rig rehearsal",
+        ),
         ({"protocol": 1, "trial": "depth=9mm"}, "fits no trial: depth=2.4mm,direction=0deg"),
         ({"seconds": 1.0, "stride_ms": 31.0}, "--stride = 31 ms: must be over 0"),
     ],

@@ -1,0 +1,280 @@
+"""Grips, and the safe state that a lost stream, a dead network or a late decision leads to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.detectors.live import Counting
+from sliplab.flows.detect import detect
+from sliplab.flows.detecting.network_process import NetworkLost, NetworkProcess
+from sliplab.flows.detecting.request import DetectRequest, make_detect_request
+from sliplab.protocols import InputError
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.reacting import SafeState
+from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.storage.streams import EventChunk
+from tests.conftest import ROOT
+from tests.flows.conftest import write
+from tests.flows.detect.detecting import keeping, slip_when_busy, stands_clear, untrained
+
+RIG = ROOT / "rigs" / "mock_gripper.yaml"
+STREAM_MS, DECISION_MS = 200.0, 100.0
+"""Timeouts of that rig file."""
+
+
+def gripping(
+    model: Path, protocol: Path, folder: Path, change: dict[str, Any] | None = None,
+    reflex: str = "grip:0.4",
+) -> DetectRequest:  # fmt: skip
+    """A trial on the rig with a gripper, with changes of its file."""
+    file = write(folder / "rig.yaml", {"extends": str(RIG), **(change or {})})
+    return make_detect_request(file, model, protocol=protocol, trial="", reflex=reflex, hold_s=0.2)
+
+
+def quiet(x: np.ndarray) -> np.ndarray:
+    """A network that never sees slip."""
+    return np.array([[9, 0, 0]], np.int64)
+
+
+def safe_state(
+    order: DetectRequest, counting: Counting, disturb: Callable[[Rig], None] = lambda rig: None
+) -> tuple[SafeState, Rig]:
+    """Run until the safe state, and return it and the rig."""
+    rigs: list[Rig] = []
+
+    def build(file: RigFile) -> Rig:
+        rig = keeping(rigs)(file)
+        disturb(rig)
+        return rig
+
+    with pytest.raises(SafeState) as found:
+        detect(order, counting=counting, build=build)
+    return found.value, rigs[0]
+
+
+# -- the safe state --------------------------------------------------------------------------
+
+
+def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    """The camera sends nothing any more, neither events nor pulses."""
+    silent_ns: list[int] = []
+
+    def disturb(rig: Rig) -> None:
+        read, pulses = rig.events.read, rig.events.read_pulses
+
+        def silent() -> bool:
+            here = rig.position().x_mm > 0
+            if here and not silent_ns:
+                silent_ns.append(rig.clock.now_ns())
+            return here
+
+        nothing = EventChunk(*(np.empty(0, t) for t in (np.uint16, np.uint16, np.uint8, np.int64)))
+        rig.events.read = lambda: nothing if silent() else read()  # type: ignore[method-assign]
+        rig.events.read_pulses = (  # type: ignore[method-assign]
+            lambda: type(pulses())(np.empty(0, np.int64)) if silent() else pulses()
+        )
+
+    order = gripping(model, protocol, tmp_path)
+    error, rig = safe_state(order, quiet, disturb)
+    assert "neither events nor pulses" in error.cause
+    assert "the safe state 'grip' was reached" in str(error)
+    reaction = error.reaction
+    assert reaction.phase == "slide"
+    assert reaction.closed_mm == pytest.approx(0.2)
+    assert reaction.depth_mm == pytest.approx(2.6, abs=0.01)
+    # in bounded time: the timeout, one poll, and the fingers
+    ended_ms = (rig.clock.now_ns() - silent_ns[0]) / 1e6
+    assert ended_ms < STREAM_MS + 100.0
+    assert rig.arm.progress().done
+    assert rig.position().depth_mm == pytest.approx(2.4, abs=0.01)  # not moved clear
+    assert -3.5 < rig.position().x_mm < 3.4
+
+
+def test_a_camera_that_fails_leads_to_the_safe_state(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
+    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}})
+    error, rig = safe_state(order, quiet)
+    assert "event camera: does not answer" in error.cause
+    assert error.reaction.closed_mm == pytest.approx(0.2)
+    assert rig.position().depth_mm > 2.0
+
+
+def test_a_camera_that_fails_in_the_hold_leads_there_too(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 0.1}
+    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}})
+    error, rig = safe_state(order, quiet)
+    assert error.reaction.phase == "hold"
+    assert rig.position().depth_mm > 2.0
+
+
+def test_a_dead_network_leads_to_the_safe_state(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    network = NetworkProcess(model, 30.0)
+    asked: list[int] = []
+
+    def dying(x: np.ndarray) -> np.ndarray:
+        asked.append(1)
+        if len(asked) == 30:
+            network.kill()
+        return quiet(x) if network(x).shape == (1, 3) else x
+
+    order = gripping(model, protocol, tmp_path, {"reflex": {"safe_state": "stop"}})
+    error, rig = safe_state(order, dying)
+    assert len(asked) == 30  # at once
+    assert "network: counts: the network's process has exited" in error.cause
+    assert error.reaction.closed_mm == 0.0
+    assert rig.position().depth_mm > 2.0
+    network.close()
+
+
+def test_a_late_decision_leads_to_the_safe_state(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    rigs: list[Rig] = []
+    asked: list[int] = []
+
+    def slow(x: np.ndarray) -> np.ndarray:
+        asked.append(1)
+        if len(asked) == 25:
+            rigs[0].clock.wait((DECISION_MS + 1.0) / 1e3)
+        return quiet(x)
+
+    order = gripping(model, protocol, tmp_path)
+    error, _ = safe_state(order, slow, rigs.append)
+    assert "a decision took 101 ms, and reflex.decision_timeout is 100 ms" in error.cause
+    assert len(asked) < 30
+
+
+def test_a_gripper_that_fails_leaves_the_arm_stopped_in_contact(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    gone = {"kind": "device_gone", "device": "gripper", "at_s": 0.6}
+    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}})
+    error, rig = safe_state(order, slip_when_busy())
+    assert "gripper: does not answer" in error.cause
+    assert "the safe state 'stop'" in str(error)
+    assert rig.position().depth_mm > 2.0
+    assert rig.arm.progress().done
+
+
+def test_without_a_safe_state_a_failure_moves_the_arm_clear(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
+    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}, "reflex": None})
+    rigs: list[Rig] = []
+    with pytest.raises(RigError, match="event camera") as found:
+        detect(order, counting=quiet, build=keeping(rigs))
+    assert not isinstance(found.value, SafeState)
+    assert stands_clear(rigs[0])
+
+
+# -- grips -----------------------------------------------------------------------------------
+
+
+def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    rigs: list[Rig] = []
+    order = gripping(model, protocol, tmp_path)
+    result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
+    reflex = result["reflex"]
+    assert reflex
+    assert reflex["done"]
+    assert reflex["stopped_mm"][2] == pytest.approx(2.4, abs=0.01)
+    assert reflex["depth_mm"] == pytest.approx(2.8, abs=0.01)
+    assert reflex["closed_mm"] == pytest.approx(0.4)
+    assert not reflex["stalled"]
+    parts = reflex["reaction_ms"]
+    assert parts["window"] == 120.0  # four windows of 30 ms
+    assert 0.0 <= parts["sensor"] < 60.0
+    # 8 ms of reaction, and 40 ms for 0.4 mm at 1000 mm/s², looked at every 2 ms
+    assert parts["actuator"] == pytest.approx(48.0, abs=4.0)
+    assert parts["total"] == pytest.approx(sum(parts.values()) - parts["total"])
+    assert stands_clear(rigs[0])
+    # the next trial begins with open fingers
+    rig = rigs[0]
+    rig.connect()
+    rig.begin_trial(order.plan.program(order.trial).home, 1)  # type: ignore[union-attr, arg-type]
+    assert rig.gripper is not None
+    assert rig.gripper.state().opening_mm == pytest.approx(40.0)
+
+
+def test_a_grip_stalls_at_the_force_of_the_rig_file(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    weak = {"mock": {"gripper": {"force_n": [2.0, 50.0]}}, "reflex": {"force": "2 N"}}
+    order = gripping(model, protocol, tmp_path, weak, "grip:1")
+    reflex = detect(order, counting=slip_when_busy())["reflex"]
+    assert reflex
+    assert reflex["stalled"]
+    assert 0.0 < reflex["closed_mm"] < 0.5
+
+
+def test_a_grip_ends_at_the_deepest_place(model: Path, protocol: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"3\.7 mm; the protocol's limits.depth is 3\.6 mm"):
+        gripping(model, protocol, tmp_path, reflex="grip:1.3")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"reflex": {"grip": None}}, "reflex.grip.*is needed by safe_state: grip"),
+        ({"mock": {"gripper": None}}, "reflex.safe_state = grip: needs a gripper"),
+        ({"reflex": {"force": "60 N"}}, "reflex.force.*must be from 5 to 50 N"),
+        ({"reflex": {"stream_timeout": "30 ms"}}, "must be over 32 ms, the camera's blocks"),
+        ({"reflex": {"safe_state": "drop"}}, "reflex.safe_state.*'stop' or 'grip'"),
+        ({"reflex": {"decision_timeout": 100}}, "reflex.decision_timeout.*has no unit"),
+        ({"mock": {"gripper": {"opening_mm": 90}}}, "mock.gripper.opening_mm = 90"),
+    ],
+)
+def test_wrong_rig_files_are_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
+    file = write(tmp_path / "rig.yaml", {"extends": str(RIG), **change})
+    with pytest.raises(InputError, match=said):
+        load_rig_file(file)
+
+
+def test_limits_of_force_hold_for_grips(model: Path, protocol: Path, tmp_path: Path) -> None:
+    change = {"mock": {"force": {}}, "limits": {"force": "10 N"}}
+    with pytest.raises(InputError, match=r"limits.force is 10 N: set reflex.force to less"):
+        gripping(model, protocol, tmp_path, change)
+
+
+# -- the network's process -------------------------------------------------------------------
+
+
+def test_the_network_in_its_process_is_the_network(model: Path) -> None:
+    from sliplab.analysis.detectors.live import counting_of
+
+    windows = untrained().windows
+    shape = (1, windows.steps, windows.channels, windows.cells, windows.cells)
+    x = np.random.default_rng(1).integers(0, 3, shape).astype(np.uint8)
+    network = NetworkProcess(model, 30.0)
+    np.testing.assert_array_equal(network(x), counting_of(untrained())(x))
+    with pytest.raises(NetworkLost):  # a window that is none: the process survives it
+        network(x[:, :1, :, :3])
+    network(x)
+    network.close()
+    with pytest.raises(NetworkLost, match="has exited"):
+        network(x)
+
+
+def test_a_model_that_is_none_does_not_start(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.pt"
+    bad.write_text(json.dumps({}))
+    with pytest.raises(NetworkLost, match="not a model file"):
+        NetworkProcess(bad, 1.0)
