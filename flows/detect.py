@@ -31,7 +31,7 @@ from sliplab.protocols import InputError
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.reacting import Reaction, run_watched
+from sliplab.rigs.core.reacting import Evidence, Reaction, run_watched
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
@@ -61,11 +61,16 @@ class ReactionMs(TypedDict):
 
 
 class ReflexJson(TypedDict):
-    """A reflex in a detection's summary, with the fields of `Reaction` where it was done."""
+    """A reflex in a detection's summary, with the fields of `Reaction` where it was done.
+
+    Attributes:
+        trial_s: end of the window that triggered it, since the stream began.
+    """
 
     kind: str
     done: bool
     phase: NotRequired[str]
+    trial_s: NotRequired[float]
     stop_ms: NotRequired[float]
     stopped_mm: NotRequired[tuple[float, float, float]]
     depth_mm: NotRequired[float]
@@ -106,6 +111,7 @@ def detect(
     *,
     counting: Counting | None = None,
     build: Callable[[RigFile], Rig] = build_rig,
+    show: bool = True,
 ) -> DetectSummary:
     """Run a detection to its end; return a summary, with ``interrupted`` if somebody ended it.
 
@@ -114,6 +120,7 @@ def detect(
         counting: the network, instead of the model's by the event-driven kernels in one thread:
             in a process of its own where the request has a safe state.
         build: makes the rig.
+        show: show decisions on the terminal.
 
     Raises:
         InputError: there is no folder for `out`.
@@ -134,13 +141,17 @@ def detect(
         detector = _detector(request, rig, counting)
         fitted = request.fitted
         most = fitted.windows.steps * fitted.network.outputs_per_class
-        view = done.enter_context(DetectView(_title(request), most))
+        view = DetectView(_title(request), most) if show else None
+        if view is not None:
+            done.enter_context(view)
 
         def on_decision(timed: TimedDecision) -> None:
             write(timed)
-            view.on_decision(timed)
+            if view is not None:
+                view.on_decision(timed)
 
-        sink = DetectSink(detector, rig.clock, on_decision, view.poll, request.timeouts)
+        poll = (lambda: None) if view is None else view.poll
+        sink = DetectSink(detector, rig.clock, on_decision, poll, request.timeouts)
         rig.connect()
         reaction, interrupted = None, False
         try:
@@ -247,10 +258,7 @@ def _title(request: DetectRequest) -> str:
     return f"detect on {request.rig.name} ({mode}), model {request.model.name}"
 
 
-def reaction_ms(reaction: Reaction) -> ReactionMs:
-    """Return the parts of a reaction's time; it was triggered by a `DetectSink`."""
-    seen = reaction.evidence
-    assert seen is not None
+def _reaction_ms(reaction: Reaction, seen: Evidence) -> ReactionMs:
     command, actuator = reaction.command_ms, reaction.actuator_ms
     return {
         "window": seen.window_ms,
@@ -269,15 +277,18 @@ def _summary(
     if request.reflex is not None:
         reflex = {"kind": request.reflex.kind, "done": reaction is not None}
         if reaction is not None:
+            seen = reaction.evidence
+            assert seen is not None  # a `DetectSink` triggered it
             reflex = {
                 **reflex,
                 "phase": reaction.phase,
+                "trial_s": seen.trial_s,
                 "stop_ms": reaction.stop_ms,
                 "stopped_mm": reaction.stopped_mm,
                 "depth_mm": reaction.depth_mm,
                 "closed_mm": reaction.closed_mm,
                 "stalled": reaction.stalled,
-                "reaction_ms": reaction_ms(reaction),
+                "reaction_ms": _reaction_ms(reaction, seen),
             }
     return {
         "simulated": request.rig.simulated,

@@ -14,6 +14,7 @@ from sliplab.rigs.core.capabilities import (
     FrameCamera,
     Operator,
     Plate,
+    PlateCourse,
     Pose,
     RigError,
     Truth,
@@ -38,6 +39,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.discovery import need_libraries
 from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.truth import plate_course, watch_plate
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import (
     EventStream,
@@ -76,6 +78,15 @@ class _MockSimulation:
         clock = self._devices.world.clocks.arm
         hold_ns = None if hold_arm_ns is None else int(clock.to_device(hold_arm_ns))
         return self._devices.truth(int(clock.to_device(reference_arm_ns)), hold_ns)
+
+    def watch_plate(self) -> None:
+        """Keep the forces on the plate from now on."""
+        watch_plate(self._devices.world)
+
+    def plate_course(self, since_arm_ns: int) -> PlateCourse:
+        """Return the plate's course since an arm controller time."""
+        world = self._devices.world
+        return plate_course(world, int(world.clocks.arm.to_device(since_arm_ns)))
 
 
 def build_rig(file: RigFile) -> Rig:

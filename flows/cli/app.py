@@ -14,6 +14,7 @@ from sliplab.flows.cli import (
     new,
     power,
     publish,
+    reflex,
     review,
     rigs,
     schema,
@@ -68,6 +69,7 @@ for part in (
     publish.app,
     review.app,
     detect.app,
+    reflex.app,
     schema.app,
     new.app,
 ):

@@ -198,7 +198,14 @@ class DetectSink(NullSink):
     def _evidence(self, decision: Decision, here_ns: int, compute_ms: float) -> Evidence:
         ended_ns = self._camera.host_ns(decision.end_us)
         assert ended_ns is not None
-        return Evidence(self.detector.span_us / 1e3, (here_ns - ended_ns) / 1e6, compute_ms)
+        origin_us = self.detector.origin_us
+        assert origin_us is not None
+        return Evidence(
+            (decision.end_us - origin_us) / 1e6,
+            self.detector.span_us / 1e3,
+            (here_ns - ended_ns) / 1e6,
+            compute_ms,
+        )
 
     def summary(self) -> DetectNumbers:
         """Return the numbers of events, windows, states and latencies, and the onsets."""

@@ -462,6 +462,22 @@ class Truth(TrueOnsets):
     clocks: NotRequired[dict[str, list[list[int]]]]
 
 
+class PlateCourse(TypedDict):
+    """A simulated plate through a motion; rows at rising times, ms from a reference.
+
+    Attributes:
+        height_mm: of the plate, 0 where it is raised. stroke_mm: that it falls to its stop.
+        normal_n: sum of the contact's normal forces.
+        depth_mm: of the sensor: the arm's, and what fingers add.
+    """
+
+    t_ms: list[float]
+    height_mm: list[float]
+    normal_n: list[float]
+    depth_mm: list[float]
+    stroke_mm: float
+
+
 @runtime_checkable
 class Simulation(Protocol):
     """The world behind a simulated rig; a real rig has none."""
@@ -483,3 +499,9 @@ class Simulation(Protocol):
             reference_arm_ns: arm controller time from which displacements are measured.
             hold_arm_ns: start of the recorded hold, to measure displacements from there too.
         """
+
+    def watch_plate(self) -> None:
+        """Keep the forces on the plate from now on, for `plate_course`, until the trial ends."""
+
+    def plate_course(self, since_arm_ns: int) -> PlateCourse:
+        """Return heights, forces and depths since an arm controller time, after `watch_plate`."""

@@ -32,12 +32,14 @@ class Evidence:
     """Times of a detection, up to the decision, ms.
 
     Attributes:
+        trial_s: end of the window that decided, since the stream began, on the camera's clock.
         window_ms: span of the events that the decision rests on.
         sensor_ms: from the end of that span until its events were read, on the rig's clock; the
             freshest arrival counts as immediate.
         network_ms: from then to the decision: windows, network and rule, in real time.
     """
 
+    trial_s: float
     window_ms: float
     sensor_ms: float
     network_ms: float

@@ -21,7 +21,7 @@ from typing import Any
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
-from sliplab.rigs.core.capabilities import RigError, Truth
+from sliplab.rigs.core.capabilities import PlateCourse, RigError, Truth
 from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.core.driver import EventCameraDriver
 from sliplab.rigs.core.registry import find_driver
@@ -141,6 +141,15 @@ class Loopback:
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
         """Return the ground truth of a trial, counted from these arm controller times."""
         found: Truth = self._ask("truth", reference_arm_ns, hold_arm_ns)
+        return found
+
+    def watch_plate(self) -> None:
+        """Keep the forces on the plate from now on."""
+        self._ask("watch_plate")
+
+    def plate_course(self, since_arm_ns: int) -> PlateCourse:
+        """Return the plate's course since an arm controller time."""
+        found: PlateCourse = self._ask("plate_course", since_arm_ns)
         return found
 
     # -- Plate and Operator ----------------------------------------------------------------

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
-from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, Truth
+from sliplab.rigs.core.capabilities import ArmState, PlateCourse, Pose, RigError, Segment, Truth
 from sliplab.rigs.core.driver import (
     ArmScene,
     EventCameraDriver,
@@ -47,7 +47,7 @@ from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
 from sliplab.rigs.mock.path import ContactPlane
 from sliplab.rigs.mock.settings import EventCamera, MockSettings
 from sliplab.rigs.mock.sync import FreeRun, MockSyncBox
-from sliplab.rigs.mock.truth import truth_of
+from sliplab.rigs.mock.truth import plate_course, truth_of, watch_plate
 from sliplab.rigs.mock.world import World, start_pose
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
@@ -279,18 +279,27 @@ class SimulationServer:
         See `rigs.mock.truth.truth_of`.
         """
         self.turn()
+        hold_ns = None if hold_arm_ns is None else self._true_ns(hold_arm_ns)
+        reference_ns = self._true_ns(reference_arm_ns)
+        return truth_of(self.world, self._box.clock, reference_ns, hold_true_ns=hold_ns)
 
-        def true_ns(arm_ns: int) -> int:
-            if self._arm_by_host:
-                total_ns = arm_ns - self._origin_ns
-            else:
-                total_ns = int(self._arm_clock.to_device(arm_ns))
-            return total_ns - self.world.past_ns
+    def watch_plate(self) -> None:
+        """Keep the forces on the plate from now on."""
+        self.turn()
+        watch_plate(self.world)
 
-        hold_ns = None if hold_arm_ns is None else true_ns(hold_arm_ns)
-        return truth_of(
-            self.world, self._box.clock, true_ns(reference_arm_ns), hold_true_ns=hold_ns
-        )
+    def plate_course(self, since_arm_ns: int) -> PlateCourse:
+        """Return the plate's course since an arm controller time."""
+        self.turn()
+        return plate_course(self.world, self._true_ns(since_arm_ns))
+
+    def _true_ns(self, arm_ns: int) -> int:
+        """Return the true time of the trial at an arm controller time."""
+        if self._arm_by_host:
+            total_ns = arm_ns - self._origin_ns
+        else:
+            total_ns = int(self._arm_clock.to_device(arm_ns))
+        return total_ns - self.world.past_ns
 
     def sent(self) -> Counter[str]:
         """Return the counts of data sent since the trial began; pulses since the last ARM."""

@@ -171,7 +171,7 @@ class Physics:
                 load, springs.spots,
             )  # fmt: skip
             self._plate_motion[:] = height[-1], 0.0
-            self._sum_up(t_ns[1:], track, load)
+            self._sum_up(t_ns[1:], track, load, count)
             return
         plate, mass_kg = self._settings.scene.plate, self._release[2]
         done, landed = advance_free(
@@ -179,7 +179,7 @@ class Physics:
             self._plate_motion, mass_kg, self._weight(t_ns), plate.stiction_n,
             -plate.stroke_mm, track, load, springs.spots,
         )  # fmt: skip
-        self._sum_up(t_ns[1:], track, load)
+        self._sum_up(t_ns[1:], track, load, done)
         if landed:
             self._hold_plate(-plate.stroke_mm)
             more = *self.more_loads.values(), *self.more_wrenches.values()
@@ -187,15 +187,19 @@ class Physics:
                 if rows is not None:
                     rows.shrink(count - done, int(t_ns[done]))
 
-    def _sum_up(self, t_ns: I64, track: F64, load: F64) -> None:
-        """Keep the tips' forces for further cameras, and their sum for a force sensor."""
+    def _sum_up(self, t_ns: I64, track: F64, load: F64, done: int) -> None:
+        """Keep the tips' forces for further cameras, and their sum for a force sensor.
+
+        Args:
+            done: rows that were computed; the others are removed where the plate has landed.
+        """
         for rows in self.more_loads.values():
             rows.grow(t_ns)[:] = load
         if self.wrench is not None or self.more_wrenches:
-            found = plate_wrench(track, load)
+            found = plate_wrench(track[:done], load[:done])
             for sums in (self.wrench, *self.more_wrenches.values()):
                 if sums is not None:
-                    sums.grow(t_ns)[:] = found
+                    sums.grow(t_ns)[:done] = found
 
     # -- the plate -------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from numba import njit
 
 from sliplab.protocols.timing import FrameGrade
-from sliplab.rigs.core.capabilities import RigError, TrueOnsets, Truth
+from sliplab.rigs.core.capabilities import PlateCourse, RigError, TrueOnsets, Truth
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.world import World
 from sliplab.storage.clockmap import IDENTITY, ClockMap
@@ -66,6 +66,36 @@ def truth_of(
             "hold_slip_mm": _moved_mm(world, hold_true_ns, reference_true_ns),
         }
     return found
+
+
+COURSE = "plate course"
+"""Name of the record of forces that `watch_plate` keeps."""
+_COURSE_NS = 1_000_000
+
+
+def watch_plate(world: World) -> None:
+    """Keep the forces on the plate from now on, for `plate_course`."""
+    world.keep_wrench(COURSE)
+
+
+def plate_course(world: World, since_true_ns: int) -> PlateCourse:
+    """Return heights, normal forces and depths every millisecond since a true time.
+
+    Raises:
+        RigError: `watch_plate` was not called before in this trial.
+    """
+    end_ns = world.advance()
+    forces = world.physics.more_wrenches.get(COURSE)
+    if forces is None:
+        raise RigError("plate", "its course is not kept: call watch_plate first")
+    t_ns = np.arange(max(since_true_ns, forces.begin_ns), end_ns + 1, _COURSE_NS, dtype=np.int64)
+    return {
+        "t_ms": ((t_ns - since_true_ns) / 1e6).tolist(),
+        "height_mm": world.tips_at(t_ns)[1].tolist(),
+        "normal_n": forces.at(t_ns)[:, 2].tolist(),
+        "depth_mm": world.depth_mm(t_ns).tolist(),
+        "stroke_mm": world.settings.scene.plate.stroke_mm,
+    }
 
 
 def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:

@@ -163,6 +163,10 @@ class World:
             sensor[:, :3] += self._shake.at(t_ns)
         return sensor
 
+    def depth_mm(self, t_ns: I64) -> F64:
+        """Depth of the sensor at increasing times, mm, (n,)."""
+        return self._sensor_at(t_ns)[:, 2]
+
     def closed_mm(self, t_ns: I64) -> F64:
         """By how much the fingers add to the arm's depth at increasing times, mm, (n,)."""
         gripper = self.settings.gripper

@@ -1,0 +1,114 @@
+"""`sliplab reflex`: detectors that know nothing, resuming, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sliplab.analysis.evaluation.reflexes import reflex_rows
+from sliplab.flows import reflex as study
+from sliplab.protocols import InputError
+from tests.command_line import here
+from tests.conftest import ROOT
+from tests.flows.conftest import write
+
+RIG = Path("mock-gripper")
+
+
+@pytest.fixture(scope="module")
+def fast(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped protocol with one condition that is over soon."""
+    data = yaml.safe_load((ROOT / "protocols" / "reflex.yaml").read_text())
+    factors = data["collection"]["factors"]
+    factors["mass"]["values"], factors["speed"]["values"] = [0.205], [4]
+    return write(tmp_path_factory.mktemp("protocol") / "reflex.yaml", data)
+
+
+def said(state: int) -> np.ndarray:
+    counts = np.zeros((1, 3), np.int64)
+    counts[0, state] = 9
+    return counts
+
+
+def test_who_cries_always_or_never_is_at_the_bottom(
+    model: Path, fast: Path, tmp_path: Path
+) -> None:
+    asked = study.request(model, RIG, tmp_path, fast, ("stop", "grip:0.4"))
+    name = next(iter(asked.requests))
+    bare = [case for case in asked.cases if case.reflex is None]
+    told = {"always": lambda x: said(1), "never": lambda x: said(0)}
+    trials = [study.measure(asked, case, {}) for case in bare]
+    for detector, counting in told.items():
+        for case in asked.cases:
+            if case.reflex is not None:
+                made = study.measure(asked, case, {name: counting})
+                trials.append(made.model_copy(update={"detector": detector}))
+    rows = {(row.detector, row.reflex): row for row in reflex_rows(trials)}
+    assert rows[None, None].dropped == 1
+    for reflex in ("stop", "grip:0.4"):
+        always, never = rows["always", reflex], rows["never", reflex]
+        # held from the very beginning, and no answer to slip
+        assert (always.dropped, always.early, always.prevented) == (0, 1, 0)
+        assert (never.dropped, never.missed, never.prevented) == (1, 1, 0)
+
+
+def test_what_was_done_is_kept_and_not_done_again(
+    model: Path, fast: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stop after the first trial loses it not; another reflex adds to what there is."""
+    measured: list[str] = []
+    measure = study.measure
+
+    def counting(asked: study.Request, case: study.Case, *rest: object) -> object:
+        if measured and measured[-1] == "stop":
+            measured.append("go")
+            raise KeyboardInterrupt
+        made = measure(asked, case, *rest)  # type: ignore[arg-type]
+        measured.append(case.reflex or "none")
+        return made
+
+    monkeypatch.setattr(study, "measure", counting)
+    asked = study.request(model, RIG, tmp_path, fast, ("stop", "press:0.2"))
+    with pytest.raises(KeyboardInterrupt):
+        study.measure_reflexes(asked)
+    assert measured == ["none", "stop", "go"]
+    found = study.measure_reflexes(asked)
+    assert measured == ["none", "stop", "go", "press:0.2"]
+    assert [row.reflex for row in found.rows] == [None, "stop", "press:0.2"]
+    again = study.measure_reflexes(replace(asked, cases=asked.cases[:2]))
+    assert len(measured) == 4
+    assert [row.reflex for row in again.rows] == [None, "stop"]
+    assert (tmp_path / "reflex.html").is_file()
+
+
+def test_the_command(model: Path, fast: Path, tmp_path: Path) -> None:
+    done = here(
+        "reflex", model, "--protocol", fast, "--reflex", "stop", "--out", tmp_path / "r", "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["simulated"] is True
+    assert result["virtual_time"] is True
+    assert [row["reflex"] for row in result["rows"]] == [None, "stop"]
+    assert result["rows"][0]["dropped"] == 1
+    assert "simulated" in (tmp_path / "r" / "reflex.html").read_text()
+
+
+def test_wrong_input_is_said(model: Path, fast: Path, tmp_path: Path) -> None:
+    for place, rig, protocol, reflexes, right in (
+        (tmp_path, RIG, fast, (), r"has no models/seed0\.pt"),
+        (model, Path("ur5"), fast, (), "must be a simulated rig"),
+        (model, RIG, Path("pilot"), (), "must be of gravity trials"),
+        (model, Path("mock"), fast, ("grip:0.4",), "needs a gripper"),
+        (model, RIG, fast, ("press:9",), "at most press:"),
+    ):
+        with pytest.raises(InputError, match=right):
+            study.request(place, rig, tmp_path / "out", protocol, reflexes)
+    assert [case.reflex for case in study.request(model, Path("mock"), tmp_path, fast).cases] == [
+        None, "stop", "press:0.4",
+    ]  # fmt: skip
