@@ -32,6 +32,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.schema.reflex import ReactionParts, ReflexStudy, ReflexTrial
+from sliplab.storage.streams import Json
 
 NAME = "reflex"
 VERSION = 1
@@ -58,6 +59,14 @@ def detectors_of(place: Path) -> dict[str, Path]:
         right = f"has no models/{MODELS['network']}: train it first, or name a model file"
         raise InputError("MODEL", "", place, right)
     return found
+
+
+def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+    return np.array([[1, 0, 0]], np.int64)
+
+
+_NEVER: Counting = _no_slip
+"""Sees no slip: for trials without a reflex, where nothing is to be detected."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +156,7 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
         RigError: a device failed; what was done is kept.
         KeyboardInterrupt: somebody stopped it; the arm is stopped, and what was done is kept.
     """
-    head = {
+    head: Json = {
         "simulated": True,
         "rig": asked.rig.name,
         "protocol": asked.plan.name,
@@ -214,7 +223,7 @@ class Seen:
                     self.course = rig.simulation.plate_course(self.began_ns)
                 return take_step(index, step, *rest)
 
-            rig.take_step = looking  # type: ignore[method-assign]
+            rig.take_step = looking  # type: ignore[assignment,method-assign]
             return rig
 
         return observed
@@ -232,9 +241,8 @@ def measure(
         networks: by the names of their detectors.
     """
     plan, trial = asked.plan, case.trial
-    if case.detector is None or case.reflex is None:
-        wanted, counting = next(iter(asked.requests.values())), _never
-    else:
+    wanted, counting = next(iter(asked.requests.values())), _NEVER
+    if case.detector is not None and case.reflex is not None:
         made = make_reflex(case.reflex, asked.rig, plan, trial, HOLD_S)
         wanted = replace(asked.requests[case.detector], reflex=made)
         counting = networks[case.detector]
@@ -279,11 +287,6 @@ def measure(
         heights_mm=tuple(round(mm, 4) for mm in heights[::STEP_MS]),
         step_ms=STEP_MS,
     )
-
-
-def _never(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    """Say no slip, where nothing is to be detected."""
-    return np.array([[1, 0, 0]], np.int64)
 
 
 def _speed_mm_s(plan: Plan, trial: Trial) -> float:

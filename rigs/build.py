@@ -12,6 +12,7 @@ from sliplab.rigs.core.capabilities import (
     Arm,
     ForceSensor,
     FrameCamera,
+    Gripper,
     Operator,
     Plate,
     PlateCourse,
@@ -129,7 +130,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
             for name, device in devices.further.items()
         ),
         gripper=devices.gripper,
-        grip_opening_mm=0.0 if file.grip_opening_mm is None else file.grip_opening_mm,
+        grip_opening_mm=file.grip_opening_mm or 0.0,
         simulation=_MockSimulation(devices),
     )
 
@@ -237,6 +238,8 @@ def _driven_rig(
             force=_force_sensor(file, devices, arm),
             force_limit_n=force_limit(file),
             further=tuple(further),
+            gripper=_gripper(devices),
+            grip_opening_mm=file.grip_opening_mm or 0.0,
             simulation=shown,
         )
         undo.pop_all()
@@ -341,6 +344,12 @@ def _force_sensor(file: RigFile, devices: DeviceSettings, arm: Arm) -> ForceSens
             f"timing.force.grade: {said}; write timing.force: {{grade: {sensor.grade}}}",
         )
     return sensor
+
+
+def _gripper(devices: DeviceSettings) -> Gripper | None:
+    """Make the rig's gripper, if it has one; not connected yet."""
+    driver = devices.gripper_driver
+    return None if driver is None else driver.build(devices.gripper)
 
 
 def _check_grade(grade: str, frames: FrameCamera, key: str) -> None:

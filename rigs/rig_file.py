@@ -251,6 +251,13 @@ class RigFile(StrictModel):
             if self.mock.force is None:
                 text = "is needed: it is what the fake of devices.force_sensor shows"
                 raise KeyedError("mock.force", None, text)
+        if (gripper := self.devices.gripper_driver) is not None:
+            fakes["gripper"] = gripper.fake
+            fingers, opening = self.mock.gripper, self.grip_opening_mm
+            found = None if fingers is None else fingers.opening_mm
+            if found != opening:
+                text = f"must be {opening:g}: the fake of devices.gripper moves these fingers"
+                raise KeyedError("mock.gripper.opening_mm", found, text)
         text = "has no fake for a loopback rig: write driver: devices"
         for name, fake in fakes.items():
             if fake is None:
@@ -373,19 +380,20 @@ class RigFile(StrictModel):
     @property
     def gripper_range(self) -> GripperRange | None:
         """Values that the gripper's commands may have; None without a gripper."""
-        if self.driver != "mock":
+        if self.driver == "mock":
+            made = self.scene.gripper
+            if made is None:
+                return None
+            return GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
+        if self.devices is None or (driver := self.devices.gripper_driver) is None:
             return None
-        made = self.scene.gripper
-        if made is None:
-            return None
-        return GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
+        return driver.range(self.devices.gripper)
 
     @property
     def grip_opening_mm(self) -> float | None:
         """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-        if self.driver != "mock" or self.scene.gripper is None:
-            return None
-        return self.scene.gripper.opening_mm
+        named = self.scene if self.driver == "mock" else self.devices
+        return None if named is None or named.gripper is None else named.gripper.opening_mm
 
     def drivers(self) -> Iterator[tuple[str, Driver[Any], Any]]:
         """Return the part in the rig, driver and settings of every device, the arm first."""

@@ -41,11 +41,12 @@ def reaction_cells(row: ReflexRow) -> list[str]:
 
 
 def example(study: ReflexStudy) -> list[ReflexTrial]:
-    """Return the trials of one condition: of those that drop without a reflex, the middle one."""
+    """Return one trial in all its forms: of those that drop without a reflex, the middle one."""
     trials = list(study.trials.values())
     drops = [it.trial for it in trials if it.reflex is None and it.dropped]
     chosen = drops[len(drops) // 2] if drops else trials[0].trial
-    return [it for it in trials if it.trial == chosen]
+    shown = [it for it in trials if it.trial == chosen]
+    return sorted(shown, key=lambda it: (it.reflex is not None, it.reflex or "", it.detector or ""))
 
 
 def render(study: ReflexStudy) -> str:

@@ -70,7 +70,7 @@ class ResultFile(Generic[DocumentT]):
     path: Path
     kind: type[DocumentT]
     field: str
-    head: Mapping[str, bool | float]
+    head: Json
 
     def load(self) -> DocumentT:
         """Read the document.

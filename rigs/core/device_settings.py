@@ -21,3 +21,11 @@ class FrameCameraSettings(DriverSettings):
 
     exposure_us: Annotated[float, Field(ge=1, le=1_000_000)] = 2000.0
     """Exposure, microseconds."""
+
+
+class GripperSettings(DriverSettings):
+    """Settings that every gripper has."""
+
+    opening_mm: Annotated[float, Field(gt=0, le=1000)]
+    """Opening at which the arm's depth is the depth in contact: that with which the contact plane
+    was taught. Every trial begins with it."""

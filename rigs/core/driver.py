@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
-from sliplab.rigs.core.device_settings import DriverSettings
+from sliplab.rigs.core.device_settings import DriverSettings, GripperSettings
 
 if TYPE_CHECKING:
     from sliplab.protocols.timing import Code, FrameGrade
@@ -22,15 +22,19 @@ if TYPE_CHECKING:
         EventCamera,
         ForceSensor,
         FrameCamera,
+        Gripper,
+        GripperRange,
         ScalarSensor,
         SyncBox,
     )
     from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
     from sliplab.rigs.core.fakes import FakeController
+    from sliplab.rigs.core.finger_motion import FingerMotion
     from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
 
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)
 ArmSettingsT = TypeVar("ArmSettingsT", bound=BaseArmSettings)
+GripperSettingsT = TypeVar("GripperSettingsT", bound=GripperSettings)
 
 
 def _no_locks(settings: Any) -> dict[str, str]:
@@ -46,8 +50,8 @@ class Driver(Generic[SettingsT]):
     """The declaration of one type of device. `name` is the value of `driver:` in rig files."""
 
     kind: ClassVar[str]
-    """``arm``, ``event camera``, ``frame camera``, ``sync box``, ``force sensor`` or ``scalar
-    sensor``."""
+    """``arm``, ``event camera``, ``frame camera``, ``sync box``, ``force sensor``, ``gripper`` or
+    ``scalar sensor``."""
     name: str
     title: str
     """Make and model for people, such as ``Universal Robots``."""
@@ -241,6 +245,48 @@ class ForceSensorDriver(Driver[SettingsT]):
     fake: Callable[[SettingsT], FakeForceSensor] | None = None
     """Make a fake; None: no loopback rig can have this sensor, unless it is the arm's."""
     reach: Callable[[SettingsT, Any], SettingsT] | None = None
+    """Return settings that reach a fake at an address."""
+
+
+@dataclass(frozen=True)
+class GripperScene:
+    """The part of a simulated scene that the fake of a gripper needs."""
+
+    fingers: FingerMotion
+    """Motion of the fingers, which stall at the contact in the scene."""
+    now_ns: Callable[[], int]
+    """Time by which the fingers move, ns."""
+
+
+class FakeGripper(Protocol):
+    """A gripper on a wire, whose fingers are a simulated scene's."""
+
+    @property
+    def address(self) -> Any:
+        """Address for the driver, used by `GripperDriver.reach`; it can be pickled."""
+
+    def silence(self) -> None:
+        """Hang: answer nothing from now on."""
+
+    def fail(self) -> None:
+        """Report a fault from now on, and stop."""
+
+    def close(self) -> None:
+        """Unplug it; safe to call more than once."""
+
+
+@dataclass(frozen=True)
+class GripperDriver(Driver[GripperSettingsT]):
+    """A kind of gripper."""
+
+    kind = "gripper"
+    build: Callable[[GripperSettingsT], Gripper] = field(kw_only=True)
+    """Make the device, not connected yet."""
+    range: Callable[[GripperSettingsT], GripperRange] = field(kw_only=True)
+    """Return the values that commands may have, without the device."""
+    fake: Callable[[GripperSettingsT, GripperScene], FakeGripper] | None = None
+    """Make a fake; None: no loopback rig can have this gripper."""
+    reach: Callable[[GripperSettingsT, Any], GripperSettingsT] | None = None
     """Return settings that reach a fake at an address."""
 
 

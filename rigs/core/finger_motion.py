@@ -64,6 +64,11 @@ class FingerMotion:
         return self._stalled
 
     @property
+    def target_mm(self) -> float:
+        """Opening at which the last move ends, or has ended."""
+        return self._legs[-1].end_mm
+
+    @property
     def last_force_n(self) -> float:
         """Force limit of the last move."""
         return self._legs[-1].force_n

@@ -15,13 +15,14 @@ from pydantic_core import CoreSchema
 
 from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel, register_tags_of
 from sliplab.rigs.core.arm_settings import BaseArmSettings
-from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
+from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings, GripperSettings
 from sliplab.rigs.core.driver import (
     ArmDriver,
     Driver,
     EventCameraDriver,
     ForceSensorDriver,
     FrameCameraDriver,
+    GripperDriver,
     SyncBoxDriver,
 )
 from sliplab.rigs.core.registry import DriverError, drivers, find_driver
@@ -35,6 +36,7 @@ _KINDS: dict[str, type[Driver[Any]]] = {
     "frame_camera": FrameCameraDriver,
     "sync_box": SyncBoxDriver,
     "force_sensor": ForceSensorDriver,
+    "gripper": GripperDriver,
 }
 """Kinds of drivers, by the key of the device in a rig file."""
 
@@ -93,6 +95,8 @@ class DeviceSettings(StrictModel):
     """Required by a real rig; a loopback rig has its own."""
     force_sensor: Annotated[DriverSettings, OfKind(ForceSensorDriver)] | None = None
     """If left out, the rig has no force sensor."""
+    gripper: Annotated[GripperSettings, OfKind(GripperDriver)] | None = None
+    """Gripper that holds the sensor; if left out, the rig has none."""
     plate: OperatedPlate | None = None
     """If left out, the rig has no sliding plate, and supports only kinematic protocols."""
 
@@ -132,3 +136,8 @@ class DeviceSettings(StrictModel):
         if self.force_sensor is None:
             return None
         return find_driver(self.force_sensor.driver, ForceSensorDriver)
+
+    @property
+    def gripper_driver(self) -> GripperDriver[Any] | None:
+        """The driver of the gripper, if the rig has one."""
+        return None if self.gripper is None else find_driver(self.gripper.driver, GripperDriver)

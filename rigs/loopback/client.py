@@ -40,8 +40,8 @@ TURN_S = 0.004
 END_S = 5.0
 
 
-Addresses = tuple[Any, Any, Any, Mapping[str, Any]]
-"""Of sync box, event camera, force sensor and further cameras."""
+Addresses = tuple[Any, Any, Any, Any, Mapping[str, Any]]
+"""Of sync box, event camera, force sensor, gripper and further cameras."""
 
 
 class Loopback:
@@ -56,7 +56,8 @@ class Loopback:
         sync_address: address of the sync box.
         event_address: where the event camera's driver finds its fake.
         stream_addresses: the same of further event cameras, by the names of their streams.
-        force_address: where that of the force sensor does; None without one.
+        force_address, gripper_address: where those of the force sensor and the gripper do; None
+            without one.
 
     Raises:
         RigError: they do not start.
@@ -116,6 +117,9 @@ class Loopback:
         force = devices.force_sensor_driver
         if force is not None and force.reach is not None and devices.force_sensor is not None:
             update["force_sensor"] = force.reach(devices.force_sensor, self.force_address)
+        gripper = devices.gripper_driver
+        if gripper is not None and gripper.reach is not None and devices.gripper is not None:
+            update["gripper"] = gripper.reach(devices.gripper, self.gripper_address)
         return devices.model_copy(update=update)
 
     def reached_stream(self, name: str, settings: DriverSettings) -> DriverSettings:
@@ -126,7 +130,8 @@ class Loopback:
         return found
 
     def _take(self, addresses: Addresses) -> None:
-        self.sync_address, self.event_address, self.force_address, self.stream_addresses = addresses
+        self.sync_address, self.event_address, self.force_address = addresses[:3]
+        self.gripper_address, self.stream_addresses = addresses[3:]
 
     # -- Simulation ------------------------------------------------------------------------
 

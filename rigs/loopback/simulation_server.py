@@ -27,6 +27,8 @@ from sliplab.rigs.core.driver import (
     EventCameraDriver,
     FakeEventCamera,
     FakeForceSensor,
+    FakeGripper,
+    GripperScene,
     PulseTrain,
 )
 from sliplab.rigs.core.fake_motion import ControllerClock
@@ -141,6 +143,13 @@ class SimulationServer:
                 self._make_force = partial(driver.fake, devices.force_sensor)
                 self.force = self._make_force()
             self._force.start()
+        self.gripper: FakeGripper | None = None
+        if (gripper := devices.gripper_driver) is not None:
+            assert self.world.fingers is not None  # the rig file was held against it
+            assert gripper.fake is not None
+            fingers = GripperScene(self.world.fingers, self._trial_now_ns)
+            self._make_gripper = partial(gripper.fake, devices.gripper, fingers)
+            self.gripper = self._make_gripper()
         scene = ArmScene(
             self._path.motion,
             ControllerClock(self._arm_now_s),
@@ -162,15 +171,17 @@ class SimulationServer:
         self._start_events()
 
     @property
-    def addresses(self) -> tuple[Any, Any, Any, dict[str, Any]]:
-        """The addresses of sync box, event camera, force sensor and further cameras."""
+    def addresses(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """The addresses of sync box, event camera, force sensor, gripper and further cameras."""
         further = {name: camera.address for name, camera in self.further.items()}
         force = self.force and self.force.address
-        return self.sync_box.address, self.camera.address, force, further
+        gripper = self.gripper and self.gripper.address
+        return self.sync_box.address, self.camera.address, force, gripper, further
 
     def close(self) -> None:
         """Close every fake."""
-        for part in (self.arm, self.camera, self.sync_box, self.force, *self.further.values()):
+        parts = self.arm, self.camera, self.sync_box, self.force, self.gripper
+        for part in (*parts, *self.further.values()):
             if part is not None:
                 part.close()
 
@@ -179,6 +190,10 @@ class SimulationServer:
     def _total_ns(self) -> int:
         """Return the total true time across all trials, by the host's clock."""
         return time.monotonic_ns() - self._origin_ns
+
+    def _trial_now_ns(self) -> int:
+        """Return the true time of the trial; the scene follows `LAG_NS` behind."""
+        return self._total_ns() - self.world.past_ns
 
     def _box_now_ns(self) -> int:
         return self._box_clock.to_reference(self._total_ns())
@@ -358,11 +373,12 @@ class SimulationServer:
         """Inject a fault of a device now.
 
         Args:
-            device: ``arm``, ``sync_box``, ``event_camera``, ``force_sensor``, or the name of a
-                further event camera's stream.
+            device: ``arm``, ``sync_box``, ``event_camera``, ``force_sensor``, ``gripper``, or the
+                name of a further event camera's stream.
             kind: for the arm a value of `rigs.core.fakes.Kind`; for the sync box ``reset``,
                 ``silence`` or ``unplug``; for the event camera ``stall`` or ``unplug``; for the
-                force sensor ``silence``, ``overload`` or ``unplug``.
+                force sensor ``silence``, ``overload`` or ``unplug``; for the gripper ``silence``,
+                ``fail`` or ``unplug``.
 
         Raises:
             RigError: no such fault.
@@ -384,13 +400,19 @@ class SimulationServer:
                 "overload": self.force.overload,
                 "unplug": self.force.close,
             }
+        if self.gripper is not None:
+            known["gripper"] = {
+                "silence": self.gripper.silence,
+                "fail": self.gripper.fail,
+                "unplug": self.gripper.close,
+            }
         try:
             what = known[device][kind]
         except KeyError:
             raise RigError(device, f"its fake cannot simulate '{kind}'") from None
         what()
 
-    def restore(self, device: str) -> tuple[Any, Any, Any, dict[str, Any]]:
+    def restore(self, device: str) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """A person puts right whatever is wrong with a device.
 
         A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
@@ -417,6 +439,9 @@ class SimulationServer:
         elif device == "force_sensor" and self.force is not None and self._make_force is not None:
             self.force.close()
             self.force = self._make_force()
+        elif device == "gripper" and self.gripper is not None:
+            self.gripper.close()
+            self.gripper = self._make_gripper()
         elif device in self.further:
             self.further[device].close()
             self.further[device] = self._make_further[device]()

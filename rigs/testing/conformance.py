@@ -23,11 +23,13 @@ from sliplab.rigs.core.driver import (
     EventCameraDriver,
     ForceSensorDriver,
     FrameCameraDriver,
+    GripperDriver,
     SyncBoxDriver,
 )
-from sliplab.rigs.testing import arm_rules, stream_rules
+from sliplab.rigs.testing import arm_rules, gripper_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
 from sliplab.rigs.testing.camera_benches import EventBench, FrameBench
+from sliplab.rigs.testing.gripper_bench import GripperBench
 from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules, Seen
 from sliplab.rigs.testing.sensor_benches import ArmForceBench, ForceBench, SyncBench
 
@@ -90,6 +92,8 @@ def cases(
         return of(lambda: FrameBench(driver, settings, limits), common, stream_rules.FRAME_RULES)
     if isinstance(driver, SyncBoxDriver):
         return of(lambda: SyncBench(driver, settings, limits), common, stream_rules.SYNC_RULES)
+    if isinstance(driver, GripperDriver):
+        return of(lambda: GripperBench(driver, settings, limits), gripper_rules.RULES)
     if not isinstance(driver, ForceSensorDriver):
         raise TypeError(f"{driver.name}: there are no rules for a {driver.kind}")
     rules = common, stream_rules.FORCE_RULES

@@ -51,10 +51,9 @@ def outcomes(rows: Sequence[ReflexRow], trials: Sequence[ReflexTrial], *, simula
         for i, line in enumerate(text):
             for k, cell in enumerate(line):
                 axes.text(k, i, cell, ha="center", va="center", fontsize=8)
-        axes.set_xticks(
-            range(len(conditions)),
-            [f"{1e3 * mass:.0f} g\n{speed:g} mm/s" for speed, mass in conditions], fontsize=7,
-        )  # fmt: skip
+        names = [f"{1e3 * mass:.0f}\n{speed:g}" for speed, mass in conditions]
+        axes.set_xticks(range(len(conditions)), names, fontsize=7.5)
+        axes.set_xlabel("mass of the plate (g), speed of the retraction (mm/s)")
         axes.set_yticks(range(len(rows)), [title_of(row) for row in rows])
         axes.spines[:].set_visible(False)
         axes.tick_params(length=0)

@@ -6,11 +6,21 @@ import pytest
 
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.registry import BUILT_IN, Listed, load_driver
-from sliplab.rigs.devices import abb, ati_net_ft, basler, dvxplorer, sync_box, ur, uvc
+from sliplab.rigs.devices import (
+    abb,
+    ati_net_ft,
+    basler,
+    dvxplorer,
+    robotiq_2f,
+    sync_box,
+    ur,
+    uvc,
+)
 from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
+from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
 from sliplab.rigs.devices.uvc.settings import UvcSettings
@@ -77,6 +87,11 @@ def uvc_cases() -> list[Case]:
     return cases(uvc.DRIVER, settings)
 
 
+def gripper_cases() -> list[Case]:
+    settings = Robotiq2fSettings(host="127.0.0.1", opening_mm=40.0, answer_s=0.5)
+    return cases(robotiq_2f.DRIVER, settings)
+
+
 LATE = "late answer"
 DEVICES = {
     # not simulated: requests of their own connection, registers, and HTTP
@@ -85,6 +100,7 @@ DEVICES = {
     "ur": (ur_cases, {LATE}),
     "ur_wrench": (wrench_cases, {"overload"}),  # the controller's own stop
     "ati_net_ft": (ati_cases, set()),
+    "robotiq_2f": (gripper_cases, set()),
     "dvxplorer": (dvxplorer_cases, set()),
     "sync_box": (sync_cases, set()),
     "basler": (basler_cases, set()),

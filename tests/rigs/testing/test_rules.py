@@ -8,7 +8,7 @@ import pytest
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import FrameCameraDriver
-from sliplab.rigs.testing import arm_rules, stream_rules
+from sliplab.rigs.testing import arm_rules, gripper_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
 from sliplab.rigs.testing.conformance import cases, conformance
 from sliplab.rigs.testing.examples import arm, events, frames
@@ -19,7 +19,7 @@ from tests.rigs.waiting import own_address
 
 KINDS = (
     arm_rules.RULES, stream_rules.RULES, stream_rules.FRAME_RULES, stream_rules.FORCE_RULES,
-    stream_rules.SYNC_RULES,
+    stream_rules.SYNC_RULES, gripper_rules.RULES,
 )  # fmt: skip
 
 

@@ -1,0 +1,61 @@
+"""Bench of grippers, each on its fake, whose fingers the bench can stall."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from sliplab.rigs.core.capabilities import Gripper, GripperState
+from sliplab.rigs.core.driver import GripperDriver, GripperScene
+from sliplab.rigs.core.finger_motion import FingerMotion
+from sliplab.rigs.testing.bench import Bench
+from sliplab.rigs.testing.rule import Bounds, NotTried
+
+REACTION_NS = 8_000_000
+ACCELERATION_MM_S2 = 1000.0
+
+
+class GripperBench(Bench):
+    """A gripper that begins at the opening of its settings, in real time."""
+
+    def __init__(self, driver: GripperDriver[Any], settings: Any, bounds: Bounds) -> None:
+        super().__init__(bounds)
+        if driver.fake is None or driver.reach is None:
+            raise NotTried(f"{driver.name} declares no fake")
+        self.driver, self.range = driver, driver.range(settings)
+        self.opening_mm: float = settings.opening_mm
+        self.fingers = FingerMotion(self.opening_mm, REACTION_NS, ACCELERATION_MM_S2)
+        self.fake = driver.fake(settings, GripperScene(self.fingers, time.monotonic_ns))
+        self.settings = driver.reach(settings, self.fake.address)
+        self.device: Gripper = driver.build(self.settings)
+
+    def open(self) -> None:
+        """Make the gripper and connect it. Raises RigError."""
+        self.device = self.driver.build(self.settings)
+        self.device.connect()
+
+    def connect(self) -> None:
+        """Open within its time limit."""
+        self.call("connect", self.open, self.bounds.connect_s)
+
+    def close_device(self) -> None:
+        """Close the gripper."""
+        self.device.close()
+
+    def close_fake(self) -> None:
+        """Close the fake."""
+        self.fake.close()
+
+    def state(self) -> GripperState:
+        """Return what the driver reports."""
+        return self.call("state", self.device.state)
+
+    def move(self, opening_mm: float, speed_mm_s: float | None = None) -> None:
+        """Start a move, at the largest speed if none is given, with the least force."""
+        speed = self.range.speed_mm_s[1] if speed_mm_s is None else speed_mm_s
+        force = self.range.force_n[0]
+        self.call("move", lambda: self.device.move(opening_mm, speed, force))
+
+    def stall(self) -> None:
+        """Let the fingers meet an object now."""
+        self.fingers.stall(time.monotonic_ns())
