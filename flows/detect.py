@@ -48,8 +48,8 @@ class ReactionMs(TypedDict):
         window: span of the events that the decision rests on; slip may begin anywhere in it.
         sensor: from its end until the events were read.
         network: from there to the decision, in real time.
-        command: until arm and gripper had their commands.
-        actuator: until arm and fingers were at rest.
+        command: until the drivers of arm and gripper had been told.
+        actuator: until arm and fingers were at rest, with the drivers' way to them.
     """
 
     window: float

@@ -64,7 +64,10 @@ def serve(fd: int, model: str) -> None:
             from sliplab.analysis.networks import model_file, training
 
             training.limit_threads(1)
-            counting = counting_of(model_file.load(Path(model)))
+            fitted = model_file.load(Path(model))
+            counting, w = counting_of(fitted), fitted.windows
+            # the first window must not wait for what is loaded and compiled
+            counting(np.zeros((1, w.steps, w.channels, w.cells, w.cells), np.uint8))
         except Exception as error:
             pipe.send((False, str(error)))
             os._exit(1)

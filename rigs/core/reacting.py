@@ -2,7 +2,9 @@
 
 `Rig.run_trial` records trials; here nothing is recorded. The watcher that reads the events triggers
 the reflex by raising `SlipDetected` while the arm moves in contact. The arm is stopped before
-anything else. A failure ends as in any trial: the arm is stopped, and moved clear if healthy.
+anything else; only a grip is commanded first where the arm gets no deeper meanwhile, because that
+returns at once, and a stop may wait for rest. A failure ends as in any trial: the arm is stopped,
+and moved clear if healthy.
 
 Where slip can no longer be detected (no events, no network, a decision too late) the rig goes to
 its safe state: the arm stops, or the gripper tightens too, and both stay, because an arm that moves
@@ -23,6 +25,8 @@ from sliplab.storage.streams import Sink
 REST_S = 2.0
 """Timeout for a stopped arm to come to rest, s."""
 GRIPPER = "gripper"
+_LEVEL = ("slide", "retract", "twist")
+"""Phases in which the arm gets no deeper."""
 _SENSES = ("event camera", GRIPPER)
 """Devices whose failure ends in the safe state; after that of another the arm moves clear."""
 
@@ -98,8 +102,9 @@ class Reaction:
     Attributes:
         phase: the interrupted phase.
         stop_ms: time from the detection until the arm was at rest.
-        command_ms: time from the detection until arm and gripper had their commands.
-        actuator_ms: time from there until all was done: arm at rest, pressed, fingers at rest.
+        command_ms: time from the detection until the drivers had been told to stop, or to grip.
+        actuator_ms: time from there until all was done: arm at rest, pressed, fingers at rest;
+            a driver's way to its device is in it.
         stopped_mm: position at which it came to rest: x, y, depth in plate coordinates.
         depth_mm: final depth in contact: the arm's, and what the fingers add.
         closed_mm: by how much the fingers closed.
@@ -245,9 +250,16 @@ def _react(
         return (rig.clock.now_ns() - began_ns) / 1e6
 
     watcher.armed = False
-    rig.arm.stop()
-    closed_mm = _grip(rig, reflex) if reflex.kind == "grip" else 0.0
-    command_ms = passed_ms()
+    closed_mm = 0.0
+    try:
+        if reflex.kind == "grip" and phase in _LEVEL:
+            closed_mm = _grip(rig, reflex)
+        command_ms = passed_ms()
+    finally:
+        rig.arm.stop()
+    if reflex.kind == "grip" and phase not in _LEVEL:
+        closed_mm = _grip(rig, reflex)
+        command_ms = passed_ms()
     watcher.step("reflex", False)
     while not (progress := rig.arm.progress()).done:
         if passed_ms() > REST_S * 1e3:
@@ -284,7 +296,6 @@ def _grip(rig: Rig, reflex: Reflex) -> float:
     """Start to close the fingers, and return by how much, mm; not beyond the deepest place."""
     if rig.gripper is None:
         raise RigError(GRIPPER, "this rig has none to tighten")
-    # the arm gets no deeper while it stops: a reflex interrupts slides and retractions only
     room_mm = reflex.deepest_mm - rig.position().depth_mm
     closed_mm = min(reflex.deeper_mm, room_mm)
     if closed_mm <= 0:

@@ -15,9 +15,9 @@ class ReactionParts(Part):
     network: Number
     """From there to the decision, in real time."""
     command: Number
-    """From there until arm and gripper had their commands."""
+    """From there until the drivers of arm and gripper had been told."""
     actuator: Number
-    """From there until arm and fingers were at rest."""
+    """From there until arm and fingers were at rest, with the drivers' way to them."""
 
     @property
     def total(self) -> float:
