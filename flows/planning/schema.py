@@ -29,6 +29,7 @@ from sliplab.storage.schema.drift import DriftFit
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.power import PowerRecord
+from sliplab.storage.schema.reflex import ReflexStudy
 from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
@@ -36,7 +37,7 @@ from sliplab.storage.schema.twin import TwinFit, TwinGap
 
 Kind = Literal[
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin", "drift", "gap", "power", "stress",
+    "classes-summary", "twin", "drift", "gap", "power", "stress", "reflex",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
@@ -52,6 +53,7 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "gap": TwinGap,
     "power": PowerRecord,
     "stress": StressRecord,
+    "reflex": ReflexStudy,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
@@ -65,6 +67,7 @@ TITLES: dict[Kind, str] = {
     "gap": "Networks of a twin, tested on the rig that it imitates, by SlipLab",
     "power": "Trials that claims need, by SlipLab",
     "stress": "Detectors under nuisances, by SlipLab",
+    "reflex": "Drops that reflexes prevent, by SlipLab",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

@@ -9,6 +9,7 @@ import pytest
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
 from sliplab.rigs.build import loopback_rig
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
@@ -38,6 +39,7 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
     assert result["losses"]["late"] == result["losses"]["gaps"] == 0
     assert result["windows"] > 15
     reflex = result["reflex"]
+    assert reflex
     assert reflex["done"]
     x, _, depth = reflex["stopped_mm"]
     assert -3.5 < x < 3.0
@@ -45,3 +47,33 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
     assert reflex["depth_mm"] == pytest.approx(2.7, abs=0.05)
     assert 0 < result["latency_ms"]["median"] < BEHIND_MS
     print(f"simulated: latency {result['latency_ms']}, compute {result['compute_ms']}, {reflex}")
+
+
+def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path: Path) -> None:
+    file = write(tmp_path / "gripper.yaml", {
+        "extends": str(rig_yaml(tmp_path)),
+        "name": "loopback",
+        "devices": {"gripper": {"driver": "robotiq_2f", "host": "127.0.0.1", "opening_mm": 40}},
+        "mock": {"gripper": {"opening_mm": 40}},
+    })  # fmt: skip
+    order = make_detect_request(
+        file, model_in(tmp_path), protocol=write(tmp_path / "p.yaml", short_slide()), trial="",
+        reflex="grip:1", hold_s=0.3,
+    )  # fmt: skip
+    with stage_of(order.rig) as stage:
+
+        def build(file: RigFile) -> Rig:
+            return loopback_rig(file, stage)
+
+        reflex = detect(order, counting=slip_when_busy(), build=build)["reflex"]
+        assert stage.arm_place()[2] < 0
+        assert reflex
+        # three steps of 1/3 mm are 1 mm, and the driver rounds to the wider opening
+        assert reflex["closed_mm"] == pytest.approx(1.0, abs=0.34)
+        assert reflex["depth_mm"] == pytest.approx(2.4 + reflex["closed_mm"], abs=0.05)
+        assert not reflex["stalled"]
+        stage.inject("gripper", "silence")
+        with pytest.raises(RigError, match="gripper: no answer"):
+            detect(order, counting=slip_when_busy(), build=build)
+        assert stage.at_rest()
+    print(f"simulated: {reflex}")

@@ -248,6 +248,17 @@ def test_wrong_rig_files_are_said(change: dict[str, Any], said: str, tmp_path: P
         load_rig_file(file)
 
 
+def test_a_loopback_rig_needs_the_fingers_that_its_gripper_moves(tmp_path: Path) -> None:
+    shipped = ROOT / "rigs" / "loopback_gripper.yaml"
+    for fingers in (None, {"opening_mm": 30}):
+        change = {"extends": str(shipped), "mock": {"gripper": fingers}}
+        with pytest.raises(InputError, match=r"mock.gripper.opening_mm.* must be 40: the fake of"):
+            load_rig_file(write(tmp_path / "rig.yaml", change))
+    allowed = load_rig_file(shipped)[0].gripper_range
+    assert allowed is not None
+    assert allowed.force_n == (20.0, 235.0)
+
+
 def test_limits_of_force_hold_for_grips(model: Path, protocol: Path, tmp_path: Path) -> None:
     change = {"mock": {"force": {}}, "limits": {"force": "10 N"}}
     with pytest.raises(InputError, match=r"limits.force is 10 N: set reflex.force to less"):
