@@ -35,8 +35,8 @@ from sliplab.protocols.yaml_file import (
 )
 from sliplab.rigs.core.arm_settings import check_units
 from sliplab.rigs.core.calibration import Calibration, without_taught
-from sliplab.rigs.core.capabilities import GripperRange
 from sliplab.rigs.core.driver import Driver, EventCameraDriver
+from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.fault_settings import StreamGone
 from sliplab.rigs.mock.settings import MockSettings, check_timing

@@ -15,6 +15,7 @@ from typing import Literal, NotRequired, Protocol, TypedDict, runtime_checkable
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Code, ForceGrade
+from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
@@ -330,20 +331,6 @@ class ScalarSensor(Protocol):
 
     def close(self) -> None:
         """Close the connection."""
-
-
-@dataclass(frozen=True)
-class GripperRange:
-    """Least and largest values that a gripper's commands may have.
-
-    Attributes:
-        step_mm: smallest step of the opening; 0 where every opening can be reached.
-    """
-
-    opening_mm: tuple[float, float]
-    speed_mm_s: tuple[float, float]
-    force_n: tuple[float, float]
-    step_mm: float = 0.0
 
 
 @dataclass(frozen=True)

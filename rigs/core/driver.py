@@ -23,13 +23,13 @@ if TYPE_CHECKING:
         ForceSensor,
         FrameCamera,
         Gripper,
-        GripperRange,
         ScalarSensor,
         SyncBox,
     )
     from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
     from sliplab.rigs.core.fakes import FakeController
     from sliplab.rigs.core.finger_motion import FingerMotion
+    from sliplab.rigs.core.gripper_range import GripperRange
     from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
 
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sliplab.rigs.core.capabilities import GripperRange, RigError
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.gripper_range import GripperRange
 
 _EPS = 1e-9
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.rigs.core.capabilities import GripperRange, GripperState, RigError
+from sliplab.rigs.core.capabilities import GripperState, RigError
 from sliplab.rigs.core.gripper_check import check_move
+from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.mock.settings import Gripper
 from sliplab.rigs.mock.world import World
 

@@ -9,7 +9,8 @@ from sliplab.rigs.core.network import answers
 from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
 
 if TYPE_CHECKING:
-    from sliplab.rigs.core.capabilities import Gripper, GripperRange
+    from sliplab.rigs.core.capabilities import Gripper
+    from sliplab.rigs.core.gripper_range import GripperRange
 
 
 def _build(settings: Robotiq2fSettings) -> Gripper:

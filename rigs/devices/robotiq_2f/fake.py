@@ -12,10 +12,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sliplab.rigs.core.capabilities import GripperRange
 from sliplab.rigs.core.driver import GripperScene
 from sliplab.rigs.core.fakes import LOOPBACK
 from sliplab.rigs.core.finger_motion import FingerMotion
+from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.devices.robotiq_2f import protocol
 from sliplab.rigs.devices.robotiq_2f.settings import Model
 

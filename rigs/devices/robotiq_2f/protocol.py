@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from sliplab.rigs.core.capabilities import GripperRange
+from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.devices.robotiq_2f.settings import Model
 
 COUNTS = 255
