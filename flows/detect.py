@@ -9,6 +9,7 @@ stored), and a reflex may interrupt it. However it ends, the arm is stopped firs
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -39,6 +40,8 @@ from sliplab.storage.errors import translated_disk_errors
 
 RATE_HZ = 100
 FOREVER_S = 1e9
+TURN_S = 0.0005
+"""Longest turn of a thread while another one waits, s."""
 
 
 class ReactionMs(TypedDict):
@@ -130,6 +133,7 @@ def detect(
     """
     training.limit_threads(1)
     with ExitStack() as done:
+        done.enter_context(_short_turns())
         counting = counting or done.enter_context(_counting(request))
         write = done.enter_context(_lines(out))
         done.enter_context(held(request.rig))
@@ -217,6 +221,17 @@ def _move(request: DetectRequest, rig: Rig, sink: DetectSink) -> Reaction | None
         request.reflex,
         request.safe,
     )
+
+
+@contextmanager
+def _short_turns() -> Iterator[None]:
+    """Let threads take short turns: those of drivers would hold a decision up for 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(TURN_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 @contextmanager
