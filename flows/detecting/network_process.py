@@ -45,6 +45,11 @@ class NetworkProcess:
         counts: npt.NDArray[np.int64] = self._process.call("counts", x, within_s=self._answer_s)
         return counts
 
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
     def kill(self) -> None:
         """End the process at once, for tests; every later call fails."""
         self._process.kill()

@@ -122,6 +122,11 @@ class LibraryProcess:
         finally:
             self._lock.release()
 
+    @property
+    def pid(self) -> int:
+        """Number of the child's process."""
+        return self._child.pid
+
     def kill(self) -> None:
         """End the child now, whatever it is doing; safe to call more than once."""
         if self._child.poll() is None:

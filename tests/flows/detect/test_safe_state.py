@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from sliplab.rigs.core.reacting import SafeState
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import EventChunk
+from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
 from tests.flows.detect.detecting import keeping, slip_when_busy, stands_clear, untrained
@@ -183,6 +186,22 @@ def test_without_a_safe_state_a_failure_moves_the_arm_clear(
     assert stands_clear(rigs[0])
 
 
+def test_the_command_says_what_was_lost_and_fails(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
+    file = write(tmp_path / "rig.yaml", {"extends": str(RIG), "mock": {"faults": [gone]}})
+    done = here(
+        "detect", "--rig", file, "--model", model, "--protocol", protocol,
+        "--trial", "depth=2.4mm", "--reflex", "grip:0.4", "--json",
+    )  # fmt: skip
+    assert done.returncode == 1
+    error = json.loads(done.stdout)["error"]
+    assert "event camera: does not answer" in error["message"]
+    assert "the safe state 'grip' was reached" in error["message"]
+    assert "secure the object, then move the arm clear" in error["message"]
+
+
 # -- grips -----------------------------------------------------------------------------------
 
 
@@ -282,6 +301,19 @@ def test_the_network_in_its_process_is_the_network(model: Path) -> None:
     network.close()
     with pytest.raises(NetworkLost, match="has exited"):
         network(x)
+
+
+def test_a_network_that_hangs_is_given_up_in_time(model: Path) -> None:
+    windows = untrained().windows
+    x = np.zeros((1, windows.steps, windows.channels, windows.cells, windows.cells), np.uint8)
+    network = NetworkProcess(model, 0.5)
+    network(x)
+    os.kill(network.pid, signal.SIGSTOP)
+    with pytest.raises(NetworkLost, match=r"no answer within 0\.5 s"):
+        network(x)
+    with pytest.raises(NetworkLost, match="has exited"):  # it was ended
+        network(x)
+    network.close()
 
 
 def test_a_model_that_is_none_does_not_start(tmp_path: Path) -> None:
