@@ -59,6 +59,7 @@ def test_a_sound_trial_leaves_no_doubt(sound: tuple[Label, Recording]) -> None:
     assert all(value is not None and abs(value) <= 30 for value in errors.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["papilla_torn", "marker_occluded"])
 @pytest.mark.parametrize("lead_s", [0.5, 0.2, -0.1])
 def test_no_lost_marker_makes_a_label_wrong(

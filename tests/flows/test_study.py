@@ -144,6 +144,7 @@ def test_nothing_changed_is_nothing_to_do(ran: tuple[list[RunRequest], Outcome])
     assert [step["done"] for step in again.steps] == [0, 0, 0, 0, 0]
 
 
+@pytest.mark.long
 def test_another_margin_is_evaluation_and_report_only(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path
 ) -> None:

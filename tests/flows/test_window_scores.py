@@ -51,6 +51,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     return store
 
 
+@pytest.mark.long
 def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> None:
     campaigns = collected(two)
     assert [t.index for t, _ in campaigns[0].of_split("test")] == [

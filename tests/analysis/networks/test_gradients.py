@@ -71,6 +71,7 @@ def batch(way: Way | None, rows: IntArray, seed: int = 0) -> Batch:
         return work.batch(x, y, rows, pool)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", WAYS)
 def test_all_ways_count_the_same_spikes_and_agree_on_gradients(way: Way) -> None:
     rows = np.array([3, 17, 0, 8, 9, 11, 2])

@@ -245,6 +245,7 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
     assert (made.verdict, made.new) == ("reject", review.Onsets())
 
 
+@pytest.mark.long
 def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: Tab) -> None:
     trial = served.made.ids[20]
     tab.find(trial)

@@ -37,6 +37,7 @@ def depth(rig: Rig) -> float:
     return rig.position().depth_mm
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong_mm", [0.0, 0.7, -0.6])
 @pytest.mark.parametrize("way", [None, find], ids=["events", "markers"])
 def test_the_surface_is_found_wherever_the_plane_is_assumed(wrong_mm: float, way: Any) -> None:

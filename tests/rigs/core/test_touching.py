@@ -69,6 +69,7 @@ def test_what_is_no_touch_is_not_taken_for_one(kind: str) -> None:
     assert noticed(way(kind), 80) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.001, 0.02, 0.2])
 def test_noise_alone_is_no_touch(noise: float) -> None:
     assert all(noticed(way("nothing", seed, noise), 1) is None for seed in range(20))

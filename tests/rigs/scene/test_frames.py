@@ -114,6 +114,7 @@ def test_discs_may_leave_the_picture_even_smeared() -> None:
     assert smeared.min() > 15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("length_px", [0.15, 0.6, 2.7, 28.0])
 @pytest.mark.parametrize("angle", [0.0, 0.5, np.pi / 2])
 def test_a_smeared_disc_is_the_mean_of_sharp_ones(length_px: float, angle: float) -> None:

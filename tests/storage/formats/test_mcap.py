@@ -423,6 +423,7 @@ def test_other_encodings_and_topics_are_named(tmp_path: Path) -> None:
     assert not list(made.folder.glob("campaigns/*"))
 
 
+@pytest.mark.long
 def test_damage_ends_in_a_message_and_leaves_nothing(rich: Store, tmp_path: Path) -> None:
     (where,) = rich.campaigns()
     (one,) = where.recordings()
