@@ -146,7 +146,27 @@ def trained_net(
     classes: int = len(CLASSES),
     batch: int = BATCH,
 ) -> tuple[Votes, dict[str, Any]]:
-    """Train one of `KINDS` or `TAXEL_KINDS`, keep its best epoch, vote on test samples.
+    """Train one of `KINDS` or `TAXEL_KINDS` as `fitted_net`, and vote on test samples.
+
+    Returns:
+        logits float32 (n, classes), and what it was: epochs, weights, multiply-adds a window.
+    """
+    net, said = fitted_net(kind, train, validation, epochs, seed, on_epoch, mirror, classes, batch)
+    return net_votes(net, test, classes), said
+
+
+def fitted_net(
+    kind: str,
+    train: SampleSet,
+    validation: SampleSet,
+    epochs: int = EPOCHS,
+    seed: int = 0,
+    on_epoch: Callable[[int, float], None] | None = None,
+    mirror: bool = True,
+    classes: int = len(CLASSES),
+    batch: int = BATCH,
+) -> tuple[nn.Module, dict[str, Any]]:
+    """Train one of `KINDS` or `TAXEL_KINDS`, and keep its best epoch.
 
     The best epoch is that of the best validation accuracy.
 
@@ -159,7 +179,7 @@ def trained_net(
         batch: windows a step of the optimiser; fewer for few windows.
 
     Returns:
-        logits float32 (n, classes), and what it was: epochs, weights, multiply-adds a window.
+        the network, and what it was: epochs, weights, multiply-adds a window.
 
     Raises:
         KeyError: no such kind.
@@ -179,7 +199,7 @@ def trained_net(
     for done in range(1, epochs + 1):
         rng = np.random.default_rng([seed, done])
         _one_epoch(net, optimizer, falling, train, rng, mirror, batch)
-        votes = _votes(net, validation.windows, classes)
+        votes = net_votes(net, validation.windows, classes)
         strict = metrics.accuracy(votes, validation.y).strict or 0.0
         loss = float(
             nn.functional.cross_entropy(torch.from_numpy(votes), torch.from_numpy(validation.y))
@@ -198,7 +218,7 @@ def trained_net(
         "weights": sum(p.numel() for p in net.parameters()),
         "multiply_adds": multiply_adds(net, train.windows.shape),
     }
-    return _votes(net, test, classes), said
+    return net, said
 
 
 def _one_epoch(
@@ -226,7 +246,8 @@ def _one_epoch(
         falling.step()
 
 
-def _votes(net: nn.Module, x: SparseWindows, classes: int) -> Votes:
+def net_votes(net: nn.Module, x: SparseWindows, classes: int = len(CLASSES)) -> Votes:
+    """Return logits of samples, float32 (n, classes)."""
     net.eval()
     out = np.empty((len(x), classes), np.float32)
     with torch.no_grad():

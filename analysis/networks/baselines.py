@@ -298,10 +298,27 @@ def boosted(
     rounds: int = ROUNDS,
     classes: int = len(CLASSES),
 ) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
-    """Fit on training samples, stop by validation samples, vote on test samples.
+    """Fit as `fitted_trees`, and vote on test samples.
 
     Returns:
         probabilities (n, classes), and what was fitted as text and numbers.
+    """
+    model = fitted_trees(train, validation, rounds, classes)
+    with threadpool_limits(1):
+        votes = model.predict_proba(features(test)) if len(test) else np.empty((0, classes))
+    return votes, {"rounds": int(model.n_iter_), "most_rounds": rounds, "patience": PATIENCE}
+
+
+def fitted_trees(
+    train: SampleSet,
+    validation: SampleSet,
+    rounds: int = ROUNDS,
+    classes: int = len(CLASSES),
+) -> Any:
+    """Fit scikit-learn's gradient boosting on training samples, stop by validation samples.
+
+    Returns:
+        the classifier of `features`.
 
     Raises:
         ValueError: a class is missing among the training samples.
@@ -324,5 +341,4 @@ def boosted(
             X_val=features(validation.windows),
             y_val=validation.y,
         )
-        votes = model.predict_proba(features(test)) if len(test) else np.empty((0, classes))
-    return votes, {"rounds": int(model.n_iter_), "most_rounds": rounds, "patience": PATIENCE}
+    return model
