@@ -1,0 +1,137 @@
+"""Interface of a detector in the bench: events in, evidence out.
+
+A detector is given a scene's events in the order of time, some at once, with the moment up to which
+they are complete. It answers with its evidence for slip and when that was known. The bench sets the
+level above which the evidence is an alarm, so a detector has no threshold of its own.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.storage.streams import EventChunk
+
+NO_LABEL = -1
+"""Label of a decision without a class."""
+
+
+@dataclass(frozen=True)
+class Slip:
+    """True times of a scene, microseconds since it began.
+
+    Attributes:
+        physical_us: the first tip slides.
+        paper_us: a marker has moved 2 pixels, the paper's incipient onset.
+        gross_us: all markers have, the paper's gross onset.
+    """
+
+    physical_us: int
+    paper_us: int
+    gross_us: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A simulated recording: a hold, and the slide that ends it.
+
+    Attributes:
+        events: of the whole scene, from time 0 on.
+        width, height: the sensor's pixels.
+        end_us: end of the recording.
+    """
+
+    name: str
+    events: EventChunk
+    width: int
+    height: int
+    end_us: int
+    slip: Slip
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Answers of a detector, in the order of time.
+
+    Attributes:
+        t_us: int64 (n,), when each was known: the end of the events that it rests on.
+        value: float64 (n,), evidence for slip, finite or -inf; larger is more.
+        label: int8 (n,), 0 no slip, 1 incipient, 2 gross slip; `NO_LABEL` without classes.
+    """
+
+    t_us: npt.NDArray[np.int64]
+    value: npt.NDArray[np.float64]
+    label: npt.NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    @staticmethod
+    def of(
+        t_us: npt.ArrayLike, value: npt.ArrayLike, label: npt.ArrayLike | None = None
+    ) -> Evidence:
+        """Return evidence of any numbers; without labels it has no classes."""
+        times = np.asarray(t_us, np.int64)
+        labels = np.full(times.shape, NO_LABEL) if label is None else label
+        return Evidence(times, np.asarray(value, np.float64), np.asarray(labels, np.int8))
+
+    @staticmethod
+    def joined(parts: Sequence[Evidence]) -> Evidence:
+        """Return evidence of parts that follow each other."""
+        none = Evidence.of([], [])
+        every = [none, *parts]
+        return Evidence(
+            np.concatenate([part.t_us for part in every]),
+            np.concatenate([part.value for part in every]),
+            np.concatenate([part.label for part in every]),
+        )
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a detector as it states it; None where it does not.
+
+    Attributes:
+        operations: additions and multiplications of a decision, mean.
+        memory_bytes: of its parameters.
+    """
+
+    operations: float | None = None
+    memory_bytes: int | None = None
+
+
+class Detector(ABC):
+    """A detector of slip; see the module."""
+
+    def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:  # noqa: B027
+        """Learn from scenes; the others choose among what was learned. By default nothing."""
+
+    @abstractmethod
+    def begin(self, width: int, height: int) -> None:
+        """Begin a scene at time 0, with a sensor of so many pixels; nothing of the last one stays.
+
+        Raises:
+            ValueError: the detector does not work with such a sensor.
+        """
+
+    @abstractmethod
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        """Take the next events, complete up to `until_us`; return what is known by then.
+
+        Args:
+            events: sorted by time, from the last call's `until_us` on and before this one's.
+
+        Returns:
+            evidence of times after the last call's `until_us`, up to this one's.
+        """
+
+    def cost(self) -> Cost:
+        """Return its cost, after `train`."""
+        return Cost()
+
+    def close(self) -> None:  # noqa: B027
+        """Release what it holds, such as a process. By default nothing."""

@@ -1,0 +1,110 @@
+"""Results of the open bench of detectors."""
+
+from __future__ import annotations
+
+from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+
+
+class MedianLatency(Part):
+    """A median over slides, missed ones infinitely late, with its 95 % interval.
+
+    None where it is infinite, or so few slides bound nothing.
+    """
+
+    value: Number | None
+    low: Number | None
+    high: Number | None
+
+
+class AlarmRate(Part):
+    """False alarms an hour without slip, with the exact 95 % interval of a Poisson rate."""
+
+    alarms: Int
+    hours: Number
+    value: Number
+    low: Number
+    high: Number
+
+
+class BenchScores(Part):
+    """Alarms of a detector on some scenes, above one level of its evidence.
+
+    Attributes:
+        latency_ms: from when the first tip slid. latency_paper_ms: from the paper's 2-pixel onset,
+            negative before it.
+        missed: slides without an alarm before gross slip. early: those of them in which a false
+            alarm lasted until the slip.
+    """
+
+    slides: Int
+    latency_ms: MedianLatency
+    latency_paper_ms: MedianLatency
+    missed: Int
+    early: Int
+    false_alarms: AlarmRate
+
+
+class BenchPoint(Part):
+    """A detector on test scenes at one asked rate of false alarms.
+
+    Attributes:
+        asked: false alarms an hour. allowed: in all validation scenes.
+        level: lowest at which these have no more; None where nothing bounds it.
+    """
+
+    asked: Number
+    allowed: Int
+    level: Number | None
+    test: BenchScores
+
+
+class BenchDetector(Part):
+    """A detector of the table.
+
+    Attributes:
+        curve: over the asked rates; the first one is the table's.
+        nuisances: scores at the table's level, by nuisance.
+        accuracy: of decisions on test scenes, mean of the classes' recalls; None without classes.
+        operations: of a decision, and memory_bytes of parameters, as the detector states them.
+        decision_us: measured.
+        train_s: seconds of training.
+    """
+
+    name: str
+    curve: tuple[BenchPoint, ...]
+    nuisances: dict[str, BenchScores]
+    accuracy: Number | None
+    operations: Number | None
+    memory_bytes: Int | None
+    decision_us: Number
+    train_s: Number
+
+    @property
+    def table(self) -> BenchPoint:
+        """Return the point of the table."""
+        return self.curve[0]
+
+
+class KeptDetector(Document):
+    """What is kept of a detector, so that a run resumes."""
+
+    row: BenchDetector
+    hours: dict[str, Number]
+
+
+class BenchResult(Document):
+    """The whole table.
+
+    Attributes:
+        version: of the bench's scenes. size: which set of them. seed: of the test worlds.
+        scenes: their number by part. hours: without slip, of validation and test scenes.
+        detectors: the best first.
+    """
+
+    simulated: Bool
+    version: Int
+    size: str
+    seed: Int
+    scenes: dict[str, Int]
+    hours: dict[str, Number]
+    detectors: tuple[BenchDetector, ...]

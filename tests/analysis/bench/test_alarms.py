@@ -1,0 +1,84 @@
+"""Alarms above a level, and the level of a rate of false ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.bench.alarms import Judged, alarm_times, level_at, outcome
+from sliplab.analysis.bench.figures import accuracy, alarm_rate, scores
+from sliplab.analysis.bench.interface import Evidence, Slip
+
+SLIP = Slip(5_000_000, 5_100_000, 8_000_000)
+
+
+def judged(*pairs: tuple[float, float], slip: Slip = SLIP) -> Judged:
+    """Evidence of (seconds, value)."""
+    t_s, value = zip(*pairs, strict=True)
+    return Judged(Evidence.of(np.round(1e6 * np.array(t_s)), value), slip)
+
+
+def test_an_alarm_lasts_a_second() -> None:
+    t_us = np.array([0, 10, 999_999, 1_000_000, 1_500_000, 2_000_001], np.int64)
+    assert alarm_times(t_us).tolist() == [0, 1_000_000, 2_000_001]
+
+
+def test_the_first_alarm_between_the_slips_onset_and_gross_slip_detects_it() -> None:
+    found = outcome(judged((1.0, 9), (4.0, 1), (5.2, 2), (5.3, 9)), 1)
+    assert (found.false, found.detected_us, found.early) == (1, 5_200_000, False)
+    assert outcome(judged((4.0, 1), (8.0, 9)), 1).detected_us is None
+
+
+@pytest.mark.parametrize("before_s", [4.0001, 4.999])
+def test_an_alarm_that_lasts_until_the_slip_has_not_detected_it(before_s: float) -> None:
+    found = outcome(judged((before_s, 9), (5.0, 9), (5.9, 9)), 1)
+    assert (found.false, found.detected_us, found.early) == (1, None, True)
+
+
+def test_a_level_is_the_lowest_that_keeps_the_alarms() -> None:
+    rng = np.random.default_rng(3)
+    scenes = []
+    for _ in range(5):
+        t_s = np.sort(rng.uniform(0, 8, 60))
+        scenes.append(judged(*zip(t_s, rng.integers(0, 40, 60), strict=True)))
+
+    def alarms(level: float) -> int:
+        return sum(outcome(scene, level).false for scene in scenes)
+
+    for allowed in (0, 1, 3, 12):
+        # brute force over all whole numbers and what is between them
+        least = min(level for level in np.arange(-1, 41, 0.5) if alarms(level) <= allowed)
+        found = level_at(scenes, allowed)
+        assert found == least
+        assert alarms(found) <= allowed < alarms(found - 0.5)
+
+
+def test_nothing_bounds_the_level_of_a_detector_without_false_alarms() -> None:
+    assert level_at([judged((5.5, 1.0))], 0) == -np.inf
+
+
+def test_a_median_with_half_of_the_slips_missed_is_infinite() -> None:
+    seen, missed = judged((5.2, 9)), judged((5.2, 0))
+    assert scores([seen, missed, missed], 1).latency_ms.value is None
+    found = scores([seen] * 7 + [missed], 1)
+    assert found.latency_ms.value == pytest.approx(200.0)
+    assert found.latency_paper_ms.value == pytest.approx(100.0)
+    assert found.latency_ms.high is None, "a missed one is among the ranks"
+
+
+def test_the_interval_of_a_rate_is_the_exact_one_of_a_poisson_count() -> None:
+    # Garwood 1936, table for 95 %: no event up to 3.69, four from 1.09 to 10.24
+    assert alarm_rate(0, 1.0).high == pytest.approx(3.689, abs=1e-3)
+    four = alarm_rate(4, 2.0)
+    assert (four.low, four.high) == pytest.approx((1.0899 / 2, 10.2416 / 2), abs=1e-4)
+
+
+def test_accuracy_weighs_classes_and_not_windows() -> None:
+    t_us = np.arange(1, 1000) * 10_000
+    middle = t_us - 15_000
+    true = (middle >= SLIP.paper_us).astype(int) + (middle >= SLIP.gross_us)
+    values = np.zeros(len(t_us))
+    assert accuracy([Judged(Evidence.of(t_us, values, true), SLIP)]) == 1.0
+    never = Judged(Evidence.of(t_us, values, np.zeros(len(t_us))), SLIP)
+    assert accuracy([never]) == pytest.approx(1 / 3)
+    assert accuracy([Judged(Evidence.of(t_us, values), SLIP)]) is None
