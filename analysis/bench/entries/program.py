@@ -1,0 +1,158 @@
+"""A program as an entry, in any language: it reads events on standard input and answers on output.
+
+All numbers are little-endian. The program is given messages with a head of 16 bytes, ``char
+kind[4]; uint32_t n; int64_t value``:
+
+- ``SCEN``: a scene begins at time 0; `n` and `value` are the sensor's width and height.
+- ``EVTS``: `n` events follow, complete up to `value` microseconds, each of 16 bytes: ``int64_t
+  t_us; uint16_t x, y; uint8_t p; uint8_t unused[3]``. To be answered by a head of the kind
+  ``EVID``, `n` the number of its records and `value` anything, and records of 24 bytes: ``int64_t
+  t_us; double value; int32_t label; int32_t unused``; label -1 is without a class.
+
+Standard input is closed at the end. A program that does not answer in time is killed.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import shlex
+import signal
+import struct
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+
+import numpy as np
+
+from sliplab.analysis.bench.feeding import BenchError
+from sliplab.analysis.bench.interface import Detector, Evidence
+from sliplab.protocols.errors import InputError
+from sliplab.storage.streams import EventChunk
+
+HEAD = struct.Struct("<4sIq")
+EVENT = np.dtype([("t_us", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1"), ("unused", "u1", (3,))])
+ANSWER = np.dtype([("t_us", "<i8"), ("value", "<f8"), ("label", "<i4"), ("unused", "<i4")])
+MOST = 1_000_000
+"""Records of an answer."""
+_PIPE = 1 << 16
+
+
+class Program(Detector):
+    """A process that speaks as the module says.
+
+    Args:
+        command: as a shell reads words; no shell runs it.
+        answer_s: longest wait for an answer. end_s: for its end.
+
+    Raises:
+        InputError: there is no such program.
+    """
+
+    def __init__(self, command: str, answer_s: float = 60.0, end_s: float = 2.0) -> None:
+        words = shlex.split(command)
+        if not words:
+            raise InputError("DETECTOR", "", "run:", "must name a command, such as run:./detector")
+        self._command, self._answer_s, self._end_s = command, answer_s, end_s
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
+        try:
+            self._process = subprocess.Popen(
+                words,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._said,
+                start_new_session=True,  # Ctrl-C ends it by `close`
+            )
+        except OSError as error:
+            self._said.close()
+            text = f"cannot be started: {error.strerror}"
+            raise InputError("DETECTOR", "", f"run:{command}", text) from None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._input, self._output = self._process.stdin.fileno(), self._process.stdout.fileno()
+        os.set_blocking(self._input, False)
+        os.set_blocking(self._output, False)
+        self._read = bytearray()
+
+    def begin(self, width: int, height: int) -> None:
+        """See `Detector`."""
+        self._exchange(HEAD.pack(b"SCEN", width, height), 0)
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        """See `Detector`."""
+        records = np.zeros(len(events), EVENT)
+        for name in ("t_us", "x", "y", "p"):
+            records[name] = getattr(events, name)
+        sent = HEAD.pack(b"EVTS", len(events), until_us) + records.tobytes()
+        kind, count, _ = HEAD.unpack(self._exchange(sent, HEAD.size))
+        if kind != b"EVID" or count > MOST:
+            raise BenchError(
+                f"{self._command}: answered {kind!r} with {count} records; must be b'EVID' with "
+                f"{MOST} at most"
+            )
+        found = np.frombuffer(self._exchange(b"", count * ANSWER.itemsize), ANSWER)
+        return Evidence.of(found["t_us"], found["value"], found["label"])
+
+    def _exchange(self, sent: bytes, wanted: int) -> bytes:
+        """Write, and return so many bytes of what is answered.
+
+        Raises:
+            BenchError: the program ended, or did not answer in time.
+        """
+        left, until_s = memoryview(sent), time.monotonic() + self._answer_s
+        with selectors.DefaultSelector() as waiting:
+            waiting.register(self._output, selectors.EVENT_READ)
+            if left:
+                waiting.register(self._input, selectors.EVENT_WRITE)
+            while left or len(self._read) < wanted:
+                ready = waiting.select(max(until_s - time.monotonic(), 0.0))
+                if not ready:
+                    self.close()
+                    raise BenchError(
+                        f"{self._command}: has not answered in {self._answer_s:g} s, and was killed"
+                    )
+                for key, _ in ready:
+                    if key.fd == self._output:
+                        self._take()
+                    else:
+                        with suppress(BrokenPipeError):  # its end is said by what is read
+                            left = left[os.write(self._input, left[:_PIPE]) :]
+                        if not left:
+                            waiting.unregister(self._input)
+        found = bytes(self._read[:wanted])
+        del self._read[:wanted]
+        return found
+
+    def _take(self) -> None:
+        """Read what has come."""
+        found = os.read(self._output, _PIPE)
+        if found:
+            self._read += found
+            return
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(self._end_s)
+        code = self._process.poll()
+        self._said.seek(0)
+        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        last = f": {lines[-1]}" if lines else ""
+        ended = "closed its output" if code is None else f"ended with exit code {code}"
+        self.close()
+        raise BenchError(f"{self._command}: {ended}{last}")
+
+    def close(self) -> None:
+        """End the process, and kill it with its children where it does not end."""
+        if self._said.closed:
+            return
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(self._end_s)
+        except subprocess.TimeoutExpired:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._process.stdout.close()
+        self._said.close()
