@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from sliplab.flows.cli import (
+    bench,
     collect,
     control,
     detect,
@@ -60,6 +61,7 @@ for part in (
     power.app,
     steps.app,
     sweeps.app,
+    bench.app,
     study.app,
     stress.app,
     store.app,

@@ -30,7 +30,7 @@ _EXPECTED = {
     "OutputLost", "WorkerKilled",
 }  # fmt: skip
 """Errors that need no traceback, by name: their modules are slow to import."""
-_OPTION = re.compile(r"--[a-z-]+|FOLDER|KIND|NAME|TRIAL|URL")
+_OPTION = re.compile(r"--[a-z-]+|DETECTOR|FOLDER|KIND|NAME|TRIAL|URL")
 """Names of options and arguments: an `InputError` about one has it in place of a file."""
 
 

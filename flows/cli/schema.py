@@ -18,7 +18,7 @@ app = typer.Typer()
 
 KINDS = (
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin", "drift", "gap", "power", "stress", "reflex",
+    "classes-summary", "twin", "drift", "gap", "power", "stress", "reflex", "bench",
 )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
+from sliplab.storage.schema.bench import BenchResult
 from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.drift import DriftFit
@@ -37,7 +38,7 @@ from sliplab.storage.schema.twin import TwinFit, TwinGap
 
 Kind = Literal[
     "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin", "drift", "gap", "power", "stress", "reflex",
+    "classes-summary", "twin", "drift", "gap", "power", "stress", "reflex", "bench",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
@@ -54,6 +55,7 @@ DOCUMENTS: dict[Kind, type[Document]] = {
     "power": PowerRecord,
     "stress": StressRecord,
     "reflex": ReflexStudy,
+    "bench": BenchResult,
 }
 TITLES: dict[Kind, str] = {
     "trial": "The record of a trial of SlipLab",
@@ -68,6 +70,7 @@ TITLES: dict[Kind, str] = {
     "power": "Trials that claims need, by SlipLab",
     "stress": "Detectors under nuisances, by SlipLab",
     "reflex": "Drops that reflexes prevent, by SlipLab",
+    "bench": "The table of the bench of detectors, by SlipLab",
 }
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"

@@ -54,6 +54,7 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     "export-model": (("ROOM/nowhere", "--out", "ROOM/e"), "ROOM/nowhere", None, None),
     "power": (("pilot", "--store", "ROOM/nowhere"), "ROOM/nowhere", None, None),
     "stress": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
+    "bench": (("nobody", "--folder", "ROOM/b"), None, "DETECTOR", "nobody"),
     "schema": (("robot",), None, "KIND", "robot"),
     "new driver": (("Lab-Arm", "--into", "ROOM"), None, "NAME", "Lab-Arm"),
     **dict.fromkeys(

@@ -1,0 +1,81 @@
+"""Scenes of the bench, version 1. Frozen: whatever changes here is another version.
+
+Worlds are simulated rigs around the shipped rig `rehearsal`, their parameters drawn uniformly in
+their logarithms. Those of training and validation have seeds that everybody knows; those of tests
+are drawn by the seed that the user gives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Span:
+    """Range of a motion's number, uniform; `logarithmic`: in its logarithm."""
+
+    low: float
+    high: float
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class Part:
+    """Scenes of one part.
+
+    Attributes:
+        worlds: simulated rigs. slides: in each of them. holds: scenes with a long hold in all.
+    """
+
+    worlds: int
+    slides: int
+    holds: int
+
+
+@dataclass(frozen=True)
+class Size:
+    """A set of scenes.
+
+    Attributes:
+        nuisance: scenes of each nuisance, in as many worlds.
+    """
+
+    train: Part
+    validation: Part
+    test: Part
+    nuisance: int
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What the scenes are drawn from.
+
+    Attributes:
+        spread: of the worlds' parameters: the largest factor less 1, either way.
+        train_seed, validation_seed: of worlds and motions.
+        beyond_mm: depth of the press beyond that at which the lowest papillae touch: one that does
+            not touch would move from the first moment on, which is no slip.
+        hold_s: before a slide. long_hold_s: of scenes for false alarms.
+        nuisance_hold_s: of scenes with a nuisance.
+    """
+
+    rig: str = "rehearsal"
+    spread: float = 0.3
+    train_seed: int = 101
+    validation_seed: int = 102
+    beyond_mm: Span = Span(0.4, 1.1)
+    speed_mm_s: Span = Span(0.6, 1.6, True)
+    direction_deg: Span = Span(0.0, 360.0)
+    distance_mm: float = 12.0
+    hold_s: Span = Span(1.0, 8.0, True)
+    long_hold_s: Span = Span(100.0, 140.0)
+    nuisance_hold_s: Span = Span(15.0, 25.0)
+
+
+DEFINITION = Definition()
+SIZES = {
+    "full": Size(Part(16, 9, 0), Part(12, 8, 30), Part(16, 12, 30), 8),
+    "small": Size(Part(4, 4, 0), Part(4, 4, 2), Part(6, 4, 2), 2),
+}
