@@ -12,9 +12,11 @@ from sliplab.storage.schema.bench import BenchDetector, BenchResult, MedianLaten
 SHIPPED = tuple(_SHIPPED)
 PLOT = "bench.svg"
 COLUMNS = (
-    "detector", "latency (ms)", "from 2 px (ms)", "missed", "early", "false alarms/h",
+    "detector", "latency (ms)", "from 2 px (ms)", "missed (early)", "false alarms/h",
     "with nuisances", "accuracy (%)", "operations", "memory (B)", "decision (us)",
 )  # fmt: skip
+COSTS = 7
+"""Column of the first cost; on a page costs have a table of their own."""
 BEGIN, END = "<!-- bench: written by `sliplab bench` -->", "<!-- bench: end -->"
 IMAGES = "images"
 
@@ -38,8 +40,7 @@ def _row(row: BenchDetector) -> list[str]:
         row.name,
         _median(test.latency_ms),
         _median(test.latency_paper_ms),
-        f"{test.missed}/{test.slides}",
-        str(test.early),
+        f"{test.missed}/{test.slides} ({test.early})",
         f"{alarms.value:.1f} ({alarms.low:.1f} to {alarms.high:.1f})",
         f"{nuisance / hours:.0f}/h" if hours else "–",
         "–" if row.accuracy is None else f"{100 * row.accuracy:.1f}",
@@ -80,9 +81,7 @@ def write_leaderboard(page: Path, found: BenchResult) -> None:
         InputError: as `check_page`.
     """
     before, after = _around(page)
-    lines = [
-        f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows(found))
-    ]
+    every = [list(COLUMNS), *rows(found)]
     hours = found.hours
     command = "sliplab bench" + (" --small" if found.size == "small" else "")
     text = [
@@ -93,15 +92,23 @@ def write_leaderboard(page: Path, found: BenchResult) -> None:
         f"{found.scenes['test']} test scenes, {hours['validation']:.2f} and {hours['test']:.2f} "
         "hours without slip.",
         "",
-        *lines,
+        *_markdown([row[:COSTS] for row in every]),
         "",
         f"![Latency against false alarms, simulated]({IMAGES}/{PLOT})",
+        "",
+        *_markdown([[row[0], *row[COSTS:]] for row in every]),
         "",
         END,
     ]
     make_folder(page.parent / IMAGES)
     write_plot(page.parent / IMAGES / PLOT, found)
     write_text(page, before + "\n".join(text) + after)
+
+
+def _markdown(table: list[list[str]]) -> list[str]:
+    """Return the lines of a table, whose first row is its head."""
+    head, *body = table
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *body)]
 
 
 def _around(page: Path) -> tuple[str, str]:

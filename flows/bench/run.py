@@ -6,6 +6,7 @@ soon as it is complete, so that a run that was stopped resumes with the next det
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -170,8 +171,20 @@ class Bench:
         found = []
         for one in drawn:
             found.append(scenes.simulated(one))
+            _give_memory_back()
             self.advance()
         return found
+
+
+def _give_memory_back() -> None:
+    """Return freed memory to the system.
+
+    What a simulation frees lies between the events of scenes that are kept, where glibc's allocator
+    keeps it: 15 MB a scene, 11 GB in the full set.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 @dataclass(frozen=True)

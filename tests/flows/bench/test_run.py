@@ -143,7 +143,7 @@ def test_the_leaderboard_is_written_between_its_lines(folder: Path, tmp_path: Pa
     text = page.read_text()
     assert text.startswith("# Bench\n\n<!--")
     assert text.endswith("<!-- bench: end -->\n\nafter\n")
-    assert text.count("| rate |") == 1
+    assert text.count("| rate |") == 2
     assert "old" not in text
     assert "**simulated**" in text
     assert (tmp_path / "images" / "bench.svg").exists()
