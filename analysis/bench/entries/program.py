@@ -116,8 +116,10 @@ class Program(Detector):
                     if key.fd == self._output:
                         self._take()
                     else:
-                        with suppress(BrokenPipeError):  # its end is said by what is read
+                        try:
                             left = left[os.write(self._input, left[:_PIPE]) :]
+                        except BrokenPipeError:  # its end is said by what is read
+                            left = left[:0]
                         if not left:
                             waiting.unregister(self._input)
         found = bytes(self._read[:wanted])

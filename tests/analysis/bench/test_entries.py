@@ -65,7 +65,8 @@ def test_a_program_gives_the_evidence_of_the_same_detector_in_python(one: Scene)
 def test_a_program_that_fails_is_ended_and_says_why(
     text: str, said: str, one: Scene, tmp_path: Path
 ) -> None:
-    detector = Program(program(tmp_path, text), answer_s=0.5, end_s=0.5)
+    answer_s = 0.5 if "sleep" in text else 30.0  # it takes a while to start
+    detector = Program(program(tmp_path, text), answer_s=answer_s, end_s=0.5)
     with pytest.raises(BenchError, match=said):
         feed(detector, one)
     detector.close()
@@ -74,7 +75,7 @@ def test_a_program_that_fails_is_ended_and_says_why(
 
 def test_a_program_that_writes_before_it_reads_blocks_nobody(one: Scene, tmp_path: Path) -> None:
     text = "import sys; sys.stdout.buffer.write(bytes(10**6)); sys.stdout.flush(); sys.stdin.read()"
-    detector = Program(program(tmp_path, text), answer_s=5.0, end_s=0.5)
+    detector = Program(program(tmp_path, text), answer_s=30.0, end_s=0.5)
     with pytest.raises(BenchError, match="answered"):
         feed(detector, one)
     detector.close()

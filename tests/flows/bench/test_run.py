@@ -16,7 +16,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.bench import BenchResult
 from tests.command_line import here
 
-TINY = Size(Part(1, 2, 0), Part(1, 3, 1), Part(2, 2, 1), 1)
+TINY = Size(Part(1, 2, 0), Part(1, 3, 0), Part(2, 2, 0), 1)
 NAMES = ("rate", "always", "random")
 
 
@@ -67,7 +67,7 @@ def test_choices_are_made_before_a_test_scene_is_there(
     monkeypatch.setattr(scenes, "simulated", simulate)
     monkeypatch.setattr(run, "validated", choose)
     run.run_bench(["rate"], "small", 1, tmp_path)
-    assert done[: done.index("chosen")] == ["train"] * 2 + ["validation"] * 4
+    assert done[: done.index("chosen")] == ["train"] * 2 + ["validation"] * 3
     assert set(done[done.index("chosen") + 1 :]) == {"test", "bursts", "mains", "event"}
 
 
@@ -83,7 +83,7 @@ def test_a_detector_is_trained_on_training_and_validation_scenes(
     run.run_bench(["rate"], "small", 1, tmp_path)
     assert seen == [
         ["train 1.1", "train 1.2"],
-        ["validation 1.1", "validation 1.2", "validation 1.3", "validation hold 1"],
+        ["validation 1.1", "validation 1.2", "validation 1.3"],
     ]
 
 

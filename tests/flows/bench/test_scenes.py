@@ -25,6 +25,16 @@ def test_version_1_is_frozen() -> None:
     )
 
 
+def test_its_scenes_are_what_they_were() -> None:
+    # another simulation gives other scenes: then it is another version, too
+    first = scenes.simulated(scenes.training_scenes(SIZES["small"])[0][0])
+    slip = first.slip
+    assert (slip.physical_us, slip.paper_us, slip.gross_us) == pytest.approx(
+        (7_805_270, 7_869_758, 13_419_878), abs=20
+    )
+    assert len(first.events) == pytest.approx(241_764, rel=1e-3)
+
+
 def test_a_seed_draws_the_test_worlds_and_nothing_else() -> None:
     one, same, other = (scenes.test_scenes(SIZE, seed) for seed in (1, 1, 2))
     assert one == same
