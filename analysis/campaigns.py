@@ -97,7 +97,7 @@ class Collected:
     @property
     def disturbed(self) -> bool:
         """True for a campaign with nuisances."""
-        return self.recorded is None and self.plan.protocol.collection.nuisances is not None
+        return IMPORTED not in self.info and self.plan.protocol.collection.nuisances is not None
 
     def describe(self, trial: Trial) -> dict[str, str]:
         """Return a trial's condition as text with units, by factor."""

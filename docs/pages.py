@@ -66,6 +66,10 @@ _DOCUMENTS = {
         "`report/power.json`: after how many trials claims are called in campaigns that were drawn "
         "from a pilot ([Fewer trials](../fewer.md#how-many-are-enough)).",
     ),
+    "reflex": (
+        "The study of reflexes",
+        "`OUT/reflex.json`: drops that reflexes prevent ([Reflexes](../reflex.md)).",
+    ),
     "bench": (
         "The table of the bench",
         "`FOLDER/bench.json`: detectors on the scenes of the bench ([The bench](../bench.md)).",

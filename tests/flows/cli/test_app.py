@@ -94,7 +94,7 @@ def test_rigs_that_ship_are_known_by_name() -> None:
     assert needed["rehearsal"] < 0.2 * needed["mock"]
     done = here("plan", "protocols/pilot.yaml", "--rig", "abacus")
     assert done.returncode == 2
-    assert "not one of the shipped rigs: irb120, loopback, mock" in done.stderr
+    assert "not one of the shipped rigs: irb120, loopback, loopback_gripper, mock" in done.stderr
 
 
 def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
         ),
         (("ROOM/nowhere",), "ROOM/nowhere", None, None),
     ),
+    "reflex": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
     "tradeoff": (("--detector", "ROOM/nowhere"), "ROOM/nowhere", None, None),
     "study": (("ROOM/nowhere", "--status"), None, "FOLDER", "ROOM/nowhere"),
     "demo": (("ROOM/file",), "ROOM/file", None, None),
