@@ -97,7 +97,14 @@ class Collected:
     @property
     def disturbed(self) -> bool:
         """True for a campaign with nuisances."""
-        return IMPORTED not in self.info and self.plan.protocol.collection.nuisances is not None
+        if IMPORTED in self.info:
+            return False
+        # most protocols have none, and need not be read to know it
+        try:
+            text = self.campaign.protocol_file.read_text(errors="replace")
+        except OSError:
+            return False
+        return "nuisances" in text and self.plan.protocol.collection.nuisances is not None
 
     def describe(self, trial: Trial) -> dict[str, str]:
         """Return a trial's condition as text with units, by factor."""
