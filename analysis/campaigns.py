@@ -192,6 +192,8 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
     if names:
         return found
     plain = [item for item in found if not item.disturbed]
+    if len(plain) == len(found):
+        return found
     if not plain or any(item.settings.training.nuisances for item in plain):
         return sorted(found, key=lambda item: item.disturbed)  # the others' settings count
     return plain
