@@ -76,6 +76,6 @@ class Definition:
 
 DEFINITION = Definition()
 SIZES = {
-    "full": Size(Part(16, 9, 0), Part(12, 8, 30), Part(16, 12, 30), 8),
-    "small": Size(Part(4, 4, 0), Part(4, 4, 2), Part(6, 4, 2), 2),
+    "full": Size(Part(16, 9, 0), Part(12, 8, 30), Part(16, 12, 30), 4),
+    "small": Size(Part(4, 4, 0), Part(4, 4, 2), Part(6, 4, 2), 1),
 }

@@ -10,7 +10,7 @@ import numpy as np
 
 from sliplab.analysis.bench.interface import Scene, Slip
 from sliplab.flows.bench.definition import DEFINITION, VERSION, Part, Size, Span
-from sliplab.flows.bench.nuisances import NUISANCES
+from sliplab.flows.bench.nuisances import NUISANCES, nuisance_faults
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
 from sliplab.flows.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.protocols import Plan
@@ -64,15 +64,15 @@ def nuisance_scenes(size: Size, seed: int) -> dict[str, list[Drawn]]:
     """Return scenes with each nuisance, in worlds that a seed draws; the same in each."""
     drawn_by = hash_integer("bench nuisances", VERSION, seed)
     found: dict[str, list[Drawn]] = {}
-    for name, nuisance in NUISANCES.items():
+    for name in NUISANCES:
         found[name] = []
         for number in range(size.nuisance):
             rng = np.random.default_rng([drawn_by, number])
             hold_s = _value(DEFINITION.nuisance_hold_s, rng)
             chance = np.random.default_rng([drawn_by, number, hash_integer(name)])
             rig = _world(drawn_by, number)
-            title = f"{name} {number + 1}"
-            found[name].append(_drawn(title, rig, hold_s, rng, nuisance(hold_s, rig.scene, chance)))
+            faults = nuisance_faults(name, hold_s, rig.scene, chance)
+            found[name].append(_drawn(f"{name} {number + 1}", rig, hold_s, rng, faults))
     return found
 
 

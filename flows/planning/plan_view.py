@@ -15,6 +15,9 @@ if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
     from sliplab.storage.schema.power import PowerRecord
     from sliplab.storage.streams import Json
 
+MOST_STRETCHES = 8
+"""Stretches without a person that are printed one by one."""
+
 
 class SceneJson(TypedDict):
     """`Scene` as part of a plan's JSON."""
@@ -144,6 +147,14 @@ def plan_json(
     }
 
 
+def _stretches(found: Plan) -> str:
+    """Return how many trials need no person in between; of many stretches, how many there are."""
+    sizes = [last - first + 1 for first, last in found.stretches()]
+    if len(sizes) > MOST_STRETCHES:
+        return f"{len(sizes)} of {min(sizes)} to {max(sizes)} trials"
+    return ", ".join(f"{size} trials" for size in sizes)
+
+
 def _claims(found: Plan) -> Iterator[str]:
     """Yield lines about the claims of a plan, and what they do to it."""
     collection = found.protocol.collection
@@ -192,9 +203,7 @@ def print_plan(
             "trials": len(found),
             "motion": console.duration(found.total_seconds),
             "disk": console.size(needed) if needed is not None else "give --rig to estimate",
-            "unattended stretches": ", ".join(
-                f"{last - first + 1} trials" for first, last in found.stretches()
-            ),
+            "unattended stretches": _stretches(found),
         },
     )
     if scene is not None:

@@ -12,6 +12,7 @@ from sliplab.analysis.bench.entries.thresholds import Rate
 from sliplab.analysis.bench.interface import Scene
 from sliplab.flows.bench import run, scenes
 from sliplab.flows.bench.definition import SIZES, Part, Size
+from sliplab.flows.bench.nuisances import NUISANCES
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.bench import BenchResult
 from tests.command_line import here
@@ -68,7 +69,7 @@ def test_choices_are_made_before_a_test_scene_is_there(
     monkeypatch.setattr(run, "validated", choose)
     run.run_bench(["rate"], "small", 1, tmp_path)
     assert done[: done.index("chosen")] == ["train"] * 2 + ["validation"] * 3
-    assert set(done[done.index("chosen") + 1 :]) == {"test", "bursts", "mains", "event"}
+    assert set(done[done.index("chosen") + 1 :]) == {"test", *NUISANCES}
 
 
 def test_a_detector_is_trained_on_training_and_validation_scenes(
