@@ -46,7 +46,7 @@ def outcomes(rows: Sequence[ReflexRow], trials: Sequence[ReflexTrial], *, simula
             held[i, k] = count / len(found) if found else np.nan
             text[i][k] = f"{count}/{len(found)}"
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(WIDTH, 0.9 + 0.32 * len(rows)))
+        figure, axes = plt.subplots(figsize=(1.35 * WIDTH, 0.9 + 0.32 * len(rows)))
         axes.imshow(held, cmap="RdYlGn", vmin=-0.1, vmax=1.1, aspect="auto")
         for i, line in enumerate(text):
             for k, cell in enumerate(line):
