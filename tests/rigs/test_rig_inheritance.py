@@ -150,7 +150,7 @@ def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.Monk
     assert load_rig_file(Path("mine"))[0].name == "mock"
     with pytest.raises(
         InputError,
-        match=r"rehersal: .* shipped rigs: irb120, loopback, mock, mock_events, mock_force, ",
+        match=r"rehersal: .* shipped rigs: irb120, loopback, loopback_gripper, mock, mock_events, ",
     ):
         rig_path(Path("rehersal"))
 
