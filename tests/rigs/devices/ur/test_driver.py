@@ -177,7 +177,7 @@ def test_a_stop_goes_on_as_far_as_it_says(robot_of: MakeRobot, arm_on: MakeArm) 
         arm.stop()
         gone.append(robot.pose().xyz_mm[1] - began)
         follow(arm, Segment(at(0.0), 40.0))
-    assert min(gone) > 0.8
+    assert min(gone) > 0.8 - 40.0 / 500  # within a cycle nobody knows where it is
     assert min(gone) < 40.0 * (arm.stopping_s(40.0) + 0.01)
 
 
