@@ -1,10 +1,11 @@
 """Detectors under nuisances: false alarms in holds, and slips that are detected in time.
 
-A detector gives an alarm when its evidence exceeds its level. It then rests for `REST_S` and begins
-anew, as it would after a reflex. An alarm earlier than the label's onset by more than the tolerance
-is false. The first one after that is the detection; a slip is missed if none comes before it is
-gross. The order is by the share of trials with neither a false alarm nor a missed slip: so a
-detector that always or never gives an alarm has no clean trial, and one that guesses few.
+A detector gives an alarm when its evidence exceeds its level. It then rests for the second that an
+alarm lasts in the bench, too, and begins anew, as it would after a reflex. An alarm earlier than
+the label's onset by more than the tolerance is false. The first one after that is the detection; a
+slip is missed if none comes before it is gross. The order is by the share of trials with neither a
+false alarm nor a missed slip: so a detector that always or never gives an alarm has no clean trial,
+and one that guesses few.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.bench.alarms import ALARM_US
 from sliplab.analysis.detectors.detectors import Detector, Predictions, first_above
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.metrics.intervals import exact_interval, poisson_interval
@@ -23,8 +25,6 @@ from sliplab.storage.schema.evaluation import Rate
 from sliplab.storage.schema.stress import StressDetector, StressFigures
 
 ALL = "all"
-REST_S = 1.0
-"""After an alarm, s."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def alarms(detector: Detector, level: float, predictions: Predictions) -> npt.ND
         if first is None:
             break
         found.append(int(rest.end_ns[first]))
-        start = int(np.searchsorted(end_ns, found[-1] + round(REST_S * 1e9), side="right"))
+        start = int(np.searchsorted(end_ns, found[-1] + 1000 * ALARM_US, side="right"))
     return np.array(found, np.int64)
 
 

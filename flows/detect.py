@@ -51,7 +51,7 @@ class ReactionMs(TypedDict):
         window: span of the events that the decision rests on; slip may begin anywhere in it.
         sensor: from its end until the events were read.
         network: from there to the decision, in real time.
-        command: until the drivers of arm and gripper had been told.
+        command: until the drivers of arm and gripper had the command.
         actuator: until arm and fingers were at rest, with the drivers' way to them.
     """
 

@@ -44,7 +44,6 @@ from sliplab.flows.judge_network import spike_keeper
 from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols import InputError, Plan, Trial
-from sliplab.protocols.quantity import FactorRef
 from sliplab.protocols.settings import Detection
 from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.schema.evaluation import Rate
@@ -108,12 +107,11 @@ def request(
 
 @dataclass(frozen=True)
 class Judged:
-    """A network with the detectors that read it, and its predictions on the trials."""
+    """A network with the detectors that read it, and the stride of the windows of each, ms."""
 
     title: str
-    detectors: list[Tuned]
-    stride_ms: int
     model: Model
+    detectors: list[tuple[int, Tuned]]
 
 
 def measure_stress(asked: Request) -> StressRecord:
@@ -134,21 +132,19 @@ def measure_stress(asked: Request) -> StressRecord:
         raise StoreError(f"{disturbed.folder}: no test trial has an onset of slip")
     detectors: list[StressDetector] = []
     accuracy: list[StressAccuracy] = []
-    networks_seen: set[str] = set()
+    tolerance = round(campaign.settings.detection.false_early_ms * 1e6)
     for judged in networks(asked):
-        title, stride = judged.title, judged.stride_ms
-        known = _predicted(disturbed, campaign, trials, judged.model, stride)
-        tolerance = round(campaign.settings.detection.false_early_ms * 1e6)
-        for tuned in judged.detectors:
+        known: dict[int, Predicted] = {}
+        for stride, tuned in judged.detectors:
+            if stride not in known:
+                known[stride] = _predicted(disturbed, campaign, trials, judged.model, stride)
             rows = [
                 (it, stress.outcome(stress.alarms(tuned.detector, tuned.levels.incipient, p),
                                     it.slip, tolerance))
-                for it, p in known
+                for it, p in known[stride]
             ]  # fmt: skip
-            detectors.append(stress.stressed(title, tuned.name, stride, rows))
-        if title not in networks_seen:
-            accuracy += _accuracy(title, judged.model, labels, campaign, trials)
-        networks_seen.add(title)
+            detectors.append(stress.stressed(judged.title, tuned.name, stride, rows))
+        accuracy += _accuracy(judged.title, judged.model, labels, campaign, trials)
     first = trials[0][1].record
     record = StressRecord(
         simulated=first.simulated,
@@ -178,20 +174,19 @@ def networks(asked: Request) -> Iterator[Judged]:
     model, settings = choose_model(wanted_models(store, campaigns)), training_settings(campaigns)
     rules = rules_of(campaigns, settings.network.outputs_per_class)
     rule = rules[training_campaigns(campaigns)[0].name]
-    yield Judged("own", [_paper(rule)], settings.stride_ms, model)
+    detectors = [(settings.stride_ms, _paper(rule))]
     work = detector_work(Labels(store), campaigns, rules, model.key)
     if work.compared is not None and settings.fine_stride_ms is not None:
         keep = spike_keeper(store, None)
         predict_trials(store, model.path, settings.windows, work.requests, keep)
-        tuned = work.tune(store, settings, rule)
-        yield Judged("own", tuned, settings.fine_stride_ms, model)
+        detectors += [(settings.fine_stride_ms, it) for it in work.tune(store, settings, rule)]
+    yield Judged("own", model, detectors)
     for other in comparison_models(store, campaigns):
         if not other.fresh:
             raise StoreError(f"{other.path}: is missing or stale; run `sliplab train` first")
         theirs = other.settings
-        yield Judged(
-            f"preset: {theirs.preset}", [_paper(theirs.detection)], theirs.stride_ms, other
-        )
+        paper = [(theirs.stride_ms, _paper(theirs.detection))]
+        yield Judged(f"preset: {theirs.preset}", other, paper)
 
 
 def _paper(rule: Detection) -> Tuned:
@@ -212,24 +207,21 @@ def _stress_trial(
     section = plan.protocol.collection.nuisances
     if slip is None or section is None:
         return None
-    condition = dict(trial.condition)
-    name, strength = (
-        condition[field.factor] if isinstance(field, FactorRef) else field
-        for field in (section.apply, section.strength)
-    )
+    name, strength = section.applied(dict(trial.condition))
     true = references_of(recording, label).get("true")
     return StressTrial(
-        str(name), float(strength), recorded_span(recording)[0], slip,
+        name, float(strength), recorded_span(recording)[0], slip,
         None if true is None else true.slip.incipient_ns,
     )  # fmt: skip
 
 
 Trials = list[tuple[Trial, Recording, StressTrial]]
+Predicted = list[tuple[StressTrial, Predictions]]
 
 
 def _predicted(
     disturbed: Store, campaign: Collected, trials: Trials, model: Model, stride_ms: int
-) -> list[tuple[StressTrial, Predictions]]:
+) -> Predicted:
     """Spikes of a network in all windows of the trials."""
     windows = model.settings.windows
     wanted: list[tuple[StressTrial, PredictionRequest]] = [

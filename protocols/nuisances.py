@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, field_validator
 
@@ -33,6 +33,7 @@ from sliplab.protocols.quantity import (
     PositiveSeconds,
     PositiveSpeed,
     canonical,
+    word_or_ref,
 )
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
 
@@ -138,7 +139,7 @@ class Regrasp(_Nuisance):
 
 
 class Flicker(_Nuisance):
-    """Lamps on the mains, whose light gets into the sensor."""
+    """Lamps on the mains, with light that gets into the sensor."""
 
     scales = "share"
     kind: Literal["flicker"]
@@ -208,7 +209,7 @@ class HotPixels(_Nuisance):
 
 
 class Warmth(_Nuisance):
-    """A warmer event camera, whose noise doubles with every 8 degC."""
+    """A warmer event camera: its noise doubles with every 8 degC."""
 
     scales = "rise"
     kind: Literal["warmth"]
@@ -233,10 +234,7 @@ AnyNuisance = (
     | Warmth
 )
 Nuisance = Annotated[AnyNuisance, Field(discriminator="kind")]
-register_tags(
-    "tap", "vibration", "arm_motion", "rotation", "regrasp", "flicker", "brush", "lost_packets",
-    "hot_pixels", "warmth",
-)  # fmt: skip
+register_tags(*(get_args(m.model_fields["kind"].annotation)[0] for m in get_args(AnyNuisance)))
 
 SHIPPED: dict[str, AnyNuisance] = {
     "tap_table": Tap(kind="tap", on="table", distance="20 um", ring="60 Hz"),
@@ -254,15 +252,9 @@ SHIPPED: dict[str, AnyNuisance] = {
 """Nuisances that every protocol knows. Their sizes are estimates: no source gives them."""
 
 
-def _word(raw: object) -> object:
-    if isinstance(raw, str) and raw.startswith("$"):
-        return FactorRef(raw[1:])
-    return raw
-
-
 WordField = Annotated[
     str | FactorRef,
-    BeforeValidator(_word),
+    BeforeValidator(word_or_ref),
     PlainSerializer(str),
     WithJsonSchema({"anyOf": [{"type": "string"}, REF_SCHEMA]}),
 ]
@@ -302,17 +294,21 @@ class Nuisances(StrictModel):
         if name not in names:
             raise KeyedError(key, name, f"must be one of {', '.join(names)}")
 
-    def in_trial(self, condition: Mapping[str, Any]) -> tuple[AnyNuisance, ...]:
-        """The nuisances of a trial with this condition, at its strength."""
+    def applied(self, condition: Mapping[str, Any]) -> tuple[str, Decimal]:
+        """The name that applies in a trial with this condition, and its strength in percent."""
 
         def of(field: Any) -> Any:
             return condition[field.factor] if isinstance(field, FactorRef) else field
 
-        name, share = of(self.apply), of(self.strength) / 100
-        if name == NONE or not share:
+        return of(self.apply), of(self.strength)
+
+    def in_trial(self, condition: Mapping[str, Any]) -> tuple[AnyNuisance, ...]:
+        """The nuisances of a trial with this condition, at its strength."""
+        name, percent = self.applied(condition)
+        if name == NONE or not percent:
             return ()
         found = self.known.values() if name == MIX else (self.known[name],)
-        return tuple(each.scaled(share) for each in found)
+        return tuple(each.scaled(percent / 100) for each in found)
 
 
 @dataclass(frozen=True)

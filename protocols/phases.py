@@ -22,6 +22,7 @@ from sliplab.protocols.quantity import (
     PositiveSecondsOrRef,
     SecondsOrRef,
     SpeedOrRef,
+    word_or_ref,
 )
 from sliplab.protocols.yaml_file import StrictModel, register_tags
 
@@ -68,15 +69,9 @@ class Slide(StrictModel):
     direction: DegreesOrRef
 
 
-def _share_or_side(raw: object) -> object:
-    if isinstance(raw, str) and raw.startswith("$"):
-        return FactorRef(raw[1:])
-    return raw
-
-
 SideField = Annotated[
     Literal["left", "right"] | FactorRef,
-    BeforeValidator(_share_or_side),
+    BeforeValidator(word_or_ref),
     PlainSerializer(str),
     WithJsonSchema({"anyOf": [{"enum": ["left", "right"]}, REF_SCHEMA]}),
 ]

@@ -158,6 +158,13 @@ def parse_or_ref(raw: object, unit: str) -> Decimal | FactorRef:
     return parse(raw, unit)
 
 
+def word_or_ref(raw: object) -> object:
+    """A word, or a reference to a factor (``$name``) of words."""
+    if isinstance(raw, str) and raw.startswith("$"):
+        return FactorRef(raw[1:])
+    return raw
+
+
 REF_SCHEMA: dict[str, Any] = {
     "type": "string",
     "pattern": r"^\$[a-z][a-z0-9_]*$",

@@ -4,7 +4,7 @@ Evidence above the level is an alarm. It lasts a second, in which the detector s
 evidence that is above the level afterwards is the next alarm. So a detector that cries always has
 an alarm each second. Alarms before the first tip slides are false, in a hold as in the motion that
 follows it. The first alarm after that, before gross slip, detects the slip; where a false alarm
-lasts until the slip, the slip counts as missed, since nobody could have told.
+lasts until the slip, the slip counts as missed, since nobody could know it.
 """
 
 from __future__ import annotations

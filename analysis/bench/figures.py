@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from sliplab.analysis.bench.alarms import (
     Judged,
@@ -20,7 +19,7 @@ from sliplab.analysis.bench.alarms import (
 )
 from sliplab.analysis.bench.interface import NO_LABEL
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.metrics.intervals import interval
+from sliplab.analysis.metrics.intervals import interval, poisson_interval
 from sliplab.storage.schema.bench import (
     AlarmRate,
     BenchDetector,
@@ -31,7 +30,6 @@ from sliplab.storage.schema.bench import (
 
 RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Asked false alarms an hour; the first one is the table's."""
-_TAIL = 0.025
 _MISSED_MS = 1e12
 """Stands for an infinite latency in ranks."""
 _LONGEST_MS = 1e7
@@ -103,9 +101,8 @@ def _finite(value: float | None) -> float | None:
 
 
 def alarm_rate(alarms: int, hours: float) -> AlarmRate:
-    """Return a Poisson rate with its exact interval (Garwood 1936)."""
-    low = float(gammaincinv(alarms, _TAIL)) if alarms else 0.0
-    high = float(gammaincinv(alarms + 1, 1 - _TAIL))
+    """Return a Poisson rate with its exact interval."""
+    low, high = poisson_interval(alarms)
     return AlarmRate(
         alarms=alarms, hours=hours, value=alarms / hours, low=low / hours, high=high / hours
     )

@@ -17,7 +17,14 @@ from sliplab.analysis.campaigns import Collected, agreeing, class_names
 from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.evaluation.classes import NAME as CLASSES
 from sliplab.analysis.metrics import classification as metrics
-from sliplab.analysis.networks.baseline_nets import BATCH, EPOCHS, KINDS, TAXEL_KINDS, trained_net
+from sliplab.analysis.networks.baseline_nets import (
+    BATCH,
+    EPOCHS,
+    KINDS,
+    TAXEL_KINDS,
+    fitted_net,
+    net_votes,
+)
 from sliplab.analysis.networks.baselines import RIDGE, ROUNDS, boosted, logistic_cells
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import CLASS_PREFIX
@@ -136,19 +143,17 @@ def train_baseline(
             validated = f"validation {100 * strict:.1f} %"
             say(f"{name}: seed {seed}, epoch {epoch} of {methods.epochs}, {validated}")
 
-        runs.append(
-            trained_net(
-                name,
-                train,
-                validation,
-                test.windows,
-                methods.epochs,
-                seed,
-                on_epoch,
-                classes=classes,
-                batch=methods.batch,
-            )
+        net, said = fitted_net(
+            name,
+            train,
+            validation,
+            methods.epochs,
+            seed,
+            on_epoch,
+            classes=classes,
+            batch=methods.batch,
         )
+        runs.append((net_votes(net, test.windows, classes), said))
     shares = [metrics.accuracy(votes, test.y).argmax for votes, _ in runs]
     each = [
         {"seed": seed, "validation_strict": said["validation_strict"], "argmax": share}

@@ -134,27 +134,6 @@ class _Best:
     state: dict[str, torch.Tensor]
 
 
-def trained_net(
-    kind: str,
-    train: SampleSet,
-    validation: SampleSet,
-    test: SparseWindows,
-    epochs: int = EPOCHS,
-    seed: int = 0,
-    on_epoch: Callable[[int, float], None] | None = None,
-    mirror: bool = True,
-    classes: int = len(CLASSES),
-    batch: int = BATCH,
-) -> tuple[Votes, dict[str, Any]]:
-    """Train one of `KINDS` or `TAXEL_KINDS` as `fitted_net`, and vote on test samples.
-
-    Returns:
-        logits float32 (n, classes), and what it was: epochs, weights, multiply-adds a window.
-    """
-    net, said = fitted_net(kind, train, validation, epochs, seed, on_epoch, mirror, classes, batch)
-    return net_votes(net, test, classes), said
-
-
 def fitted_net(
     kind: str,
     train: SampleSet,

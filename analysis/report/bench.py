@@ -106,7 +106,7 @@ def write_leaderboard(page: Path, found: BenchResult) -> None:
 
 
 def _markdown(table: list[list[str]]) -> list[str]:
-    """Return the lines of a table, whose first row is its head."""
+    """Return the lines of a table; its first row is the head."""
     head, *body = table
     return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *body)]
 

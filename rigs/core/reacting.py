@@ -102,7 +102,7 @@ class Reaction:
     Attributes:
         phase: the interrupted phase.
         stop_ms: time from the detection until the arm was at rest.
-        command_ms: time from the detection until the drivers had been told to stop, or to grip.
+        command_ms: time from the detection until the drivers had the command to stop, or to grip.
         actuator_ms: time from there until all was done: arm at rest, pressed, fingers at rest;
             a driver's way to its device is in it.
         stopped_mm: position at which it came to rest: x, y, depth in plate coordinates.

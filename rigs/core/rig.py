@@ -111,7 +111,7 @@ class Rig:
         force: a force/torque sensor, or None.
         force_limit_n: largest force on the plate, in any direction, before the arm is stopped.
         further: devices with streams of their own names.
-        gripper: whose fingers hold the sensor, or None.
+        gripper: its fingers hold the sensor; or None.
         grip_opening_mm: opening at which the arm's depth is the depth in contact; every trial
             begins with it.
         simulation: the world behind a simulated rig, None on a real one.

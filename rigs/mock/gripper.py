@@ -12,7 +12,7 @@ from sliplab.rigs.mock.world import World
 
 
 class MockGripper:
-    """A gripper that reacts after a delay, and whose fingers stall at the force of their move."""
+    """A gripper that reacts after a delay; its fingers stall at the force of their move."""
 
     def __init__(self, world: World, settings: Gripper) -> None:
         assert world.fingers is not None

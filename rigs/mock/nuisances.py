@@ -49,7 +49,7 @@ def faults_of(nuisances: TrialNuisances, camera: EventCamera, seed: int) -> list
     """The faults that stand for a trial's nuisances; those of the arm have none.
 
     Args:
-        camera: whose noise warmth multiplies.
+        camera: warmth multiplies its noise.
         seed: of the trial.
     """
     found: list[AnyFault] = []

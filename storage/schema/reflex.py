@@ -15,7 +15,7 @@ class ReactionParts(Part):
     network: Number
     """From there to the decision, in real time."""
     command: Number
-    """From there until the drivers of arm and gripper had been told."""
+    """From there until the drivers of arm and gripper had the command."""
     actuator: Number
     """From there until arm and fingers were at rest, with the drivers' way to them."""
 

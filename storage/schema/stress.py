@@ -20,7 +20,7 @@ class StressFigures(Part):
     per_hour: Rate
     """False alarms per hour of holding, with the exact Poisson interval."""
     clean: Rate
-    """Share of the trials without a false alarm whose slip was detected before it was gross."""
+    """Share of the trials with no false alarm, and a slip that was detected before it was gross."""
     missed: Int
     """Slips that were not detected before they were gross."""
     latency_ms: Number | None
@@ -58,7 +58,7 @@ class StressRecord(Document):
     protocol: str
     trials: Int
     without_onsets: Int
-    """Trials besides, whose label lacks the incipient onset; nothing is judged by them."""
+    """Trials besides that have no incipient onset in their label; nothing is judged by them."""
     hold_h: Number
     detectors: tuple[StressDetector, ...]
     accuracy: tuple[StressAccuracy, ...]

@@ -6,19 +6,13 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from sliplab.analysis.report.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    RED,
+    PALETTE,
     STYLE,
     WIDTH,
     svg_text,
 )
 from sliplab.storage.schema.bench import BenchResult
 
-COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
 MARKERS = "osD^vPX*"
 TICKS_MS = (10, 20, 30, 50, 70, 100, 150, 200, 300, 400, 500, 700, 1000, 2000, 3000, 5000)
 _LEAST = 0.5
@@ -42,9 +36,9 @@ def latency_against_alarms(found: BenchResult) -> str:
             ]
             if not points:
                 continue
-            colour, marker = COLOURS[drawn % len(COLOURS)], MARKERS[drawn % len(MARKERS)]
+            colour, marker = PALETTE[drawn % len(PALETTE)], MARKERS[drawn % len(MARKERS)]
             x, y = zip(*points, strict=True)
-            style = "-" if drawn < len(COLOURS) else "--"
+            style = "-" if drawn < len(PALETTE) else "--"
             axes.plot(x, y, style, color=colour, lw=1, marker=marker, ms=4.5, mfc="white")
             filled = row.table.test.latency_ms.value is not None
             axes.plot(

@@ -9,18 +9,14 @@ import numpy as np
 
 from sliplab.analysis.report.figures.style import (
     BLUE,
-    GREEN,
     GREY,
-    ORANGE,
-    PURPLE,
+    PALETTE,
     RED,
     STYLE,
     WIDTH,
     svg_text,
 )
 from sliplab.storage.schema.power import ClaimPower, Learning
-
-COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE)
 
 
 def decisions(rows: Mapping[str, Sequence[int | None]], planned: int, *, simulated: bool) -> str:
@@ -38,8 +34,8 @@ def decisions(rows: Mapping[str, Sequence[int | None]], planned: int, *, simulat
             last = k == len(rows) - 1 and len(rows) > 1
             axes.step(
                 x, 100.0 * share, where="post", label=title, lw=2.0 if last else 1.2,
-                color="black" if last else COLOURS[k % len(COLOURS)],
-                ls="--" if k >= len(COLOURS) and not last else "-",
+                color="black" if last else PALETTE[k % len(PALETTE)],
+                ls="--" if k >= len(PALETTE) and not last else "-",
             )  # fmt: skip
         axes.set_xlim(0, planned)
         axes.set_ylim(-2, 102)

@@ -8,20 +8,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sliplab.analysis.report.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    RED,
+    PALETTE,
     STYLE,
     WIDTH,
     name_cells,
     svg_text,
 )
 from sliplab.storage.schema.stress import StressAccuracy, StressDetector
-
-COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, GREY)
 
 
 def clean_trials(
@@ -67,7 +60,7 @@ def by_strength(
             squeeze=False,
         )  # fmt: skip
         for axes, name in zip(grid.flat, names, strict=False):
-            for colour, (network, found) in zip(COLOURS, rows.items(), strict=False):
+            for colour, (network, found) in zip(PALETTE, rows.items(), strict=False):
                 ours = [
                     (it.strength, it.strict)
                     for it in found

@@ -25,6 +25,8 @@ BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
     "#CC79A7",
     "#666666",
 )
+PALETTE = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
+"""For lines and points of one figure, in this order."""
 Array = npt.NDArray[Any]
 CLASS_COLOURS = (BLUE, ORANGE, RED)
 CLASS_WORDS = ("no slip", "incipient slip", "gross slip")

@@ -1,15 +1,19 @@
 """Trees and ordinary networks learn what can be learned, repeat, and say what they cost."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from sliplab.analysis.metrics.classification import accuracy
 from sliplab.analysis.networks.baseline_nets import (
+    EPOCHS,
     KINDS,
     TAXEL_KINDS,
+    fitted_net,
     multiply_adds,
-    trained_net,
+    net_votes,
 )
 from sliplab.analysis.networks.baselines import boosted
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
@@ -33,6 +37,19 @@ def events(n: int, seed: int) -> SampleSet:
 
 
 TRAIN, VALIDATION, TEST = events(240, 0), events(60, 1), events(90, 2)
+
+
+def trained_net(
+    kind: str,
+    train: SampleSet,
+    validation: SampleSet,
+    test: SparseWindows,
+    epochs: int = EPOCHS,
+    seed: int = 0,
+) -> tuple[Any, dict[str, Any]]:
+    """Votes of a trained network on test windows, and what it was."""
+    net, said = fitted_net(kind, train, validation, epochs, seed)
+    return net_votes(net, test, 3), said
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS | TAXEL_KINDS))

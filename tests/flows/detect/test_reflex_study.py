@@ -41,9 +41,9 @@ def test_who_cries_always_or_never_is_at_the_bottom(
     asked = study.request(model, RIG, tmp_path, fast, ("stop", "grip:0.4"))
     name = next(iter(asked.requests))
     bare = [case for case in asked.cases if case.reflex is None]
-    told = {"always": lambda x: said(1), "never": lambda x: said(0)}
+    countings = {"always": lambda x: said(1), "never": lambda x: said(0)}
     trials = [study.measure(asked, case, {}) for case in bare]
-    for detector, counting in told.items():
+    for detector, counting in countings.items():
         for case in asked.cases:
             if case.reflex is not None:
                 made = study.measure(asked, case, {name: counting})

@@ -21,7 +21,7 @@ SECOND = 1_000_000_000
 
 
 def book(*faults: Any) -> FaultBook:
-    """Faults of a trial whose recording begins at its start."""
+    """Faults of a trial with a recording from its start on."""
     made = FaultBook(faults, 1)
     made.recording_ns = 0
     return made
