@@ -7,15 +7,18 @@ its trial is over, so a stop resumes. Nothing is recorded, and no safe state is 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import collected
+from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.live import Counting, counting_of
 from sliplab.analysis.evaluation.reflexes import dropped, extra_force_n, reflex_rows
 from sliplab.analysis.report import reflex as page
@@ -23,9 +26,11 @@ from sliplab.analysis.sweeps.runner import ResultFile, Sweep
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request, make_reflex
 from sliplab.flows.running import console
+from sliplab.flows.store_detectors import store_detectors
 from sliplab.protocols import InputError, Plan, Trial, load_plan
-from sliplab.protocols.hashing import hash_data
+from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
+from sliplab.protocols.settings import Detection
 from sliplab.rigs.build import build_rig, loopback_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
@@ -33,6 +38,7 @@ from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.schema.reflex import ReactionParts, ReflexStudy, ReflexTrial
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
 
 NAME = "reflex"
 VERSION = 1
@@ -45,19 +51,47 @@ MODELS = {"network": "seed0.pt", "paper": "paper-seed0.pt"}
 """A store's models by the names of their detectors."""
 
 
-def detectors_of(place: Path) -> dict[str, Path]:
-    """Return model files by the names of their detectors: a model itself, or those of a store.
+@dataclass(frozen=True)
+class Chosen:
+    """A network, and what reads its spikes.
+
+    Attributes:
+        detector: None for the rule of the protocol that is run.
+        stride_ms: from one window's start to the next one's; None for the window's length.
+    """
+
+    model: Path
+    detector: Tuned | None = None
+    stride_ms: int | None = None
+
+
+def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
+    """Return detectors by their names: a model with the rule, or all that a store has.
+
+    Args:
+        names: of those that are wanted; left out, all.
 
     Raises:
         InputError: there is none.
+        StoreError: a network of the store is missing or stale.
     """
-    if not place.is_dir():
-        return {place.stem: place}
-    found = {name: place / "models" / file for name, file in MODELS.items()}
-    found = {name: file for name, file in found.items() if file.is_file()}
+    found = _of_store(place) if place.is_dir() else {place.stem: Chosen(place)}
+    unknown = next((name for name in names if name not in found), None)
+    if unknown is not None:
+        raise InputError("--detector", "", unknown, f"must be one of {', '.join(found)}")
+    return {name: found[name] for name in names or found}
+
+
+def _of_store(place: Path) -> dict[str, Chosen]:
+    models = {name: place / "models" / file for name, file in MODELS.items()}
+    found = {name: Chosen(file) for name, file in models.items() if file.is_file()}
     if not found:
         right = f"has no models/{MODELS['network']}: train it first, or name a model file"
         raise InputError("MODEL", "", place, right)
+    store = Store(place)
+    for network in store_detectors(store, collected(store, None)):
+        for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule
+            found[tuned.name] = Chosen(network.model.path, tuned, stride_ms)
     return found
 
 
@@ -111,15 +145,17 @@ def request(
     protocol: Path = Path(NAME),
     reflexes: Sequence[str] = (),
     count: int = 1,
+    detectors: Sequence[str] = (),
 ) -> Request:
     """Check what is asked for.
 
     Args:
-        reflexes: left out, all that the rig can do.
+        reflexes: left out, all that the rig can do. detectors: left out, all of a store.
         count: trials of each condition.
 
     Raises:
-        InputError: model, rig, protocol or a reflex; the message says what would be right.
+        InputError: model, rig, protocol, detector or reflex; the message says what would be right.
+        StoreError: a network of the store is missing or stale.
     """
     file, text = load_rig_file(rig)
     if not file.simulated:
@@ -130,8 +166,15 @@ def request(
         raise InputError("--protocol", "", protocol, "must be of gravity trials: no plate falls")
     trials = [it for it in plan if it.role == "measured" and it.repetition <= count]
     requests = {
-        name: make_detect_request(rig, model, protocol=protocol, trial=trials[0].id)
-        for name, model in detectors_of(place).items()
+        name: make_detect_request(
+            rig,
+            it.model,
+            protocol=protocol,
+            trial=trials[0].id,
+            detector=it.detector,
+            stride_ms=it.stride_ms,
+        )
+        for name, it in detectors_of(place, detectors).items()
     }
     if not reflexes:
         can_grip = () if file.gripper_range is None else ("grip:0.4",)
@@ -141,12 +184,20 @@ def request(
     for trial in trials:
         cases.append(Case(trial, None, None, hash_data([made, trial.id])))
         for name, asked in requests.items():
-            rule = asked.detection.model_dump(mode="json")
+            rule = _numbers(asked.detection)
             for reflex in reflexes:
                 make_reflex(reflex, file, plan, trial, HOLD_S)  # said before anything moves
                 key = hash_data([made, trial.id, asked.model_sha256, rule, reflex])
                 cases.append(Case(trial, name, reflex, key))
     return Request(next(iter(requests.values())).rig, plan, requests, cases, out)
+
+
+def _numbers(detection: Detection | Tuned) -> Json:
+    """Return the settings of a rule, or the hash of another detector's numbers."""
+    if isinstance(detection, Detection):
+        return detection.model_dump(mode="json")
+    text = json.dumps(asdict(detection), default=lambda array: array.tolist())
+    return {"name": detection.name, "numbers": hash_text(text)}
 
 
 def measure_reflexes(asked: Request) -> ReflexStudy:

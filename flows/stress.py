@@ -15,8 +15,7 @@ import numpy as np
 
 from sliplab.analysis import stress
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.detectors.detector_comparison import Tuned
-from sliplab.analysis.detectors.detectors import Levels, Predictions, Smoothing
+from sliplab.analysis.detectors.detectors import Predictions
 from sliplab.analysis.detectors.latency import slip_of
 from sliplab.analysis.detectors.onset_references import references_of
 from sliplab.analysis.detectors.predictions import (
@@ -24,18 +23,10 @@ from sliplab.analysis.detectors.predictions import (
     predict_trials,
     prediction_request,
 )
-from sliplab.analysis.evaluation.detectors import detector_work
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.models import (
-    Model,
-    choose_model,
-    comparison_models,
-    rules_of,
-    training_settings,
-    wanted_models,
-)
+from sliplab.analysis.networks.models import Model, choose_model, wanted_models
 from sliplab.analysis.report import stress as page
 from sliplab.analysis.stress import StressTrial
 from sliplab.analysis.windows.dataset import recorded_span
@@ -43,8 +34,8 @@ from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.store_detectors import store_detectors
 from sliplab.protocols import InputError, Plan, Trial
-from sliplab.protocols.settings import Detection
 from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.schema.evaluation import Rate
 from sliplab.storage.schema.stress import StressAccuracy, StressDetector, StressRecord
@@ -105,15 +96,6 @@ def request(
     return Request(store, campaigns, taken, out)
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A network with the detectors that read it, and the stride of the windows of each, ms."""
-
-    title: str
-    model: Model
-    detectors: list[tuple[int, Tuned]]
-
-
 def measure_stress(asked: Request) -> StressRecord:
     """Take, label and judge what is missing; write the page and the numbers.
 
@@ -133,7 +115,7 @@ def measure_stress(asked: Request) -> StressRecord:
     detectors: list[StressDetector] = []
     accuracy: list[StressAccuracy] = []
     tolerance = round(campaign.settings.detection.false_early_ms * 1e6)
-    for judged in networks(asked):
+    for judged in store_detectors(asked.store, asked.campaigns):
         known: dict[int, Predicted] = {}
         for stride, tuned in judged.detectors:
             if stride not in known:
@@ -160,39 +142,6 @@ def measure_stress(asked: Request) -> StressRecord:
     write_json(asked.out / f"{NAME}.json", record.to_json())
     write_text(asked.out / f"{NAME}.html", page.render(record))
     return record
-
-
-def networks(asked: Request) -> Iterator[Judged]:
-    """Yield the store's own network with every detector, then the networks that `also` names.
-
-    Their levels are set by validation trials of the store.
-
-    Raises:
-        StoreError: a network is missing or stale.
-    """
-    store, campaigns = asked.store, asked.campaigns
-    model, settings = choose_model(wanted_models(store, campaigns)), training_settings(campaigns)
-    rules = rules_of(campaigns, settings.network.outputs_per_class)
-    rule = rules[training_campaigns(campaigns)[0].name]
-    detectors = [(settings.stride_ms, _paper(rule))]
-    work = detector_work(Labels(store), campaigns, rules, model.key)
-    if work.compared is not None and settings.fine_stride_ms is not None:
-        keep = spike_keeper(store, None)
-        predict_trials(store, model.path, settings.windows, work.requests, keep)
-        detectors += [(settings.fine_stride_ms, it) for it in work.tune(store, settings, rule)]
-    yield Judged("own", model, detectors)
-    for other in comparison_models(store, campaigns):
-        if not other.fresh:
-            raise StoreError(f"{other.path}: is missing or stale; run `sliplab train` first")
-        theirs = other.settings
-        paper = [(theirs.stride_ms, _paper(theirs.detection))]
-        yield Judged(f"preset: {theirs.preset}", other, paper)
-
-
-def _paper(rule: Detection) -> Tuned:
-    """The protocol's rule as a detector: its level is the margin, which is enough."""
-    level = float(np.nextafter(rule.margin, -np.inf))
-    return Tuned(f"rule, {rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
 
 
 def _stress_trial(

@@ -22,6 +22,7 @@ from sliplab.analysis.detectors.detectors import (
     Levels,
     Predictions,
     Smoothing,
+    Tuned,
     decide,
     first_above,
     learn,
@@ -195,15 +196,6 @@ def thinned(trial: Labelled, every: int) -> Labelled:
         predictions.counts[::every], predictions.events[::every], predictions.end_ns[::every]
     )
     return replace(trial, predictions=kept)
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """A detector with the levels that validation trials set."""
-
-    name: str
-    detector: Detector
-    levels: Levels
 
 
 def tuned(

@@ -114,9 +114,22 @@ def forward(chain: Chain, log_likelihood: FloatArray) -> FloatArray:
         raise ValueError(f"likelihoods {log_likelihood.shape}; expected (n, {chain.states})")
     if not np.isfinite(log_likelihood).all():
         raise ValueError("a log likelihood is not finite")
+    return _advanced(chain, _first_state(chain), log_likelihood)
+
+
+def _first_state(chain: Chain) -> FloatArray:
+    """Return the log probabilities before the first window, float64 (states,)."""
+    belief = np.full(chain.states, -np.inf)
+    belief[0] = 0.0
+    return belief
+
+
+def _advanced(chain: Chain, belief: FloatArray, log_likelihood: FloatArray) -> FloatArray:
+    """Return `forward` from `belief` on, which becomes that after the last window."""
     out = np.empty(log_likelihood.shape)
     stay = np.append(np.log1p(-chain.leave), 0.0)
-    _forward(stay, np.log(chain.leave), np.ascontiguousarray(log_likelihood, np.float64), out)
+    seen = np.ascontiguousarray(log_likelihood, np.float64)
+    _forward(stay, np.log(chain.leave), belief, seen, out)
     return out
 
 
@@ -128,10 +141,8 @@ def _add(a: Any, b: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _forward(stay: Any, go: Any, seen: Any, out: Any) -> None:
+def _forward(stay: Any, go: Any, belief: Any, seen: Any, out: Any) -> None:
     windows, states = seen.shape
-    belief = np.full(states, -np.inf)
-    belief[0] = 0.0
     for n in range(windows):
         total = -np.inf
         # from the last state down: each needs what its predecessor was before this window
@@ -374,11 +385,30 @@ class Evidence:
     gross_after: Callable[[int], FloatArray]
 
 
+class Running(Protocol):
+    """A detector on a running stream: the evidence of a trial window by window, to the bit."""
+
+    def step(self, window: Predictions) -> tuple[float, float]:
+        """Return the evidence after one more window: for slip, and for gross slip.
+
+        The latter means something only after `detected`.
+
+        Args:
+            window: of that one.
+        """
+
+    def detected(self) -> None:
+        """Note that incipient slip was detected in the last window."""
+
+
 class Detector(Protocol):
     """Evidence that slip has begun."""
 
     def evidence(self, predictions: Predictions) -> Evidence:
         """The evidence of one trial."""
+
+    def begin(self) -> Running:
+        """Begin a stream, whose windows come one by one."""
 
 
 @dataclass(frozen=True)
@@ -398,6 +428,28 @@ class Smoothing:
             lead_of(predictions.counts, self.width, INCIPIENT),
             lambda first: gross,
         )
+
+    def begin(self) -> Running:
+        """See `Detector`."""
+        return _RunningSmoothing(self.width)
+
+
+class _RunningSmoothing:
+    """`Smoothing` of the last windows."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._last = np.empty((0, len(CLASSES)), np.int64)
+
+    def step(self, window: Predictions) -> tuple[float, float]:
+        self._last = np.concatenate([self._last, window.counts])[-self._width :]
+        incipient, gross = (
+            float(lead_of(self._last, self._width, it)[-1]) for it in (INCIPIENT, GROSS)
+        )
+        return incipient, gross
+
+    def detected(self) -> None:
+        """Nothing depends on it."""
 
 
 @dataclass(frozen=True)
@@ -433,6 +485,25 @@ class Filter:
         gross = log_odds(belief, GROSS)
         return Evidence(predictions.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
 
+    def begin(self) -> Running:
+        """See `Detector`."""
+        return _RunningFilter(self)
+
+
+class _RunningFilter:
+    """`Filter` from the belief after the last window on."""
+
+    def __init__(self, filtered: Filter) -> None:
+        self._filter, self._belief = filtered, _first_state(filtered.chain)
+
+    def step(self, window: Predictions) -> tuple[float, float]:
+        log = self._filter.reading.log(window)
+        belief = _advanced(self._filter.chain, self._belief, log)
+        return float(log_odds(belief, INCIPIENT)[0]), float(log_odds(belief, GROSS)[0])
+
+    def detected(self) -> None:
+        """Nothing depends on it."""
+
 
 @dataclass(frozen=True)
 class Cusum:
@@ -452,6 +523,27 @@ class Cusum:
 
         return Evidence(predictions.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after)
 
+    def begin(self) -> Running:
+        """See `Detector`."""
+        return _RunningCusum(self.reading)
+
+
+class _RunningCusum:
+    """`Cusum` from its statistics after the last window on."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+        self._incipient = self._gross = 0.0
+
+    def step(self, window: Predictions) -> tuple[float, float]:
+        ((no_slip, incipient, gross),) = self._reading.log(window).tolist()
+        self._incipient = max(0.0, self._incipient + (incipient - no_slip))
+        self._gross = max(0.0, self._gross + (gross - incipient))
+        return self._incipient, self._gross
+
+    def detected(self) -> None:
+        self._gross = 0.0
+
 
 @dataclass(frozen=True)
 class Levels:
@@ -459,6 +551,15 @@ class Levels:
 
     incipient: float
     gross: float
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A detector with the levels that validation trials set."""
+
+    name: str
+    detector: Detector
+    levels: Levels
 
 
 def decide(evidence: Evidence, levels: Levels) -> Found:

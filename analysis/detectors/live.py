@@ -20,12 +20,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any, Protocol, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, winners
+from sliplab.analysis.detectors.detectors import Predictions, Tuned
+from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP, winners
 from sliplab.analysis.networks.training import Fitted, engine
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
@@ -155,6 +156,65 @@ class Step:
     onset: str | None
 
 
+class LiveRule(Protocol):
+    """What is decided after each window.
+
+    Attributes:
+        width: windows that a decision rests on at least.
+    """
+
+    width: int
+
+    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> Step:
+        """Take the output spikes, integer (3,), and events of the window after the last one."""
+
+    def interrupt(self) -> None:
+        """Forget the windows, as the next one does not follow them."""
+
+
+def rule_of(detection: Detection | Tuned) -> LiveRule:
+    """Return the paper's rule by its settings, or another detector at its levels."""
+    return StepRule(detection) if isinstance(detection, Detection) else StepDetector(detection)
+
+
+class StepDetector:
+    """A detector at its levels, window by window.
+
+    A window is of gross slip once that was detected, of incipient slip where its evidence exceeds
+    the level. After an interruption evidence begins anew; onsets stay.
+    """
+
+    width = 1
+
+    def __init__(self, tuned: Tuned) -> None:
+        self._tuned, self._windows = tuned, 0
+        self._incipient = self._gross = False
+        self.interrupt()
+
+    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> Step:
+        """See `LiveRule`."""
+        self._windows += 1
+        row = np.asarray(counts).astype(np.int64)
+        seen = Predictions(row[None], np.array([events]), np.array([self._windows]))
+        incipient, gross = self._running.step(seen)
+        levels, onset = self._tuned.levels, None
+        if not self._incipient:
+            if incipient > levels.incipient:
+                self._incipient, onset = True, CLASSES[INCIPIENT]
+                self._running.detected()
+        elif not self._gross and gross > levels.gross:
+            self._gross, onset = True, CLASSES[GROSS]
+        slips = INCIPIENT if incipient > levels.incipient else NO_SLIP
+        a, b, c = row.tolist()
+        return Step((a, b, c), GROSS if self._gross else slips, onset)
+
+    def interrupt(self) -> None:
+        """See `LiveRule`."""
+        self._running = self._tuned.detector.begin()
+        if self._incipient:
+            self._running.detected()
+
+
 class StepRule:
     """The rule of `analysis.detectors.smoothing_rule.detect`, window by window, to the bit.
 
@@ -162,14 +222,14 @@ class StepRule:
     """
 
     def __init__(self, settings: Detection) -> None:
-        self._width = settings.smoothing
+        self.width = settings.smoothing
         self._lead = settings.margin * settings.smoothing
         self._held: deque[npt.NDArray[np.int64]] = deque()
         self._sum = np.zeros(len(CLASSES), np.int64)
         self._incipient = self._gross = False
 
-    def step(self, counts: npt.NDArray[np.integer[Any]]) -> Step:
-        """Take the counts, integer (3,), of the window after the last one.
+    def step(self, counts: npt.NDArray[np.integer[Any]], events: int = 0) -> Step:
+        """See `LiveRule`; events do not matter.
 
         Raises:
             ValueError: another shape or type.
@@ -180,10 +240,10 @@ class StepRule:
         row = row.astype(np.int64)
         self._held.append(row)
         self._sum = self._sum + row
-        if len(self._held) > self._width:
+        if len(self._held) > self.width:
             self._sum = self._sum - self._held.popleft()
         valid = -1
-        if len(self._held) == self._width:
+        if len(self._held) == self.width:
             valid = int(winners(self._sum[None], self._lead)[0])
         a, b, c = (self._sum / len(self._held)).tolist()
         return Step((a, b, c), valid, self._onset(valid))
@@ -241,7 +301,7 @@ class LiveDetector:
     Args:
         counts: the network.
         windows: shape of a sample.
-        detection: sliding window and margin.
+        detection: sliding window and margin of the paper's rule, or another detector.
         width, height: the sensor's pixels.
         centre_px: middle of the crop, as for `analysis.windows.windows.bin_events`.
         stride_us: from one window's start to the next one's; the window's length by default.
@@ -258,7 +318,7 @@ class LiveDetector:
         self,
         counts: Counting,
         windows: Windows,
-        detection: Detection,
+        detection: Detection | Tuned,
         *,
         width: int = 640,
         height: int = 480,
@@ -269,7 +329,7 @@ class LiveDetector:
         back_us: int = BACK_US,
     ) -> None:
         self._counts, self._windows = counts, windows
-        self._rule, self._smoothing = StepRule(detection), detection.smoothing
+        self._rule = rule_of(detection)
         self._geometry = (width, height, centre_px)
         self._length_us = windows.length_ms * 1000
         self._stride_us = self._length_us if stride_us is None else stride_us
@@ -301,7 +361,7 @@ class LiveDetector:
     @property
     def span_us(self) -> int:
         """Span of the windows that a decision rests on."""
-        return self._length_us + (self._smoothing - 1) * self._stride_us
+        return self._length_us + (self._rule.width - 1) * self._stride_us
 
     @property
     def open_windows(self) -> int:
@@ -340,6 +400,7 @@ class LiveDetector:
             made.append(self._judge(self._next, by_event=False))
         return made
 
+    # -- events ------------------------------------------------------------------------------
     # -- events ------------------------------------------------------------------------------
 
     def _ordered(self, chunk: EventChunk) -> EventChunk:
@@ -416,7 +477,7 @@ class LiveDetector:
         window = self._opened(number, start_us)
         del self._open[number]
         counts = self._counts(window.x)[0]
-        said = self._rule.step(counts)
+        said = self._rule.step(counts, window.events)
         self._next = number + 1
         self._judged_us = start_us + self._length_us
         a, b, c = counts.tolist()

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.detectors.detector_comparison import Parts, Tuned, compare, tuned
-from sliplab.analysis.detectors.detectors import Labelled, Predictions
+from sliplab.analysis.detectors.detector_comparison import Parts, compare, tuned
+from sliplab.analysis.detectors.detectors import Labelled, Predictions, Tuned
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.onset_references import References, references_of
 from sliplab.analysis.detectors.predictions import (

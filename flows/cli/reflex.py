@@ -19,7 +19,7 @@ def reflex(
         Path,
         typer.Argument(
             metavar="MODEL|STORE",
-            help="A trained network, or a store: its own and the paper's network.",
+            help="A trained network, or a store with all its detectors.",
         ),
     ],
     rig: Annotated[
@@ -36,6 +36,14 @@ def reflex(
             "on a rig with a gripper.",
         ),
     ] = None,
+    detectors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--detector",
+            help="Of a store: network or paper (with the rule), or another. Repeatable. Default: "
+            "all.",
+        ),
+    ] = None,
     trials: Annotated[
         int, typer.Option("--trials", min=1, max=10_000, help="Trials of each condition.")
     ] = 1,
@@ -45,10 +53,18 @@ def reflex(
     as_json: JsonOption = False,
 ) -> None:
     """Run trials with and without reflexes: drops prevented, way fallen, force, reaction time."""
+    if model.is_dir():
+        from sliplab.flows.steps import prepare_store
+        from sliplab.storage.remote.mirror import open_store
+
+        open_store(model)
+        prepare_store(model)  # before anything imports Prefect
     from sliplab.analysis.report.reflex import COLUMNS, cells
     from sliplab.flows.reflex import measure_reflexes, request
 
-    study = measure_reflexes(request(model, rig, out, protocol, reflexes or (), trials))
+    study = measure_reflexes(
+        request(model, rig, out, protocol, reflexes or (), trials, detectors or ())
+    )
     page = out / "reflex.html"
     if as_json:
         console.print_json({"page": str(page), **study.to_json()})

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.detecting.sink import Timeouts
@@ -29,6 +30,7 @@ class DetectRequest:
     """A requested live detection, checked by `make_detect_request`.
 
     Attributes:
+        detection: the paper's rule by its settings, or another detector with its levels.
         safe: reaction when slip cannot be detected any more, where a reflex is asked for.
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until somebody ends it.
@@ -38,7 +40,7 @@ class DetectRequest:
     model: Path
     model_sha256: str
     fitted: Fitted
-    detection: Detection
+    detection: Detection | Tuned
     plan: Plan | None = None
     trial: Trial | None = None
     reflex: Reflex | None = None
@@ -75,8 +77,12 @@ def make_detect_request(
     margin: float | None = None,
     smoothing: int | None = None,
     poll_s: float = POLL_S,
+    detector: Tuned | None = None,
 ) -> DetectRequest:
     """Read and check everything that can be known before anything moves.
+
+    Args:
+        detector: instead of the protocol's rule.
 
     Raises:
         InputError: rig, model, protocol, trial or reflex; the message says what would be right.
@@ -86,6 +92,7 @@ def make_detect_request(
     fitted.check_slip(model, "detection")
     given = (("margin", margin), ("smoothing", smoothing))
     change = {name: value for name, value in given if value is not None}
+    ruled = partial(_detection, fitted=fitted, change=change)
     if stride_ms is not None and not 0 < stride_ms <= fitted.windows.length_ms:
         right = f"must be over 0 and at most the window's {fitted.windows.length_ms} ms"
         raise InputError("--stride", "", f"{stride_ms:g} ms", right)
@@ -103,7 +110,8 @@ def make_detect_request(
             raise InputError("--seconds", "", None, right)
         return requested(
             rig=file,
-            detection=_detection(AnalysisSettings(network=fitted.network), fitted, change),
+            detection=detector
+            or _detection(AnalysisSettings(network=fitted.network), fitted, change),
             seconds=seconds,
         )
     if seconds is not None:
@@ -116,7 +124,7 @@ def make_detect_request(
     chosen = choose_trial(plan, trial)
     return requested(
         rig=with_level(file, plan) if file.simulated else file,
-        detection=_detection(plan.protocol.analysis, fitted, change),
+        detection=detector or ruled(plan.protocol.analysis),
         plan=plan,
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),

@@ -69,6 +69,26 @@ def test_later_windows_change_nothing(
 
 
 @pytest.mark.parametrize("name", DETECTORS)
+@settings(max_examples=10, deadline=None)
+@given(rows=ROWS, first=st.integers(0, 24))
+def test_window_by_window_is_the_whole_to_the_bit(
+    name: str, rows: list[tuple[int, ...]], first: int
+) -> None:
+    seen = predictions(np.array(rows).reshape(-1, 3))
+    whole, running = DETECTORS[name].evidence(seen), DETECTORS[name].begin()
+    for k in range(len(rows)):
+        one = slice(k, k + 1)
+        incipient, gross = running.step(
+            Predictions(seen.counts[one], seen.events[one], seen.end_ns[one])
+        )
+        assert incipient == whole.incipient[k]
+        if k > first:
+            assert gross == whole.gross_after(first)[k]
+        if k == first:
+            running.detected()
+
+
+@pytest.mark.parametrize("name", DETECTORS)
 def test_no_windows_silent_windows_and_a_trial_without_slip(name: str) -> None:
     detector = DETECTORS[name]
     for counts in (np.empty((0, 3)), np.zeros((1, 3))):

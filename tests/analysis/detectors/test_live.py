@@ -10,15 +10,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sliplab.analysis.detectors.detectors import (
+    Chain,
+    Cusum,
+    Detector,
+    Filter,
+    Levels,
+    Predictions,
+    Reading,
+    Smoothing,
+    Tuned,
+    decide,
+    fit_logistic,
+)
 from sliplab.analysis.detectors.live import (
     SPAN_NS,
     ClockFellBack,
     Decision,
     FreshestArrival,
     LiveDetector,
+    StepDetector,
     StepRule,
 )
 from sliplab.analysis.detectors.smoothing_rule import detect
+from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import EventChunk
@@ -26,6 +41,12 @@ from sliplab.storage.streams import EventChunk
 TINY = Windows(length_ms=4, step_ms=1, crop_px=40, pool_px=20, polarity="both")
 SIZE = {"width": 60, "height": 50}
 LENGTH_US = 4000
+ROW = np.array([[3, 9, 4]])
+_MEANS = np.repeat([(9, 3, 3), ROW[0], (2, 4, 9)], 50, axis=0)
+READING = Reading(
+    fit_logistic(np.random.default_rng(0).poisson(_MEANS), np.repeat([0, 1, 2], 50), 3), False, 1.0
+)
+"""Of spike counts in the three states."""
 
 
 class Network:
@@ -127,6 +148,41 @@ def test_the_rule_step_by_step_is_the_rule(
     onsets = {step.onset: int(end) for step, end in zip(said, ends, strict=True) if step.onset}
     found = {"incipient": whole.incipient_ns, "gross": whole.gross_ns}
     assert onsets == {name: end for name, end in found.items() if end is not None}
+
+
+@settings(max_examples=50)
+@given(
+    st.lists(st.tuples(*[st.integers(0, 30)] * 3), max_size=30),
+    st.sampled_from([Smoothing(2), Cusum(READING), Filter(Chain(np.array([0.1, 0.2])), READING)]),
+    st.floats(0.0, 6.0),
+)
+def test_a_detector_step_by_step_decides_as_on_the_whole(
+    rows: list[tuple[int, ...]], detector: Detector, level: float
+) -> None:
+    counts = np.array(rows, np.int64).reshape(-1, 3)
+    seen = Predictions(counts, counts.sum(axis=1), np.arange(len(rows)))
+    levels = Levels(level, level / 2)
+    expected = decide(detector.evidence(seen), levels)
+    running = StepDetector(Tuned("", detector, levels))
+    steps = [running.step(row, int(row.sum())) for row in counts]
+    found = [next((k for k, it in enumerate(steps) if it.onset == name), None) for name in CLASSES]
+    assert found == [None, expected.incipient_ns, expected.gross_ns]
+    if expected.incipient_ns is not None:
+        assert steps[expected.incipient_ns].valid_class == INCIPIENT
+        assert all(it.valid_class == NO_SLIP for it in steps[: expected.incipient_ns])
+
+
+def test_a_detector_begins_anew_after_a_gap() -> None:
+    """Evidence of half the level, a gap, and the same again: no slip; without the gap there is."""
+    ratio = float(np.diff(READING.log(Predictions(ROW, np.zeros(1), np.zeros(1)))[0])[0])
+    assert ratio > 0
+    level = 1.5 * ratio
+    for gap, onset in ((False, "incipient"), (True, None)):
+        running = StepDetector(Tuned("", Cusum(READING), Levels(level, level)))
+        assert running.step(ROW[0], 0).onset is None
+        if gap:
+            running.interrupt()
+        assert running.step(ROW[0], 0).onset == onset
 
 
 @settings(max_examples=40)

@@ -1,0 +1,70 @@
+"""The detectors of a store: its networks, each with its rule, and all that its trials tune."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.detectors.detectors import Levels, Smoothing, Tuned
+from sliplab.analysis.detectors.predictions import predict_trials
+from sliplab.analysis.evaluation.detectors import detector_work
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.networks.models import (
+    Model,
+    choose_model,
+    comparison_models,
+    rules_of,
+    training_settings,
+    wanted_models,
+)
+from sliplab.flows.judge_network import spike_keeper
+from sliplab.protocols.settings import Detection
+from sliplab.storage.trials.store import Store, StoreError
+
+OWN = "own"
+"""Title of the store's own network."""
+
+
+@dataclass(frozen=True)
+class NetworkDetectors:
+    """A network with the detectors that read it, and the stride of the windows of each, ms."""
+
+    title: str
+    model: Model
+    detectors: list[tuple[int, Tuned]]
+
+
+def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[NetworkDetectors]:
+    """Yield the store's own network with every detector, then the networks that `also` names.
+
+    The first detector of each is its rule; the levels of the others are set by validation trials
+    of the store.
+
+    Raises:
+        StoreError: a network is missing or stale.
+    """
+    model, settings = choose_model(wanted_models(store, campaigns)), training_settings(campaigns)
+    rules = rules_of(campaigns, settings.network.outputs_per_class)
+    rule = rules[training_campaigns(campaigns)[0].name]
+    detectors = [(settings.stride_ms, _paper(rule))]
+    work = detector_work(Labels(store), campaigns, rules, model.key)
+    if work.compared is not None and settings.fine_stride_ms is not None:
+        keep = spike_keeper(store, None)
+        predict_trials(store, model.path, settings.windows, work.requests, keep)
+        detectors += [(settings.fine_stride_ms, it) for it in work.tune(store, settings, rule)]
+    yield NetworkDetectors(OWN, model, detectors)
+    for other in comparison_models(store, campaigns):
+        if not other.fresh:
+            raise StoreError(f"{other.path}: is missing or stale; run `sliplab train` first")
+        theirs = other.settings
+        paper = [(theirs.stride_ms, _paper(theirs.detection))]
+        yield NetworkDetectors(f"preset: {theirs.preset}", other, paper)
+
+
+def _paper(rule: Detection) -> Tuned:
+    """The protocol's rule as a detector: its level is the margin, which is enough."""
+    level = float(np.nextafter(rule.margin, -np.inf))
+    return Tuned(f"rule, {rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
