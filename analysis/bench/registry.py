@@ -28,7 +28,10 @@ _ENTRIES = "sliplab.analysis.bench.entries"
 SHIPPED = {
     "paper": f"{_ENTRIES}.network:Paper",
     "ours": f"{_ENTRIES}.network:Ours",
+    "paper_physical": f"{_ENTRIES}.network:PaperByPhysicalOnset",
+    "ours_2px": f"{_ENTRIES}.network:OursByPaperOnset",
     "cnn": f"{_ENTRIES}.nets:Cnn",
+    "cnn_2px": f"{_ENTRIES}.nets:CnnByPaperOnset",
     "gru": f"{_ENTRIES}.nets:Gru",
     "boosting": f"{_ENTRIES}.boosting:Boosting",
     "hyperdimensional": f"{_ENTRIES}.hyperdimensional:Hyperdimensional",

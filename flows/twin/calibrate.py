@@ -30,7 +30,7 @@ from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.drawn_rigs import samples_file, write_samples
-from sliplab.flows.twin.needs import cheapest_path, measure_needs, write_cheapest
+from sliplab.flows.twin.needs import Needs, cheapest_path, measure_needs, write_cheapest
 from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
 from sliplab.flows.twin.worlds import (
     Prior,
@@ -66,12 +66,14 @@ class Calibration:
     Attributes:
         prior: worlds around the simulated rig to start from. rig_path: the rig's file.
         out: rig file to write. worlds: to simulate.
+        needs: whether to measure what the scene needs, which no parameter depends on.
     """
 
     prior: Prior
     rig_path: Path
     out: Path
     worlds: int
+    needs: bool = True
 
     @property
     def rig(self) -> RigFile:
@@ -192,7 +194,9 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     worlds = judging_worlds(scene)
     predicted = predict(worlds)
     judged = [pilot.slides[trial.id] for trial in pilot.judged]
-    needs = measure_needs(judged, worlds[: len(worlds) // 2], predicted[0])
+    needs = Needs()
+    if wanted.needs:
+        needs = measure_needs(judged, worlds[: len(worlds) // 2], predicted[0])
     fit = TwinFit(
         simulated=bool(item.info.get("simulated")),
         campaign=item.name,

@@ -18,19 +18,22 @@ EPOCHS = 6
 
 
 class Net(Classifier):
-    """A network of `networks.baseline_nets`, trained on the first tip's sliding.
+    """A network of `networks.baseline_nets`.
 
     Args:
         kind: its name there.
+        by_paper: trained on the 2-pixel onset and not on the first tip's sliding.
     """
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, *, by_paper: bool = False) -> None:
         super().__init__(Windows(), 10)
-        self._kind = kind
+        self._kind, self._by_paper = kind, by_paper
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
         """See `Detector`."""
-        train, val = (samples(part, self.windows) for part in (scenes, validation))
+        train, val = (
+            samples(part, self.windows, by_paper=self._by_paper) for part in (scenes, validation)
+        )
         self._net, self._said = fitted_net(self._kind, train, val, EPOCHS)
 
     def votes(self, x: SparseWindows) -> npt.NDArray[np.floating]:
@@ -47,6 +50,13 @@ class Cnn(Net):
 
     def __init__(self) -> None:
         super().__init__("cnn_frame")
+
+
+class CnnByPaperOnset(Net):
+    """`Cnn`, trained on the 2-pixel onset."""
+
+    def __init__(self) -> None:
+        super().__init__("cnn_frame", by_paper=True)
 
 
 class Gru(Net):

@@ -93,9 +93,9 @@ class Paper(Spiking):
     bench may raise the rule's margin, and cannot lower it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, by_paper: bool = True) -> None:
         settings = _settings(preset="paper")
-        super().__init__(settings, settings.stride_ms, by_paper=True)
+        super().__init__(settings, settings.stride_ms, by_paper)
 
     def restart(self) -> None:
         """See `WindowDetector`."""
@@ -116,8 +116,8 @@ class Ours(Spiking):
     Windows overlap, and log likelihoods are those of a regression on the three counts.
     """
 
-    def __init__(self, stride_ms: int = 10) -> None:
-        super().__init__(_settings(), stride_ms, by_paper=False)
+    def __init__(self, stride_ms: int = 10, *, by_paper: bool = False) -> None:
+        super().__init__(_settings(), stride_ms, by_paper)
         self._share = stride_ms / self.windows.length_ms
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
@@ -150,5 +150,20 @@ class Ours(Spiking):
         x = list_events(scene.events, starts, self.windows, scene.width, scene.height)
         slip = scene.slip
         predictions = Predictions(self.counts(x), x.totals, (starts + length_us) * 1000)
-        true = TrueSlip(slip.physical_us * 1000, slip.gross_us * 1000, scene.end_us * 1000)
+        onset_us = slip.paper_us if self._by_paper else slip.physical_us
+        true = TrueSlip(onset_us * 1000, slip.gross_us * 1000, scene.end_us * 1000)
         return Labelled(predictions, true)
+
+
+class PaperByPhysicalOnset(Paper):
+    """`Paper`, trained on the first tip's sliding: what the label alone changes."""
+
+    def __init__(self) -> None:
+        super().__init__(by_paper=False)
+
+
+class OursByPaperOnset(Ours):
+    """`Ours`, trained on the 2-pixel onset."""
+
+    def __init__(self) -> None:
+        super().__init__(by_paper=True)

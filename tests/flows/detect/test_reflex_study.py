@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
+from sliplab.analysis.detectors.detectors import Tuned
+from sliplab.analysis.detectors.live import counting_of
 from sliplab.analysis.evaluation.reflexes import reflex_rows
 from sliplab.flows import reflex as study
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.study import Outcome
 from sliplab.protocols import InputError
+from sliplab.protocols.settings import Detection
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
@@ -84,6 +89,28 @@ def test_what_was_done_is_kept_and_not_done_again(
     assert len(measured) == 4
     assert [row.reflex for row in again.rows] == [None, "stop"]
     assert (tmp_path / "reflex.html").is_file()
+
+
+def test_a_store_has_all_its_detectors(
+    ran: tuple[list[RunRequest], Outcome], fast: Path, tmp_path: Path
+) -> None:
+    """Each at its level and stride; one reacts in a trial, and another one's name is refused."""
+    place = ran[0][0].store
+    rule, tuned = "network", "cusum counts"
+    asked = study.request(place, RIG, tmp_path, fast, ("stop",), detectors=[rule, tuned])
+    assert [it.detector for it in asked.cases] == [None, rule, tuned]
+    assert isinstance(asked.requests[rule].detection, Detection)
+    found = asked.requests[tuned]
+    assert isinstance(found.detection, Tuned)
+    assert found.stride_ms == 10
+    counting = counting_of(found.fitted)
+    made = [study.measure(asked, case, {tuned: counting}) for case in asked.cases[::2]]
+    assert made[0].detected_ms is None
+    assert made[1].detected_ms is not None
+    with pytest.raises(InputError, match="must be one of network, smoothing, smoothing chosen"):
+        study.request(place, RIG, tmp_path, fast, detectors=["smooth"])
+    keys = {it.key for it in asked.cases}
+    assert len(keys) == len(asked.cases)
 
 
 def test_the_command(model: Path, fast: Path, tmp_path: Path) -> None:
