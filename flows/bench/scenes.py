@@ -158,7 +158,11 @@ def simulated(drawn: Drawn) -> Scene:
     events = EventChunk.joined(sink.events)
     t_us = events.t_us - begin_ns // 1000
     inside = slice(*np.searchsorted(t_us, (0, end_us)))
-    kept = EventChunk(events.x[inside], events.y[inside], events.p[inside], t_us[inside])
+    # copies: views would keep what follows in memory
+    kept = EventChunk(
+        events.x[inside].copy(), events.y[inside].copy(), events.p[inside].copy(),
+        t_us[inside].copy(),
+    )  # fmt: skip
     return Scene(drawn.name, kept, built.events.width, built.events.height, int(end_us), slip)
 
 
