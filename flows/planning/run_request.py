@@ -279,7 +279,9 @@ def _of_mappings(*lists: list[Any]) -> bool:
 
 
 def _shown_value(value: Any, key: str) -> str:
-    return "not there" if value is _MISSING or value is None else shown(value, key)
+    if value is _MISSING:
+        return "not there"
+    return "null" if value is None else shown(value, key)
 
 
 def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from sliplab.protocols import InputError, load_plan
-from sliplab.rigs.rig_file import check_plan, load_rig_file
+from sliplab.rigs.rig_file import check_plan, load_rig_file, same_rig
 from tests.conftest import ROOT
 
 Change = Callable[[dict[str, Any]], None]
@@ -200,3 +200,13 @@ def test_maintenance_beyond_the_rig_is_refused(
     path.write_text(yaml.safe_dump(small))
     with pytest.raises(InputError, match=says):
         check_plan(rig, load_plan(path), str(rig_path))
+
+
+def test_a_default_that_is_written_out_is_the_same_rig() -> None:
+    """A newer version has more keys: their defaults change no campaign, null elsewhere does."""
+    data = yaml.safe_load(MOCK)
+    data["mock"] = {**data.get("mock", {}), "gripper": None}
+    assert same_rig(MOCK, yaml.safe_dump(data))
+    stiff = {"base_normal_n_per_m": None}
+    data["mock"]["scene"] = {**data["mock"].get("scene", {}), "skin": stiff}
+    assert not same_rig(MOCK, yaml.safe_dump(data))

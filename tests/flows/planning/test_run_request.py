@@ -31,7 +31,7 @@ def test_differences_name_key_old_and_new() -> None:
         ("b[2]", "not there", "{c: 4}"),
         ("d", "[1, 2]", "[1, 3]"),
         ("e", "{f: 1}", "not there"),
-        ("g", "not there", "2"),
+        ("g", "null", "2"),
         ("h", "not there", "{i: 1}"),
     ]
     assert format_differences(old, old) == ""
