@@ -11,7 +11,7 @@ import pytest
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.testing.broken import BROKEN, Broken
 from sliplab.rigs.testing.conformance import Case, cases
-from sliplab.rigs.testing.examples import arm, events, force, frames, sync
+from sliplab.rigs.testing.examples import arm, events, force, frames, gripper, sync
 from sliplab.rigs.testing.rule import Bounds
 from tests.rigs.testing.trying import LIMITS, each_apart, try_all
 from tests.rigs.waiting import own_address
@@ -23,8 +23,9 @@ SETTINGS: dict[str, Any] = {
     "frame camera": frames.ExampleFramesSettings(stall_s=0.4),
     "force sensor": force.ExampleForceSettings(stall_s=0.4),
     "sync box": sync.ExampleSyncSettings(stall_s=0.4),
+    "gripper": gripper.ExampleGripperSettings(opening_mm=40),
 }
-EXAMPLES = [kind.DRIVER for kind in (arm, events, force, frames, sync)]
+EXAMPLES = [kind.DRIVER for kind in (arm, events, force, frames, sync, gripper)]
 
 
 def cases_of(driver: Driver[Any]) -> list[Case]:
