@@ -30,7 +30,8 @@ def driver(
         str, typer.Argument(help="Name of the driver, as rig files will write it: my_arm.")
     ],
     kind: Annotated[
-        str, typer.Option("--kind", help="Kind of device: arm, events, frames, sync or force.")
+        str,
+        typer.Option("--kind", help="Kind of device: arm, events, frames, sync, force or gripper."),
     ] = "arm",
     into: Annotated[
         Path, typer.Option("--into", help="Folder in which the package's own folder is made.")

@@ -1,4 +1,4 @@
-"""A new package with a driver: an example driver under another name, with a test and a page."""
+"""A new package: an example driver under another name, with a rig file, a test and a page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sliplab.rigs.core.registry import listed
 
 KINDS = {
     "arm": "arm", "events": "event_camera", "frames": "frame_camera", "sync": "sync_box",
-    "force": "force_sensor",
+    "force": "force_sensor", "gripper": "gripper",
 }  # fmt: skip
 """Key of the device in a rig file, by the example that a new driver starts from."""
 _EXAMPLES = "sliplab.rigs.testing.examples"
@@ -50,6 +50,7 @@ A driver for SlipLab. It runs as it stands, on a fake of a device that does not 
 pip install -e .[dev]
 pytest                       # the rules that SlipLab holds a driver of this kind to
 sliplab rigs --drivers       # lists $name
+sliplab rigs rig.yaml        # reads the rig file that uses it
 ```
 
 | file | change it to |
@@ -58,15 +59,36 @@ sliplab rigs --drivers       # lists $name
 | `$name/driver.py` | how your device is spoken to: its protocol, or its maker's library |
 | `$name/fake.py` | what your device answers, so that all of it is tested without one |
 
-A rig file names it:
-
-```yaml
-devices:
-  $key: {driver: $name}
-```
+`rig.yaml` is a loopback rig with its fake; the rig file of a real rig has the same section of
+`devices:`, with the settings of your device.
 
 Write down here what was never tried on the device itself.
 """)
+
+RIG = Template("""\
+# The loopback rig with $name, on its fake: all that it stores is simulated.
+extends: loopback
+name: $project-loopback
+devices:
+  $key: {driver: $name$device}
+$more""")
+_IN_RIG = {
+    "arm": (
+        ", host: 127.0.0.1, limits: {frame: plate, low_mm: [-20, -20, -70],\n"
+        "    high_mm: [20, 20, 4.4], depth_mm: 4.4, speed_mm_s: 100}",
+        "mock: {arm: {start_xyz_mm: [397, 0, 300]}}   # within the limits\n",
+    ),
+    "force": (
+        "",
+        "timing: {force: {grade: host time, delay: {shortest_us: 0, longest_us: 400000}}}\n"
+        "mock: {force: {}}   # what its fake shows\n",
+    ),
+    "gripper": (
+        ", opening_mm: 40",
+        "mock: {gripper: {opening_mm: 40}}   # the fingers that its fake moves\n",
+    ),
+}
+"""What a rig file needs besides the name of the driver, in the device's section and below it."""
 
 TEST = Template('''\
 """$name keeps the rules that SlipLab holds a driver of its kind to, on its fake."""
@@ -76,10 +98,14 @@ from sliplab.testing import conformance$more
 
 test_driver = conformance(DRIVER, $settings($arguments))
 ''')
-_ARM_ARGUMENTS = """
-    host="127.0.0.1", port=free_port(),
-    limits={"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)},
-"""
+_ARGUMENTS = {
+    "arm": (
+        '\n    host="127.0.0.1", port=free_port(),\n'
+        '    limits={"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)},\n'
+    ),
+    "gripper": "opening_mm=40",
+}
+"""What the settings of the test need."""
 
 
 def name_fault(name: str) -> str:
@@ -102,23 +128,25 @@ def package_files(name: str, kind: str) -> dict[str, str]:
     """
     class_name = "".join(part.capitalize() for part in name.split("_"))
     example = f"Example{kind.capitalize()}"
+    device, rest = _IN_RIG.get(kind, ("", ""))
     words = {
         "name": name, "project": name.replace("_", "-"), "key": KINDS[kind],
         "settings": f"{class_name}Settings",
         "more": ", free_port" if kind == "arm" else "",
-        "arguments": _ARM_ARGUMENTS if kind == "arm" else "",
+        "arguments": _ARGUMENTS.get(kind, ""),
     }  # fmt: skip
     found = {
         "pyproject.toml": PYPROJECT.substitute(words),
         "README.md": README.substitute(words),
+        "rig.yaml": RIG.substitute(words, device=device, more=rest),
         f"tests/test_{name}.py": TEST.substitute(words),
     }
     for module in ("__init__", "driver", "fake"):
         text = (files(_EXAMPLES) / kind / f"{module}.py").read_text()
         text = text.replace(f"{_EXAMPLES}.{kind}", name)
         text = text.replace(example, class_name).replace(f"example_{kind}", name)
-        text = re.sub(r"(?:the e|E)xample (?:arm|event camera|frame camera|sync box|force sensor)",
-                      name, text)  # fmt: skip
+        text = re.sub(r"(?:the e|E)xample (?:arm|event camera|frame camera|sync box|"
+                      r"force sensor|gripper)", name, text)  # fmt: skip
         found[f"{name}/{module}.py"] = _own_imports_last(text, name)
     return found
 

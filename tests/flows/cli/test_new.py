@@ -18,7 +18,7 @@ from tests.rigs.waiting import own_address
 
 _OFFLINE = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--no-compile")
 LIMIT_S = 300
-USUAL = {"arm", "events"}
+USUAL = {"arm", "gripper"}
 
 
 def run(*words: object, cwd: Path, site: Path) -> str:
@@ -30,6 +30,16 @@ def run(*words: object, cwd: Path, site: Path) -> str:
     )  # fmt: skip
     assert done.returncode == 0, f"{words}\n{done.stdout}{done.stderr}"
     return done.stdout
+
+
+def install(site: Path, into: Path, *kinds: str) -> list[Path]:
+    """Write a package of each kind, and install it to `site`; their folders."""
+    folders = [
+        answer("new", "driver", f"lab_{kind}", "--kind", kind, "--into", into)["folder"]
+        for kind in kinds
+    ]
+    run("pip", "install", *_OFFLINE, "--target", site, *folders, cwd=into, site=site)
+    return list(map(Path, folders))
 
 
 def test_it_writes_what_it_says(tmp_path: Path) -> None:
@@ -86,7 +96,7 @@ def test_it_overwrites_nothing(tmp_path: Path) -> None:
 def test_a_kind_or_a_folder_that_is_none_is_refused_in_a_line(tmp_path: Path) -> None:
     done = here("new", "driver", "lab_arm", "--kind", "camera", "--into", tmp_path)
     assert done.returncode == 2
-    assert "must be one of arm, events, frames, sync, force" in done.stderr
+    assert "must be one of arm, events, frames, sync, force, gripper" in done.stderr
     (tmp_path / "file").write_text("")
     done = here("new", "driver", "lab_arm", "--into", tmp_path / "file")
     assert done.returncode == 2
@@ -98,12 +108,17 @@ def test_a_kind_or_a_folder_that_is_none_is_refused_in_a_line(tmp_path: Path) ->
     "kind",
     [pytest.param(k, marks=() if k in USUAL else pytest.mark.long) for k in KINDS],
 )
-def test_the_package_keeps_every_rule_by_its_own_test(kind: str, tmp_path: Path) -> None:
-    made = answer("new", "driver", f"lab_{kind}", "--kind", kind, "--into", tmp_path)
-    folder = Path(made["folder"])
-    said = run("pytest", "-q", "-p", "no:cacheprovider", cwd=folder, site=folder)
+def test_an_installed_package_keeps_every_rule_and_its_rig_file_is_valid(
+    kind: str, tmp_path: Path
+) -> None:
+    site = tmp_path / "site"
+    (folder,) = install(site, tmp_path, kind)
+    said = run("pytest", "-q", "-p", "no:cacheprovider", cwd=folder, site=site)
     assert "passed" in said
     assert "skipped" not in said
+    (rig,) = json.loads(run("sliplab", "rigs", "rig.yaml", "--json", cwd=folder, site=site))["rigs"]
+    assert rig["name"] == f"lab-{kind}-loopback"
+    assert not rig["wrong"]
 
 
 @pytest.mark.programs
@@ -113,26 +128,12 @@ def test_a_rig_of_new_drivers_alone_collects_on_a_loopback_rig(
 ) -> None:
     site, work = tmp_path / "site", tmp_path / "work"
     work.mkdir()
-    folders = [
-        answer("new", "driver", f"lab_{kind}", "--kind", kind, "--into", tmp_path)["folder"]
-        for kind in KINDS
-    ]
-    run("pip", "install", *_OFFLINE, "--target", site, *folders, cwd=tmp_path, site=site)
-    devices: dict[str, Any] = {key: {"driver": f"lab_{kind}"} for kind, key in KINDS.items()}
-    devices["arm"] |= {
-        "host": own_address(),
-        "limits": {
-            "frame": "plate", "low_mm": [-20, -20, -70], "high_mm": [20, 20, 4.4],
-            "depth_mm": 4.4, "speed_mm_s": 100,
-        },
-    }  # fmt: skip
-    devices["frame_camera"]["exposure_us"] = 2000
-    delay = {"shortest_us": 0, "longest_us": 400_000}
-    rig = {
-        "extends": "loopback", "name": "lab", "devices": devices,
-        "timing": {"force": {"grade": "host time", "delay": delay}},
-        "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}, "force": {}},
-    }  # fmt: skip
+    rig: dict[str, Any] = {}
+    for folder in install(site, tmp_path, *KINDS):
+        for key, value in yaml.safe_load((folder / "rig.yaml").read_text()).items():
+            rig[key] = {**rig.get(key, {}), **value} if isinstance(value, dict) else value
+    assert {each["driver"] for each in rig["devices"].values()} == {f"lab_{k}" for k in KINDS}
+    rig["devices"]["arm"]["host"] = own_address()
     (work / "rig.yaml").write_text(yaml.safe_dump(rig))
     collection = small["collection"]
     collection["factors"] = {
