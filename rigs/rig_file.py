@@ -491,8 +491,8 @@ def same_rig(one: str, other: str) -> bool:
         rigs = [validate(RigFile, data, "rig.yaml") for data in (first, second)]
     except InputError:  # a campaign's own copy may be older than a rule
         return False
-    first, second = (_lasting(rig.model_dump(mode="json")) for rig in rigs)
-    return first == second
+    one_rig, other_rig = (_lasting(rig.model_dump(mode="json")) for rig in rigs)
+    return one_rig == other_rig
 
 
 def _lasting(data: dict[str, Any]) -> dict[str, Any]:

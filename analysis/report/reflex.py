@@ -10,6 +10,8 @@ COLUMNS = (
     "reflex", "trials", "dropped", "drops prevented (95 %)", "too early", "missed",
     "fallen (mm), median", "95 %", "extra force (N), median", "largest",
 )  # fmt: skip
+MOST_SHOWN = 7
+"""Courses in the figure of one trial."""
 REACTION = ("reflex", "total (ms)", "window", "sensor", "network", "command", "actuator", "p99")
 
 
@@ -41,11 +43,22 @@ def reaction_cells(row: ReflexRow) -> list[str]:
 
 
 def example(study: ReflexStudy) -> list[ReflexTrial]:
-    """Return one trial in all its forms: of those that drop without a reflex, the middle one."""
+    """Return one trial without a reflex, and with each reflex and detector; at most `MOST_SHOWN`.
+
+    It is the middle one of those that drop without a reflex. Where there are more detectors, each
+    reflex is shown with the one that prevents the most drops, and the one that prevents the fewest.
+    """
     trials = list(study.trials.values())
     drops = [it.trial for it in trials if it.reflex is None and it.dropped]
     chosen = drops[len(drops) // 2] if drops else trials[0].trial
     shown = [it for it in trials if it.trial == chosen]
+    if len(shown) > MOST_SHOWN:
+        ends: set[tuple[str | None, str | None]] = {(None, None)}
+        for reflex in {row.reflex for row in study.rows if row.reflex is not None}:
+            rows = [row for row in study.rows if row.reflex == reflex]
+            for choose in (max, min):
+                ends.add((choose(rows, key=lambda row: row.prevented).detector, reflex))
+        shown = [it for it in shown if (it.detector, it.reflex) in ends]
     return sorted(shown, key=lambda it: (it.reflex is not None, it.reflex or "", it.detector or ""))
 
 
