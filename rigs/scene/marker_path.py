@@ -19,6 +19,8 @@ from numba import njit
 
 COLUMN, ROW, RADIUS = 0, 1, 2
 """First index of the path's coordinates, all in px."""
+UNEVEN = 8.0
+"""Rows nearly coincide whose step is the longest beside it over more than this."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -78,7 +80,9 @@ def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-u
     """Weigh the rows for the slope at each row of a block, from its own rows alone.
 
     The slope is that of the cubic through the four nearest rows (Lagrange), at both ends of a
-    block a one-sided one; through all of them where a block has fewer.
+    block a one-sided one; through all of them where a block has fewer. Rows that nearly coincide
+    with this one, or with a nearer one, are left out: a tip that comes free in a short step would
+    swing the curve far out in the long one beside it.
 
     Args:
         t: times of rows, ns, (r,).
@@ -88,21 +92,43 @@ def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-u
         weights: (4, columns), 1/ns, of the rows from `nearest_row` on; written.
     """
     points = min(last - first + 1, 4)
+    used = np.empty(4, np.bool_)
     for k in range(first, last):
         inverse[k] = 1.0 / (t[k + 1] - t[k])
     for k in range(first, last + 1):
         low = nearest_row(k, first, last)
+        _without_twins(t, low, k, points, used)
         own = 0.0
         for j in range(points):
             weights[j, k + shift] = 0.0
-            if low + j != k:
+            if low + j != k and used[j]:
                 weight = 1.0 / (t[low + j] - t[k])
                 for m in range(points):
-                    if m != j and low + m != k:
+                    if m != j and low + m != k and used[m]:
                         weight *= (t[k] - t[low + m]) / (t[low + j] - t[low + m])
                 weights[j, k + shift] = weight
                 own -= weight
         weights[k - low, k + shift] = own
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _without_twins(t, low, k, points, used):  # type: ignore[no-untyped-def]
+    """Mark of the rows from `low` on those that do not nearly coincide with row k or a nearer one.
+
+    Args:
+        used: (points,), written.
+    """
+    longest = 0.0
+    for j in range(points - 1):
+        longest = max(longest, t[low + j + 1] - t[low + j])
+    least = longest / UNEVEN
+    for j in range(points):
+        used[j] = low + j == k or abs(t[low + j] - t[k]) >= least
+    for j in range(points):
+        for m in range(points):
+            far = abs(t[low + j] - t[k]) > abs(t[low + m] - t[k])
+            if used[j] and used[m] and far and abs(t[low + j] - t[low + m]) < least:
+                used[j] = False
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
