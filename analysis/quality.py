@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from sliplab.analysis.clocks.synchronise import (
     SyncStreams,
@@ -30,6 +29,7 @@ from sliplab.analysis.labels.rest import offsets
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
+from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Clocks, Counts, Gate, StreamRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from sliplab.rigs.scene.edges import CUT, level_at
 from sliplab.rigs.scene.events import EventOptics, Events
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64
 
 FRAME_NS = 1_000_000

@@ -7,8 +7,9 @@ in the order in which numpy makes them, so that compiled or not a map is the sam
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sliplab.storage.kernels import njit
 
 Floats = NDArray[np.float64]
 

@@ -14,7 +14,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
@@ -22,6 +21,7 @@ from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import References
 from sliplab.analysis.detectors.smoothing_rule import Found, lead_of
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
+from sliplab.storage.kernels import njit
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+
+from sliplab.storage.kernels import njit
 
 Frame = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -126,7 +127,7 @@ def checked_frame(frame: Frame) -> Frame:
     return np.ascontiguousarray(frame)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _moments(part: Any, labels: Any, label: int, threshold: int) -> Any:
     """(x, y, weight, roundness) of a component; x, y weighted by the excess over the threshold."""
     weight, wx, wy = 0.0, 0.0, 0.0

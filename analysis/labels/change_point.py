@@ -21,9 +21,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sliplab.storage.kernels import njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -132,7 +133,7 @@ def _posterior(
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _design(u: Any, along: Any, relief: Any, half: float, table: Any) -> None:
     """Fill (n, 3 + r): rest, way at speed 1, r reliefs of length 1, and what was measured."""
     for i in range(u.size):
@@ -146,7 +147,7 @@ def _design(u: Any, along: Any, relief: Any, half: float, table: Any) -> None:
         table[i, 2 + relief.size] = along[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _whiten(u: Any, sigma: Any, strength: float, drift: float, root: Any, table: Any) -> float:
     """Solve by the covariance's Cholesky root in place; the logarithm of its determinant's root.
 
@@ -176,7 +177,7 @@ def _whiten(u: Any, sigma: Any, strength: float, drift: float, root: Any, table:
     return spread
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _log_positive(z: float) -> float:
     """Logarithm of the normal distribution function."""
     if z > -30.0:
@@ -184,7 +185,7 @@ def _log_positive(z: float) -> float:
     return -0.5 * z * z - np.log(-z * math.sqrt(2.0 * math.pi))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _evidence(table: Any, k: int) -> float:
     """Of whitened columns, relief k: place, speed and relief integrated out with flat priors.
 
@@ -212,7 +213,7 @@ def _evidence(table: Any, k: int) -> float:
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _log_evidence(
     times: Any, t: Any, along: Any, sigma: Any, strengths: Any, relief: Any, half: float
 ) -> Any:

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
+
+from sliplab.storage.kernels import njit
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

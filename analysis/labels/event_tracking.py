@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
 F64 = NDArray[np.float64]

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from sliplab.storage.kernels import njit
 
 LOST, WHOLE, PARTIAL = 0, 1, 2
 FLANK = 0.06
@@ -29,7 +30,7 @@ _KEEPS_UP = 0.02
 """Fastest lasting change of a marker's area (tilted plate, bent papilla), share per frame."""
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _line(frame, y, left, right):  # type: ignore[no-untyped-def]
     """Sum, pixels, and sum of squared steps of a piece of a row; none of it outside the picture."""
     left, right = max(left, 0), min(right, frame.shape[1])
@@ -45,7 +46,7 @@ def _line(frame, y, left, right):  # type: ignore[no-untyped-def]
     return float(total), right - left, float(squares)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _levels(frame: Any, left: int, top: int, side: int, radius: float) -> Any:
     """Ground in a box's corners, white in its middle, noise, and how uneven the ground is."""
     squares, steps, known = 0.0, 0, 0
@@ -76,7 +77,7 @@ def _levels(frame: Any, left: int, top: int, side: int, radius: float) -> Any:
     return dark, bright, noise, highest - lowest
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _box_sums(frame, left, top, side, low, high, c, y):  # type: ignore[no-untyped-def]
     """Weight and weighted sums of x and y in a square box; four rows at a time.
 
@@ -105,7 +106,7 @@ def _box_sums(frame, left, top, side, low, high, c, y):  # type: ignore[no-untyp
     return total, sum_x + left * total, (top + side) * total - sum_y
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _disc_sums(frame, cx, cy, reach, cuts, low, high):  # type: ignore[no-untyped-def]
     """The same in a disc, less what lies beyond a cut (x0, y0) in its direction (dx, dy)."""
     height, width = frame.shape
@@ -130,7 +131,7 @@ def _disc_sums(frame, cx, cy, reach, cuts, low, high):  # type: ignore[no-untype
     return total, sum_x, sum_y
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _near_cuts(xy: Any, k: int, x: float, y: float, known: Any, reach: float, cuts: Any) -> Any:
     """The lines half-way to those neighbours of marker k that may look into its disc."""
     n = 0
@@ -143,7 +144,7 @@ def _near_cuts(xy: Any, k: int, x: float, y: float, known: Any, reach: float, cu
     return cuts[:n]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-untyped-def]
     """Return True where a box lies in the image and no other marker can appear in it."""
     if left < 0 or top < 0 or left + side > shape[1] or top + side > shape[0]:
@@ -158,7 +159,7 @@ def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-unty
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _one(
     frame: Any, xy: Any, k: int, known: Any, radius: float, margin: float, found: Any, area: float,
     tolerance: float, cuts: Any, c: Any, y_sums: Any,
@@ -225,7 +226,7 @@ def _one(
     return xy[k, 0], xy[k, 1], LOST
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def follow(
     frame: Any, xy: Any, selected: Any, radius: float, margin: float, area: Any, tolerance: float,
     state: Any, found: Any,

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from sliplab.storage.kernels import njit
 
 LEAST_CONTRAST = 30.0
 _PROFILES = 32
@@ -22,7 +23,7 @@ _KEPT = 0.6
 """Share of a side's profiles that have to agree."""
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _grey(frame: Any, x: float, y: float) -> float:
     """Return the bilinear grey level; NaN outside the image."""
     if not (0.0 <= x < frame.shape[1] - 1 and 0.0 <= y < frame.shape[0] - 1):
@@ -34,7 +35,7 @@ def _grey(frame: Any, x: float, y: float) -> float:
     return (1.0 - v) * above + v * below
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _side(frame: Any, ax: float, ay: float, bx: float, by: float, reach: float) -> Any:
     """Return the side's outward offsets at a and at b, and its scatter, px; NaN if lost.
 
@@ -93,7 +94,7 @@ def _side(frame: Any, ax: float, ay: float, bx: float, by: float, reach: float) 
     return level - 0.5 * slope, level + 0.5 * slope, scatter
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def refine_square(frame: Any, corners: Any, rounds: int) -> Any:
     """The dark square near `corners`, (4, 2), clockwise in the picture.
 
@@ -138,7 +139,7 @@ def refine_square(frame: Any, corners: Any, rounds: int) -> Any:
     return result, np.sqrt(scatters / 4.0 / _PROFILES / 2.0 + GRID_PX**2)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def cells(frame: Any, corners: Any) -> Any:
     """Grey levels at the centres of the 6 x 6 cells of the square `corners`, (36,).
 

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from numba import njit
 from torch import nn
 
 from sliplab.analysis.metrics.classification import winners
@@ -36,6 +35,7 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.speck import STATE_BITS, WEIGHT_BITS
 from sliplab.analysis.networks.training import Fitted
+from sliplab.storage.kernels import njit
 from sliplab.storage.schema.export import CountChange
 
 LOWEST = np.float32(-(1 << STATE_BITS - 1))

@@ -19,10 +19,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from sliplab.analysis.networks.lanes import LANES, add, add_times
 from sliplab.analysis.networks.spiking_kernels import add_bias, fire, scatter, scatter_counts
+from sliplab.storage.kernels import njit
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 _U0, _LANES = np.uint64(0), np.uint64(LANES)

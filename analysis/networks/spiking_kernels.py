@@ -25,9 +25,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from sliplab.analysis.networks.lanes import BLOCK, LANES, add, add_times, fires, fires_kept, lowest
+from sliplab.storage.kernels import njit
 
 _U0, _U1 = np.uint64(0), np.uint64(1)
 _LANES, _BLOCK = np.uint64(LANES), np.uint64(BLOCK)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from scipy.stats import poisson
@@ -43,6 +42,7 @@ from sliplab.analysis.twin.rims import (
     first_moments,
     fit_rims,
 )
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64, EventChunk
 
 Mask = NDArray[np.bool_]

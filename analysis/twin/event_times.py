@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.optimize import minimize_scalar
 
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64, I64, EventChunk
 
 SCANS_HZ = (900.0, 11_000.0)

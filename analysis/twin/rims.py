@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64
 
 I32 = np.typing.NDArray[np.int32]

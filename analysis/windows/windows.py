@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Windows
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
 _UNSORTED = -1
@@ -211,7 +211,7 @@ def _raise_for_status(state: int, columns: _Columns, width: int, height: int) ->
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:
     """0, or _UNSORTED, or one plus the index of the first event outside the sensor."""
     # no early exit, so that the loop is vectorised
@@ -230,7 +230,7 @@ def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _bin(
     x: Any, y: Any, p: Any, t: Any, starts: Any, step_us: int, polarity: int, of_x: Any, of_y: Any,
     out: Any,
@@ -260,7 +260,7 @@ def _bin(
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _list(
     x: Any, y: Any, p: Any, t: Any, starts: Any, step_us: int, steps: int, polarity: int,
     of_x: Any, of_y: Any, rows: int, across: int, plane: Any, touched: Any, offsets: Any,
@@ -305,7 +305,7 @@ def _list(
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _total(
     x: Any, y: Any, p: Any, t: Any, starts: Any, length_us: int, polarity: int, of_x: Any,
     of_y: Any, out: Any,

@@ -12,7 +12,6 @@ import itertools
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.capabilities import RigError
@@ -33,6 +32,7 @@ from sliplab.rigs.scene.frames import (
 )
 from sliplab.rigs.scene.lens import BoardCamera, BoardPlace, BoardPrint, draw_board
 from sliplab.rigs.scene.randomness import generator
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import ClockReads, FrameChunk
 
 F32 = npt.NDArray[np.float32]

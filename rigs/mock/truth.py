@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.capabilities import PlateCourse, RigError, TrueOnsets, Truth
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.world import World
 from sliplab.storage.clockmap import IDENTITY, ClockMap
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

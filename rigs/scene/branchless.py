@@ -10,7 +10,8 @@ from __future__ import annotations
 from math import factorial
 
 import numpy as np
-from numba import njit
+
+from sliplab.storage.kernels import njit
 
 # ln 2 in two parts, the first of which times a small whole number is exact
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10

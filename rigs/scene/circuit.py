@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.crossings import distance_at
 from sliplab.rigs.scene.edges import CUT, level_at, widen
 from sliplab.rigs.scene.marker_path import excursion, fit_blocks, stands_still
 from sliplab.rigs.scene.readout import larger
 from sliplab.rigs.scene.rim_pixels import near_rim
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

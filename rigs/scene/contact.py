@@ -24,7 +24,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sliplab.rigs.scene import springs as of
 from sliplab.rigs.scene.friction import (
@@ -62,6 +61,7 @@ from sliplab.rigs.scene.slip import (
     strengthened,
 )
 from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK
+from sliplab.storage.kernels import njit
 
 LANES = 20
 """Nineteen papillae, and one more for whole registers of four."""

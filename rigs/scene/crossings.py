@@ -13,9 +13,9 @@ halved. So a reversal is found however short it is, and a tangent pixel has two 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sliplab.rigs.scene.edges import CUT, rim_of
+from sliplab.storage.kernels import njit
 
 _DONE_PX = 1e-10
 

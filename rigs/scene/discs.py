@@ -7,7 +7,8 @@ drawn only round discs: over the whole image it would cost more than everything 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from sliplab.storage.kernels import njit
 
 SHIFTS = 128
 """A noise tile is this much wider than anything drawn from it: there are so many shifts."""

@@ -8,7 +8,8 @@ next at which it fires positive, the next at which it fires negative, and where 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from sliplab.storage.kernels import njit
 
 CUT = 5.0
 """End of the logistic edge, in units of its scale."""

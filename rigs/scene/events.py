@@ -16,7 +16,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.circuit import (
     OFF,
@@ -70,6 +69,7 @@ from sliplab.rigs.scene.rim_pixels import (
     reaches,
     renew,
 )
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

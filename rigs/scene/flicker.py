@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.readout import larger
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -18,11 +18,11 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.discs import MARGIN_PX, SHIFTS, add_noise, draw_discs, draw_still
 from sliplab.rigs.scene.lens import Lens
 from sliplab.rigs.scene.randomness import generator, key
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -18,11 +18,11 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.branchless import exp_minus, logarithm
 from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.skin import Skin
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 

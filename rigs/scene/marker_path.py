@@ -15,7 +15,8 @@ are cut up: their discs turn a pixel's direction too far in one go.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from sliplab.storage.kernels import njit
 
 COLUMN, ROW, RADIUS = 0, 1, 2
 """First index of the path's coordinates, all in px."""

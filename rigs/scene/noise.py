@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.edges import CUT, level_at
 from sliplab.rigs.scene.randomness import generator
+from sliplab.storage.kernels import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

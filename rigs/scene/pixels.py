@@ -20,7 +20,6 @@ wait for each other, so neither the cut of a trial into calls nor the order of p
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sliplab.rigs.scene.branchless import logarithm
 from sliplab.rigs.scene.crossings import events_of_segment, solve, time_between, turning
@@ -28,6 +27,7 @@ from sliplab.rigs.scene.edges import CUT, FAR, LAST, LEVEL, OFF, ON, TAIL
 from sliplab.rigs.scene.marker_path import (
     bound_rates,
 )
+from sliplab.storage.kernels import njit
 
 LANES = 256
 STRIDE = LANES + 8

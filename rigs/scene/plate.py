@@ -14,7 +14,6 @@ Regularised friction would let a held plate creep.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sliplab.rigs.scene.contact import (
     LANES,
@@ -28,6 +27,7 @@ from sliplab.rigs.scene.contact import (
 )
 from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import ACROSS, STUCK, Law
+from sliplab.storage.kernels import njit
 
 _ITERATIONS = 200
 _NEVER = 1e9

@@ -24,7 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from sliplab.storage.kernels import njit
 
 NEVER_NS = -(1 << 62)
 _TIME_BITS = 27

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.rigs.scene.edges import CUT, OFF, ON
+from sliplab.storage.kernels import njit
 
 REACH_PX = 1.5
 """Distance that a marker may move, and grow, before its list is made again."""

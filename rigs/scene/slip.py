@@ -18,10 +18,10 @@ All vectors are split along the slip and across it; across it the tip does not m
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sliplab.rigs.scene.branchless import logarithm
 from sliplab.rigs.scene.friction import KNOT_MM, grip_at
+from sliplab.storage.kernels import njit
 
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""

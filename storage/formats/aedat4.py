@@ -18,7 +18,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow as pa
-from numba import njit
 
 from sliplab.storage.formats.flatbuffers import (
     GREY,
@@ -40,6 +39,7 @@ from sliplab.storage.formats.foreign import (
     event_chunk,
     grey,
 )
+from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import U8, EventChunk, FrameChunk
 

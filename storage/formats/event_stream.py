@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.foreign import (
@@ -26,6 +25,7 @@ from sliplab.storage.formats.foreign import (
     event_chunk,
     read_head,
 )
+from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import EventChunk
 

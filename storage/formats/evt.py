@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from sliplab.storage.formats.foreign import LATEST_US
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import I64
 
 OUTSIDE, FELL, LATE = 1, 2, 3

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numba import njit
 
 from sliplab.analysis.networks.lanes import BLOCK, LANES, add, add_times, fires, fires_kept, lowest
+from sliplab.storage.kernels import njit
 
 F32 = npt.NDArray[np.float32]
 ROOM = 96
@@ -22,27 +22,27 @@ NUMBERS = st.floats(width=32, allow_nan=False)
 ROWS = arrays(np.float32, ROOM, elements=NUMBERS)
 
 
-@njit
+@njit()
 def _add(a: Any, at: Any, b: Any, of: Any) -> None:
     add(a, at, b, of)
 
 
-@njit
+@njit()
 def _add_times(a: Any, at: Any, b: Any, of: Any, factor: Any) -> None:
     add_times(a, at, b, of, factor)
 
 
-@njit
+@njit()
 def _fires(current: Any, v: Any, at: Any, threshold: Any) -> Any:
     return fires(current, v, at, threshold)
 
 
-@njit
+@njit()
 def _fires_kept(current: Any, v: Any, u: Any, at: Any, threshold: Any) -> Any:
     return fires_kept(current, v, u, at, threshold)
 
 
-@njit
+@njit()
 def _lowest(bits: Any) -> Any:
     return lowest(bits)
 

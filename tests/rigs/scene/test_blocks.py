@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numba import njit
 
 from sliplab.rigs.scene.contact import (
     BLOCK,
@@ -33,6 +32,7 @@ from sliplab.rigs.scene.springs import (
     make_springs,
     new_tips,
 )
+from sliplab.storage.kernels import njit
 from tests.rigs.scene.steps import MU, ideal_skin, line, run, springs_of
 
 SWITCHES = {
@@ -43,7 +43,7 @@ SWITCHES = {
 }
 
 
-@njit
+@njit()
 def states(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-untyped-def]
     """The state after each row, (m, n, 18)."""
     n, blocks = state.shape[0], make_blocks(table, field, state)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
 from scipy.optimize import brentq
 
 from sliplab.rigs.scene.crossings import events_of_segment
@@ -31,6 +30,7 @@ from sliplab.rigs.scene.pixels import (
     events_of_pixels,
     pack_steps,
 )
+from sliplab.storage.kernels import njit
 
 CONTRAST, EDGE, RADIUS = 2.08, 0.8, 8.0
 HEIGHT, WIDTH, STEPS = 40, 44, 8
@@ -123,7 +123,7 @@ def one_by_one(a: Look, state: np.ndarray) -> np.ndarray:
     return np.sort(out[:n])
 
 
-@njit
+@njit()
 def search_all(  # type: ignore[no-untyped-def]
     segments, first, since, until, inverse, curve, tree, threshold, state, stack, out
 ):

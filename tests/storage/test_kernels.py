@@ -1,0 +1,88 @@
+"""Compiled kernels are kept on disk, and compiled again when anything changes that is in them."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from sliplab.storage import kernels
+
+CALLER = """
+from sliplab.storage.kernels import njit
+from sliplab.made_callee import FACTOR, twice
+@njit(cache=True)
+def made(x):
+    return FACTOR * twice(x)
+"""
+CALLEE = """
+from sliplab.storage.kernels import njit
+from sliplab.made_constants import BASE
+FACTOR = {factor}
+@njit(cache=True)
+def twice(x):
+    return {twice} * x + BASE
+"""
+
+
+def load(folder: Path, name: str, text: str) -> ModuleType:
+    """Write a module of the package and import it anew, as another program would."""
+    file = folder / f"{name}.py"
+    file.write_text(text)
+    spec = importlib.util.spec_from_file_location(f"sliplab.{name}", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(folder: Path, *, factor: int = 1, twice: int = 2, base: int = 0) -> tuple[int, int]:
+    """Return what the caller gives of 10, and how many kernels came from disk."""
+    kernels._folder.cache_clear()
+    load(folder, "made_constants", f"BASE = {base}\n")
+    callee = load(folder, "made_callee", CALLEE.format(factor=factor, twice=twice))
+    caller = load(folder, "made_caller", CALLER)
+    result = caller.made(10)
+    callee.twice(10)
+    kept = [sum(it.stats.cache_hits.values()) for it in (caller.made, callee.twice)]
+    return result, sum(kept)
+
+
+@pytest.fixture(autouse=True)
+def _modules_are_removed() -> Iterator[None]:
+    yield
+    for name in [name for name in sys.modules if name.startswith("sliplab.made_")]:
+        del sys.modules[name]
+
+
+def test_a_kernel_is_compiled_again_when_another_file_changes(tmp_path: Path) -> None:
+    assert run(tmp_path) == (20, 0)
+    assert run(tmp_path) == (20, 2)
+    assert run(tmp_path, twice=3) == (30, 0)
+    assert run(tmp_path, factor=5) == (100, 0)
+    # a constant two files away
+    assert run(tmp_path, base=1) == (21, 0)
+    assert run(tmp_path, base=1) == (21, 2)
+
+
+def test_kernels_of_earlier_versions_are_deleted(tmp_path: Path) -> None:
+    for twice in (2, 3, 4):
+        run(tmp_path, twice=twice)
+    folders = sorted(it.name for it in (tmp_path / "__pycache__").glob("kernels-*"))
+    assert [name.rpartition("-")[0] for name in folders] == [
+        "kernels-made_callee", "kernels-made_caller",
+    ]  # fmt: skip
+
+
+def test_a_folder_that_is_named_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "named"))
+    assert run(tmp_path) == (20, 0)
+    assert run(tmp_path) == (20, 2)
+    assert not (tmp_path / "__pycache__").exists()
+    assert len(list((tmp_path / "named").glob("kernels-sliplab.made_*"))) == 2
