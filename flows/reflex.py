@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import collected
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.live import Counting, counting_of
 from sliplab.analysis.evaluation.reflexes import dropped, extra_force_n, reflex_rows
@@ -26,7 +25,7 @@ from sliplab.analysis.sweeps.runner import ResultFile, Sweep
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request, make_reflex
 from sliplab.flows.running import console
-from sliplab.flows.store_detectors import store_detectors
+from sliplab.flows.store_detectors import detectors_of
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
@@ -38,7 +37,6 @@ from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.schema.reflex import ReactionParts, ReflexStudy, ReflexTrial
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
 
 NAME = "reflex"
 VERSION = 1
@@ -47,52 +45,6 @@ HOLD_S = 1.0
 """Time for which the arm stays after a reflex; a plate that slides at its end has dropped."""
 STEP_MS = 20
 """Step of the heights that are kept."""
-MODELS = {"network": "seed0.pt", "paper": "paper-seed0.pt"}
-"""A store's models by the names of their detectors."""
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """A network, and what reads its spikes.
-
-    Attributes:
-        detector: None for the rule of the protocol that is run.
-        stride_ms: from one window's start to the next one's; None for the window's length.
-    """
-
-    model: Path
-    detector: Tuned | None = None
-    stride_ms: int | None = None
-
-
-def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
-    """Return detectors by their names: a model with the rule, or all that a store has.
-
-    Args:
-        names: of those that are wanted; left out, all.
-
-    Raises:
-        InputError: there is none.
-        StoreError: a network of the store is missing or stale.
-    """
-    found = _of_store(place) if place.is_dir() else {place.stem: Chosen(place)}
-    unknown = next((name for name in names if name not in found), None)
-    if unknown is not None:
-        raise InputError("--detector", "", unknown, f"must be one of {', '.join(found)}")
-    return {name: found[name] for name in names or found}
-
-
-def _of_store(place: Path) -> dict[str, Chosen]:
-    models = {name: place / "models" / file for name, file in MODELS.items()}
-    found = {name: Chosen(file) for name, file in models.items() if file.is_file()}
-    if not found:
-        right = f"has no models/{MODELS['network']}: train it first, or name a model file"
-        raise InputError("MODEL", "", place, right)
-    store = Store(place)
-    for network in store_detectors(store, collected(store, None)):
-        for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule
-            found[tuned.name] = Chosen(network.model.path, tuned, stride_ms)
-    return found
 
 
 def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:

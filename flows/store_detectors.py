@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.detectors.detectors import Levels, Smoothing, Tuned
 from sliplab.analysis.detectors.predictions import predict_trials
 from sliplab.analysis.evaluation.detectors import detector_work
@@ -21,11 +22,14 @@ from sliplab.analysis.networks.models import (
     wanted_models,
 )
 from sliplab.flows.judge_network import spike_keeper
+from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
 from sliplab.storage.trials.store import Store, StoreError
 
 OWN = "own"
 """Title of the store's own network."""
+MODELS = {"network": "seed0.pt", "paper": "paper-seed0.pt"}
+"""A store's models by the names of their rules."""
 
 
 @dataclass(frozen=True)
@@ -68,3 +72,47 @@ def _paper(rule: Detection) -> Tuned:
     """The protocol's rule as a detector: its level is the margin, which is enough."""
     level = float(np.nextafter(rule.margin, -np.inf))
     return Tuned(f"rule, {rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A network, and what reads its spikes.
+
+    Attributes:
+        detector: None for the rule of the protocol that is run.
+        stride_ms: from one window's start to the next one's; None for the window's length.
+    """
+
+    model: Path
+    detector: Tuned | None = None
+    stride_ms: int | None = None
+
+
+def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
+    """Return detectors by their names: a model with the rule, or all that a store has.
+
+    Args:
+        names: of those that are wanted; left out, all.
+
+    Raises:
+        InputError: there is none.
+        StoreError: a network of the store is missing or stale.
+    """
+    found = _of_store(place) if place.is_dir() else {place.stem: Chosen(place)}
+    unknown = next((name for name in names if name not in found), None)
+    if unknown is not None:
+        raise InputError("--detector", "", unknown, f"must be one of {', '.join(found)}")
+    return {name: found[name] for name in names or found}
+
+
+def _of_store(place: Path) -> dict[str, Chosen]:
+    models = {name: place / "models" / file for name, file in MODELS.items()}
+    found = {name: Chosen(file) for name, file in models.items() if file.is_file()}
+    if not found:
+        right = f"has no models/{MODELS['network']}: train it first, or name a model file"
+        raise InputError("MODEL", "", place, right)
+    store = Store(place)
+    for network in store_detectors(store, collected(store, None)):
+        for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule
+            found[tuned.name] = Chosen(network.model.path, tuned, stride_ms)
+    return found

@@ -9,10 +9,12 @@ import typer
 
 from sliplab.flows.cli.common import EnableOption, JsonOption, RigOption
 from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
     from sliplab.flows.detect import DetectSummary
     from sliplab.flows.detecting.sink import Times
+    from sliplab.flows.store_detectors import Chosen
 
 app = typer.Typer()
 
@@ -20,7 +22,18 @@ app = typer.Typer()
 @app.command()
 def detect(
     rig: RigOption,
-    model: Annotated[Path, typer.Option("--model", help="A trained network: models/seed0.pt.")],
+    model: Annotated[
+        Path,
+        typer.Option("--model", help="A trained network, models/seed0.pt, or a store with one."),
+    ],
+    detector: Annotated[
+        str,
+        typer.Option(
+            "--detector",
+            help="Of a store: network or paper (with the rule), or a compared one, such as 'hmm "
+            "counts', at the level that validation trials set.",
+        ),
+    ] = "network",
     protocol: Annotated[
         Path | None,
         typer.Option("--protocol", help="Run a trial of this protocol; default: only listen."),
@@ -76,19 +89,21 @@ def detect(
     from sliplab.flows.detect import detect as run
     from sliplab.flows.detecting.request import make_detect_request
 
+    chosen = _chosen(model, detector, stride, (margin, smoothing))
     order = make_detect_request(
         rig,
-        model,
+        chosen.model,
         protocol=protocol,
         trial=trial,
         enable=tuple(enable or ()),
         reflex=reflex,
         hold_s=hold,
         seconds=seconds,
-        stride_ms=stride,
+        stride_ms=stride if chosen.stride_ms is None else chosen.stride_ms,
         margin=margin,
         smoothing=smoothing,
         poll_s=poll / 1000,
+        detector=chosen.detector,
     )
     result = run(order, out)
     if as_json:
@@ -98,6 +113,38 @@ def detect(
         console.print_pairs(f"detect on {result['rig']}{simulated}", _shown(result))
     if result["interrupted"]:
         raise typer.Exit(console.INTERRUPTED)
+
+
+def _chosen(
+    model: Path, detector: str, stride: float | None, rule: tuple[float | None, int | None]
+) -> Chosen:
+    """Return a detector of a store, or a network with the rule.
+
+    Raises:
+        InputError: there is no such detector, or it has no such option.
+        StoreError: a network of the store is missing or stale.
+    """
+    if model.is_dir():
+        from sliplab.flows.steps import prepare_store
+        from sliplab.storage.remote.mirror import open_store
+
+        open_store(model)
+        prepare_store(model)  # before anything imports Prefect
+    from sliplab.flows.store_detectors import Chosen, detectors_of
+
+    if not model.is_dir():
+        if detector != "network":
+            right = "is a detector of a store: name the store with --model"
+            raise InputError("--detector", "", detector, right)
+        return Chosen(model)
+    found = detectors_of(model, [detector])[detector]
+    if found.detector is not None:
+        given = (("--stride", stride), ("--margin", rule[0]), ("--smoothing", rule[1]))
+        for name, value in given:
+            if value is not None:
+                right = f"is of the rule; '{detector}' has the stride and level of its validation"
+                raise InputError(name, "", value, right)
+    return found
 
 
 def _shown(result: DetectSummary) -> dict[str, str | None]:

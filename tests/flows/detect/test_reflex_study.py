@@ -107,10 +107,31 @@ def test_a_store_has_all_its_detectors(
     made = [study.measure(asked, case, {tuned: counting}) for case in asked.cases[::2]]
     assert made[0].detected_ms is None
     assert made[1].detected_ms is not None
-    with pytest.raises(InputError, match="must be one of network, smoothing, smoothing chosen"):
+    with pytest.raises(InputError, match="must be one of network, paper, smoothing, smoothing chosen"):
         study.request(place, RIG, tmp_path, fast, detectors=["smooth"])
     keys = {it.key for it in asked.cases}
     assert len(keys) == len(asked.cases)
+
+
+def test_a_store_detects_by_any_of_its_detectors(
+    ran: tuple[list[RunRequest], Outcome], fast: Path
+) -> None:
+    place = ran[0][0].store
+    asked = ("detect", "--rig", RIG, "--protocol", fast, "--trial", "speed=4mmps", "--json")
+    done = here(*asked, "--model", place, "--detector", "cusum counts", "--reflex", "stop")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert Path(result["model"]["file"]).name == "seed0.pt"
+    assert result["states"]["undecided"] == 0  # that is the rule's
+    model = place / "models" / "seed0.pt"
+    for options, right in (
+        (("--model", place, "--detector", "cusum"), "must be one of network, paper, smoothing"),
+        (("--model", model, "--detector", "hmm counts"), "name the store with --model"),
+        (("--model", place, "--detector", "hmm counts", "--margin", "2"), "is of the rule"),
+    ):
+        done = here(*asked, *options)
+        assert done.returncode == 2
+        assert right in json.loads(done.stdout)["error"]["message"]
 
 
 def test_the_command(model: Path, fast: Path, tmp_path: Path) -> None:
