@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,15 +29,12 @@ def twice(x):
 
 
 def load(folder: Path, name: str, text: str) -> ModuleType:
-    """Write a module of the package and import it anew, as another program would."""
-    file = folder / f"{name}.py"
-    file.write_text(text)
-    spec = importlib.util.spec_from_file_location(f"sliplab.{name}", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    """Write a module of the package and run it anew, as another program would."""
+    module = ModuleType(f"sliplab.{name}")
+    module.__file__ = str(folder / f"{name}.py")
+    Path(module.__file__).write_text(text)
+    sys.modules[module.__name__] = module
+    exec(compile(text, module.__file__, "exec"), module.__dict__)
     return module
 
 
