@@ -98,19 +98,22 @@ def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
         InputError: there is none.
         StoreError: a network of the store is missing or stale.
     """
-    found = _of_store(place) if place.is_dir() else {place.stem: Chosen(place)}
+    found = _of_store(place, names) if place.is_dir() else {place.stem: Chosen(place)}
     unknown = next((name for name in names if name not in found), None)
     if unknown is not None:
         raise InputError("--detector", "", unknown, f"must be one of {', '.join(found)}")
     return {name: found[name] for name in names or found}
 
 
-def _of_store(place: Path) -> dict[str, Chosen]:
+def _of_store(place: Path, names: Sequence[str]) -> dict[str, Chosen]:
+    """Return the networks with their rules, and the tuned detectors, unless none is wanted."""
     models = {name: place / "models" / file for name, file in MODELS.items()}
     found = {name: Chosen(file) for name, file in models.items() if file.is_file()}
     if not found:
         right = f"has no models/{MODELS['network']}: train it first, or name a model file"
         raise InputError("MODEL", "", place, right)
+    if names and set(names) <= found.keys():
+        return found
     store = Store(place)
     for network in store_detectors(store, collected(store, None)):
         for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule

@@ -401,7 +401,6 @@ class LiveDetector:
         return made
 
     # -- events ------------------------------------------------------------------------------
-    # -- events ------------------------------------------------------------------------------
 
     def _ordered(self, chunk: EventChunk) -> EventChunk:
         """Return the chunk sorted by time, and count events that arrived out of order."""
