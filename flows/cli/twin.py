@@ -59,7 +59,7 @@ def calibrate_scene(
     campaign: Annotated[
         str | None, typer.Option("--campaign", help="The pilot; may be left out if it is alone.")
     ] = None,
-    worlds: WorldsOption = 300,
+    worlds: WorldsOption = 240,
     spread: SpreadOption = 0.5,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
