@@ -28,8 +28,8 @@ from sliplab.storage.trials.store import Store, StoreError
 
 OWN = "own"
 """Title of the store's own network."""
-MODELS = {"network": "seed0.pt", "paper": "paper-seed0.pt"}
-"""A store's models by the names of their rules."""
+NETWORK = "network"
+"""Name of its detector with the rule; that of another network is its preset's."""
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,28 @@ def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[Networ
     model, settings = choose_model(wanted_models(store, campaigns)), training_settings(campaigns)
     rules = rules_of(campaigns, settings.network.outputs_per_class)
     rule = rules[training_campaigns(campaigns)[0].name]
-    detectors = [(settings.stride_ms, _paper(rule))]
+    detectors = [(settings.stride_ms, _with_rule(rule))]
     work = detector_work(Labels(store), campaigns, rules, model.key)
     if work.compared is not None and settings.fine_stride_ms is not None:
         keep = spike_keeper(store, None)
         predict_trials(store, model.path, settings.windows, work.requests, keep)
         detectors += [(settings.fine_stride_ms, it) for it in work.tune(store, settings, rule)]
     yield NetworkDetectors(OWN, model, detectors)
+    for other in _others(store, campaigns):
+        theirs = other.settings
+        with_rule = [(theirs.stride_ms, _with_rule(theirs.detection))]
+        yield NetworkDetectors(f"preset: {theirs.preset}", other, with_rule)
+
+
+def _others(store: Store, campaigns: list[Collected]) -> Iterator[Model]:
+    """Yield the networks that `also` names. Raises StoreError if one is missing or stale."""
     for other in comparison_models(store, campaigns):
         if not other.fresh:
             raise StoreError(f"{other.path}: is missing or stale; run `sliplab train` first")
-        theirs = other.settings
-        paper = [(theirs.stride_ms, _paper(theirs.detection))]
-        yield NetworkDetectors(f"preset: {theirs.preset}", other, paper)
+        yield other
 
 
-def _paper(rule: Detection) -> Tuned:
+def _with_rule(rule: Detection) -> Tuned:
     """The protocol's rule as a detector: its level is the margin, which is enough."""
     level = float(np.nextafter(rule.margin, -np.inf))
     return Tuned(f"rule, {rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
@@ -107,15 +113,17 @@ def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
 
 def _of_store(place: Path, names: Sequence[str]) -> dict[str, Chosen]:
     """Return the networks with their rules, and the tuned detectors, unless none is wanted."""
-    models = {name: place / "models" / file for name, file in MODELS.items()}
-    found = {name: Chosen(file) for name, file in models.items() if file.is_file()}
-    if not found:
-        right = f"has no models/{MODELS['network']}: train it first, or name a model file"
+    if not any((place / "models").glob("*.pt")):
+        right = "has no models/*.pt: train it first, or name a model file"
         raise InputError("MODEL", "", place, right)
+    store = Store(place)
+    campaigns = collected(store, None)
+    found = {NETWORK: Chosen(choose_model(wanted_models(store, campaigns)).path)}
+    for other in _others(store, campaigns):
+        found[str(other.settings.preset)] = Chosen(other.path)
     if names and set(names) <= found.keys():
         return found
-    store = Store(place)
-    for network in store_detectors(store, collected(store, None)):
+    for network in store_detectors(store, campaigns):
         for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule
             found[tuned.name] = Chosen(network.model.path, tuned, stride_ms)
     return found

@@ -1,4 +1,4 @@
-"""`njit` whose code on disk is that of the kernels as they are, with all that they call.
+"""`njit` that keeps the code of kernels on disk, and sees when anything that they call changes.
 
 numba keeps a kernel's machine code for as long as the file that defines it stays the same. Kernels
 and constants of other files are part of that code, and numba does not see when those change: after

@@ -34,6 +34,10 @@ class Slip:
     paper_us: int
     gross_us: int
 
+    def incipient_us(self, by_paper: bool) -> int:
+        """Return the onset of incipient slip, by the 2-pixel rule or the physical one."""
+        return self.paper_us if by_paper else self.physical_us
+
 
 @dataclass(frozen=True)
 class Scene:

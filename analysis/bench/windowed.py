@@ -74,7 +74,7 @@ def samples(scenes: Sequence[Scene], windows: Windows, *, by_paper: bool = False
     parts = []
     for number, scene in enumerate(scenes):
         slip = scene.slip
-        onset_us = slip.paper_us if by_paper else slip.physical_us
+        onset_us = slip.incipient_us(by_paper)
         chosen = choose_windows(
             0, scene.end_us, onset_us, slip.gross_us, windows.length_ms * 1000, PER_CLASS, number
         )

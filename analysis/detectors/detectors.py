@@ -176,13 +176,14 @@ def log_odds(log_probability: FloatArray, state: int) -> FloatArray:
 # decides for "no change", so that test is left out.
 
 
-def cusum(log_ratio: FloatArray) -> FloatArray:
+def cusum(log_ratio: FloatArray, level: float = 0.0) -> FloatArray:
     """Page's statistic after each window, float64 (n,), never negative.
 
-    ``g(t) = max(0, g(t-1) + l(t))`` with ``g = 0`` before the first window.
+    ``g(t) = max(0, g(t-1) + l(t))``.
 
     Args:
         log_ratio: float64 (n,), log likelihood after the change less before it, finite.
+        level: g before the first window.
 
     Raises:
         ValueError: another shape, or a value that is not finite.
@@ -190,7 +191,6 @@ def cusum(log_ratio: FloatArray) -> FloatArray:
     if log_ratio.ndim != 1 or not np.isfinite(log_ratio).all():
         raise ValueError(f"log ratios {log_ratio.shape}: must be finite and one a window")
     out = np.empty(len(log_ratio))
-    level = 0.0
     for n, value in enumerate(log_ratio.tolist()):
         level = max(0.0, level + value)
         out[n] = level
@@ -408,7 +408,7 @@ class Detector(Protocol):
         """The evidence of one trial."""
 
     def begin(self) -> Running:
-        """Begin a stream, whose windows come one by one."""
+        """Begin a stream of windows that come one by one."""
 
 
 @dataclass(frozen=True)
@@ -536,9 +536,9 @@ class _RunningCusum:
         self._incipient = self._gross = 0.0
 
     def step(self, window: Predictions) -> tuple[float, float]:
-        ((no_slip, incipient, gross),) = self._reading.log(window).tolist()
-        self._incipient = max(0.0, self._incipient + (incipient - no_slip))
-        self._gross = max(0.0, self._gross + (gross - incipient))
+        log = self._reading.log(window)
+        self._incipient = float(cusum(log[:, INCIPIENT] - log[:, NO_SLIP], self._incipient)[0])
+        self._gross = float(cusum(log[:, GROSS] - log[:, INCIPIENT], self._gross)[0])
         return self._incipient, self._gross
 
     def detected(self) -> None:

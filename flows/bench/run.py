@@ -178,7 +178,7 @@ class Bench:
 
 
 def _give_memory_back() -> None:
-    """Free a simulated rig, whose parts refer to each other, and return its memory to the system.
+    """Free a simulated rig with its parts, which refer to each other, and return their memory.
 
     What a simulation frees lies between the events of scenes that are kept, where glibc's allocator
     keeps it: 15 MB a scene, 11 GB in the full set.

@@ -21,7 +21,7 @@ from sliplab.storage.kernels import njit
 COLUMN, ROW, RADIUS = 0, 1, 2
 """First index of the path's coordinates, all in px."""
 UNEVEN = 8.0
-"""Rows nearly coincide whose step is the longest beside it over more than this."""
+"""Rows nearly coincide if the longest step beside them is longer by more than this factor."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

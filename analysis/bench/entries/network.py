@@ -137,9 +137,7 @@ class Ours(Spiking):
     def evidence(self, counts: npt.NDArray[np.int64]) -> npt.ArrayLike:
         """See `Spiking`."""
         log = self._share * self._reading.likelihood.log(counts)
-        # the level so far is a window more, after which the statistic is what it was
-        ratios = np.concatenate([[self._level], log[:, INCIPIENT] - log[:, NO_SLIP]])
-        found = cusum(ratios)[1:]
+        found = cusum(log[:, INCIPIENT] - log[:, NO_SLIP], self._level)
         self._level = float(found[-1]) if len(found) else self._level
         return found
 
@@ -150,7 +148,7 @@ class Ours(Spiking):
         x = list_events(scene.events, starts, self.windows, scene.width, scene.height)
         slip = scene.slip
         predictions = Predictions(self.counts(x), x.totals, (starts + length_us) * 1000)
-        onset_us = slip.paper_us if self._by_paper else slip.physical_us
+        onset_us = slip.incipient_us(self._by_paper)
         true = TrueSlip(onset_us * 1000, slip.gross_us * 1000, scene.end_us * 1000)
         return Labelled(predictions, true)
 
