@@ -73,7 +73,7 @@ def reactions(rows: Sequence[ReflexRow], *, simulated: bool) -> str:
                 axes.barh(i, value, left=left, color=colour, label=part if i == 0 else None)
                 left += value
         axes.set_yticks(range(len(shown)), [title_of(row) for row in shown])
-        axes.invert_yaxis()
+        axes.set_ylim(len(shown) - 0.5, -0.5)
         axes.set_xlabel("ms after the first tip slipped (medians of the parts)")
         figure.legend(loc="outside lower center", ncols=len(PART_COLOURS), fontsize=8)
         return svg_text(figure, simulated)
@@ -100,7 +100,8 @@ def courses(trials: Sequence[ReflexTrial], *, simulated: bool) -> str:
     """Draw the plates of one condition over time, without and with reflexes."""
     colours = (GREY, BLUE, ORANGE, GREEN, PURPLE, RED)
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(WIDTH, 2.6))
+        rows = -(-len(trials) // 2)
+        figure, axes = plt.subplots(figsize=(WIDTH, 2.4 + 0.17 * rows))
         for k, it in enumerate(trials):
             t_s = np.arange(len(it.heights_mm)) * it.step_ms / 1e3
             axes.plot(
@@ -111,5 +112,5 @@ def courses(trials: Sequence[ReflexTrial], *, simulated: bool) -> str:
                 axes.axvline(it.detected_ms / 1e3, color=colours[k % len(colours)], lw=0.6, ls=":")
         axes.set_xlabel("s after the retraction began; dotted: slip detected")
         axes.set_ylabel("plate (mm)")
-        figure.legend(loc="outside lower center", ncols=3, fontsize=7.5)
+        figure.legend(loc="outside lower center", ncols=2, fontsize=7.5)
         return svg_text(figure, simulated)
