@@ -9,7 +9,8 @@ worlds were drawn around. Then the same study is done on the hidden world, on it
 on the rig as it was: the kinematic grid with `--repetitions` of each condition (3 in full), and for
 one of these 4 of each gravity and 2 of each disturbance trial. Trials of one id have the same
 chance on each of them. The network of each is tested on the hidden world's test trials. What
-figures differ by alone is shown by the hidden world's study with a network of another seed.
+figures differ by alone is shown by the hidden world's study with a network of another seed; what
+the twin's scene alone changes, by its trials with the hidden world's network.
 
 FOLDER keeps all stores: a run that was stopped goes on, and more worlds may be added.
 """
@@ -141,16 +142,20 @@ def studied(rig: Path, files: Sequence[Path], folder: Path) -> Study:
     return Study(store, campaigns, model_file.load(model.path))
 
 
-def trained_again(study: Study) -> Fitted:
-    """Train a study's network with another seed."""
+def trained_again(study: Study, path: Path) -> Fitted:
+    """Train a study's network with another seed, unless `path` has it."""
+    if path.exists():
+        return model_file.load(path)
     labels, settings = Labels(study.store), training_settings(study.campaigns)
     train, validation = (
         load_samples(labels, study.campaigns, split) for split in ("train", "validation")
     )
-    return training.fit(
+    fitted = training.fit(
         train.windows, train.y, validation.windows, validation.y, settings.network,
         settings.windows, settings.training, settings.training.seeds[0] + 1,
     )  # fmt: skip
+    model_file.save(path, fitted)
+    return fitted
 
 
 def figures_of(judged: Judged) -> dict[str, float | None]:
@@ -193,12 +198,14 @@ def world_row(asked: argparse.Namespace, number: int, files: Sequence[Path]) -> 
         "twin": studied(twin, files, folder / "twin"),
         "assumed": studied(assumed, files, asked.folder / "assumed"),
     }
-    own, again = studies["hidden"], trained_again(studies["hidden"])
+    own = studies["hidden"]
+    again = trained_again(own, folder / "again.pt")
     return {
         "world": number,
         "studies": {
             **{name: figures_of(it.judged(it.fitted)) for name, it in studies.items()},
             "hidden, another seed": figures_of(own.judged(again)),
+            "twin, hidden world's network": figures_of(studies["twin"].judged(own.fitted)),
         },
         "networks": {
             **{name: transferred(own.judged(it.fitted)) for name, it in studies.items()},
@@ -211,7 +218,7 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield tables of all worlds in Markdown, and summaries."""
     yield f"| world | study on | {' | '.join(FIGURES.values())} | within |"
     yield "| --- | --- |" + " --- |" * (len(FIGURES) + 1)
-    near: dict[str, list[bool]] = {"twin": [], "assumed": [], "hidden, another seed": []}
+    near: dict[str, list[bool]] = {}
     for row in rows:
         own = row["studies"]["hidden"]
         for name, found in row["studies"].items():
@@ -220,9 +227,9 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
                 for key, value in ((key, found[key]) for key in FIGURES)
             ]
             said = ""
-            if name in near:
+            if found is not own:
                 held = within(own, found)
-                near[name].append(all(held.values()))
+                near.setdefault(name, []).append(all(held.values()))
                 said = f"{sum(held.values())} of {len(held)}"
             yield f"| {row['world']} | {name} | {' | '.join(cells)} | {said} |"
     for name, held in near.items():
