@@ -10,9 +10,12 @@ plate are measured from the plate's own marker and need none of this.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sliplab.storage.kernels import njit
 
 Floats = NDArray[np.float64]
 
@@ -59,6 +62,16 @@ def camera_shift(away: Floats) -> CameraShift:
     Args:
         away: (n, m, 2) offsets from where they stood at rest, px, NaN where unknown.
     """
+    shift, unsure, sigma, drifted = _followed(np.asarray(away, np.float64))
+    knocked = np.hypot(*np.diff(shift, axis=0, prepend=0.0).T).max(initial=0.0) > KNOCK_PX
+    if not (drifted or knocked):
+        return no_shift(len(away))
+    return CameraShift(shift, unsure, sigma)
+
+
+@njit(cache=True, nogil=True)
+def _followed(away: Any) -> Any:
+    """Return shift, unsure and sigma of each frame, and whether many that stand still moved."""
     n, m, _ = away.shape
     shift, unsure, sigma = np.zeros((n, 2)), np.zeros(n, np.bool_), np.full(n, _UNANCHORED_PX)
     stuck, gone = np.ones(m, np.bool_), np.zeros(m, np.int64)
@@ -66,53 +79,44 @@ def camera_shift(away: Floats) -> CameraShift:
     now, drifted, fastest, restless = np.zeros(2), False, 0.0, 0
     for f in range(n):
         seen = np.isfinite(away[f, :, 0])
-        hold, last, trembles = stuck & seen, now, restless >= _RESTLESS
+        hold, last, trembles = away[f][stuck & seen], now, restless >= _RESTLESS
         anchored = False
-        if hold.sum() >= ANCHORS:
-            middle = np.median(away[f, hold], axis=0)
-            near = np.hypot(*(away[f, hold] - middle).T) < _APART_PX
-            anchored = near.sum() >= max(ANCHORS, 0.5 * hold.sum())
+        if len(hold) >= ANCHORS:
+            near = _lengths(hold - _median(hold)) < _APART_PX
+            anchored = near.sum() >= max(ANCHORS, 0.5 * len(hold))
             if anchored:
-                now = np.median(away[f, hold][near], axis=0)
-                still = np.hypot(*away[f, hold].T) < LEAST_PX
-                if np.hypot(*now) > LEAST_PX and still.sum() >= ANCHORS and not trembles:
+                now = _median(hold[near])
+                still = _lengths(hold) < LEAST_PX
+                if _length(now) > LEAST_PX and still.sum() >= ANCHORS and not trembles:
                     # papillae that do not touch move together, and are more than those that do
-                    near, now = still, np.median(away[f, hold][still], axis=0)
-                sigma[f] = np.sqrt(np.mean((away[f, hold][near] - now) ** 2))
-                drifted |= bool(near.sum() >= MANY and np.hypot(*now) > LEAST_PX)
+                    near, now = still, _median(hold[still])
+                sigma[f] = np.sqrt(np.mean((hold[near] - now) ** 2))
+                drifted |= near.sum() >= MANY and _length(now) > LEAST_PX
         if not anchored and seen.any():
             # innovations: of what stood still its place, of what slides its step
-            new = np.where(stuck[:, None], away[f] - now, away[f] - before - velocity - now)
+            new = np.where(stuck[:, None], away[f], away[f] - before - velocity) - now
             known = seen & np.isfinite(new[:, 0])
-            step = np.median(new[known], axis=0) if known.sum() >= ANCHORS else np.zeros(2)
-            knock = bool(np.hypot(*step) > KNOCK_PX)
+            step = _median(new[known]) if known.sum() >= ANCHORS else np.zeros(2)
+            knock = _length(step) > KNOCK_PX
             if knock and fastest > KNOCK_PX and not trembles:
                 knock = _all_took(step, new, known, stuck, velocity)
             if knock:
                 now = now + step
                 unsure[f] = True
         shift[f] = now
-        restless += bool(np.hypot(*(now - last)) > LEAST_PX)
+        restless += _length(now - last) > LEAST_PX
         place = away[f] - now
-        gone = np.where(seen & (np.hypot(*place.T) > 2 * _APART_PX), gone + 1, 0)
+        gone = np.where(seen & (_lengths(place) > 2 * _APART_PX), gone + 1, 0)
         stuck &= gone < _GONE_FRAMES
         moved = np.where(np.isfinite(before), place - before, 0.0)
-        fastest = max(fastest, float(np.hypot(*moved.T).max()))
-        velocity = np.where(seen[:, None], _KEEP * velocity + (1 - _KEEP) * moved, velocity)
-        before = np.where(seen[:, None], place, before)
-    knocked = np.hypot(*np.diff(shift, axis=0, prepend=0.0).T).max(initial=0.0) > KNOCK_PX
-    if not (drifted or knocked):
-        return no_shift(n)
-    return CameraShift(shift, unsure, sigma)
+        fastest = max(fastest, _lengths(moved).max())
+        velocity[seen] = _KEEP * velocity[seen] + (1 - _KEEP) * moved[seen]
+        before[seen] = place[seen]
+    return shift, unsure, sigma, drifted
 
 
-def _all_took(
-    step: Floats,
-    new: Floats,
-    known: NDArray[np.bool_],
-    stuck: NDArray[np.bool_],
-    velocity: Floats,
-) -> bool:
+@njit(cache=True, nogil=True)
+def _all_took(step: Any, new: Any, known: Any, stuck: Any, velocity: Any) -> bool:
     """Return whether a median step is the camera's: then no marker goes on as it did.
 
     It is asked once a marker has moved by more than a knock in a frame, as in slides above some
@@ -123,18 +127,36 @@ def _all_took(
         new, velocity: (m, 2) innovations, and motion per frame so far, px.
         known, stuck: (m,) markers with an innovation; those that stood still.
     """
-    witnesses = known & stuck if (known & stuck).any() else known
-    if np.mean(np.hypot(*new[witnesses].T) < _APART_PX) >= _CALM_SHARE:
+    standing = known & stuck
+    witnesses = standing if standing.any() else known
+    if np.mean(_lengths(new[witnesses]) < _APART_PX) >= _CALM_SHARE:
         return False
-    if (known & stuck).any():
+    if standing.any():
         return True
-    common = np.median(velocity[known], axis=0)
-    speed = float(np.hypot(*common))
+    common = _median(velocity[known])
+    speed = _length(common)
     if speed <= _APART_PX:
         return True
-    slower = -float(step @ common) / speed
-    across = np.hypot(*(step + slower * common / speed))
+    slower = -(step[0] * common[0] + step[1] * common[1]) / speed
+    across = _length(step + slower * common / speed)
     return not (across < _APART_PX and 0 < slower < speed + _APART_PX)
+
+
+@njit(cache=True, nogil=True)
+def _median(places: Any) -> Any:
+    """Median of each coordinate of (k, 2)."""
+    return np.array([np.median(places[:, 0]), np.median(places[:, 1])])
+
+
+@njit(cache=True, nogil=True)
+def _lengths(vectors: Any) -> Any:
+    """Lengths of (k, 2)."""
+    return np.hypot(vectors[:, 0], vectors[:, 1])
+
+
+@njit(cache=True, nogil=True)
+def _length(vector: Any) -> float:
+    return np.hypot(vector[0], vector[1])
 
 
 def no_shift(n: int) -> CameraShift:
