@@ -13,7 +13,7 @@ import ast
 import inspect
 import sys
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import Any
 
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
@@ -36,42 +36,33 @@ from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.schema.twin import TwinFit, TwinGap
 
-Kind = Literal[
-    "protocol", "rig", "adapter", "trial", "label", "evaluation", "summary", "classes",
-    "classes-summary", "twin", "drift", "gap", "power", "stress", "reflex", "bench",
-]  # fmt: skip
-KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
-DOCUMENTS: dict[Kind, type[Document]] = {
-    "trial": TrialRecord,
-    "label": TrialLabel,
-    "evaluation": Evaluation,
-    "summary": Summary,
-    "classes": ClassEvaluation,
-    "classes-summary": ClassSummary,
-    "twin": TwinFit,
-    "drift": DriftFit,
-    "gap": TwinGap,
-    "power": PowerRecord,
-    "stress": StressRecord,
-    "reflex": ReflexStudy,
-    "bench": BenchResult,
+FILES: dict[str, tuple[type[BaseModel], str]] = {
+    "protocol": (Protocol, "A protocol of SlipLab"),
+    "rig": (RigFile, "A rig file of SlipLab"),
+    "adapter": (Adapter, "An adapter of SlipLab"),
 }
-TITLES: dict[Kind, str] = {
-    "trial": "The record of a trial of SlipLab",
-    "label": "The label of a trial of SlipLab",
-    "evaluation": "An evaluation of SlipLab",
-    "summary": "The summary of a report of SlipLab",
-    "classes": "An evaluation of SlipLab on recordings of classes",
-    "classes-summary": "The summary of a report of SlipLab on recordings of classes",
-    "twin": "A fit of a simulated rig to a pilot, by SlipLab",
-    "drift": "The drift of a campaign's reference trials, by SlipLab",
-    "gap": "Networks of a twin, tested on the rig that it imitates, by SlipLab",
-    "power": "Trials that claims need, by SlipLab",
-    "stress": "Detectors under nuisances, by SlipLab",
-    "reflex": "Drops that reflexes prevent, by SlipLab",
-    "bench": "The table of the bench of detectors, by SlipLab",
+"""Files that people write, with the titles of their schemas."""
+DOCUMENTS: dict[str, tuple[type[Document], str]] = {
+    "trial": (TrialRecord, "The record of a trial of SlipLab"),
+    "label": (TrialLabel, "The label of a trial of SlipLab"),
+    "evaluation": (Evaluation, "An evaluation of SlipLab"),
+    "summary": (Summary, "The summary of a report of SlipLab"),
+    "classes": (ClassEvaluation, "An evaluation of SlipLab on recordings of classes"),
+    "classes-summary": (
+        ClassSummary,
+        "The summary of a report of SlipLab on recordings of classes",
+    ),
+    "twin": (TwinFit, "A fit of a simulated rig to a pilot, by SlipLab"),
+    "drift": (DriftFit, "The drift of a campaign's reference trials, by SlipLab"),
+    "gap": (TwinGap, "Networks of a twin, tested on the rig that it imitates, by SlipLab"),
+    "power": (PowerRecord, "Trials that claims need, by SlipLab"),
+    "stress": (StressRecord, "Detectors under nuisances, by SlipLab"),
+    "reflex": (ReflexStudy, "Drops that reflexes prevent, by SlipLab"),
+    "bench": (BenchResult, "The table of the bench of detectors, by SlipLab"),
 }
+"""Documents of a store, with the titles of their schemas."""
+KINDS = (*FILES, *DOCUMENTS)
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"
 
@@ -91,16 +82,15 @@ class _Described(GenerateJsonSchema):
         return False
 
 
-def file_schema(kind: Kind) -> Schema:
-    """Return the JSON Schema (draft 7) of a file or document, as plain data."""
+def file_schema(kind: str) -> Schema:
+    """Return the JSON Schema (draft 7) of one of `KINDS`, as plain data."""
     load_packages()  # their units, too
-    if kind == "rig":
-        return _rig_schema()
-    if kind == "protocol":
-        return _finished(_made(Protocol), "A protocol of SlipLab")
-    if kind == "adapter":
-        return _finished(_made(Adapter), "An adapter of SlipLab")
-    return _finished(_made(DOCUMENTS[kind]), TITLES[kind])
+    model, title = FILES[kind] if kind in FILES else DOCUMENTS[kind]
+    return {
+        "$schema": _DIALECT,
+        **(_rig_schema() if kind == "rig" else _made(model)),
+        "title": title,
+    }
 
 
 def _rig_schema() -> Schema:
@@ -113,14 +103,13 @@ def _rig_schema() -> Schema:
         "description": "The rig file that this one changes, from its own folder.",
         "examples": ["mock.yaml"],
     }
-    schema = {
+    return {
         "type": "object",
         "if": {"required": [KEY]},
         "then": {"$ref": f"#/definitions/RigFile{_PART}"},
         "else": {"$ref": "#/definitions/RigFile"},
         "definitions": models | parts,
     }
-    return _finished(schema, "A rig file of SlipLab")
 
 
 def _made(model: type[BaseModel]) -> Schema:
@@ -130,10 +119,6 @@ def _made(model: type[BaseModel]) -> Schema:
     made["definitions"] = made.pop("$defs")
     plain: Schema = _plain(made)
     return plain
-
-
-def _finished(schema: Schema, title: str) -> Schema:
-    return {"$schema": _DIALECT, **schema, "title": title}
 
 
 def _plain(part: Any) -> Any:
