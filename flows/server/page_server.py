@@ -130,10 +130,11 @@ def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
 
 
 def refuse_open(url: str) -> None:
-    """Check that a Prefect server asks for a password; one that does not answer is ignored.
+    """Check that a Prefect server asks for a password; where nobody listens, Prefect says so.
 
     Raises:
-        InputError: it does not, and whoever reaches it can move the arm.
+        InputError: it does not, and whoever reaches it can move the arm; or it does not answer in
+            time, so that nobody knows.
     """
     address = run_records.server_name(url)
     try:
@@ -141,8 +142,14 @@ def refuse_open(url: str) -> None:
         opener = build_opener(ProxyHandler({}))
         with opener.open(f"{address}{urlsplit(url).path}/admin/version", timeout=ANSWER_S):
             pass
-    except OSError:  # 401 is one, too
-        return
+    except OSError as error:  # 401 is one, too
+        if not isinstance(getattr(error, "reason", error), TimeoutError):
+            return
+        raise InputError(
+            "PREFECT_API_URL", "", address,
+            f"did not answer in {ANSWER_S:g} s, so whether it asks for a password is not known; "
+            "try again",
+        ) from None  # fmt: skip
     raise InputError(
         "PREFECT_API_URL", "", address,
         "has no password, so any web page in a browser that reaches it could move the arm; "

@@ -236,6 +236,16 @@ def test_a_permanent_server_needs_a_password_too(service: Service, tmp_path: Pat
         process.wait(30)
 
 
+def test_a_server_that_is_silent_is_not_taken_for_one_with_a_password(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(page_server, "ANSWER_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(InputError, match=r"did not answer in 0\.2 s, so whether it asks"):
+            page_server.refuse_open(f"http://127.0.0.1:{port}/api")
+
+
 def _answers(url: str) -> bool:
     try:
         with urlopen(url, timeout=5) as answer:
