@@ -1,14 +1,19 @@
 """A scene fitted to pilots of hidden worlds: intervals that hold, and effects that it lacks.
 
     python -m benchmarks.twin coverage [--clean 40] [--bank 150] [--seed 1]
-                                       [--file WORLDS.jsonl] [--cores 2]
+                                       [--file WORLDS.jsonl] [--cores 2] [--plot RANKS.png]
     python -m benchmarks.twin misfits [--worlds 10] and the same
 
 A hidden world is a simulated rig with a force sensor, its parameters drawn 30 % around the
 defaults, with another skin and other pixels, and depth zero off by up to 0.1 mm. Its pilot has 36
 slides; test trials are left out. The bank's worlds are drawn as in a fit, 50 % around the
-defaults; each of them is compared with the others, too, as a clean world. Every world is
-looked at twice: with its forces, and without.
+defaults; each of them is compared with others, too, as a clean world. Every world is looked at
+twice: with its forces, and without.
+
+Coverage has two tables. Hidden worlds lie in the middle of the bank's, where errors are smaller
+than its intervals say. The bank's own, a tenth at a time against the others, are as wide apart as
+what intervals are made of: simulation-based calibration (Talts et al. 2018). There a truth's rank
+among the posterior's samples is uniform, which `--plot` shows for each parameter.
 
 Effects have the sizes that docs/faults.md names. The light is as bright as makes a pixel of 2.7
 standard deviations below the mean threshold fire, as light of the default share does on the default
@@ -30,10 +35,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import kstest, kstwo
 from threadpoolctl import threadpool_limits
 
 from sliplab.analysis.twin.misfits import misfits
-from sliplab.analysis.twin.posterior import posterior
+from sliplab.analysis.twin.posterior import Bank, Estimate, Fitted, fitted
 from sliplab.analysis.twin.statistics import Statistics, of_names, statistics
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.pilots import event_trials
@@ -44,6 +51,7 @@ from sliplab.rigs.mock.settings import EventCamera
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.schema.twin import MisfitCheck
+from sliplab.storage.streams import F64
 
 ROOT = Path(__file__).parents[1]
 SPREAD, HIDDEN_SPREAD = 0.5, 0.3
@@ -58,6 +66,7 @@ STREAMS = {
 CLEAN, BANK = "clean", "bank"
 KINDS = (BANK, CLEAN, *STREAMS)
 FORCES = ("without forces", "with forces")
+TENTHS = 10
 
 
 @dataclass(frozen=True)
@@ -189,35 +198,119 @@ def run_misfits(asked: argparse.Namespace) -> None:
             print(f"| {kind} | {name} | {len(misfit)} of {len(called)} | {counted} | {first} |")
 
 
+@dataclass(frozen=True)
+class Called:
+    """An estimate, the truth (logarithm), and the share of the posterior's samples below it."""
+
+    estimate: Estimate
+    truth: float
+    rank: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the interval holds the truth."""
+        return self.estimate.low <= self.truth <= self.estimate.high
+
+
+Worlds = list[tuple[Called, ...]]
+"""Of each world, one for each parameter."""
+
+
+def called(bank: Bank, observed: F64, truths: F64) -> Worlds:
+    """Return what a bank says of worlds.
+
+    Args:
+        observed: statistics, (k, q). truths: logarithms of parameters, (k, p).
+    """
+    fits: dict[bytes, Fitted] = {}
+    found = []
+    for seen, truth in zip(observed, truths, strict=True):
+        usable = np.isfinite(seen)
+        key = usable.tobytes()
+        if key not in fits:
+            fits[key] = fitted(bank, usable)
+        said = fits[key].at(seen)
+        ranks = (said.samples < truth).mean(axis=0)
+        found.append(tuple(map(Called, said.estimates, truth.tolist(), ranks.tolist())))
+    return found
+
+
+def called_of_bank(bank: Bank) -> Worlds:
+    """Return what a bank says of its own worlds, a tenth at a time by the others."""
+    found: Worlds = []
+    for part in range(TENTHS):
+        own = np.arange(len(bank)) % TENTHS == part
+        others = replace(bank, theta=bank.theta[~own], s=bank.s[~own])
+        found += called(others, bank.s[own], bank.theta[own])
+    return found
+
+
+def coverage_lines(worlds: Worlds, forces: str) -> Iterator[str]:
+    """Yield rows of a table: each parameter with Kolmogorov's test of its ranks, and all."""
+    known = [one for world in worlds for one in world if one.estimate.identified]
+    for column in zip(*worlds, strict=True):
+        cells = _cells([one for one in column if one.estimate.identified], len(column))
+        uniform = kstest([one.rank for one in column], "uniform").pvalue
+        name = column[0].estimate.parameter
+        yield f"| {name} | {forces} | {' | '.join(cells)} | {uniform:.2g} |"
+    yield f"| all | {forces} | {' | '.join(_cells(known, sum(map(len, worlds))))} | |"
+
+
+def _cells(known: Sequence[Called], of: int) -> tuple[str, str, str]:
+    if not known:
+        return f"0 of {of}", "-", "-"
+    holds = sum(one.holds for one in known)
+    off = [abs(math.expm1(one.estimate.median - one.truth)) for one in known]
+    held = f"{holds} of {len(known)} ({100 * holds / len(known):.1f} %)"
+    return f"{len(known)} of {of}", held, f"{100 * np.median(off):.1f} %"
+
+
 def run_coverage(asked: argparse.Namespace) -> None:
     """Print how often intervals hold the truth, and how far medians are off."""
     counts = {BANK: asked.bank, CLEAN: asked.clean}
     jobs = [Job(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
     found = taken(jobs, asked.file, asked.cores)
-    print("| parameter | forces | identified | interval holds | median error |")
-    print("| --- | --- | --- | --- | --- |")
     prior, hidden = prior_of(BANK, asked.seed), prior_of(CLEAN, asked.seed)
-    for name in FORCES:
-        bank = prior.bank([seen_in(row, name) for row in found[BANK]])
-        known, held, errors = 0, 0, []
-        pairs = []
-        for row in found[CLEAN]:
-            observed = of_names(seen_in(row, name).fitted, bank.statistics)
-            truth = hidden.values(row["number"])
-            estimates = posterior(bank, observed).estimates
-            pairs.append([(it, np.log(truth[it.parameter])) for it in estimates])
-        for column in zip(*pairs, strict=True):
-            called = [(it, truth) for it, truth in column if it.identified]
-            holds = sum(it.low <= truth <= it.high for it, truth in called)
-            off = [abs(np.expm1(it.median - truth)) for it, truth in called]
-            known, held, errors = known + len(called), held + holds, errors + off
-            error = f"{100 * np.median(off):.1f} %" if off else "-"
-            cells = (f"{len(called)} of {len(column)}", f"{holds} of {len(called)}", error)
-            print(f"| {column[0][0].parameter} | {name} | {' | '.join(cells)} |")
-        print(
-            f"| all | {name} | {known} of {sum(map(len, pairs))} | {held} of {known} "
-            f"({100 * held / max(known, 1):.1f} %) | {100 * np.median(errors):.1f} % |"
-        )
+    ranks = {}
+    for title in ("hidden worlds", "worlds of the bank"):
+        print(f"| {title} | forces | identified | interval holds | median error | ranks, p |")
+        print("| --- | --- | --- | --- | --- | --- |")
+        for name in FORCES:
+            bank = prior.bank([seen_in(row, name) for row in found[BANK]])
+            if title == "hidden worlds":
+                seen = [
+                    of_names(seen_in(row, name).fitted, bank.statistics) for row in found[CLEAN]
+                ]
+                values = [hidden.values(row["number"]) for row in found[CLEAN]]
+                truths = np.log([[it[key] for key in bank.parameters] for it in values])
+                worlds = called(bank, np.stack(seen), truths)
+            else:
+                worlds = called_of_bank(bank)
+                ranks[name] = np.array([[one.rank for one in world] for world in worlds])
+            print("\n".join(coverage_lines(worlds, name)))
+        print()
+    if asked.plot is not None:
+        draw_ranks(ranks, asked.plot)
+
+
+def draw_ranks(ranks: Mapping[str, F64], path: Path) -> None:
+    """Draw the share of worlds below each rank less that rank, one line a parameter.
+
+    The band is that of Kolmogorov's test at 5 %, for one parameter.
+
+    Args:
+        ranks: of worlds and parameters, (k, p), by the title of their panel.
+    """
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    panels = figure.subplots(1, len(ranks), sharey=True, squeeze=False)[0]
+    for panel, (title, of) in zip(panels, ranks.items(), strict=True):
+        share = (np.arange(len(of)) + 0.5) / len(of)
+        panel.axhspan(*100.0 * np.array([-1, 1]) * kstwo.isf(0.05, len(of)), color="0.9")
+        for column in np.sort(of, axis=0).T:
+            panel.plot(column, 100.0 * (share - column), color="tab:blue", lw=0.7, alpha=0.6)
+        panel.set(title=f"{title}, simulated", xlabel="rank of the truth among samples, 0 to 1")
+    panels[0].set_ylabel("worlds with a smaller rank,\nless expected (points)")
+    figure.savefig(path, dpi=90)
 
 
 def main() -> None:
@@ -234,6 +327,7 @@ def main() -> None:
         each.add_argument("--seed", type=int, default=1)
         each.add_argument("--file", type=Path, help="keeps what was simulated")
         each.add_argument("--cores", type=int, default=2)
+    other.add_argument("--plot", type=Path, help="writes the ranks of the bank's truths")
     asked = parser.parse_args()
     asked.run(asked)
 
