@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sliplab.analysis.twin.effects import Effect, effects_of
-from sliplab.analysis.twin.needs import Marked, Need, marked, need
+from sliplab.analysis.twin.needs import Marked, Need, marked, marks, need
 from sliplab.analysis.twin.parameters import PARAMETERS, value_of
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.needs import WORLDS
@@ -82,7 +83,8 @@ def rigs(
 def shown(worlds: Sequence[World], settings: Json) -> Marked:
     """Return what worlds show under other settings."""
     taken = [
-        World(changed(one.rig, settings), one.slides, one.seed, one.guess).take() for one in worlds
+        [marks(trial) for trial in replace(one, rig=changed(one.rig, settings)).take()]
+        for one in worlds
     ]
     return marked(taken, GROUPS)
 

@@ -218,7 +218,7 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield tables of all worlds in Markdown, and summaries."""
     yield f"| world | study on | {' | '.join(FIGURES.values())} | within |"
     yield "| --- | --- |" + " --- |" * (len(FIGURES) + 1)
-    near: dict[str, list[bool]] = {}
+    near: dict[str, list[dict[str, bool]]] = {}
     for row in rows:
         own = row["studies"]["hidden"]
         for name, found in row["studies"].items():
@@ -229,13 +229,17 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             said = ""
             if found is not own:
                 held = within(own, found)
-                near.setdefault(name, []).append(all(held.values()))
+                near.setdefault(name, []).append(held)
                 said = f"{sum(held.values())} of {len(held)}"
             yield f"| {row['world']} | {name} | {' | '.join(cells)} | {said} |"
-    for name, held in near.items():
-        yield f"all figures within {POINTS:g} point and {100 * SHARE:g} %, {name}: " + (
-            f"{sum(held)} of {len(held)} worlds"
-        )
+    yield ""
+    title = f"within {POINTS:g} point, or {100 * SHARE:g} %"
+    yield f"| {title} | {' | '.join(FIGURES.values())} | all |"
+    yield "| --- |" + " --- |" * (len(FIGURES) + 1)
+    for name, worlds in near.items():
+        counts = [sum(held[key] for held in worlds) for key in FIGURES]
+        counts.append(sum(all(held.values()) for held in worlds))
+        yield f"| {name} | {' | '.join(f'{count} of {len(worlds)}' for count in counts)} |"
     yield ""
     yield "| world | network trained on | accuracy on the hidden world (%) | 95 % |"
     yield "| --- | --- | --- | --- |"

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from sliplab.analysis.report.figures import twin as figures
 from sliplab.analysis.report.page import Figure, Table, render_page
 from sliplab.analysis.twin.parameters import PARAMETERS
-from sliplab.analysis.twin.pilot import PilotTrial
-from sliplab.analysis.twin.shown import event_map, rate_per_s, slips_s
+from sliplab.analysis.twin.shown import Course, Shown
 from sliplab.storage.schema.twin import EffectNeed, ParameterFit, TwinFit
 from sliplab.storage.streams import F64
 
@@ -26,9 +25,9 @@ WOULD_IDENTIFY = {
 def render(
     fit: TwinFit,
     name: str,
-    pilot: Sequence[PilotTrial],
-    twin: Sequence[Sequence[PilotTrial]],
-    before: Sequence[Sequence[PilotTrial]],
+    pilot: Sequence[Shown],
+    twin: Sequence[Sequence[Shown]],
+    before: Sequence[Sequence[Shown]],
     rings: F64,
     streams: frozenset[str],
 ) -> str:
@@ -135,39 +134,25 @@ def _missing(fit: TwinFit, streams: frozenset[str]) -> Table | None:
 
 
 def _figures(
-    pilot: Sequence[PilotTrial],
-    twin: Sequence[Sequence[PilotTrial]],
-    before: Sequence[Sequence[PilotTrial]],
+    pilot: Sequence[Shown],
+    twin: Sequence[Sequence[Shown]],
+    before: Sequence[Sequence[Shown]],
     rings: F64,
     simulated: bool,
 ) -> list[tuple[Figure, str]]:
     """Return figures of the test trials, each with its caption."""
     found = []
-    shown = range(min(PANELS, len(pilot)))
-    if all(trial.camera is not None for trial in pilot):
-        rates = [
-            figures.Curves(
-                pilot[k].trial, *rate_per_s(pilot[k]),
-                _aligned([rate_per_s(world[k]) for world in twin], rate_per_s(pilot[k])[0]),
-                _aligned([rate_per_s(world[k]) for world in before], rate_per_s(pilot[k])[0]),
-            )
-            for k in shown
-        ]  # fmt: skip
+    events = all(trial.map is not None for trial in pilot)
+    if events:
+        rates = _curves(pilot, twin, before, lambda trial: trial.rate)
         svg = figures.over_time(rates, "positive events/s", simulated=simulated)
         found.append((Figure(svg), "Positive events per second, in bins of 0.1 s."))
-    moved = [
-        figures.Curves(
-            pilot[k].trial, *_moved(pilot[k]),
-            _aligned([_moved(world[k]) for world in twin], pilot[k].frame_s),
-            _aligned([_moved(world[k]) for world in before], pilot[k].frame_s),
-        )
-        for k in shown
-    ]  # fmt: skip
+    moved = _curves(pilot, twin, before, lambda trial: trial.moved)
     svg = figures.over_time(moved, "moved (mm)", simulated=simulated)
     found.append((Figure(svg), "Mean displacement of the markers along the slide."))
-    of_pilot = np.stack([slips_s(trial) for trial in pilot])
+    of_pilot = np.stack([trial.slips_s for trial in pilot])
     order = [
-        np.nanmedian([[slips_s(trial) for trial in world] for world in worlds], axis=0)
+        np.nanmedian([[trial.slips_s for trial in world] for world in worlds], axis=0)
         for worlds in (twin, before)
     ]
     svg = figures.slip_order(of_pilot, order[0], order[1], rings, simulated=simulated)
@@ -178,9 +163,9 @@ def _figures(
             "worlds, over the pilot's.",
         )
     )
-    if all(trial.camera is not None for trial in pilot):
+    if events:
         means = [
-            np.mean([event_map(trial) for world in worlds for trial in world], axis=0)
+            np.mean([it.map for world in worlds for it in world if it.map is not None], axis=0)
             for worlds in ([pilot], twin, before)
         ]
         svg = figures.maps(means[0], means[1], means[2], simulated=simulated)
@@ -189,11 +174,21 @@ def _figures(
     return found
 
 
-def _moved(trial: PilotTrial) -> tuple[F64, F64]:
-    along = trial.moved_mm @ trial.slide.direction
-    return trial.frame_s, np.nanmean(along, axis=1)
-
-
-def _aligned(curves: Sequence[tuple[F64, F64]], t_s: F64) -> F64:
-    """Return curves at the times of another one, (k, n)."""
-    return np.stack([np.interp(t_s, own_s, values) for own_s, values in curves])
+def _curves(
+    pilot: Sequence[Shown],
+    twin: Sequence[Sequence[Shown]],
+    before: Sequence[Sequence[Shown]],
+    of: Callable[[Shown], Course | None],
+) -> list[figures.Curves]:
+    """Return a course of the first trials, the worlds' at the times of the pilot's."""
+    found = []
+    for k, trial in enumerate(pilot[:PANELS]):
+        own = of(trial)
+        theirs = [[of(world[k]) for world in worlds] for worlds in (twin, before)]
+        if own is not None:
+            aligned = (
+                np.stack([np.interp(own[0], *course) for course in courses if course is not None])
+                for courses in theirs
+            )
+            found.append(figures.Curves(trial.trial, *own, *aligned))
+    return found

@@ -9,7 +9,7 @@ chance, so numbers that the effect does not touch cancel.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,11 @@ NEGLIGIBLE = 0.02
 FEWEST_TRIALS = FEWEST_WORLDS = 3
 
 
-def marks(trial: PilotTrial) -> dict[str, F64]:
+Marks = Mapping[str, F64]
+"""Numbers of a trial by group."""
+
+
+def marks(trial: PilotTrial) -> Marks:
     """Return the numbers of a trial by group; a group is left out without its stream."""
     slips = slips_s(trial)
     found = {
@@ -129,16 +133,16 @@ class Marked:
     groups: tuple[str, ...]
 
 
-def marked(worlds: Sequence[Sequence[PilotTrial]], kept: Collection[str]) -> Marked:
+def marked(worlds: Sequence[Sequence[Marks]], kept: Collection[str]) -> Marked:
     """Return the numbers of worlds that took the same trials.
 
     Args:
-        kept: groups.
+        worlds: `marks` of each trial. kept: groups.
     """
-    found = [[marks(trial) for trial in world] for world in worlds]
-    names = [name for name in found[0][0] if name in kept]
-    groups = tuple(name for name in names for _ in found[0][0][name])
-    values = [[np.concatenate([one[name] for name in names]) for one in row] for row in found]
+    first = worlds[0][0]
+    names = [name for name in first if name in kept]
+    groups = tuple(name for name in names for _ in first[name])
+    values = [[np.concatenate([one[name] for name in names]) for one in row] for row in worlds]
     return Marked(np.array(values), groups)
 
 

@@ -6,7 +6,7 @@ Nothing is fitted by these; the test trials' own are shown beside those of simul
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ SLIP_MM = 0.1
 BIN_S = 0.1
 CELLS = 20
 """Cells of a map, each way; the centre crop is as wide as the picture is high."""
+Course = tuple[F64, F64]
+"""Times, (n,), s, and values at these, (n,)."""
 QUANTITIES = {
     "first_slip_s": "first slip (s)",
     "centre_slip_s": "centre's slip (s)",
@@ -49,7 +51,7 @@ def slips_s(trial: PilotTrial) -> F64:
     return times
 
 
-def rate_per_s(trial: PilotTrial) -> tuple[F64, F64]:
+def rate_per_s(trial: PilotTrial) -> Course:
     """Return middles of bins of 0.1 s from the hold's start on, s, and positive events/s in them.
 
     Raises:
@@ -116,6 +118,34 @@ def quantities(trial: PilotTrial) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
+class Shown:
+    """A slide as it is compared, without its events, of which there are millions.
+
+    Attributes:
+        trial: its id. numbers: by the names of `QUANTITIES`, NaN where it has none.
+        slips_s: see the function.
+        moved: times of the frames, s, and the markers' mean displacement along the slide, mm.
+        rate: see `rate_per_s`. map: see `event_map`. None without an event camera.
+    """
+
+    trial: str
+    numbers: Mapping[str, float]
+    slips_s: F64
+    moved: Course
+    rate: Course | None = None
+    map: F64 | None = None
+
+
+def show(trial: PilotTrial) -> Shown:
+    """Return what is compared of a slide."""
+    along = np.nanmean(trial.moved_mm @ trial.slide.direction, axis=1)
+    found = Shown(trial.trial, quantities(trial), slips_s(trial), (trial.frame_s, along))
+    if trial.camera is None:
+        return found
+    return replace(found, rate=rate_per_s(trial), map=event_map(trial))
+
+
+@dataclass(frozen=True)
 class Compared:
     """One quantity of the test trials: the pilot's, the twin's and the rig's as it was.
 
@@ -133,9 +163,7 @@ class Compared:
 
 
 def compare(
-    pilot: Sequence[PilotTrial],
-    twin: Sequence[Sequence[PilotTrial]],
-    before: Sequence[Sequence[PilotTrial]],
+    pilot: Sequence[Shown], twin: Sequence[Sequence[Shown]], before: Sequence[Sequence[Shown]]
 ) -> list[Compared]:
     """Compare the same trials of a pilot and of several worlds, quantity by quantity.
 
@@ -162,6 +190,5 @@ def compare(
     return found
 
 
-def _table(trials: Sequence[PilotTrial]) -> Mapping[str, F64]:
-    rows = [quantities(trial) for trial in trials]
-    return {name: np.array([row[name] for row in rows]) for name in QUANTITIES}
+def _table(trials: Sequence[Shown]) -> Mapping[str, F64]:
+    return {name: np.array([trial.numbers[name] for trial in trials]) for name in QUANTITIES}

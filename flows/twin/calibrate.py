@@ -22,10 +22,10 @@ from sliplab.analysis.report import twin as page
 from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, papillae, read_contact
 from sliplab.analysis.twin.contact_slips import find_slips
 from sliplab.analysis.twin.misfits import misfits
+from sliplab.analysis.twin.needs import Marks, marks
 from sliplab.analysis.twin.parameters import Parameter, settings_of, value_of
-from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
-from sliplab.analysis.twin.shown import QUANTITIES, compare
+from sliplab.analysis.twin.shown import QUANTITIES, Shown, compare, show
 from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
@@ -192,11 +192,15 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     pilot = read_pilot(store, item)
     scene = fit_scene(store, pilot, wanted.prior, wanted.worlds)
     worlds = judging_worlds(scene)
-    predicted = predict(worlds)
     judged = [pilot.slides[trial.id] for trial in pilot.judged]
+    twin, before = predict(worlds)
+    shown = (
+        [show(slide) for slide in judged], [one.shown for one in twin],
+        [one.shown for one in before],
+    )  # fmt: skip
     needs = Needs()
     if wanted.needs:
-        needs = measure_needs(judged, worlds[: len(worlds) // 2], predicted[0])
+        needs = measure_needs(judged, worlds[: len(twin)], [one.marks for one in twin])
     fit = TwinFit(
         simulated=bool(item.info.get("simulated")),
         campaign=item.name,
@@ -205,7 +209,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
         trials=len(pilot.fitted),
         judged=len(pilot.judged),
         worlds=len(scene.bank),
-        predicted=len(predicted[0]),
+        predicted=len(twin),
         seconds=round(monotonic() - began, 1),
         parameters=tuple(
             parameter_fit(it, value_of(wanted.rig.scene, it), estimate)
@@ -219,7 +223,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
             of_names(scene.observed.fitted, scene.bank.statistics),
             scene.bank.s,
         ),
-        compared=compared(pilot, *predicted),
+        compared=compared(*shown),
         needs=needs.effects,
         cheapest=needs.cheapest,
     )
@@ -246,7 +250,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     write_cheapest(wanted.out, needs)
     write_json(wanted.out.with_suffix(".json"), fit.to_json())
     rings = ring_of(wanted.rig)
-    text = page.render(fit, wanted.out.stem, judged, *predicted, rings, pilot.streams)
+    text = page.render(fit, wanted.out.stem, *shown, rings, pilot.streams)
     write_text(wanted.out.with_suffix(".html"), text)
     return fit
 
@@ -291,9 +295,23 @@ def judging_worlds(scene: SceneFit) -> list[World]:
     ]
 
 
-def predict(worlds: Sequence[World]) -> tuple[list[list[PilotTrial]], list[list[PilotTrial]]]:
+@dataclass(frozen=True)
+class Predicted:
+    """The test trials in a world: what is compared of them, and their numbers for scores."""
+
+    shown: list[Shown]
+    marks: list[Marks]
+
+
+def predicted_in(world: World) -> Predicted:
+    """Take the test trials in a world."""
+    slides = world.take()
+    return Predicted([show(slide) for slide in slides], [marks(slide) for slide in slides])
+
+
+def predict(worlds: Sequence[World]) -> tuple[list[Predicted], list[Predicted]]:
     """Take the test trials in worlds of the twin and in as many of the rig file as it was."""
-    taken, half = everywhere("test trials (worlds)", World.take, worlds), len(worlds) // 2
+    taken, half = everywhere("test trials (worlds)", predicted_in, worlds), len(worlds) // 2
     return taken[:half], taken[half:]
 
 
@@ -329,18 +347,17 @@ def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
 
 
 def compared(
-    pilot: Pilot, twin: list[list[PilotTrial]], before: list[list[PilotTrial]]
+    pilot: Sequence[Shown], twin: Sequence[Sequence[Shown]], before: Sequence[Sequence[Shown]]
 ) -> tuple[QuantityCompared, ...]:
     """Return the test trials' quantities beside those of simulated worlds."""
-    if not pilot.judged:
+    if not pilot:
         return ()
-    judged = [pilot.slides[trial.id] for trial in pilot.judged]
     return tuple(
         QuantityCompared(
             title=QUANTITIES[it.name], pilot=it.pilot, twin=it.twin, before=it.before,
             scatter=it.scatter,
         )
-        for it in compare(judged, twin, before)
+        for it in compare(pilot, twin, before)
     )  # fmt: skip
 
 

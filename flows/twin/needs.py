@@ -19,6 +19,7 @@ from sliplab.analysis.twin.needs import (
     FEWEST_TRIALS,
     FEWEST_WORLDS,
     Marked,
+    Marks,
     Need,
     marked,
     marks,
@@ -103,21 +104,22 @@ class _Judged:
 
 
 def _numbers(world: World, kept: frozenset[str]) -> F64:
-    return marked([world.take()], kept).values
+    return marked([[marks(trial) for trial in world.take()]], kept).values
 
 
 def measure_needs(
-    pilot: Sequence[PilotTrial], worlds: Sequence[World], taken: Sequence[Sequence[PilotTrial]]
+    pilot: Sequence[PilotTrial], worlds: Sequence[World], taken: Sequence[Sequence[Marks]]
 ) -> Needs:
     """Measure which effects a pilot's test trials ask for; nothing with too few of them.
 
     Args:
-        pilot: test trials. worlds: of the twin, with these trials. taken: what they show.
+        pilot: test trials. worlds: of the twin, with these trials. taken: marks of these.
     """
     if len(pilot) < FEWEST_TRIALS or len(worlds) < FEWEST_WORLDS:
         return Needs()
-    both = marks(pilot[0]).keys() & marks(taken[0][0]).keys()
-    judged = _Judged(marked([pilot], both), worlds[:WORLDS], marked(taken[:WORLDS], both))
+    own = [marks(trial) for trial in pilot]
+    both = own[0].keys() & taken[0][0].keys()
+    judged = _Judged(marked([own], both), worlds[:WORLDS], marked(taken[:WORLDS], both))
     scene = worlds[0].rig.scene
     effects = list(effects_of(scene))
     found, against = _measured(judged, effects)

@@ -101,7 +101,7 @@ def test_marks_of_a_trial() -> None:
     assert found["times of events"] == pytest.approx([0.5, np.log(2.0)])
     assert found["places of events"].shape == (25,)
     assert found["forces"] == pytest.approx([2.5, 2.5, 2.5, 3.0])
-    some = marked([[drawn(1.0, seen)] * 2] * 3, {"slips", "forces"})
+    some = marked([[marks(drawn(1.0, seen))] * 2] * 3, {"slips", "forces"})
     assert some.groups == ("slips",) * 3 + ("forces",) * 4
     assert some.values.shape == (3, 2, 7)
     assert "times of events" not in marks(drawn(1.0))

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.twin.pilot import Camera, Forces, PilotTrial, Slide
-from sliplab.analysis.twin.shown import compare, event_map, quantities, rate_per_s, slips_s
+from sliplab.analysis.twin.shown import (
+    Shown,
+    compare,
+    event_map,
+    quantities,
+    rate_per_s,
+    show,
+    slips_s,
+)
 from sliplab.storage.streams import EventChunk
 
 PLACES = np.array([[0.0, 0.0], [5.6, 0.0], [0.0, 5.6]])
@@ -68,9 +76,12 @@ def test_rates_and_maps_count_positive_events_only() -> None:
 
 
 def test_worlds_are_compared_trial_by_trial() -> None:
-    pilot = [drawn(1.0), drawn(1.4)]
-    twin = [[drawn(1.1), drawn(1.5)], [drawn(0.9), drawn(1.3)]]
-    before = [[drawn(1.5), drawn(1.9)]] * 2
+    def shown(*slips_s: float) -> list[Shown]:
+        return [show(drawn(slip_s)) for slip_s in slips_s]
+
+    pilot = shown(1.0, 1.4)
+    twin = [shown(1.1, 1.5), shown(0.9, 1.3)]
+    before = [shown(1.5, 1.9)] * 2
     first = compare(pilot, twin, before)[0]
     assert first.name == "first_slip_s"
     assert first.pilot == pytest.approx(1.3)

@@ -11,8 +11,7 @@ import pytest
 
 from sliplab.analysis.report.tradeoff_scene import choice_pairs
 from sliplab.analysis.twin.effects import EFFECTS
-from sliplab.analysis.twin.needs import Need
-from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.analysis.twin.needs import Marks, Need, marks
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin import needs
 from sliplab.flows.twin.worlds import Slides, World, guess_of, other_rig
@@ -39,8 +38,8 @@ def worlds(rig_path: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Wor
 
 
 @pytest.fixture(scope="module")
-def taken(worlds: list[World]) -> list[list[PilotTrial]]:
-    return [world.take() for world in worlds]
+def taken(worlds: list[World]) -> list[list[Marks]]:
+    return [[marks(trial) for trial in world.take()] for world in worlds]
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ def written(twin: Path, found: needs.Needs) -> Path:
 
 
 def test_effects_that_the_pilot_has_are_asked_for(
-    worlds: list[World], taken: list[list[PilotTrial]], quick: None, tmp_path: Path
+    worlds: list[World], taken: list[list[Marks]], quick: None, tmp_path: Path
 ) -> None:
     pilot = replace(worlds[0], seed=99).take()
     found = needs.measure_needs(pilot, worlds, taken)
@@ -79,7 +78,7 @@ def test_effects_that_the_pilot_has_are_asked_for(
 
 
 def test_an_effect_that_the_pilot_lacks_is_left_out_of_the_cheapest_scene(
-    worlds: list[World], taken: list[list[PilotTrial]], quick: None, tmp_path: Path
+    worlds: list[World], taken: list[list[Marks]], quick: None, tmp_path: Path
 ) -> None:
     pilot = replace(worlds[0], rig=changed(worlds[0].rig, STILL), seed=99).take()
     found = needs.measure_needs(pilot, worlds, taken)
@@ -133,9 +132,10 @@ def test_large_deflection_is_only_left_out_with_all_that_its_level_lacks() -> No
 
 
 def test_too_few_test_trials_say_nothing(
-    worlds: list[World], taken: list[list[PilotTrial]], tmp_path: Path
+    worlds: list[World], taken: list[list[Marks]], tmp_path: Path
 ) -> None:
-    found = needs.measure_needs(taken[0][:2], worlds, [world[:2] for world in taken])
+    pilot = worlds[0].take()[:2]
+    found = needs.measure_needs(pilot, worlds, [world[:2] for world in taken])
     assert found == needs.Needs()
     assert not written(tmp_path / "twin.yaml", found).exists()
 
