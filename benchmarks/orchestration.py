@@ -191,10 +191,10 @@ def _server_cpu_s() -> float:
 
 
 def _drained(run_id: str, count: int) -> None:
-    """Wait until the server has kept so many task runs of a flow run as completed."""
+    """Wait until the server has kept so many task runs of a flow run with their end."""
     wanted = {
         "flow_runs": {"id": {"any_": [run_id]}},
-        "task_runs": {"state": {"type": {"any_": ["COMPLETED"]}}},
+        "task_runs": {"state": {"type": {"any_": ["COMPLETED", "FAILED"]}}},
     }
     from prefect.client.orchestration import get_client
     from prefect.settings import temporary_settings
