@@ -1,6 +1,6 @@
 """Studies on a calibrated twin, beside those on the hidden world that it was fitted to.
 
-    python -m benchmarks.twin_studies FOLDER [--worlds 3] [--first 0] [--seed 1] [--bank 300]
+    python -m benchmarks.twin_studies FOLDER [--worlds 3] [--first 0] [--seed 1] [--bank 240]
                                       [--repetitions 1]
 
 A hidden world is a clean one of `benchmarks.twin` with the same seed, and so are the worlds that a
@@ -255,7 +255,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="number of the first world")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--bank", type=int, default=300, help="worlds that fits simulate")
+    parser.add_argument("--bank", type=int, default=240, help="worlds that fits simulate")
     parser.add_argument("--repetitions", type=int, default=1, help="3 is the whole study")
     asked = parser.parse_args()
     asked.folder = asked.folder.resolve()
