@@ -211,7 +211,7 @@ def _move(request: DetectRequest, rig: Rig, sink: DetectSink) -> Reaction | None
     if rezero is not None:
         slot = plan.rezero_task(trial).slot
         seed = hash_integer(collection.seed, "rezero", slot)
-        rig.touch_off(float(rezero.speed), float(rezero.search), seed)
+        rig.rezero(rezero, seed)
     return run_watched(
         rig,
         plan.program(trial),

@@ -145,6 +145,9 @@ class Rezero(StrictModel):
     speed: PositiveSpeed
     search: PositiveMillimetres
     """Largest search distance beyond the taught plane for the touch; a hard limit."""
+    touches: Annotated[int, Field(ge=1, le=100)] = 1
+    """Touches whose mean is depth zero. Where few pixels see the first contact, single touches
+    differ by up to a tenth of a millimetre."""
 
 
 class Cleaning(StrictModel):

@@ -303,6 +303,9 @@ class Plan:
                 data["gates"].pop(name)
         if gates.reference is not None and gates.reference.friction is None:
             data["gates"]["reference"].pop("friction")
+        rezero = self.protocol.collection.maintenance.rezero
+        if rezero is not None and rezero.touches == 1:
+            data["maintenance"]["rezero"].pop("touches")
         if gates.speed_deviation == Gates().speed_deviation:  # the same
             data["gates"].pop("speed_deviation")
         return data

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import ClassVar
 
 import numpy as np
@@ -178,7 +179,7 @@ def quality_section(
         ],
         [(item.name, _over_campaign(item, stream, simulated)) for item in taken],
         [(name, _references(name, found.trials, simulated)) for name, found in references.items()],
-        [table for item in taken for table in _gates(item)],
+        [*_depth_zeros(taken), *(table for item in taken for table in _gates(item))],
     )
 
 
@@ -245,6 +246,36 @@ def _gates(item: Collected) -> list[Table]:
         listed = [[str(count), cause] for cause, count in causes.most_common()]
         found.append(Table(("attempts", "cause"), listed, f"Campaign {item.name}: quarantine."))
     return found
+
+
+def _depth_zeros(taken: Sequence[Collected]) -> list[Table]:
+    """List what touching off found in each campaign that does it; none if none does."""
+    rows = []
+    for item in taken:
+        rezero = item.plan.protocol.collection.maintenance.rezero
+        records = [recording.record for _, recording in item.trials]
+        found = [(r.depth_zero_mm, r.depth_zero_sd_mm) for r in records]
+        # trials after one touching off have its figures to the bit
+        blocks = [each for each, _ in groupby(found) if each[0] is not None]
+        if rezero is None or not blocks:
+            continue
+        zeros = np.array([zero for zero, _ in blocks], np.float64)
+        squares = [sd**2 for _, sd in blocks if sd is not None]
+        sd = float(np.mean(squares)) ** 0.5 if squares else None
+        rows.append([
+            item.name, str(len(blocks)), str(rezero.touches),
+            *(f"{value:+.3f}" for value in (zeros[0], zeros[-1], zeros.min(), zeros.max())),
+            *("-" if sd is None else f"{sd / share:.3f}" for share in (1, rezero.touches**0.5)),
+        ])  # fmt: skip
+    columns = (
+        "campaign", "touched off", "touches each", "first (mm)", "last (mm)", "lowest (mm)",
+        "highest (mm)", "SD of one touch (mm)", "SD of their mean (mm)",
+    )  # fmt: skip
+    caption = (
+        "Depth zero from the rig's plane, as touching off found it. A drift moves all depths; so "
+        "does the scatter of single touches, which `touches` of `maintenance.rezero` averages."
+    )
+    return [Table(columns, rows, caption)] if rows else []
 
 
 def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, References]:

@@ -194,6 +194,7 @@ class TrialCollector:
     _previous: Trial | None = None
     _warm: bool = False
     _zero_slot: int | None = None
+    _zero_sd_mm: float | None = None
 
     def take(self, trials: list[Trial]) -> None:
         """Take `trials`, and do before each what the protocol asks for.
@@ -262,10 +263,8 @@ class TrialCollector:
             slot = self.plan.rezero_task(trial).slot
             if slot != self._zero_slot:
                 seed = hash_integer(self.plan.protocol.collection.seed, "rezero", slot)
-                self.rig.touch_off(
-                    float(maintenance.rezero.speed), float(maintenance.rezero.search), seed
-                )
-                self._zero_slot = slot
+                zero = self.rig.rezero(maintenance.rezero, seed)
+                self._zero_slot, self._zero_sd_mm = slot, zero.sd_mm
 
     def _mounted(self, trial: Trial) -> bool:
         """Check that the plate that the trial needs hangs on the slider, to a gram."""
@@ -379,6 +378,7 @@ class TrialCollector:
             recorded_s=(recorded[1] - recorded[0]) / 1e9,
             motion_s=(last.end_ns - first.start_ns) / 1e9,
             depth_zero_mm=run.zero_mm,
+            depth_zero_sd_mm=self._zero_sd_mm,
             counts=found.counts,
             clocks=found.clocks,
             timing=RecordedTiming(

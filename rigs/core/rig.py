@@ -13,6 +13,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
+from sliplab.protocols.conditions import Rezero
+from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.motion import UNTWIST_DEG_S
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import (
@@ -86,14 +90,23 @@ class TrialRun:
     zero_mm: float
     truth: Truth | None
     path: tuple[PathSegment, ...] = ()
-    pressed_mm: float | None = None
     """Commanded segments of the recorded steps."""
+    pressed_mm: float | None = None
 
     @property
     def recorded_ns(self) -> tuple[int, int]:
         """Start and end of the recorded steps on the arm's clock."""
         recorded = [step for step, kept in self.steps if kept]
         return recorded[0].start_ns, recorded[-1].end_ns
+
+
+@dataclass(frozen=True)
+class TouchedZero:
+    """Depth zero as the mean of some touches, and the standard deviation of single ones, mm."""
+
+    mm: float
+    sd_mm: float | None
+    """None of a single touch."""
 
 
 @dataclass
@@ -320,6 +333,25 @@ class Rig:
                 deep = Position(0.0, 0.0, depth_mm)
                 self.move(Move("warm up", deep, speed_mm_s), home, None)
                 self.move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
+
+    def rezero(self, asked: Rezero, seed: int) -> TouchedZero:
+        """Find depth zero as a protocol asks for: the mean of several touches.
+
+        Args:
+            seed: of the first touch on a simulated rig; the others have their own.
+
+        Returns:
+            The new depth zero, which the plate's frame uses from now on.
+
+        Raises:
+            RigError: as `touch_off`; one touch without a plate is enough.
+        """
+        speed, search = float(asked.speed), float(asked.search)
+        seeds = (seed, *(hash_integer(seed, "touch", n) for n in range(1, asked.touches)))
+        found = np.array([self.touch_off(speed, search, each) for each in seeds])
+        zero = float(found.mean())
+        self.plate_frame = self.plate_frame.with_zero(zero)
+        return TouchedZero(zero, float(found.std(ddof=1)) if len(found) > 1 else None)
 
     def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
         """Find depth zero: creep in until the event rate shows that the centre papilla touches.

@@ -320,6 +320,8 @@ class TrialRecord(Document):
     """Seconds from the first step to the end of the last."""
     depth_zero_mm: Number | None = None
     """Depth at which the arm found contact, from the rig's plane."""
+    depth_zero_sd_mm: Number | None = None
+    """Standard deviation of the touches whose mean that is; None of a single touch."""
     counts: Counts
     clocks: Clocks
     timing: RecordedTiming | None = None

@@ -373,6 +373,7 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     data["collection"]["references"] = {
         "every": 1, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
     }  # fmt: skip
+    data["collection"]["maintenance"]["rezero"]["touches"] = 3
     run_request = make_request(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
     collect(run_request)
     store = Store.open(run_request.store)
@@ -390,6 +391,15 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     section = campaign.quality_section([item], known, simulated=True)
     names = [figure.name for figure in section.all_figures()]
     assert names == ["quality-tiny", "references-tiny"]
+    records = [recording.record for _, recording in item.trials]
+    zeros = [record.depth_zero_mm or 0.0 for record in records]
+    sds = list(dict.fromkeys(record.depth_zero_sd_mm or 0.0 for record in records))
+    sd = (sum(sd**2 for sd in sds) / len(sds)) ** 0.5
+    assert section.tables[0].rows == [[
+        "tiny", str(len(sds)), "3", f"{zeros[0]:+.3f}", f"{zeros[-1]:+.3f}",
+        f"{min(zeros):+.3f}", f"{max(zeros):+.3f}", f"{sd:.3f}", f"{sd / 3**0.5:.3f}",
+    ]]  # fmt: skip
+    assert 0.0 < sd < 0.05
     words = "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
     assert words in render_section(section, simulated=True)[1]
     steep = {"tiny": known["tiny"].model_copy(update={"wear": found})}

@@ -61,7 +61,7 @@ def test_what_changed_in_the_collection_is_said(tmp_path: Path) -> None:
     data = tiny()
     data["collection"]["motion"][1]["speed"] = "1 mm/s"
     data["collection"]["gates"]["retakes"] = 5
-    data["collection"]["maintenance"]["rezero"]["every"] = 4
+    data["collection"]["maintenance"]["rezero"] |= {"every": 4, "touches": 5}
     data["collection"]["factors"]["direction"]["values"].append(330)  # this alone would do
     message = refused(tmp_path, data)
     assert "was begun under another `collection:` section" in message
@@ -69,6 +69,7 @@ def test_what_changed_in_the_collection_is_said(tmp_path: Path) -> None:
         "collection.motion[1].speed: 2 mm/s -> 1 mm/s",
         "collection.gates.retakes: 2 -> 5",
         "collection.maintenance.rezero.every: 3 -> 4",
+        "collection.maintenance.rezero.touches: none -> 5",
     ):
         assert f"\n  {line}" in message
 
@@ -78,6 +79,7 @@ def test_another_way_to_write_the_same_is_no_change(tmp_path: Path) -> None:
     data = tiny()
     data["collection"]["motion"][1]["speed"] = "0.2 cm/s"
     data["collection"]["gates"]["path_deviation"] = "0.1 mm"  # the default
+    data["collection"]["maintenance"]["rezero"]["touches"] = 1  # the default, newer than stores
     make_request(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
 
 

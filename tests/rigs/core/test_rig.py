@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sliplab.protocols import Plan, Protocol, load_plan, make_plan
+from sliplab.protocols.conditions import Rezero
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError
@@ -267,11 +268,34 @@ FAR_CAMERA: dict[str, Any] = {
 """A soft skin, faint markers and a camera so far off that a touch makes a third of the events."""
 
 
+REZERO = {"every": 48, "speed": "0.5 mm/s", "search": "1.5 mm"}
+
+
 def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
     rig = make_rig(**FAR_CAMERA)
     found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 7)]
     assert min(found) > 0.0  # such a skin is noticed deeper than at the shipped `touch_depth`
     assert max(found) < 0.4
+
+
+def test_depth_zero_is_the_mean_of_as_many_touches_as_asked_for() -> None:
+    """Of eight touches it is within four standard errors of the mean of 24 others."""
+    rig = make_rig(**FAR_CAMERA)
+    others = [rig.touch_off(0.5, 1.5, seed) for seed in range(100, 124)]
+    asked = Rezero.model_validate({**REZERO, "touches": 8})
+    found = rig.rezero(asked, 1)
+    assert rig.plate_frame.zero_mm == found.mm
+    assert found.sd_mm == pytest.approx(np.std(others, ddof=1), rel=1.0)
+    error = float(np.std(others, ddof=1)) * (1 / 8 + 1 / 24) ** 0.5
+    assert found.mm == pytest.approx(np.mean(others), abs=4 * error)
+    assert rig.rezero(asked, 1) == found  # by its seed
+    assert rig.rezero(asked, 2) != found
+
+
+def test_one_touch_is_what_it_was() -> None:
+    rig = make_rig()
+    found = rig.rezero(Rezero.model_validate(REZERO), 3)
+    assert (found.mm, found.sd_mm) == (rig.touch_off(0.5, 1.5, 3), None)
 
 
 def test_touching_off_in_much_noise_finds_the_surface_nevertheless() -> None:
