@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
-from benchmarks.twin_studies import ASSUMED, FIGURES, hidden_rig, lines, protocols, within
+from benchmarks.twin_studies import (
+    ASSUMED,
+    FIGURES,
+    REPETITIONS,
+    SPLIT,
+    hidden_rig,
+    lines,
+    shipped,
+    within,
+)
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
@@ -35,6 +45,8 @@ def test_a_hidden_rig_file_is_the_world_that_was_drawn(tmp_path: Path) -> None:
     world = replace(prior_of(CLEAN, 2), rig=base).world(1, pilot_slides())
     assert rig.scene == world.rig.scene
     assert rig.scene.scene.friction.kinetic != base.scene.scene.friction.kinetic
-    sizes = [len(load_plan(file).trials) for file in protocols(tmp_path, 1)]
-    assert sizes == [288, 36, 16]
-    assert load_plan(tmp_path / "kinematic.yaml").protocol.analysis.also is None
+    plans = [load_plan(shipped(name, tmp_path, count)) for name, count in REPETITIONS.items()]
+    assert [len(plan) for plan in plans] == [576, 108, 48]
+    counts = Counter(trial.split for trial in plans[0])
+    assert all(abs(counts[name] / 576 - share) < 0.02 for name, share in SPLIT.items())
+    assert plans[0].protocol.analysis.also is None
