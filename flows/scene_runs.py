@@ -8,7 +8,6 @@ faults.
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -136,7 +135,6 @@ def timed(
     clock: Callable[[], float] = perf_counter,
 ) -> float:
     """Return the seconds that simulating a trial takes; building the rig is left out."""
-    gc.collect()  # rigs of earlier calls are cycles of many megabytes, and not this one's time
     built = _ready(rig, plan, trial)
     try:
         start = clock()

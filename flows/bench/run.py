@@ -7,7 +7,6 @@ soon as it is complete, so that a run that was stopped resumes with the next det
 from __future__ import annotations
 
 import ctypes
-import gc
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -178,12 +177,11 @@ class Bench:
 
 
 def _give_memory_back() -> None:
-    """Free a simulated rig with its parts, which refer to each other, and return their memory.
+    """Return what a simulation has freed.
 
-    What a simulation frees lies between the events of scenes that are kept, where glibc's allocator
-    keeps it: 15 MB a scene, 11 GB in the full set.
+    It lies between the events of scenes that are kept, where glibc's allocator keeps it: 15 MB a
+    scene, 11 GB in the full set.
     """
-    gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

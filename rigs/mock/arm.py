@@ -31,7 +31,7 @@ class MockArm:
         self._period_ns = round(1e9 / world.settings.arm.pose_rate_hz)
         self._legs: list[Leg] = []
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         world = self._world

@@ -143,7 +143,7 @@ class MockEventCamera:
         self._bursts = Bursts(world, self.width, self.height) if self._own.first else None
         self._input = SyncInput(world, box, self._own.name)
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         self._running = False

@@ -56,7 +56,7 @@ class MockForceSensor:
         self._period_ns = 1_000_000_000 // settings.rate_hz
         self._bias = np.zeros(6)
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         world, settings = self._world, self._settings

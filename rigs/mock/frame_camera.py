@@ -76,7 +76,7 @@ class MockFrameCamera:
         self._view: PlateView | None = None
         self._shown: tuple[tuple[BoardPlace, tuple[int, int]], U8] | None = None
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         self._running, self._until_ns = False, 0

@@ -6,6 +6,8 @@ camera both are sources of ticks: tick k is the start of exposure k.
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import numpy.typing as npt
 
@@ -46,7 +48,7 @@ class Ticks:
         self._world = world
         self.run = 0
         self._clear()
-        world.on_begin.append(self._clear)
+        world.at_begin(self._clear)
 
     def _clear(self) -> None:
         """Discard the train, because a trial begins."""
@@ -149,7 +151,7 @@ class ExposureLine:
     def __init__(self, world: World, camera: FreeRun) -> None:
         self._world, self._camera = world, camera
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         self._run, self._read = self._camera.run, 0
@@ -186,7 +188,7 @@ class ClockReader:
     def __init__(self, world: World, device: str) -> None:
         self._world, self._device = world, device
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         self._random = generator(self._world.seed, f"{self._device} clock reads")
@@ -300,7 +302,7 @@ class SyncInput:
     def __init__(self, world: World, box: MockSyncBox, device: str) -> None:
         self._world, self._box, self._device = world, box, device
         self._reset()
-        world.on_begin.append(self._reset)
+        world.at_begin(self._reset)
 
     def _reset(self) -> None:
         self._run, self._read = self._box.run, 0
@@ -337,7 +339,8 @@ class _PulseFaults:
     """Faults of the pulses of one train in one device."""
 
     def __init__(self, world: World, box: MockSyncBox, device: str) -> None:
-        self._box, self._device, self._book = box, device, world.faults
+        self._box = weakref.proxy(box)  # which has its own
+        self._device, self._book = device, world.faults
         self._waiting = np.empty((2, 0), np.int64)
         doubled = [fault.device for fault in self._book.of(PulsesDuplicated)]
         late = [fault.device for fault in self._book.of(PulsesLate)]

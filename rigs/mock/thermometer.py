@@ -27,7 +27,7 @@ class MockThermometer:
         self._world, self._settings, self._name, self.unit = world, settings, name, unit
         self._period_ns = round(1e9 / settings.rate_hz)
         self._begin()
-        world.on_begin.append(self._begin)
+        world.at_begin(self._begin)
 
     def _begin(self) -> None:
         seed = key(self._world.seed, f"stream {self._name}") % _SEEDS

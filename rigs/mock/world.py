@@ -11,6 +11,7 @@ trial from the seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from weakref import WeakMethod
 
 import numpy as np
 import numpy.typing as npt
@@ -88,7 +89,7 @@ class World:
         self.path = path or ArmPath(self.plane, start_pose(settings))
         self.fingers = fingers_of(settings)
         self.arm_state = ArmState.READY
-        self.on_begin: list[Callable[[], None]] = []
+        self._at_begin: list[WeakMethod[Callable[[], None]]] = []
         self.slid_mm = np.zeros(len(self.skin))
         self._prepare(settings.seed)
 
@@ -114,8 +115,18 @@ class World:
         self.now_ns = 0
         self.trials += 1
         self._prepare(seed, nuisances)
-        for callback in self.on_begin:
-            callback()
+        for device in self._at_begin:
+            begin = device()
+            if begin is not None:
+                begin()
+
+    def at_begin(self, method: Callable[[], None]) -> None:
+        """Call a device's method whenever a trial begins, after everything else is reset.
+
+        The device, which knows the world, is not kept alive by it: a rig that is used no more
+        returns its megabytes at once.
+        """
+        self._at_begin.append(WeakMethod(method))
 
     def _prepare(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         settings = self.settings
@@ -139,10 +150,21 @@ class World:
         )
         self._shake = Shake(self.faults, seed)
         self.physics = Physics(
-            settings, self.faults.grips(self.skin, self.slid_mm), seed, self._sensor_at,
+            settings, self.faults.grips(self.skin, self.slid_mm), seed, self._weak_sensor_at(),
             self.faults.torn, self.faults.spots(), self.fingers, fine=bool(self._shake),
         )  # fmt: skip
         self.plate_marked = False
+
+    def _weak_sensor_at(self) -> Callable[[I64], F64]:
+        """Return `_sensor_at` for the physics, which this world has, without a cycle of them."""
+        method = WeakMethod(self._sensor_at)
+
+        def sensor_at(t_ns: I64) -> F64:
+            found = method()
+            assert found is not None, "physics are used through their world"
+            return found(t_ns)
+
+        return sensor_at
 
     def _sensor_at(self, t_ns: I64) -> F64:
         """Return x, y and depth (mm) of the sensor and slopes of depth at times, (k, 5).

@@ -6,7 +6,6 @@ against the simulation's own truth: depth of the sensor, speeds of arm and finge
 
 from __future__ import annotations
 
-import gc
 from collections import Counter
 from typing import Any, Literal
 
@@ -187,8 +186,6 @@ def many(count: int, first: int = 0) -> Counter[str]:
     ended: Counter[str] = Counter()
     for number in range(first, first + count):
         ended[one_trial(number)] += 1
-        if number % 50 == 0:
-            gc.collect()  # worlds are cycles of few objects and much memory
     return ended
 
 

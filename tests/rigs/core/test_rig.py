@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import gc
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,13 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.rig import Rig, StopRequested
-from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
     FrameChunk,
+    NullSink,
     PoseChunk,
     PulseChunk,
     StreamChunk,
@@ -350,3 +354,24 @@ def test_a_twist_that_is_stopped_comes_straight_out_and_turns_back_in_the_next_t
     done = rig.run_trial(program, Memory(), 7, None, 100)
     assert [step.phase for step, kept in done.steps if kept] == ["hold", "twist"]
     assert angle_deg(rig.arm.pose(), Pose(stood.xyz_mm, straight)) < 1e-6
+
+
+@pytest.mark.parametrize("name", [name for name in shipped_rigs() if name.startswith("mock")])
+def test_a_simulated_rig_is_freed_once_nobody_has_it(name: str) -> None:
+    """Without the garbage collector, which sees few objects and not their megabytes."""
+    file, plan = load_rig_file(shipped_rigs()[name])[0], short_plan()
+    gc.collect()
+    gc.disable()
+    try:
+        rig = build_rig(file)
+        rig.connect()
+        rig.run_trial(
+            plan.program(plan.trials[0]), NullSink(), 7, file.frame_px(plan), 100,
+            file.with_events(plan),
+        )  # fmt: skip
+        rig.close()
+        parts = [weakref.ref(part) for part in (rig, *rig._devices())]
+        del rig
+        assert [part() for part in parts if part() is not None] == []
+    finally:
+        gc.enable()
