@@ -171,7 +171,7 @@ def simulate_pilot(
     assert size is not None
     rate_hz = plan.protocol.collection.recording.sync_rate
     built = build_rig(tracked)
-    built.poll_s = built.force_poll_s = POLL_S
+    built.poll_s, built.force_limit_n = POLL_S, None
     found = []
     try:
         built.connect()

@@ -157,9 +157,6 @@ class Rig:
     """The event camera while it is recorded."""
     _reading: tuple[FurtherStream, ...] = field(default=(), init=False)
     """The further devices while they are recorded."""
-    force_poll_s: float = field(default=force_watch.POLL_S, init=False)
-    """Interval at which forces are read and held against their limit, s; a run in memory, where
-    nothing can break, need not look so often."""
     _forces: ForceWatch | None = field(default=None, init=False)
     """Forces while they are watched, whether or not they are recorded."""
     _reported: str = field(default="", init=False)
@@ -555,13 +552,14 @@ class Rig:
                 raise StopRequested
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
-        """Let time pass; forces are read meanwhile, where there are any."""
+        """Let time pass; forces are read after it, and meanwhile where they have a limit."""
         if self._forces is None:
             self.clock.wait(seconds)
             return
+        most_s = seconds if self.force_limit_n is None else force_watch.POLL_S
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
-            self.clock.wait(min(self.force_poll_s, left / 1e9))
+            self.clock.wait(min(most_s, left / 1e9))
             forces = self._forces.read()
             if sink is not None:
                 sink.add_stream(FORCE, forces)

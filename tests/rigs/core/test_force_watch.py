@@ -12,7 +12,7 @@ import pytest
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import Mounting
-from sliplab.rigs.core.force_watch import ForceWatch
+from sliplab.rigs.core.force_watch import POLL_S, ForceWatch
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.force import MockForceSensor
@@ -165,6 +165,38 @@ def press(rig: Rig, seed: int, speed_mm_s: float, target_n: float = TARGET_N) ->
         sensor.stop()
     end_n = float(np.interp(rested_ns, times, force[:, 2]))
     return Pressed(end_n, float(np.linalg.norm(force, axis=1).max()))
+
+
+def read_in_a_press(limit_n: float | None) -> list[np.ndarray]:
+    """Press 4.8 mm at 1 mm/s on the same rig; return the forces of each reading."""
+    rig, home = force_rig(3), Position(0.0, 0.0, -2.0)
+    rig.force_limit_n = limit_n
+    sensor, found = rig.force, []
+    assert isinstance(sensor, MockForceSensor)
+    read = sensor.read
+
+    def noted() -> WrenchChunk:
+        chunk = read()
+        found.append(chunk.force_n)
+        return chunk
+
+    sensor.read = noted  # type: ignore[method-assign]
+    with rig.safely(home):
+        rig.begin_trial(home, 5)
+        rig._watch_forces()
+        rig.take_step(0, Move("press", Position(0.0, 0.0, 2.8), 1.0), home, None)
+    rig.close()
+    return found
+
+
+def test_forces_are_read_often_where_they_have_a_limit() -> None:
+    """And are the same as those that are read with the other streams."""
+    often, seldom = read_in_a_press(100.0), read_in_a_press(None)
+    assert len(often) == pytest.approx(4.8 / POLL_S, rel=0.1)
+    assert len(seldom) < len(often) / 5
+    most = min(sum(map(len, often)), sum(map(len, seldom)))
+    assert most > 4_500
+    np.testing.assert_array_equal(np.concatenate(often)[:most], np.concatenate(seldom)[:most])
 
 
 def presses(trials: int, a_rig: int = TRIALS_A_RIG) -> list[Pressed]:
