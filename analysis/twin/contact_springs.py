@@ -31,6 +31,7 @@ class Guess:
         bending: 12 for a guided end, 3 for a free one. poisson_ratio: of the skin.
         kinetic, youngs_modulus_mpa, base_normal_n_per_m, base_tangential_n_per_m, layer_step_mm:
             where the fit begins. It holds each within `LOOSE` if the data say nothing.
+        zero_mm: largest error of depth zero, which is where the centre papilla touches.
     """
 
     height_mm: float = 10.1
@@ -42,11 +43,11 @@ class Guess:
     base_normal_n_per_m: float = 150.0
     base_tangential_n_per_m: float = 200.0
     layer_step_mm: float = 1.1
+    zero_mm: float = 0.1
 
 
 LOOSE = 0.4
 """Prior standard deviation of the logarithm of each common quantity."""
-LOOSE_ZERO_MM = 0.1
 SCATTER = 0.06
 """Prior standard deviation of a papilla's friction, relative, and of its height, mm."""
 
@@ -81,7 +82,8 @@ class Fit:
 
     Attributes:
         kinetic: friction. normal_compliance, tangential_compliance: Young's modulus over the base's
-            stiffnesses, 1/mm. layer_step_mm. zero_mm: depth beyond the reported one.
+            stiffnesses, 1/mm. layer_step_mm. zero_mm: indentation of the centre papilla beyond the
+            reported depth.
         youngs_modulus_mpa: NaN without forces.
         friction: of each papilla over the mean, (m,). raised_mm: height over its ring's, (m,).
         gap_mm: depth at which each touches over that of the centre, (m,).
@@ -200,7 +202,8 @@ def _unpacked(x: F64, guess: Guess) -> tuple[F64, F64, F64, F64]:
     ])  # fmt: skip
     m = (x.shape[1] - COMMON) // 2
     own = SCATTER * x[:, COMMON:]
-    return np.exp(start + LOOSE * x[:, :5]), LOOSE_ZERO_MM * x[:, 5], np.exp(own[:, :m]), own[:, m:]
+    zero = guess.zero_mm / 3**0.5 * x[:, 5]  # as it scatters if no error is more likely
+    return np.exp(start + LOOSE * x[:, :5]), zero, np.exp(own[:, :m]), own[:, m:]
 
 
 def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
@@ -208,6 +211,9 @@ def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
     common, zero, friction, raised = _unpacked(x, guess)
     mu, normal, tangential, step, young = (column[:, None, None] for column in common.T)
     height = guess.height_mm - step * lags.ring + raised[:, None]
+    # depth zero is where the centre papilla touches, as that came out
+    centre = lags.ring == 0
+    zero = zero - raised[:, centre].sum(axis=1) / max(int(centre.sum()), 1)
     deep = lags.depth_mm[:, None] + zero[:, None, None] - (guess.height_mm - height)
     grip = mu * friction[:, None]
     lag, pressed = steady(grip, height, deep, normal, tangential, guess)

@@ -24,7 +24,7 @@ def events_of(slides: Sequence[PilotTrial], with_events: Collection[str]) -> lis
     return [slide for slide in slides if slide.trial in with_events and slide.camera is not None]
 
 
-VERSION = 3
+VERSION = 4
 """Raised with every change of a statistic or of the scene's physics: worlds are simulated anew."""
 
 

@@ -169,8 +169,8 @@ def with_tracking_noise(rig: RigFile, pilot: Pilot) -> RigFile:
 
 def fit_scene(store: Store, pilot: Pilot, prior: Prior, worlds: int) -> SceneFit:
     """Compare a pilot with simulated worlds."""
-    prior = replace(prior, rig=with_tracking_noise(prior.rig, pilot))
-    observed = pilot.statistics(guess_of(prior.rig))
+    prior = replace(prior, rig=with_tracking_noise(prior.rig, pilot), zero_mm=pilot.zero_mm)
+    observed = pilot.statistics(guess_of(prior.rig, prior.zero_mm))
     slides = Slides(pilot.plan, pilot.fitted, pilot.with_events)
     kept = Derived.of(store, "scene-worlds")
     seen = simulated("pilot's trials (worlds)", prior, slides, worlds, kept)
@@ -257,7 +257,9 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
 
 def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
     """Return the papillae as the pilot shows them, for `mock.scene.skin`; None if it does not."""
-    contact = read_contact([pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig))
+    contact = read_contact(
+        [pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig, pilot.zero_mm)
+    )
     found = None if contact is None else papillae(contact)
     design = np.array(rig.skin.layout_mm())
     if found is None or len(found.gap_mm) != len(design):
@@ -291,7 +293,8 @@ def judging_worlds(scene: SceneFit) -> list[World]:
     rigs = [other_rig(rig, one, scene.skin) for one in values]
     rigs += [other_rig(rig, {}, {})] * PREDICTED
     return [
-        World(one, slides, seed, guess_of(rig)) for one, seed in zip(rigs, chance * 2, strict=True)
+        World(one, slides, seed, guess_of(rig, scene.prior.zero_mm))
+        for one, seed in zip(rigs, chance * 2, strict=True)
     ]
 
 

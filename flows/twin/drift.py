@@ -26,7 +26,6 @@ from sliplab.analysis.twin.statistics import of_names, statistics
 from sliplab.flows.running import orchestration
 from sliplab.flows.twin.pilots import check_level, read_slide
 from sliplab.flows.twin.worlds import (
-    ZERO_MM,
     Prior,
     Slides,
     World,
@@ -77,9 +76,9 @@ class OneSpecimen(Prior):
     def world(self, number: int, slides: Slides) -> World:
         """Return a world: the same specimen, with another error of depth zero."""
         values, rng = self._drawn(number)
-        zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
+        zero_mm = float(rng.uniform(-self.zero_mm, self.zero_mm))
         rig = other_rig(self.rig, values, {}, zero_mm)
-        return World(rig, slides, int(rng.integers(2**31)), guess_of(self.rig))
+        return World(rig, slides, int(rng.integers(2**31)), guess_of(self.rig, self.zero_mm))
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -39,6 +40,10 @@ EVENT_TRIALS = 12
 need few trials."""
 POLL_S = 60.0
 """Nothing waits for the streams, so that they are read once a step; the data are the same."""
+ZEROS_MM = (0.03, 0.06, 0.1)
+"""Largest errors of depth zero that are distinguished: pilots with one share simulated worlds."""
+TOUCH_DEPTH_MM = 0.02
+"""Error of a rig's `touch_depth`, which a lab measures with a gauge."""
 COARSE_MS = 4
 """Step of the contact without events: slips are exact at any step, and marker places that are seen
 100 times a second change by less than their noise."""
@@ -53,6 +58,7 @@ class Pilot:
         slides: all of them as arrays, by id.
         with_events: ids of the fitted trials whose events are read.
         checksum: of the fitted trials' files.
+        zero_mm: largest error of their depth zero.
     """
 
     plan: Plan
@@ -61,6 +67,7 @@ class Pilot:
     slides: Mapping[str, PilotTrial]
     with_events: frozenset[str]
     checksum: str
+    zero_mm: float
 
     @property
     def streams(self) -> frozenset[str]:
@@ -97,8 +104,24 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
         raise StoreError(f"campaign '{item.name}': has no straight slides to fit a scene to")
     fitted = tuple(parts[False])
     return Pilot(
-        item.plan, fitted, tuple(parts[True]), slides, event_trials(fitted), sums.hexdigest()
-    )
+        item.plan, fitted, tuple(parts[True]), slides, event_trials(fitted), sums.hexdigest(),
+        zero_error_mm(item),
+    )  # fmt: skip
+
+
+def zero_error_mm(item: Collected) -> float:
+    """Return the largest error of a campaign's depth zero: one of `ZEROS_MM`.
+
+    Of the mean of several touches: two standard errors, and the error of the touch depth.
+    """
+    rezero = item.plan.protocol.collection.maintenance.rezero
+    scatter = [recording.record.depth_zero_sd_mm for _, recording in item.trials]
+    known = [sd for sd in scatter if sd is not None]
+    if rezero is None or len(known) < len(scatter):
+        return ZEROS_MM[-1]
+    scatter_mm = (float(np.mean(np.square(known))) / rezero.touches) ** 0.5
+    most = math.hypot(2.0 * scatter_mm, TOUCH_DEPTH_MM)
+    return next((limit for limit in ZEROS_MM if most <= limit), ZEROS_MM[-1])
 
 
 def check_level(item: Collected) -> None:

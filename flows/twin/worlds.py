@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -24,7 +24,7 @@ from sliplab.analysis.twin.posterior import Bank
 from sliplab.analysis.twin.statistics import VERSION, Statistics, of_names, statistics
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin.pilots import LEVEL, simulate_pilot
+from sliplab.flows.twin.pilots import LEVEL, ZEROS_MM, simulate_pilot
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.core.capabilities import RigError
@@ -36,8 +36,8 @@ from sliplab.storage.trials.derived import Derived, make_key
 T = TypeVar("T")
 TOUCH_MM_S, TOUCH_SEARCH_MM, TOUCHES = 0.5, 1.5, 16
 """As the shipped protocols touch off, and how often here."""
-ZERO_MM = 0.1
-"""Largest error of depth zero: touching off finds the plate only so exactly."""
+ZERO_MM = ZEROS_MM[-1]
+"""Largest error of depth zero by one touch: touching off finds the plate only so exactly."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,12 @@ def touch_section(rig: RigFile) -> dict[str, Any]:
         return {}
 
 
-def guess_of(rig: RigFile) -> Guess:
-    """Return the design of a rig's skin, and what it assumes of it."""
+def guess_of(rig: RigFile, zero_mm: float = ZERO_MM) -> Guess:
+    """Return the design of a rig's skin, and what it assumes of it.
+
+    Args:
+        zero_mm: largest error of depth zero.
+    """
     skin, friction = rig.scene.scene.skin, rig.scene.scene.friction
     rigid = 1e9
     return Guess(
@@ -162,6 +166,7 @@ def guess_of(rig: RigFile) -> Guess:
         base_normal_n_per_m=skin.base_normal_n_per_m or rigid,
         base_tangential_n_per_m=skin.base_tangential_n_per_m or rigid,
         layer_step_mm=(skin.heights_mm[0] - skin.heights_mm[-1]) / max(len(skin.heights_mm) - 1, 1),
+        zero_mm=zero_mm,
     )
 
 
@@ -172,11 +177,13 @@ class Prior:
     Attributes:
         spread: largest factor less 1, either way: 0.5 is from 1/1.5 to 1.5 times the value.
         seed: of the worlds. The world with a number is the same however many are drawn.
+        zero_mm: largest error of depth zero.
     """
 
     rig: RigFile
     spread: float
     seed: int
+    zero_mm: float = field(default=ZERO_MM, kw_only=True)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -195,10 +202,10 @@ class Prior:
     def world(self, number: int, slides: Slides) -> World:
         """Return a world, with another skin and another error of depth zero."""
         values, rng = self._drawn(number)
-        zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
+        zero_mm = float(rng.uniform(-self.zero_mm, self.zero_mm))
         specimen, chance = (int(n) for n in rng.integers(2**31, size=2))
         rig = other_specimen(self.rig, values, specimen, zero_mm)
-        return World(rig, slides, chance, guess_of(self.rig))
+        return World(rig, slides, chance, guess_of(self.rig, self.zero_mm))
 
     def _drawn(self, number: int) -> tuple[dict[str, float], np.random.Generator]:
         rng = np.random.default_rng([self.seed, number])
@@ -230,7 +237,10 @@ def simulated(
     rig = prior.rig.model_dump(mode="json", exclude={"name", "twin"})
     wanted = [rig, slides.plan.collection_hash, sorted(trial.id for trial in slides.trials)]
     # what is drawn depends on the kind of prior, too
-    drawn_by = [type(prior).__name__, [it.key for it in prior.parameters], prior.spread, prior.seed]
+    drawn_by = [
+        type(prior).__name__, [it.key for it in prior.parameters],
+        prior.spread, prior.seed, prior.zero_mm,
+    ]  # fmt: skip
     key = make_key("scene worlds", VERSION, wanted, [sorted(slides.with_events), *drawn_by])
     name = f"worlds-{key[:16]}"
     found = _read(kept, name) if kept.fresh(name, key) else {}

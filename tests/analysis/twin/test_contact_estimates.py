@@ -278,13 +278,19 @@ def test_a_light_press_has_the_closed_form() -> None:
 TRUE = {"kinetic": 0.95, "young": 0.5, "normal": 4.5, "tangential": 2.5, "step": 1.2}
 
 
-def exact_lags(forces: bool) -> tuple[Lags, np.ndarray, np.ndarray]:
-    """Lags and forces of known springs, and these, without noise."""
-    rng = np.random.default_rng(7)
+def exact_lags(
+    forces: bool, zero_mm: float = 0.05, seed: int = 7
+) -> tuple[Lags, np.ndarray, np.ndarray]:
+    """Lags and forces of known springs, and these, without noise.
+
+    Args:
+        zero_mm: by how much the centre papilla is deeper than reported.
+    """
+    rng = np.random.default_rng(seed)
     friction, raised = 1 + rng.normal(0, 0.05, 19), rng.uniform(-0.08, 0.08, 19)
     depth = np.array([2.4, 2.8, 3.4])
     height = 10.1 - TRUE["step"] * RING + raised
-    deep = depth[:, None] + 0.05 - (10.1 - height)
+    deep = depth[:, None] + zero_mm - (height[0] - height)
     mu, guess = TRUE["kinetic"] * friction, Guess()
     lag, pressed = steady(mu, height, deep, TRUE["normal"], TRUE["tangential"], guess)
     nothing = np.full(3, np.nan)
@@ -324,6 +330,20 @@ def test_lags_alone_tell_steps_but_no_force() -> None:
     inside = found.gap_mm[RING == 2] - found.gap_mm[RING == 2].mean()
     outer = raised[RING == 2]
     np.testing.assert_allclose(inside, outer.mean() - outer, atol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_exact_depth_zero_shows_how_much_later_the_rings_touch(seed: int) -> None:
+    """Depth zero is where the centre papilla touches, whatever height that came out with."""
+    lags, _, raised = exact_lags(forces=True, zero_mm=0.0, seed=seed)
+    exact, by_one_touch = (fit_springs(lags, Guess(zero_mm=each)) for each in (0.03, 0.1))
+    assert exact is not None
+    assert by_one_touch is not None
+    outer = RING > 0
+    off = (exact.gap_mm - (TRUE["step"] * RING - raised + raised[0]))[outer]
+    assert abs(off.mean()) < 0.015
+    assert exact.gap_error_mm[outer].max() < 0.85 * by_one_touch.gap_error_mm[outer].max()
+    assert abs(exact.zero_mm) < 0.03
 
 
 def test_a_papilla_that_is_not_there_carries_no_force() -> None:

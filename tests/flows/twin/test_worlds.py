@@ -1,13 +1,16 @@
-"""Where a simulated rig detects touches: its file must say so for depth zero to be right."""
+"""Where a simulated rig detects touches, and how exact a pilot's depth zero is."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sliplab.flows.scene_runs import changed
+from sliplab.flows.twin.pilots import zero_error_mm
 from sliplab.flows.twin.worlds import touch_depth_mm
 from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.mock.devices import build_mock
@@ -63,3 +66,20 @@ def test_touches_that_differ_leave_no_common_error_of_depth() -> None:
     assert np.std(errors) > 0.04
     # the standard error of both means is 0.017 mm
     assert abs(np.mean(errors)) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("sd_mm", "touches", "most_mm"),
+    [(None, 1, 0.1), (0.02, 8, 0.03), (0.05, 8, 0.06), (0.05, 2, 0.1), (0.2, 8, 0.1)],
+)
+def test_the_error_of_depth_zero_follows_from_the_touches(
+    sd_mm: float | None, touches: int, most_mm: float
+) -> None:
+    """Two standard errors of the mean and 0.02 mm of the touch depth, in quadrature."""
+    maintenance = SimpleNamespace(rezero=SimpleNamespace(touches=touches))
+    protocol = SimpleNamespace(collection=SimpleNamespace(maintenance=maintenance))
+    record = SimpleNamespace(record=SimpleNamespace(depth_zero_sd_mm=sd_mm))
+    item: Any = SimpleNamespace(plan=SimpleNamespace(protocol=protocol), trials=[(None, record)])
+    assert zero_error_mm(item) == most_mm
+    maintenance.rezero = None
+    assert zero_error_mm(item) == 0.1
