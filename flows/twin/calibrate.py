@@ -27,11 +27,11 @@ from sliplab.analysis.twin.parameters import Parameter, settings_of, value_of
 from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
 from sliplab.analysis.twin.shown import QUANTITIES, Shown, compare, show
 from sliplab.analysis.twin.statistics import Statistics, of_names
-from sliplab.flows.running import orchestration
+from sliplab.flows.running import console, orchestration
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.drawn_rigs import samples_file, write_samples
 from sliplab.flows.twin.needs import Needs, cheapest_path, measure_needs, write_cheapest
-from sliplab.flows.twin.pilots import LEVEL, Pilot, read_pilot
+from sliplab.flows.twin.pilots import LEVEL, ZEROS_MM, Pilot, read_pilot
 from sliplab.flows.twin.worlds import (
     Prior,
     Slides,
@@ -190,6 +190,11 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     began = monotonic()
     orchestration.configure_prefect(store.folder)
     pilot = read_pilot(store, item)
+    if pilot.zero_mm == ZEROS_MM[-1]:
+        console.say(
+            f"hint: depth zero of '{item.name}' is known to {pilot.zero_mm:g} mm, by single or "
+            "scattered touches; a pilot with touches: 8 in maintenance.rezero is more exact"
+        )
     scene = fit_scene(store, pilot, wanted.prior, wanted.worlds)
     worlds = judging_worlds(scene)
     judged = [pilot.slides[trial.id] for trial in pilot.judged]
