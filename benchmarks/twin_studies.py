@@ -1,6 +1,7 @@
 """Studies on a calibrated twin, beside those on the hidden world that it was fitted to.
 
     python -m benchmarks.twin_studies FOLDER [--worlds 3] [--first 0] [--seed 1] [--bank 240]
+                                      [--again]
 
 A hidden world is a clean one of `benchmarks.twin` with the same seed, and so are the worlds that a
 fit simulates. Its pilot of 36 slides calibrates a twin, beginning with the rig that all hidden
@@ -8,8 +9,8 @@ worlds were drawn around. Then the same study is done on the hidden world, on it
 on the rig as it was: the kinematic grid with `REPETITIONS` of each condition, of which `SPLIT` are
 tests, and gravity and disturbance trials in full. Trials of one id have the same
 chance on each of them. The network of each is tested on the hidden world's test trials. What
-figures differ by alone is shown by the hidden world's study with a network of another seed; what
-the twin's scene alone changes, by its trials with the hidden world's network.
+the twin's scene alone changes is shown by its trials with the hidden world's network; what figures
+differ by alone, with `--again`, by the hidden world's study with a network of another seed.
 
 FOLDER keeps all stores: a run that was stopped goes on, and more worlds may be added.
 """
@@ -204,18 +205,17 @@ def world_row(asked: argparse.Namespace, number: int, files: Sequence[Path]) -> 
         "assumed": studied(assumed, files, asked.folder / "assumed"),
     }
     own = studies["hidden"]
-    again = trained_again(own, folder / "again.pt")
+    judged = {name: it.judged(it.fitted) for name, it in studies.items()}
+    judged["twin, hidden world's network"] = studies["twin"].judged(own.fitted)
+    networks = {name: it.fitted for name, it in studies.items()}
+    again = folder / "again.pt"
+    if asked.again or again.exists():
+        networks["hidden, another seed"] = trained_again(own, again)
+        judged["hidden, another seed"] = own.judged(networks["hidden, another seed"])
     return {
         "world": number,
-        "studies": {
-            **{name: figures_of(it.judged(it.fitted)) for name, it in studies.items()},
-            "hidden, another seed": figures_of(own.judged(again)),
-            "twin, hidden world's network": figures_of(studies["twin"].judged(own.fitted)),
-        },
-        "networks": {
-            **{name: transferred(own.judged(it.fitted)) for name, it in studies.items()},
-            "hidden, another seed": transferred(own.judged(again)),
-        },
+        "studies": {name: figures_of(it) for name, it in judged.items()},
+        "networks": {name: transferred(own.judged(it)) for name, it in networks.items()},
     }
 
 
@@ -261,6 +261,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first world")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--bank", type=int, default=240, help="worlds that fits simulate")
+    parser.add_argument("--again", action="store_true", help="train with another seed, too")
     asked = parser.parse_args()
     asked.folder = asked.folder.resolve()
     (asked.folder / "scene-worlds").mkdir(parents=True, exist_ok=True)
