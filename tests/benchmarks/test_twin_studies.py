@@ -28,11 +28,13 @@ def test_a_figure_that_is_missing_or_too_far_away_does_not_hold() -> None:
     held = within(own, other)
     assert [name for name in FIGURES if held[name]] == ["kinematic", "gravity", "disturbance_lead"]
     assert within(own, {**own, "accuracy": 93.0})["accuracy"]
+    assert not within(own, {**own, "kinematic": 112.0})["kinematic"]
+    assert within({**own, "kinematic": 79.0}, {**own, "kinematic": 89.0}, 10.1)["kinematic"]
     networks = {name: {"share": 90.0, "low": None, "high": None} for name in ("hidden", "twin")}
     studies = {"hidden": own, "twin": {**own, "gross": 10.0}, "assumed": other}
     table = list(lines([{"world": 3, "studies": studies, "networks": networks}]))
     counts = next(line for line in table if line.startswith("| twin |")).split(" | ")[1:]
-    assert counts == ["1 of 1", "1 of 1", "0 of 1", *["1 of 1"] * 4, "0 of 1 |"]
+    assert counts == ["1 of 1", "1 of 1", "0 of 1", *["1 of 1"] * 4, "0 of 1", "0 of 1 |"]
     assert any(line.startswith("| 3 | assumed | 95.1 |") for line in table)
     assert table[-1] == "| 3 | twin | 90.0 | - |"
 
