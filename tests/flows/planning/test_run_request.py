@@ -69,7 +69,7 @@ def test_what_changed_in_the_collection_is_said(tmp_path: Path) -> None:
         "collection.motion[1].speed: 2 mm/s -> 1 mm/s",
         "collection.gates.retakes: 2 -> 5",
         "collection.maintenance.rezero.every: 3 -> 4",
-        "collection.maintenance.rezero.touches: none -> 5",
+        "collection.maintenance.rezero.touches: not there -> 5",
     ):
         assert f"\n  {line}" in message
 
