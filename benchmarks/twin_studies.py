@@ -215,15 +215,16 @@ def world_row(asked: argparse.Namespace, number: int, files: Sequence[Path]) -> 
     own = studies["hidden"]
     judged = {name: it.judged(it.fitted) for name, it in studies.items()}
     judged["twin, hidden world's network"] = studies["twin"].judged(own.fitted)
-    networks = {name: it.fitted for name, it in studies.items()}
+    on_hidden = {name: own.judged(studies[name].fitted) for name in ("twin", "assumed")}
+    on_hidden["hidden"] = judged["hidden"]
     again = folder / "again.pt"
     if asked.again or again.exists():
-        networks["hidden, another seed"] = trained_again(own, again)
-        judged["hidden, another seed"] = own.judged(networks["hidden, another seed"])
+        other_seed = own.judged(trained_again(own, again))
+        judged["hidden, another seed"] = on_hidden["hidden, another seed"] = other_seed
     return {
         "world": number,
         "studies": {name: figures_of(it) for name, it in judged.items()},
-        "networks": {name: transferred(own.judged(it)) for name, it in networks.items()},
+        "networks": {name: transferred(it) for name, it in on_hidden.items()},
     }
 
 

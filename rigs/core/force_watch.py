@@ -19,8 +19,8 @@ from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.storage.streams import WrenchChunk
 
 POLL_S = 0.02
-"""Interval at which forces are read for their limit, or the end of a press, s: how late either may
-be seen. Forces without a limit are read with the other streams."""
+"""Interval at which forces are read, s: how late a limit, an overload or the end of a press may be
+seen. A simulated rig without a limit reads them with its other streams."""
 _LINE_NS = 10_000_000
 _FEWEST = 5
 """Samples through which a straight line is laid: those of the last 10 ms, at least five."""

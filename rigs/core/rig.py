@@ -552,11 +552,15 @@ class Rig:
                 raise StopRequested
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
-        """Let time pass; forces are read after it, and meanwhile where they have a limit."""
+        """Let time pass; forces are read after it, and often meanwhile.
+
+        Not on a simulated rig without a limit, where an overload breaks nothing.
+        """
         if self._forces is None:
             self.clock.wait(seconds)
             return
-        most_s = seconds if self.force_limit_n is None else force_watch.POLL_S
+        often = self.simulation is None or self.force_limit_n is not None
+        most_s = force_watch.POLL_S if often else seconds
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
             self.clock.wait(min(most_s, left / 1e9))
