@@ -253,14 +253,17 @@ def _depth_zeros(taken: Sequence[Collected]) -> list[Table]:
     rows = []
     for item in taken:
         rezero = item.plan.protocol.collection.maintenance.rezero
-        records = [recording.record for _, recording in item.trials]
-        found = [(r.depth_zero_mm, r.depth_zero_sd_mm) for r in records]
-        # trials after one touching off have its figures to the bit
-        blocks = [each for each, _ in groupby(found) if each[0] is not None]
+        found = [
+            (item.plan.rezero_task(trial).slot, record.depth_zero_mm, record.depth_zero_sd_mm)
+            for trial, recording in item.trials
+            for record in (recording.record,)
+        ]
+        # one slot is touched off for again after a pause
+        blocks = [each for each, _ in groupby(found) if each[1] is not None]
         if rezero is None or not blocks:
             continue
-        zeros = np.array([zero for zero, _ in blocks], np.float64)
-        squares = [sd**2 for _, sd in blocks if sd is not None]
+        zeros = np.array([zero for _, zero, _ in blocks], np.float64)
+        squares = [sd**2 for _, _, sd in blocks if sd is not None]
         sd = float(np.mean(squares)) ** 0.5 if squares else None
         rows.append([
             item.name, str(len(blocks)), str(rezero.touches),

@@ -32,7 +32,7 @@ from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
 STEP = "report"
-VERSION = 11
+VERSION = 12
 
 
 def report_folder(store: Store) -> Path:
