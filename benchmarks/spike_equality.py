@@ -20,7 +20,7 @@ import torch
 
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import exact, matrices, spike_counts
-from sliplab.analysis.networks.training import engine, restore
+from sliplab.analysis.networks.training import restore
 from sliplab.analysis.windows.dataset import SampleSet
 
 PART = 2048
@@ -31,7 +31,7 @@ def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int |
     # waiting for each other, Sinabs' threads take longer beside other work
     torch.set_num_threads(1)
     fitted = model_file.load(model)
-    net, fast = restore(fitted), engine(fitted)
+    net, fast = restore(fitted), fitted.engine
     compared = differ = with_spikes = 0
     for part in samples:
         for start in range(0, len(part), PART):

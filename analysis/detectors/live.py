@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.detectors.detectors import Predictions, Tuned
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP, winners
-from sliplab.analysis.networks.training import Fitted, engine
+from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import EventChunk
@@ -291,7 +291,7 @@ def counting_of(fitted: Fitted) -> Counting:
         InputError: its classes are not those of slip.
     """
     fitted.check_slip("the model", "detection")
-    fast = engine(fitted)
+    fast = fitted.engine
     return lambda x: fast.counts(x, 1)
 
 

@@ -197,7 +197,7 @@ def _stateful(recording: Recording, inference: _Inference, fitted: training.Fitt
     """Run inference once through the trial; windows are trailing sums of its spikes."""
     windows = inference.windows
     x, ends = dataset.trial_windows(recording, windows)
-    spikes = stateful_spikes(training.engine(fitted), x)
+    spikes = stateful_spikes(fitted.engine, x)
     running = np.concatenate([[0], x.count.cumsum(dtype=np.int64)])
     events = np.diff(running[x.offsets])
     length, stride = windows.steps, inference.stride_ms // windows.step_ms

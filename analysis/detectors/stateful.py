@@ -23,7 +23,7 @@ def stateful_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
     """Output spikes of every step of consecutive windows, states kept from each to the next.
 
     Args:
-        engine: the network; see `analysis.networks.training.engine`.
+        engine: the network; see `analysis.networks.training.Fitted.engine`.
         x: n windows that follow each other.
 
     Returns:

@@ -159,7 +159,7 @@ def _speck(
     net = training.restore(fitted)
     margin = source.margin
     ran = chip_run(quantised_net(fitted, whole), seen.x)
-    counts = training.engine(fitted).counts(seen.windows)
+    counts = fitted.engine.counts(seen.windows)
     rounding = whole.rounding(net)
     layers = {
         name: QuantisedLayer(
@@ -194,7 +194,7 @@ def _card(
     detection: Latencies,
     made_from_these: bool,
 ) -> ModelCard:
-    net, engine = training.restore(source.fitted), training.engine(source.fitted)
+    net, engine = training.restore(source.fitted), source.fitted.engine
     kinematic = training_campaigns(source.campaigns)
     splits = {
         split: SplitResult(

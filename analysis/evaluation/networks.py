@@ -322,7 +322,7 @@ def _counter(
     if description is None:
         fitted = model_file.parse(content, "the model")
         if engine == "fast":
-            return training.engine(fitted).counts
+            return fitted.engine.counts
         net = training.restore(fitted)
         return lambda x: spike_counts(net, x.dense())
     model = ExternalModel(description, content)

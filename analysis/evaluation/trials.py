@@ -99,7 +99,7 @@ def latencies(
         on_trial: called before each of them; some thousand windows take a second.
     """
     rules = rules_of(campaigns, fitted.network.outputs_per_class)
-    fast, chip = training.engine(fitted), quantised_net(fitted, whole)
+    fast, chip = fitted.engine, quantised_net(fitted, whole)
     found: tuple[dict[str, list[TrialLatency]], ...] = ({}, {})
     for item in campaigns:
         rule = rules[item.name]

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -275,6 +276,11 @@ class Fitted:
         """The record of the chosen epoch."""
         return self.history[self.chosen_epoch - 1]
 
+    @cached_property
+    def engine(self) -> Engine:
+        """The event-driven engine of the network; it may count in several threads at a time."""
+        return Engine(restore(self), self.windows.cells)
+
     def check_slip(self, model: Path | str, purpose: str) -> None:
         """Check that the classes are those of slip, for what is made for these alone.
 
@@ -394,18 +400,13 @@ def restore(fitted: Fitted) -> nn.Sequential:
     return net
 
 
-def engine(fitted: Fitted) -> Engine:
-    """Return the event-driven engine of the trained network."""
-    return Engine(restore(fitted), fitted.windows.cells)
-
-
 def predict_counts(fitted: Fitted, x: Samples) -> npt.NDArray[np.int64]:
     """Output spikes int64 (n, classes) of samples (n, steps, channels, cells, cells).
 
     Raises:
         ValueError: samples of another shape.
     """
-    return engine(fitted).counts(x)
+    return fitted.engine.counts(x)
 
 
 def limit_threads(count: int) -> None:

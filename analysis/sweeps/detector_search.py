@@ -309,7 +309,7 @@ class DetectorSearch:
         fitted = training.fit(
             x.windows, x.y, x.windows, x.y, run.network, run.windows, how, run.seed
         )
-        engine = training.engine(fitted)
+        engine = fitted.engine
         began = time.perf_counter()
         engine.counts(x.windows)
         each = (time.perf_counter() - began) / len(x)

@@ -108,7 +108,7 @@ def test_accuracy_by_length_is_that_of_spikes_so_far(judged: Store) -> None:
     found = class_evaluation_of(judged)
     fitted = model_file.load(judged.folder / "models" / f"classes-seed{found.seed}.pt")
     test = samples(judged, "test")
-    stream = training.engine(fitted).stream()
+    stream = fitted.engine.stream()
     spikes = []
     for window in test.x:
         stream.reset()
