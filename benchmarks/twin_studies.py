@@ -308,22 +308,30 @@ def beyond(spans: Mapping[str, Any]) -> dict[str, bool]:
     return found
 
 
-def world_row(asked: argparse.Namespace, number: int, files: Sequence[Path]) -> dict[str, Any]:
-    """Do everything of one hidden world; return its figures."""
+def world_row(
+    asked: argparse.Namespace, number: int, files: Sequence[Path], assumed: Study, usual: Outcome
+) -> dict[str, Any]:
+    """Do everything of one hidden world; return its figures.
+
+    Args:
+        files: the protocols.
+        assumed, usual: the study on the rig as it was, and its outcome.
+    """
     folder: Path = asked.folder / f"world{number}"
     folder.mkdir(exist_ok=True)
-    assumed = asked.folder / "assumed.yaml"
-    hidden = hidden_rig(folder, assumed, asked.seed, number)
-    twin = calibrated(asked, folder, hidden)
-    studies = {
-        "hidden": studied(hidden, files, folder / "hidden"),
-        "twin": studied(twin, files, folder / "twin"),
-        "assumed": studied(assumed, files, asked.folder / "assumed"),
+    hidden = hidden_rig(folder, asked.folder / "assumed.yaml", asked.seed, number)
+    twin = studied(calibrated(asked, folder, hidden), files, folder / "twin")
+    own = studied(hidden, files, folder / "hidden")
+    outcomes = {
+        "hidden": own.outcome(own.networks),
+        "twin": twin.outcome(twin.networks),
+        "assumed": usual,
+        "twin, hidden world's networks": twin.outcome(own.networks),
     }
-    own = studies["hidden"]
-    outcomes = {name: it.outcome(it.networks) for name, it in studies.items()}
-    on_hidden = {name: own.outcome(studies[name].networks) for name in ("twin", "assumed")}
-    outcomes["twin, hidden world's networks"] = studies["twin"].outcome(own.networks)
+    on_hidden = {
+        "twin": own.outcome(twin.networks),
+        "assumed": own.outcome(assumed.networks),
+    }
     if asked.again:
         further = own.outcome(trained_again(own, folder))
         outcomes["hidden, further networks"] = on_hidden["hidden, further networks"] = further
@@ -399,11 +407,13 @@ def main() -> None:
     ]
     kept = asked.folder / "rows.json"
     rows = read_json(kept)["rows"] if kept.exists() else []
+    assumed = studied(asked.folder / "assumed.yaml", files, asked.folder / "assumed")
+    usual = assumed.outcome(assumed.networks)
     for number in range(asked.first, asked.first + asked.worlds):
         if number in [row["world"] for row in rows]:
             continue
         try:
-            rows.append(world_row(asked, number, files))
+            rows.append(world_row(asked, number, files, assumed, usual))
         except RigError as error:
             print(f"world {number} cannot be collected: {error}")
             continue
