@@ -126,7 +126,7 @@ def test_a_hidden_rig_file_is_the_world_that_was_drawn(tmp_path: Path) -> None:
     assert rig.scene == world.rig.scene
     assert rig.scene.scene.friction.kinetic != base.scene.scene.friction.kinetic
     plans = [load_plan(shipped(name, tmp_path, count, 3)) for name, count in REPETITIONS.items()]
-    assert [len(plan) for plan in plans] == [576, 108, 48]
+    assert [len(plan) for plan in plans] == [576, 108, 144]
     counts = Counter(trial.split for trial in plans[0])
     assert all(abs(counts[name] / 576 - share) < 0.02 for name, share in SPLIT.items())
     assert plans[0].protocol.analysis.also is None
