@@ -101,13 +101,21 @@ def knee_s(t_s: F64, values: F64, flatter: float) -> float | None:
     t = np.add.reduceat(t_s, edges[:-1]) / counts
     y = np.add.reduceat(values, edges[:-1]) / counts
     knots = t[2:-2]
-    hinge = np.maximum(t[:, None] - knots[None, :], 0.0)
     basis, _ = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))
-    hinge_left = hinge - basis @ (basis.T @ hinge)
-    y_left = y - basis @ (basis.T @ y)
-    gain = (hinge_left.T @ y_left) ** 2 / np.sum(hinge_left**2, axis=0)
-    k = int(np.argmax(gain))
-    design = np.stack([np.ones_like(t), t, hinge[:, k]], axis=1)
+    left = y - basis @ (basis.T @ y)
+
+    def hinges(columns: F64) -> F64:
+        """Return products of the hinge of each knot, max(t - knot, 0), with columns (n, m)."""
+        behind = np.cumsum((t[:, None] * columns)[::-1], axis=0)[::-1]
+        count = np.cumsum(columns[::-1], axis=0)[::-1]
+        return behind[3:-1] - knots[:, None] * count[3:-1]
+
+    # what a hinge adds to a line is what of it no line can show; its square is that of the hinge
+    # less that of its projection, and sums over what lies behind a knot are made once for all
+    since = hinges(np.stack([t, np.ones_like(t)], axis=1))
+    square = since[:, 0] - knots * since[:, 1] - (hinges(basis) ** 2).sum(axis=1)
+    k = int(np.argmax(hinges(left[:, None])[:, 0] ** 2 / square))
+    design = np.stack([np.ones_like(t), t, np.maximum(t - knots[k], 0.0)], axis=1)
     _, before, bend = np.linalg.lstsq(design, y, rcond=None)[0].tolist()
     if before <= 0.0 or before + bend >= flatter * before:
         return None

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mpmath import mp
 
-from sliplab.analysis.labels.change_point import ChangePoint, change_point, departure
+from sliplab.analysis.labels.change_point import (
+    ChangePoint,
+    _evidence,
+    change_point,
+    departure,
+)
 from sliplab.analysis.labels.slip_times import slip_times
 
 PERIOD = 10_000_000
@@ -111,3 +117,34 @@ def test_slips_of_a_trial() -> None:
     assert times.at_ns[2] == -1
     assert times.doubts().incipient is times.doubts().gross is None
     assert abs(times.at_ns[1] / PERIOD - 30.5) < 0.1
+
+
+def evidence(table: np.ndarray, k: int) -> float:
+    """Return `_evidence` by inverse and determinant with 60 digits."""
+    with mp.workdps(60):
+        x = mp.matrix(table[:, [0, 1, 2 + k]].tolist())
+        y = mp.matrix(table[:, -1].tolist())
+        normal, right = x.T * x + mp.mpf("1e-9") * mp.eye(3), x.T * y
+        inverse = normal**-1
+        best = inverse * right
+        said = -((y.T * y)[0] - (right.T * best)[0]) / 2 - mp.log(mp.det(normal)) / 2
+        for a in (1, 2):
+            said += mp.log(mp.ncdf(best[a] / mp.sqrt(inverse[a, a])))
+        return float(said)
+
+
+@pytest.mark.parametrize("case", ["plain", "no frame after the slip", "one direction", "nearly"])
+def test_what_is_integrated_out_agrees_with_sixty_digits(case: str) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        table = rng.normal(0.0, 100.0, (18, 9))
+        table[:, -1] = table[:, 0] + table[:, 1] + rng.normal(0.0, 1.0, 18)
+        if case == "no frame after the slip":
+            table[:, 1:-1] = 0.0
+        elif case == "one direction":  # a relief so long that it is a straight line
+            table[:, 2:-1] = table[:, 1:2]
+        elif case == "nearly":
+            table[:, 2:-1] = table[:, 1:2] * (1.0 + rng.normal(0.0, 1e-5, (18, 6)))
+        # what rounding leaves of a column's square, 1e-11, is beside the ridge of 1e-9
+        digits = 1e-9 if case in {"plain", "no frame after the slip"} else 0.05
+        assert _evidence(table, 3) == pytest.approx(evidence(table, 3), abs=digits, rel=1e-9)
