@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from benchmarks.twin import BANK, CLEAN, pilot_slides, prior_of
 from sliplab.analysis.campaigns import Collected
@@ -213,59 +214,62 @@ def trained_again(study: Study, folder: Path) -> list[Fitted]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What several networks make of the same test trials, in the order of the protocols.
+    """What several networks make of the same test trials.
 
     Attributes:
-        hits: windows of each slide that each network classified correctly, (networks, slides).
-        windows: of each slide, (slides,).
-        times: by figure, ms (networks, trials of its experiment); NaN where none is counted.
+        values: by figure, a row for each network and a column for each trial: ms, NaN where no time
+            is counted; of the accuracy, windows that it classified correctly.
+        windows: of each slide.
     """
 
-    hits: FloatArray
-    windows: FloatArray
-    times: dict[str, FloatArray]
+    values: dict[str, pd.DataFrame]
+    windows: pd.Series[float]
 
     @classmethod
     def of(cls, judged: Sequence[Judged]) -> Outcome:
         """Collect what networks made of the trials of one store."""
-        pairs = np.array([list(it.hits_by_trial(False).values()) for it in judged], np.float64)
-        times = {}
+        slides = [it.hits_by_trial(False) for it in judged]
+        windows = {trial: count for trial, (_, count) in slides[0].items()}
+        values = {}
         for name, figure in FIGURES.items():
-            if figure.time is not None:
+            if figure.time is None:
+                rows = [{trial: hits for trial, (hits, _) in it.items()} for it in slides]
+            else:
                 rows = [
-                    [row.latency for row in it.rows if row.experiment == figure.experiment]
+                    {
+                        row.trial: getattr(row.latency, figure.time, None)
+                        for row in it.rows
+                        if row.experiment == figure.experiment
+                    }
                     for it in judged
                 ]
-                # None, of a detection that is not counted, becomes NaN
-                times[name] = np.array(
-                    [[getattr(trial, figure.time, None) for trial in each] for each in rows],
-                    np.float64,
-                )
-        return cls(pairs[:, :, 0], pairs[0, :, 1], times)
+            values[name] = pd.DataFrame(rows, dtype=np.float64)
+        return cls(values, pd.Series(windows, dtype=np.float64))
 
-    def trials(self, name: str) -> int:
-        """Return how many trials a figure is of."""
-        return len(self.windows) if name == "accuracy" else self.times[name].shape[1]
-
-    def drawn(self, name: str, networks: IntArray, trials: IntArray) -> FloatArray:
+    def drawn(
+        self, name: str, trials: pd.Index[str], networks: IntArray, picked: IntArray
+    ) -> FloatArray:
         """Return a figure of `FIGURES` of draws of networks and trials, the mean over networks.
 
         Args:
-            networks, trials: indices of each draw, (draws, k) and (draws, n).
+            trials: that are drawn from; one that is not here counts for nothing.
+            networks, picked: indices of each draw, (draws, k) and (draws, n).
 
         Returns:
             (draws,); NaN where a network has no time.
         """
-        which = networks[:, :, None], trials[:, None, :]
+        values = self.values[name].reindex(columns=trials).to_numpy()
+        values = values[networks[:, :, None], picked[:, None, :]]
         if name == "accuracy":
-            windows = self.windows[trials].sum(axis=1)
-            return 100.0 * self.hits[which].sum(axis=2).mean(axis=1) / windows
-        return medians_ms(self.times[name][which]).mean(axis=1)
+            windows = self.windows.reindex(trials, fill_value=0.0).to_numpy()[picked].sum(axis=1)
+            return np.asarray(100.0 * np.nansum(values, axis=2).mean(axis=1) / windows)
+        return np.asarray(medians_ms(values).mean(axis=1))
 
     def figure(self, name: str) -> float:
         """Return a figure of `FIGURES`, the mean over networks; NaN where one has no time."""
-        networks, trials = np.arange(len(self.hits)), np.arange(self.trials(name))
-        return float(self.drawn(name, networks[None], trials[None])[0])
+        values = self.values[name]
+        k, n = values.shape
+        return float(self.drawn(name, values.columns, np.arange(k)[None], np.arange(n)[None])[0])
 
     def figures(self) -> dict[str, float | None]:
         """Return all figures; None where there are no times."""
@@ -278,14 +282,16 @@ class Outcome:
         Trials of both are drawn again together, since they have the same chance, and so are the
         networks of each; None where nothing is known.
         """
-        trials = drawn(self.trials(name))
-        a = self.drawn(name, drawn(len(self.hits), 1), trials)
-        b = own.drawn(name, drawn(len(own.hits), 2), trials)
+        here, there = self.values[name], own.values[name]
+        trials = there.columns.union(here.columns, sort=False)
+        picked = drawn(len(trials))
+        a = self.drawn(name, trials, drawn(len(here), 1), picked)
+        b = own.drawn(name, trials, drawn(len(there), 2), picked)
         found = a - b if name == "accuracy" else a / b - 1.0
-        there = found[np.isfinite(found)]
-        if not len(there):
+        known = found[np.isfinite(found)]
+        if not len(known):
             return None
-        low, high = np.quantile(there, (0.025, 0.975))
+        low, high = np.quantile(known, (0.025, 0.975))
         return float(low), float(high)
 
 

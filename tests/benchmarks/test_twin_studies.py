@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
@@ -86,9 +87,29 @@ def test_medians_of_rounded_times_come_near_those_of_exact_ones() -> None:
 
 def outcome(hits: FloatArray, times: FloatArray) -> Outcome:
     """Return an outcome whose times are the same for each figure."""
-    windows = np.full(hits.shape[1], 50.0)
-    names = [name for name, figure in FIGURES.items() if figure.time is not None]
-    return Outcome(hits, windows, dict.fromkeys(names, times))
+    trials = [f"trial{k}" for k in range(hits.shape[1])]
+    values = {
+        name: pd.DataFrame(hits if figure.time is None else times, columns=trials)
+        for name, figure in FIGURES.items()
+    }
+    return Outcome(values, pd.Series(50.0, trials))
+
+
+def test_a_trial_that_only_one_study_has_leaves_the_others_in_pairs() -> None:
+    rng = np.random.default_rng(9)
+    times = np.repeat(300.0 + rng.normal(0.0, 60.0, (1, 40)), 2, axis=0)
+    own = outcome(np.full((2, 40), 45.0), times)
+    fewer = outcome(np.full((2, 40), 45.0), times)
+    for name, values in fewer.values.items():
+        fewer.values[name] = values.drop(columns=["trial3", "trial17"])
+    fewer = Outcome(fewer.values, fewer.windows.drop(["trial3", "trial17"]))
+    assert fewer.figure("accuracy") == pytest.approx(90.0)
+    assert fewer.against(own, "accuracy") == pytest.approx((0.0, 0.0))
+    apart = outcome(np.full((2, 40), 45.0), times[:, ::-1])
+    (low, high), (low_apart, high_apart) = (
+        it.against(own, "gravity") or (np.nan, np.nan) for it in (fewer, apart)
+    )
+    assert 0.0 <= high - low < 0.5 * (high_apart - low_apart)
 
 
 def test_figures_are_means_over_networks_and_their_intervals_hold() -> None:
