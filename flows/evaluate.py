@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING
 
 from prefect import flow, task
@@ -13,7 +14,7 @@ from sliplab.analysis.campaigns import (
     of_classes,
     training_campaigns,
 )
-from sliplab.analysis.detectors.predictions import count_spikes, predict_trials
+from sliplab.analysis.detectors.predictions import count_spikes, predict_trials, seed_step
 from sliplab.analysis.evaluation import evaluation
 from sliplab.analysis.evaluation.evaluation import Job, make_job, score_store
 from sliplab.analysis.networks.models import (
@@ -78,7 +79,12 @@ def evaluate_flow(argument: Opaque[tuple[Job, Cluster | None]]) -> None:
     windows = training_settings(job.campaigns).windows
     with timed(job.store, "evaluate"):
         trials = [(item.name, recording, key) for item, _, recording, key in job.trials]
-        count_spikes(job.store, job.model.path, windows, trials, keep, threads)
+        count_spikes(job.store, job.model.path, trials, keep, threads)
+        for model, item in product(job.others, job.campaigns):
+            count_spikes(
+                job.store, model.path, job.counted_by(model, item), keep, threads,
+                seed_step(model.seed), job.detection[item.name].stride_ms,
+            )  # fmt: skip
         predict_trials(job.store, job.model.path, windows, job.detectors.requests, keep, threads)
         train, test = (
             load_samples(job.labels, job.campaigns, split, sample_maker(job.store, split, cluster))

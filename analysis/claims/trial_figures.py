@@ -85,8 +85,8 @@ def _of_network(
     recording: Recording, label: TrialLabel, settings: AnalysisSettings, fitted: Fitted
 ) -> dict[str, float | None]:
     from sliplab.analysis.detectors.latency import score_trial, true_slip
+    from sliplab.analysis.detectors.predictions import window_counts
     from sliplab.analysis.detectors.smoothing_rule import detect
-    from sliplab.analysis.evaluation.trials import window_counts
     from sliplab.analysis.metrics import window_groups
     from sliplab.analysis.networks import training
     from sliplab.analysis.windows import dataset
@@ -96,7 +96,7 @@ def _of_network(
         return dict.fromkeys(("latency_incipient", "latency_gross", "lead", "accuracy"))
     outputs = fitted.network.outputs_per_class
     rule = settings.rule_for(outputs, MARGIN * outputs)
-    counts, end_ns = window_counts(recording, fitted, rule)
+    counts, end_ns = window_counts(recording, fitted, rule.stride_ms)
     scored = score_trial(detect(counts, end_ns, rule), slip, round(rule.false_early_ms * 1e6))
     name = dataset.TrialId("", recording.folder.name)
     seed = hash_integer("samples", recording.folder.name)

@@ -1,7 +1,8 @@
 """Predictions that detectors read: spikes of all windows of a trial, at any stride, kept once made.
 
-Spike counts are of consecutive windows of the trials that are scored; predictions, which count
-events too, of windows that overlap and of the trials that detectors learn from and are set by.
+Spike counts are of consecutive windows of the trials that are scored, by every trained network;
+predictions, which count events too, of windows that overlap and of the trials that detectors learn
+from and are set by.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.analysis.detectors.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
+from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived, make_key
@@ -28,42 +31,51 @@ COUNTS = "counts"
 COUNTS_VERSION = 1
 
 
+def seed_step(seed: int) -> str:
+    """Name of the step that keeps spike counts of a trained network that was not chosen."""
+    return f"{COUNTS}_seed{seed}"
+
+
 @dataclass(frozen=True)
 class _Counting:
     """Inputs of spike counts besides the trial.
 
     Attributes:
         threads: of the network; None for as many as there are cores.
+        stride_ms: of the windows; None for consecutive ones.
     """
 
     model: bytes
-    windows: Windows
     threads: int | None
+    stride_ms: int | None
 
 
 def count_spikes(
     store: Store,
     model: Path,
-    windows: Windows,
     trials: Sequence[tuple[str, Recording, str]],
     keep: KeepTrials,
     threads: int | None = None,
+    step: str = COUNTS,
+    stride_ms: int | None = None,
 ) -> int:
-    """Run a network over all consecutive windows of every trial that needs it.
+    """Run a network over all windows of every trial that needs it.
 
     Args:
         trials: campaign, recording and the key that its counts must have.
         keep: makes the stale ones and keeps each.
         threads: of the network; None for as many as there are cores.
+        step: that keeps the counts.
+        stride_ms: of the windows; None for consecutive ones.
 
     Returns:
         how many trials were counted.
     """
-    counting = _Counting(model.read_bytes(), windows, threads)
+    counting = _Counting(model.read_bytes(), threads, stride_ms)
     required = [TrialWork(recording, name, key, counting) for name, recording, key in trials]
-    work = stale_trials(store, COUNTS, required)
+    work = stale_trials(store, step, required)
     if work:
-        keep(COUNTS, work, _count)
+        keep(step, work, _count)
     return len(work)
 
 
@@ -71,9 +83,33 @@ def _count(recording: Recording, counting: _Counting) -> tuple[Json, Arrays]:
     """Spike counts of all windows of a trial."""
     if counting.threads is not None:
         training.limit_threads(counting.threads)
-    x, end_ns = dataset.trial_windows(recording, counting.windows)
-    counts = training.predict_counts(_fitted(counting.model), x)
+    counts, end_ns = window_counts(recording, _fitted(counting.model), counting.stride_ms)
     return {}, {"counts": counts, "end_ns": end_ns}
+
+
+def window_counts(
+    recording: Recording, fitted: training.Fitted, stride_ms: int | None
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return spikes of a trial's windows (n, 3), and where they end (n,), ns.
+
+    Args:
+        stride_ms: of the windows; None for consecutive ones.
+    """
+    if stride_ms is None:
+        x, end_ns = dataset.trial_windows(recording, fitted.windows)
+    else:
+        x, end_ns = _strided(recording, fitted.windows, stride_ms)
+    return training.predict_counts(fitted, x), end_ns
+
+
+def _strided(
+    recording: Recording, windows: Windows, stride_ms: int
+) -> tuple[SparseWindows, npt.NDArray[np.int64]]:
+    """Return windows at a stride, and where they end, ns."""
+    length_ns = windows.length_ms * 1_000_000
+    span = dataset.recorded_span(recording)
+    starts = strided_windows(*span, length_ns, stride_ms * 1_000_000)
+    return dataset.cut_windows(recording, starts, windows), starts + length_ns
 
 
 PREDICTIONS = "heard"
@@ -181,16 +217,8 @@ def _infer(recording: Recording, inference: _Inference) -> tuple[Json, Arrays]:
 
 def _stateless(recording: Recording, inference: _Inference, fitted: training.Fitted) -> Arrays:
     """Run inference with states reset at every window."""
-    length_ns = inference.windows.length_ms * 1_000_000
-    starts = strided_windows(
-        *dataset.recorded_span(recording), length_ns, inference.stride_ms * 1_000_000
-    )
-    x = dataset.cut_windows(recording, starts, inference.windows)
-    return {
-        "counts": training.predict_counts(fitted, x),
-        "events": x.totals,
-        "end_ns": starts + length_ns,
-    }
+    x, end_ns = _strided(recording, inference.windows, inference.stride_ms)
+    return {"counts": training.predict_counts(fitted, x), "events": x.totals, "end_ns": end_ns}
 
 
 def _stateful(recording: Recording, inference: _Inference, fitted: training.Fitted) -> Arrays:

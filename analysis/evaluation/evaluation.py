@@ -9,6 +9,7 @@ from sliplab.analysis.detectors.onset_references import VERSION as REFERENCES_VE
 from sliplab.analysis.detectors.predictions import (
     COUNTS,
     COUNTS_VERSION,
+    seed_step,
     trial_counts,
 )
 from sliplab.analysis.detectors.rule_sweep import settled
@@ -50,9 +51,24 @@ class Job:
     detectors: DetectorWork
     key: str
 
+    @property
+    def others(self) -> list[Model]:
+        """Models of the seeds that were not chosen."""
+        return [model for model in self.models if model.seed != self.model.seed]
+
+    def counted_by(self, model: Model, item: Collected) -> list[tuple[str, Recording, str]]:
+        """Return campaign, recording and key of spike counts of each trial that is scored."""
+        stride = {"stride_ms": self.detection[item.name].stride_ms}
+        return [
+            (item.name, it, make_key(COUNTS, COUNTS_VERSION, [model.key, it.checksum], stride))
+            for known, _, it, _ in self.trials
+            if known.name == item.name
+        ]
+
 
 STEP = "evaluation"
 VERSION = 4
+BY_SEED_VERSION = 1
 NAME = "evaluation"
 FORMAT = (VERSION, WINDOWS_VERSION)
 """Stands in an evaluation, so that who reads it knows that its keys are those of today."""
@@ -99,7 +115,9 @@ def make_job(
     states = labels.states(campaigns)
     of_review = [] if states is None else [states]
     # evaluations of before, which lack the figures by each reference, can be read all the same
-    made_of = [model.key, inputs, detectors.inputs, REFERENCES_VERSION, *of_review]
+    # and so can those of several seeds that have latencies of the chosen one alone
+    of_seeds = [BY_SEED_VERSION] if len(models) > 1 else []
+    made_of = [model.key, inputs, detectors.inputs, REFERENCES_VERSION, *of_review, *of_seeds]
     key = make_key(STEP, VERSION, made_of, used)
     return Job(store, campaigns, labels, model, models, detection, trials, detectors, key)
 
@@ -120,11 +138,20 @@ def evaluation_of(store: Store) -> Evaluation:
     return kept.load(NAME, Evaluation)
 
 
-def _score_trials(job: Job, detection: dict[str, Detection]) -> list[TrialScore]:
-    """One row a trial: onsets, detections, latency."""
+def _score_trials(
+    job: Job, detection: dict[str, Detection], other: Model | None = None
+) -> list[TrialScore]:
+    """One row a trial: onsets, detections, latency.
+
+    Args:
+        other: than the chosen model.
+    """
     rows = []
     for item, trial, recording, _ in job.trials:
-        found = trial_counts(job.store, item.name, trial.id, detection[item.name])
+        if other is None:
+            found = trial_counts(job.store, item.name, trial.id, detection[item.name])
+        else:
+            found = Derived.of(job.store, seed_step(other.seed), item.name).arrays(trial.id)
         label = job.labels.read(item, recording)
         rows.append(
             score_row(item, trial, label, found["counts"], found["end_ns"], detection[item.name])
@@ -139,6 +166,8 @@ def score_store(job: Job, train: SampleSet, test: SampleSet) -> None:
     detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
     kinematic = training_campaigns(job.campaigns)[0].name
     rows = _score_trials(job, detection)
+    of_seeds = {job.model.seed: rows}
+    of_seeds |= {model.seed: _score_trials(job, detection, model) for model in job.others}
     states = job.labels.states(job.campaigns)
     result = Evaluation(
         format=FORMAT,
@@ -154,7 +183,7 @@ def score_store(job: Job, train: SampleSet, test: SampleSet) -> None:
             detection[kinematic].margin,
         ),
         trials=tuple(rows),
-        experiments=summaries(rows),
+        experiments=summaries(rows, of_seeds, job.model.seed),
         label_error_ms=label_errors(job.store, job.campaigns),
         label_rules_ms=rules_compared(job.store, job.campaigns),
         reviewed=None if states is None else {str(name): n for name, n in states.items()},

@@ -16,6 +16,7 @@ from sliplab.analysis.detectors.latency import (
     summarise_lead,
     true_slip,
 )
+from sliplab.analysis.detectors.predictions import window_counts
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
@@ -26,10 +27,14 @@ from sliplab.analysis.networks.quantised import Quantised, chip_run, quantised_n
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import load_samples
-from sliplab.analysis.windows.samples import strided_windows
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import ExperimentScores, TrialLatency, TrialScore
+from sliplab.storage.schema.evaluation import (
+    ExperimentScores,
+    SeedTimes,
+    TrialLatency,
+    TrialScore,
+)
 from sliplab.storage.schema.export import ExperimentLatency, Latencies
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.sweeps import HoldoutScores
@@ -71,19 +76,44 @@ def score_row(
     )
 
 
-def summaries(rows: Sequence[TrialScore]) -> dict[str, ExperimentScores]:
-    """Latency and lead by experiment, of rows of `score_row`."""
+def summaries(
+    rows: Sequence[TrialScore],
+    of_seeds: Mapping[int, Sequence[TrialScore]] | None = None,
+    chosen: int | None = None,
+) -> dict[str, ExperimentScores]:
+    """Latency and lead by experiment, of rows of `score_row`.
+
+    Args:
+        of_seeds: the same trials by every trained network, that of the seed `chosen` among them.
+    """
+    seeds = of_seeds if of_seeds is not None and len(of_seeds) > 1 else {}
     result = {}
     for experiment in ("kinematic", "gravity", "disturbance"):
         ours = [row for row in rows if row.experiment == experiment]
-        scored = [row.latency for row in ours if row.latency is not None]
-        result[experiment] = ExperimentScores(
+        scored = _scored(rows, experiment)
+        found = ExperimentScores(
             trials=len(ours),
             without_onsets=len(ours) - len(scored),
             latency_ms=summarise_latency(scored),
             lead_ms=summarise_lead(scored),
         )
+        by_seed = tuple(
+            SeedTimes(
+                seed=seed,
+                chosen=seed == chosen,
+                latency_ms=summarise_latency(times),
+                lead_ms=summarise_lead(times),
+            )
+            for seed, theirs in sorted(seeds.items())
+            for times in [_scored(theirs, experiment)]
+        )
+        result[experiment] = found.model_copy(update={"by_seed": by_seed}) if by_seed else found
     return result
+
+
+def _scored(rows: Sequence[TrialScore], experiment: str) -> list[TrialLatency]:
+    """Return the latencies of an experiment's trials that have both onsets."""
+    return [row.latency for row in rows if row.experiment == experiment and row.latency is not None]
 
 
 def latencies(
@@ -186,24 +216,9 @@ def judge(
     for item in campaigns:
         settings = detection[item.name]
         for trial, recording in item.of_split("test"):
-            counts, end_ns = window_counts(recording, fitted, settings)
+            counts, end_ns = window_counts(recording, fitted, settings.stride_ms)
             of_trial = labels.read(item, recording)
             row = score_row(item, trial, of_trial, counts, end_ns, settings)
             rows.append((row, recording))
     samples = load_samples(labels, training_campaigns(campaigns), "test")
     return Judged(training.predict_counts(fitted, samples.windows), samples, rows)
-
-
-def window_counts(
-    recording: Recording, fitted: Fitted, settings: Detection
-) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return spikes of consecutive windows (n, 3), and where they end (n,), ns."""
-    windows = fitted.windows
-    if settings.stride_ms is None:
-        x, end_ns = dataset.trial_windows(recording, windows)
-    else:
-        length_ns = windows.length_ms * 1_000_000
-        span, stride_ns = dataset.recorded_span(recording), settings.stride_ms * 1_000_000
-        starts = strided_windows(*span, length_ns, stride_ns)
-        x, end_ns = dataset.cut_windows(recording, starts, windows), starts + length_ns
-    return training.predict_counts(fitted, x), end_ns

@@ -85,6 +85,7 @@ class LatencySection(Content):
     statistics: Table
     accounts: Table
     levels: Sequence[Table]
+    seeds: Table | None
 
     @property
     def lead_mean(self) -> str:
@@ -135,6 +136,7 @@ def latency_section(
         _figures(experiment, found, by, summary.simulated), _statistics(numbers, kinds),
         _accounts(experiment, numbers.accounted),
         [] if kinematic else [_by_level(found, factor) for factor in found.varied()],
+        _by_seed(numbers, kinds),
     )  # fmt: skip
 
 
@@ -252,6 +254,23 @@ def _statistics(numbers: Experiment, kinds: Sequence[str]) -> Table:
         ]
         rows.append([name, *cells])
     return Table(("", *STATISTICS.values()), rows)
+
+
+def _by_seed(numbers: Experiment, kinds: Sequence[str]) -> Table | None:
+    """Show medians of every trained network; None of one alone."""
+    if not numbers.by_seed:
+        return None
+    rows = []
+    for found in numbers.by_seed:
+        of = {**vars(found.latency_ms), "lead": found.lead_ms}
+        medians = [number(of[kind].median) for kind in kinds]
+        incipient = found.latency_ms.incipient
+        counts = (incipient.missed, incipient.late, incipient.false_early)
+        shown = f"{found.seed}, shown above" if found.chosen else str(found.seed)
+        rows.append([shown, *medians, *map(str, counts)])
+    names = ["lead" if kind == "lead" else f"{kind} latency" for kind in kinds]
+    columns = ("seed", *(f"median {name} (ms)" for name in names), "missed", "late", "false early")
+    return Table(columns, rows)
 
 
 def _accounts(experiment: str, accounts: Accounts) -> Table:

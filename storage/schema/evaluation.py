@@ -323,6 +323,15 @@ class LatencyByOnset(Part):
     gross: LatencyFigures
 
 
+class SeedTimes(Part):
+    """One trained network on the trials of one experiment, by the chosen one's rule."""
+
+    seed: Int
+    chosen: Bool
+    latency_ms: LatencyByOnset
+    lead_ms: LeadFigures
+
+
 class ExperimentScores(Part):
     """The trials of one experiment."""
 
@@ -331,6 +340,8 @@ class ExperimentScores(Part):
     """Trials whose label lacks an onset; they are not in the figures."""
     latency_ms: LatencyByOnset
     lead_ms: LeadFigures
+    by_seed: tuple[SeedTimes, ...] = ()
+    """Every trained network on the same trials; written only where there are several."""
 
 
 class Deviation(Part):
