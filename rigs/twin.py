@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from sliplab.protocols.plan import Plan
-from sliplab.protocols.program import Move
+from sliplab.protocols.program import ACTING, Move
 from sliplab.protocols.yaml_file import StrictModel
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
@@ -66,10 +66,15 @@ def warnings(twin: TwinRecord, plan: Plan) -> Iterator[str]:
     """
     depths, speeds = set(), set()
     for trial in plan:
+        at_mm = 0.0
         for step in plan.program(trial).steps:
-            if isinstance(step, Move) and step.phase in ("slide", "retract", "move", "twist"):
-                depths.add(step.to.depth_mm)
+            if not isinstance(step, Move):
+                continue
+            if step.phase in ACTING:
+                # a retraction begins in contact and ends clear of the plate
+                depths |= {max(at_mm, 0.0), max(step.to.depth_mm, 0.0)}
                 speeds.add(step.speed_mm_s)
+            at_mm = step.to.depth_mm
     for name, unit, found, fitted in (
         ("depth", "mm", depths, twin.depth_mm),
         ("speed", "mm/s", speeds, twin.speed_mm_s),

@@ -82,7 +82,8 @@ def check(
     if as_json:
         console.print_json(preflight.checks_json(found))
     else:
-        rows = [["ok" if item.passed else "FAILED", item.name, item.finding] for item in found]
+        said = ["FAILED" if not it.passed else "note" if it.caution else "ok" for it in found]
+        rows = [[word, it.name, it.finding] for word, it in zip(said, found, strict=True)]
         console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
     if not all(item.passed for item in found):
         raise typer.Exit(console.FAILED)

@@ -34,11 +34,16 @@ LISTEN_S = 3.0
 
 @dataclass(frozen=True)
 class Check:
-    """One check and its finding."""
+    """One check and its finding.
+
+    Attributes:
+        caution: the finding is worth a look, although nothing is wrong.
+    """
 
     name: str
     passed: bool
     finding: str
+    caution: bool = False
 
 
 def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[Check]:
@@ -55,11 +60,11 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     ]
     found.append(Check("outside camera", True, _outside_camera(run_request)))
     found += check_region(run_request)
-    found += [Check("hint", True, text) for text in run_request.plan.warnings()]
+    found += [Check("hint", True, text, True) for text in run_request.plan.warnings()]
     if (twin := run_request.rig.twin) is not None:
         cautions = list(warnings(twin, run_request.plan))
         within = f"within what it was fitted on: {twin.trials} trials of '{twin.campaign}'"
-        found += [Check("twin", True, text) for text in cautions or [within]]
+        found += [Check("twin", True, text, bool(cautions)) for text in cautions or [within]]
     try:
         free = check_disk([run_request])
         needed = size(missing_bytes(run_request))

@@ -42,6 +42,15 @@ def test_a_plan_that_goes_deeper_or_faster_says_by_how_much() -> None:
     ]
 
 
+def test_a_retraction_is_in_contact_from_the_press_on() -> None:
+    """It ends clear of the plate: its last depth once stood for all of it."""
+    twin = TwinRecord.model_validate(RECORD)
+    assert list(warnings(twin, load_plan(Path("gravity")))) == [
+        "depth 0 to 4 mm in contact; the twin was fitted on 2.4 to 3.4 mm",
+        "speed 0.3 to 0.7 mm/s in contact; the twin was fitted on 0.6 to 1.6 mm/s",
+    ]
+
+
 def test_what_the_scene_lacks_is_said_of_every_plan() -> None:
     twin = TwinRecord.model_validate(RECORD | {"misfits": ["events: light that flickers"]})
     assert list(warnings(twin, load_plan(Path("pilot")))) == [
