@@ -37,12 +37,10 @@ import pandas as pd
 from benchmarks.twin import BANK, CLEAN, pilot_slides, prior_of
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.trials import Judged, judge
-from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics.intervals import drawn
-from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.models import rules_of, training_settings, wanted_models
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.models import rules_of, wanted_models
 from sliplab.analysis.networks.training import Fitted
-from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration
@@ -121,6 +119,12 @@ def shipped(name: str, folder: Path, repetitions: int = 1, networks: int = 1) ->
     return path
 
 
+def protocols(folder: Path, networks: int) -> list[Path]:
+    """Write the protocols of a study that trains so many networks."""
+    folder.mkdir(exist_ok=True)
+    return [shipped(name, folder, count, networks) for name, count in REPETITIONS.items()]
+
+
 def medians_ms(times: FloatArray) -> FloatArray:
     """Return medians over the last axis of times known in steps of `STEP_MS`, NaN left out.
 
@@ -190,26 +194,6 @@ def studied(rig: Path, files: Sequence[Path], folder: Path) -> Study:
     train(store, campaigns)
     models = wanted_models(store, campaigns)
     return Study(store, campaigns, [model_file.load(it.path) for it in models])
-
-
-def trained_again(study: Study, folder: Path) -> list[Fitted]:
-    """Train as many networks from further seeds as the study has, or read them from `folder`."""
-    labels, settings = Labels(study.store), training_settings(study.campaigns)
-    train, validation = (
-        load_samples(labels, study.campaigns, split) for split in ("train", "validation")
-    )
-    found = []
-    for seed in settings.training.seeds:
-        seed += len(study.networks)
-        path = folder / f"seed{seed}.pt"
-        if not path.exists():
-            fitted = training.fit(
-                train.windows, train.y, validation.windows, validation.y, settings.network,
-                settings.windows, settings.training, seed,
-            )  # fmt: skip
-            model_file.save(path, fitted)
-        found.append(model_file.load(path))
-    return found
 
 
 @dataclass(frozen=True)
@@ -315,19 +299,23 @@ def beyond(spans: Mapping[str, Any]) -> dict[str, bool]:
 
 
 def world_row(
-    asked: argparse.Namespace, number: int, files: Sequence[Path], assumed: Study, usual: Outcome
-) -> dict[str, Any]:
+    asked: argparse.Namespace, number: int, files: Sequence[Path], hidden_files: Sequence[Path],
+    assumed: Study, usual: Outcome,
+) -> dict[str, Any]:  # fmt: skip
     """Do everything of one hidden world; return its figures.
 
     Args:
         files: the protocols.
+        hidden_files: those of the hidden world, which may ask for further networks.
         assumed, usual: the study on the rig as it was, and its outcome.
     """
     folder: Path = asked.folder / f"world{number}"
     folder.mkdir(exist_ok=True)
     hidden = hidden_rig(folder, asked.folder / "assumed.yaml", asked.seed, number)
     twin = studied(calibrated(asked, folder, hidden), files, folder / "twin")
-    own = studied(hidden, files, folder / "hidden")
+    own = studied(hidden, hidden_files, folder / "hidden")
+    further = own.networks[asked.networks :]
+    own = replace(own, networks=own.networks[: asked.networks])
     outcomes = {
         "hidden": own.outcome(own.networks),
         "twin": twin.outcome(twin.networks),
@@ -338,9 +326,9 @@ def world_row(
         "twin": own.outcome(twin.networks),
         "assumed": own.outcome(assumed.networks),
     }
-    if asked.again:
-        further = own.outcome(trained_again(own, folder))
-        outcomes["hidden, further networks"] = on_hidden["hidden, further networks"] = further
+    if further:
+        found = own.outcome(further)
+        outcomes["hidden, further networks"] = on_hidden["hidden, further networks"] = found
     first = outcomes.pop("hidden")
     rows: dict[str, Any] = {"hidden": {"figures": first.figures()}}
     for name, found in outcomes.items():
@@ -408,9 +396,8 @@ def main() -> None:
     (asked.folder / "scene-worlds").mkdir(parents=True, exist_ok=True)
     orchestration.configure_prefect(asked.folder)
     (asked.folder / "assumed.yaml").write_text(rig_yaml(ASSUMED))
-    files = [
-        shipped(name, asked.folder, count, asked.networks) for name, count in REPETITIONS.items()
-    ]
+    files = protocols(asked.folder, asked.networks)
+    hidden_files = protocols(asked.folder / "hidden", asked.networks * (2 if asked.again else 1))
     kept = asked.folder / "rows.json"
     rows = read_json(kept)["rows"] if kept.exists() else []
     assumed = studied(asked.folder / "assumed.yaml", files, asked.folder / "assumed")
@@ -419,7 +406,7 @@ def main() -> None:
         if number in [row["world"] for row in rows]:
             continue
         try:
-            rows.append(world_row(asked, number, files, assumed, usual))
+            rows.append(world_row(asked, number, files, hidden_files, assumed, usual))
         except RigError as error:
             print(f"world {number} cannot be collected: {error}")
             continue
