@@ -1,7 +1,7 @@
 """Studies on a calibrated twin, beside those on the hidden world that it was fitted to.
 
     python -m benchmarks.twin_studies FOLDER [--worlds 3] [--first 0] [--seed 1] [--bank 240]
-                                      [--networks 2] [--again]
+                                      [--networks 2] [--again] [--whole-grid]
 
 A hidden world is a clean one of `benchmarks.twin` with the same seed, and so are the worlds that a
 fit simulates. Its pilot of 36 slides calibrates a twin, beginning with the rig that all hidden
@@ -12,7 +12,8 @@ chance on each of them. Each study trains `--networks` networks from other seeds
 are their means: one network alone may find slip 0.2 s later than another of the same trials. The
 networks of each are tested on the hidden world's test trials. What the twin's scene alone changes
 is shown by its trials with the hidden world's networks; what figures differ by anyway, with
-`--again`, by as many further networks of the hidden world's study.
+`--again`, by as many further networks of the hidden world's study. `--whole-grid` is another study:
+the grid alone, as shipped, with 605 slides to train on and 132 tests.
 
 Labels are known in steps of 10 ms, the frames' period, and so are latencies. Their medians are
 those of values that lie anywhere within their steps (`statistics.median_grouped`).
@@ -104,25 +105,35 @@ STEP_MS = 10
 """Latencies and leads are known in steps of the frames' period."""
 
 
-def shipped(name: str, folder: Path, repetitions: int = 1, networks: int = 1) -> Path:
-    """Write a shipped protocol as it is used here; the paper's network is left out."""
+def shipped(
+    name: str, folder: Path, repetitions: int | None = None, networks: int = 1,
+    split: Mapping[str, float] | None = None,
+) -> Path:  # fmt: skip
+    """Write a shipped protocol as it is used here; the paper's network is left out.
+
+    Args:
+        repetitions, split: in place of the shipped ones.
+    """
     source = ROOT / f"protocols/{name}.yaml"
     data = parse_yaml(source.read_text(), source)
-    data["collection"]["repetitions"] = repetitions
+    if repetitions is not None:
+        data["collection"]["repetitions"] = repetitions
     data["collection"]["maintenance"]["rezero"]["touches"] = TOUCHES
     data["analysis"].pop("also", None)
     if name == "kinematic":
-        data["analysis"]["split"].update(SPLIT)
+        data["analysis"]["split"].update(split or {})
         data["analysis"]["training"]["seeds"] = list(range(networks))
     path = folder / f"{name}.yaml"
     path.write_text(rig_yaml(data))
     return path
 
 
-def protocols(folder: Path, networks: int) -> list[Path]:
+def protocols(folder: Path, networks: int, whole_grid: bool) -> list[Path]:
     """Write the protocols of a study that trains so many networks."""
     folder.mkdir(exist_ok=True)
-    return [shipped(name, folder, count, networks) for name, count in REPETITIONS.items()]
+    if whole_grid:
+        return [shipped("kinematic", folder, networks=networks)]
+    return [shipped(name, folder, count, networks, SPLIT) for name, count in REPETITIONS.items()]
 
 
 def medians_ms(times: FloatArray) -> FloatArray:
@@ -253,6 +264,8 @@ class Outcome:
         """Return a figure of `FIGURES`, the mean over networks; NaN where one has no time."""
         values = self.values[name]
         k, n = values.shape
+        if not n:
+            return math.nan
         return float(self.drawn(name, values.columns, np.arange(k)[None], np.arange(n)[None])[0])
 
     def figures(self) -> dict[str, float | None]:
@@ -264,10 +277,12 @@ class Outcome:
         """Return the 95 % interval of how far a figure lies from `own`'s: points, or a share.
 
         Trials of both are drawn again together, since they have the same chance, and so are the
-        networks of each; None where nothing is known.
+        networks of each; None where there are no times.
         """
         here, there = self.values[name], own.values[name]
         trials = there.columns.union(here.columns, sort=False)
+        if trials.empty:
+            return None
         picked = drawn(len(trials))
         a = self.drawn(name, trials, drawn(len(here), 1), picked)
         b = own.drawn(name, trials, drawn(len(there), 2), picked)
@@ -343,18 +358,21 @@ def world_row(
 
 def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield tables of all worlds in Markdown, and summaries."""
-    titles = " | ".join(figure.title for figure in FIGURES.values())
+    every_study = [study["figures"] for row in rows for study in row["studies"].values()]
+    known = [name for name in FIGURES if any(it[name] is not None for it in every_study)]
+    titles = " | ".join(FIGURES[name].title for name in known)
     yield f"| world | study on | {titles} | within |"
-    yield "| --- | --- |" + " --- |" * (len(FIGURES) + 1)
+    yield "| --- | --- |" + " --- |" * (len(known) + 1)
     near: dict[str, list[dict[str, bool]]] = {}
     far: dict[str, list[dict[str, bool]]] = {}
     for row in rows:
         own = row["studies"]["hidden"]["figures"]
         for name, study in row["studies"].items():
             found, said = study["figures"], ""
-            cells = ["-" if found[key] is None else f"{found[key]:.1f}" for key in FIGURES]
+            cells = ["-" if found[key] is None else f"{found[key]:.1f}" for key in known]
             if name != "hidden":
-                held = within(own, found)
+                near_by = within(own, found)
+                held = {key: near_by[key] for key in known}
                 near.setdefault(name, []).append(held)
                 far.setdefault(name, []).append(beyond(study["spans"]))
                 said = f"{sum(held.values())} of {len(held)}"
@@ -365,9 +383,9 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     ):
         yield ""
         yield f"| {title} | {titles} | {every} |"
-        yield "| --- |" + " --- |" * (len(FIGURES) + 1)
+        yield "| --- |" + " --- |" * (len(known) + 1)
         for name, worlds in counted.items():
-            counts = [sum(held[key] for held in worlds) for key in FIGURES]
+            counts = [sum(held[key] for held in worlds) for key in known]
             whole = all if every == "all" else lambda found: not any(found)
             counts.append(sum(whole(found.values()) for found in worlds))
             yield f"| {name} | {' | '.join(f'{count} of {len(worlds)}' for count in counts)} |"
@@ -391,13 +409,15 @@ def main() -> None:
     parser.add_argument("--bank", type=int, default=240, help="worlds that fits simulate")
     parser.add_argument("--networks", type=int, default=2, help="networks of each study")
     parser.add_argument("--again", action="store_true", help="and as many of the hidden world's")
+    parser.add_argument("--whole-grid", action="store_true", help="the shipped grid, and it alone")
     asked = parser.parse_args()
     asked.folder = asked.folder.resolve()
     (asked.folder / "scene-worlds").mkdir(parents=True, exist_ok=True)
     orchestration.configure_prefect(asked.folder)
     (asked.folder / "assumed.yaml").write_text(rig_yaml(ASSUMED))
-    files = protocols(asked.folder, asked.networks)
-    hidden_files = protocols(asked.folder / "hidden", asked.networks * (2 if asked.again else 1))
+    files = protocols(asked.folder, asked.networks, asked.whole_grid)
+    hidden_networks = asked.networks * (2 if asked.again else 1)
+    hidden_files = protocols(asked.folder / "hidden", hidden_networks, asked.whole_grid)
     kept = asked.folder / "rows.json"
     rows = read_json(kept)["rows"] if kept.exists() else []
     assumed = studied(asked.folder / "assumed.yaml", files, asked.folder / "assumed")

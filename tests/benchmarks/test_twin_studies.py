@@ -16,7 +16,6 @@ from benchmarks.twin import CLEAN, pilot_slides, prior_of
 from benchmarks.twin_studies import (
     ASSUMED,
     FIGURES,
-    REPETITIONS,
     SPLIT,
     FloatArray,
     Outcome,
@@ -24,7 +23,7 @@ from benchmarks.twin_studies import (
     hidden_rig,
     lines,
     medians_ms,
-    shipped,
+    protocols,
     within,
 )
 from sliplab.protocols import load_plan
@@ -112,6 +111,21 @@ def test_a_trial_that_only_one_study_has_leaves_the_others_in_pairs() -> None:
     assert 0.0 <= high - low < 0.5 * (high_apart - low_apart)
 
 
+def test_a_study_of_slides_alone_has_no_figures_of_others() -> None:
+    slides = outcome(np.full((2, 10), 45.0), np.full((2, 10), 120.0))
+    for name in ("gravity", "gravity_lead", "disturbance", "disturbance_lead"):
+        slides.values[name] = pd.DataFrame([{}, {}], dtype=np.float64)
+    assert slides.figures()["gravity"] is None
+    assert slides.against(slides, "gravity") is None
+    studies: dict[str, Any] = {"hidden": {"figures": slides.figures()}}
+    spans = {name: slides.against(slides, name) for name in FIGURES}
+    studies["twin"] = {"figures": slides.figures(), "spans": spans}
+    networks = {"hidden": {"accuracy": 90.0, "span": (0.0, 0.0)}}
+    table = list(lines([{"world": 3, "studies": studies, "networks": networks}]))
+    assert "| 3 | twin | 90.0 | 120.0 | 120.0 | 3 of 3 |" in table
+    assert "| twin | 1 of 1 | 1 of 1 | 1 of 1 | 1 of 1 |" in table
+
+
 def test_figures_are_means_over_networks_and_their_intervals_hold() -> None:
     rng = np.random.default_rng(7)
     held, same = [], []
@@ -146,9 +160,11 @@ def test_a_hidden_rig_file_is_the_world_that_was_drawn(tmp_path: Path) -> None:
     world = replace(prior_of(CLEAN, 2), rig=base).world(1, pilot_slides())
     assert rig.scene == world.rig.scene
     assert rig.scene.scene.friction.kinetic != base.scene.scene.friction.kinetic
-    plans = [load_plan(shipped(name, tmp_path, count, 3)) for name, count in REPETITIONS.items()]
+    plans = [load_plan(path) for path in protocols(tmp_path, 3, whole_grid=False)]
     assert [len(plan) for plan in plans] == [576, 108, 144]
     counts = Counter(trial.split for trial in plans[0])
     assert all(abs(counts[name] / 576 - share) < 0.02 for name, share in SPLIT.items())
     assert plans[0].protocol.analysis.also is None
     assert plans[0].protocol.analysis.training.seeds == (0, 1, 2)
+    (grid,) = (load_plan(path) for path in protocols(tmp_path, 2, whole_grid=True))
+    assert Counter(trial.split for trial in grid) == {"train": 605, "validation": 127, "test": 132}
