@@ -6,6 +6,7 @@ counts are points of probability. It has no synaptic operations, and no other de
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from sliplab.analysis.campaigns import Collected, kinematic_campaigns
 from sliplab.analysis.detectors.latency import true_slip
 from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing, settled
-from sliplab.analysis.evaluation.evaluation import FORMAT, NAME, STEP
+from sliplab.analysis.evaluation.evaluation import BY_SEED_VERSION, FORMAT, NAME, STEP
 from sliplab.analysis.evaluation.trials import score_row, summaries
 from sliplab.analysis.evaluation.windows import NAME as WINDOWS_NAME
 from sliplab.analysis.evaluation.windows import STEP as WINDOWS
@@ -48,9 +49,10 @@ from sliplab.storage.schema.evaluation import (
 )
 from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
 from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import StoreError
 
-F64 = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 
 VERSION = 1
@@ -164,14 +166,18 @@ def make_marker_job(
     states = labels.states(campaigns)
     of_review = [] if states is None else [states]
     keys = [each.key for each in models]
-    key = make_key("evaluate markers", VERSION, [keys, model.key, inputs, *of_review], used)
+    # evaluations of one seed, of before, are fresh all the same
+    of_seeds = [BY_SEED_VERSION] if len(models) > 1 else []
+    made_of = [keys, model.key, inputs, *of_review, *of_seeds]
+    key = make_key("evaluate markers", VERSION, made_of, used)
     return MarkerJob(labels, campaigns, models, model, detection, key)
 
 
 def evaluate_markers(job: MarkerJob) -> None:
     """Score windows, detections and labels of the test trials, and keep them as one result."""
     labels, campaigns = job.labels, job.campaigns
-    net = marker_net.load(job.model.path)
+    nets = {model.seed: marker_net.load(model.path) for model in job.models}
+    net = nets[job.model.seed]
     kinematic = kinematic_campaigns(campaigns)
     by = job.detection[kinematic[0].name].choose
     choosing = [] if by == "protocol" else _counted(job, net, by)
@@ -183,12 +189,13 @@ def evaluate_markers(job: MarkerJob) -> None:
         detection[item.name] = settled(rule, choice)
         if choice is None:
             detection[item.name] = rule.model_copy(update={"choose": "protocol"})
-    rows = [row for item in campaigns for row in _rows(labels, item, net, detection[item.name])]
+    of_seeds = _rows(job, nets, detection)
+    rows = of_seeds[job.model.seed]
     states = labels.states(campaigns)
     result = Evaluation(
         format=FORMAT, seed=job.model.seed,
         windows=_score_windows(job, net, detection[kinematic[0].name].margin),
-        trials=tuple(rows), experiments=summaries(rows),
+        trials=tuple(rows), experiments=summaries(rows, of_seeds, job.model.seed),
         label_error_ms=label_errors(labels.store, campaigns),
         label_rules_ms=rules_compared(labels.store, campaigns),
         reviewed=None if states is None else {str(name): n for name, n in states.items()},
@@ -201,11 +208,11 @@ def evaluate_markers(job: MarkerJob) -> None:
     Derived.of(labels.store, STEP).write(NAME, job.key, result)
 
 
-def _points(labels: Labels, item: Collected, recording: Any, net: MarkerNet) -> tuple[I64, I64]:
-    """Return points (n, 3) of every window of a trial, and the times of their newest frames."""
+def _frames(labels: Labels, item: Collected, recording: Recording) -> tuple[F32, I64]:
+    """Return every window of a trial, and the times of their newest frames."""
     frame_ns, moved = marker_displacements(labels, item, recording)
     x, newest = all_frames(moved)
-    return net.points(x), frame_ns[newest]
+    return x, frame_ns[newest]
 
 
 def _counted(job: MarkerJob, net: MarkerNet, split: str) -> list[Counted]:
@@ -215,17 +222,24 @@ def _counted(job: MarkerJob, net: MarkerNet, split: str) -> list[Counted]:
         for _, recording in item.of_split(split):
             slip = true_slip(job.labels.read(item, recording))
             if slip is not None:
-                found.append(Counted(*_points(job.labels, item, recording, net), slip))
+                x, end_ns = _frames(job.labels, item, recording)
+                found.append(Counted(net.points(x), end_ns, slip))
     return found
 
 
-def _rows(labels: Labels, item: Collected, net: MarkerNet, rule: Detection) -> list[TrialScore]:
-    return [
-        score_row(
-            item, trial, labels.read(item, recording), *_points(labels, item, recording, net), rule
-        )
-        for trial, recording in item.of_split("test")
-    ]
+def _rows(
+    job: MarkerJob, nets: Mapping[int, MarkerNet], rules: Mapping[str, Detection]
+) -> dict[int, list[TrialScore]]:
+    """Return a row for each test trial, by the network's seed; rules are those of campaigns."""
+    found: dict[int, list[TrialScore]] = {seed: [] for seed in nets}
+    for item in job.campaigns:
+        for trial, recording in item.of_split("test"):
+            x, end_ns = _frames(job.labels, item, recording)
+            label = job.labels.read(item, recording)
+            for seed, net in nets.items():
+                row = score_row(item, trial, label, net.points(x), end_ns, rules[item.name])
+                found[seed].append(row)
+    return found
 
 
 def _score_windows(job: MarkerJob, net: MarkerNet, margin: float) -> WindowScores:

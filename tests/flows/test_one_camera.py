@@ -41,6 +41,7 @@ def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
         "validation_levels": {"direction": ["120 deg"]},
         "test_levels": {"direction": ["240 deg"]},
     }
+    slides["analysis"].setdefault("training", {})["seeds"] = [0, 1] if camera == "frames" else [0]
     path = write(folder / "rig.yaml", {**rig, "name": f"one-{camera}", "cameras": [camera]})
     protocols = [
         write(folder / "tiny.yaml", slides),
@@ -128,6 +129,13 @@ def test_a_study_with_one_camera_runs_to_its_report(
         assert summary.kinematic.accuracy.strict > 0.8
         assert summary.kinematic.work is None
         assert len(summary.trials) == 3
+        assert summary.gravity is not None
+        for experiment in (summary.kinematic, summary.gravity):
+            (chosen,) = (it for it in experiment.by_seed if it.chosen)
+            assert sorted(it.seed for it in experiment.by_seed) == [0, 1]
+            assert chosen.latency_ms == experiment.latency_ms
+            assert chosen.lead_ms == experiment.lead_ms
+            assert f"{chosen.seed}, shown above" in page
         assert "The classifier on marker displacements" in page
         assert "no clock lies between them" in page
         assert (store.folder / "report" / "figures" / "confusion.svg").exists()
