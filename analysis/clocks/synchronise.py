@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from sliplab.analysis.clocks.clocks import (
     fit_clock,
     fit_numbered,
 )
-from sliplab.analysis.clocks.counters import split_at_restarts
 from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTiming, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
@@ -348,6 +348,16 @@ def _try(found: TrialSync, name: str, fit: Callable[[], DeviceSync]) -> None:
         found.devices[name] = fit()
     except (ClockRefused, BoundsContradictError) as error:
         found.refused[name] = str(error)
+
+
+def split_at_restarts(times_ns: I64, back_ns: int) -> list[slice]:
+    """Stretches of times that came in order, cut where the clock falls back by `back_ns`.
+
+    After a restart nothing that was known of a clock holds: each stretch is fitted by itself.
+    """
+    cuts = np.flatnonzero(np.diff(times_ns) < -back_ns) + 1
+    edges = [0, *cuts.tolist(), int(times_ns.size)]
+    return [slice(a, b) for a, b in pairwise(edges) if b > a]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The white papilla tops in the outside video: one track each, to a few thousandths of a pixel.
 
-The paper thresholds every frame and finds its blobs (`analysis.labels.reference_tracks`); at 100
+The paper thresholds every frame and finds its blobs (the tests' `reference_tracks`); at 100
 frames a second over hours of video that is the slowest step of the labelling, and the blobs have no
 names. Here the first frame is searched so, the blobs get their names from the skin's layout, and
 from then on each marker is followed inside a small box around where it must be. Each place comes

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock
+from sliplab.analysis.clocks.synchronise import split_at_restarts
 from tests.analysis.clocks.test_clocks import TICK_NS, code
 
 Ints = NDArray[np.int64]
@@ -100,3 +101,9 @@ def test_pulses_lost_doubled_and_late_here_and_there_are_no_jump() -> None:
     assert fit is not None
     assert np.abs(fit.map.to_reference(true) - reference).max() <= 3 * fit.uncertainty_ns
     assert (fit.pulses_late, fit.pulses_missed) == (15, 40)
+
+
+def test_times_that_fall_back_begin_a_new_stretch() -> None:
+    times = np.array([5, 6, 7, 6, 8, 1, 2, 3], np.int64) * 1000
+    assert split_at_restarts(times, 3_000) == [slice(0, 5), slice(5, 8)]
+    assert split_at_restarts(times[:0], 10) == []
