@@ -27,8 +27,8 @@ from sliplab.analysis.report.figures.intervals import differences
 from sliplab.analysis.report.page import Figure, Number, Table, render_page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
-from sliplab.storage.schema.evaluation import Share
-from sliplab.storage.schema.summary import Kinematic, Summary, TrialOutcome
+from sliplab.storage.schema.evaluation import SeedTimes, Share
+from sliplab.storage.schema.summary import Experiment, Kinematic, Summary, TrialOutcome
 from sliplab.storage.streams import Json
 
 Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]
@@ -250,8 +250,10 @@ def _strict(ours: Kinematic, theirs: Kinematic) -> Change | None:
     return Change.of("accuracy, strict, the chosen network", "share", a, b, span, "same trials")
 
 
-def _around(name: str, a: float, b: float, noise: float, basis: Basis) -> Change:
-    return Change.of(name, "share", a, b, (a - b - noise, a - b + noise), basis)
+def _around(
+    name: str, a: float, b: float, noise: float, basis: Basis, unit: str = "share"
+) -> Change:
+    return Change.of(name, unit, a, b, (a - b - noise, a - b + noise), basis)
 
 
 def _of_trials(here: Summary, there: Summary, experiment: str) -> list[Change]:
@@ -264,7 +266,8 @@ def _of_trials(here: Summary, there: Summary, experiment: str) -> list[Change]:
         return []
     same = ours.keys() == theirs.keys() and _same_collection(here, there, experiment)
     rows = [list(ours.values()), [theirs[key] for key in ours] if same else list(theirs.values())]
-    found = []
+    found = _of_seeds(getattr(here, experiment), getattr(there, experiment), experiment)
+    who = ", the chosen network" if found else ""
     for key, title in _TIMES.items():
 
         def time(row: TrialOutcome, key: str = key) -> float:
@@ -272,7 +275,7 @@ def _of_trials(here: Summary, there: Summary, experiment: str) -> list[Change]:
             return math.nan if value is None else float(value)
 
         for statistic, word in _STATISTICS.items():
-            name = f"{experiment}: {title}, {word}"
+            name = f"{experiment}: {title}, {word}{who}"
             found += _measured(name, "ms", rows, time, statistic, same)
     for entry, outcome, title in _SHARES:
 
@@ -280,8 +283,34 @@ def _of_trials(here: Summary, there: Summary, experiment: str) -> list[Change]:
             return float(getattr(row, entry) == outcome)
 
         if any(hit(row) for of in rows for row in of):
-            found += _measured(f"{experiment}: {title}", "share", rows, hit, "mean", same)
+            found += _measured(f"{experiment}: {title}{who}", "share", rows, hit, "mean", same)
     return found
+
+
+def _of_seeds(ours: Experiment, theirs: Experiment, experiment: str) -> list[Change]:
+    """Compare median times of all trained networks; nothing where both reports have one."""
+    found = []
+    for key, title in _TIMES.items():
+        a, b = ([_median(it, key) for it in part.by_seed or (part,)] for part in (ours, theirs))
+        mine, other = ([value for value in each if value is not None] for each in (a, b))
+        if len(mine) < len(a) or len(other) < len(b):
+            continue
+        noise = between_seeds(mine, other)
+        if noise is not None:
+            name = f"{experiment}: {title}, median, mean of seeds"
+            means = float(np.mean(mine)), float(np.mean(other))
+            found.append(_around(name, *means, noise, "seeds", "ms"))
+    return found
+
+
+def _median(times: SeedTimes | Experiment, key: str) -> float | None:
+    """Return the median of a time of `_TIMES`."""
+    of = {
+        "latency_incipient_ms": times.latency_ms.incipient,
+        "latency_gross_ms": times.latency_ms.gross,
+        "lead_ms": times.lead_ms,
+    }
+    return of[key].median
 
 
 def _same_collection(here: Summary, there: Summary, experiment: str) -> bool:

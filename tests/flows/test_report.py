@@ -17,7 +17,7 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.report import campaign, programs
-from sliplab.analysis.report.against import compare
+from sliplab.analysis.report.against import Change, compare
 from sliplab.analysis.report.outcomes import (
     MOST_FAILURES,
     OUTCOMES,
@@ -37,7 +37,7 @@ from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import read_summary, report
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import json_text, read_json, write_json
-from sliplab.storage.schema.evaluation import Seeds, SeedScores, TrialScore
+from sliplab.storage.schema.evaluation import Seeds, SeedScores, SeedTimes, TrialScore
 from sliplab.storage.schema.summary import ReferenceTrial, Summary, TrialOutcome
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
@@ -469,6 +469,48 @@ def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store
     theirs = theirs.model_copy(update={"protocols": protocols})
     found = {row.name: row for row in compare(ours, theirs).figures}
     assert found["gravity: incipient latency, mean"].basis == "trials"
+
+
+def several_times(summary: Summary, *medians_ms: float) -> Summary:
+    """The same with trained seeds of these median times of gravity trials."""
+    gravity = summary.gravity
+    each = []
+    for seed, median in enumerate(medians_ms):
+        times = gravity.latency_ms.incipient.model_copy(update={"median": median})
+        latency = gravity.latency_ms.model_copy(update={"incipient": times, "gross": times})
+        lead = gravity.lead_ms.model_copy(update={"median": median})
+        each.append(SeedTimes(seed=seed, chosen=not seed, latency_ms=latency, lead_ms=lead))
+    own = gravity.model_copy(
+        update={
+            "latency_ms": each[0].latency_ms, "lead_ms": each[0].lead_ms,
+            "by_seed": tuple(each) if len(each) > 1 else (),
+        }
+    )  # fmt: skip
+    return summary.model_copy(update={"gravity": own})
+
+
+def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store) -> None:
+    summary = read_summary(store)
+
+    def figures(ours: tuple[float, ...], theirs: tuple[float, ...]) -> dict[str, Change]:
+        both = several_times(summary, *ours), several_times(summary, *theirs)
+        return {row.name: row for row in compare(*both).figures}
+
+    of_seeds = "gravity: incipient latency, median, mean of seeds"
+    far = figures((300.0, 302.0, 301.0), (250.0, 252.0))[of_seeds]
+    assert (far.unit, far.basis, far.here, far.there) == ("ms", "seeds", 301.0, 251.0)
+    assert far.beyond is True
+    # two networks of one study
+    near = figures((494.0, 249.0), (240.0,))
+    assert near[of_seeds].difference == pytest.approx(371.5 - 240.0)
+    assert near[of_seeds].beyond is False
+    assert near["gravity: lead, median, mean of seeds"].beyond is False
+    assert not any(name.startswith("kinematic") and "seeds" in name for name in near)
+    alone = figures((300.0,), (250.0,))
+    assert of_seeds not in alone
+    assert len(near) == len(alone) + 3
+    for name in (name for name in alone if name.startswith("gravity: ") and "small" not in name):
+        assert f"{name}, the chosen network" in near
 
 
 def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
