@@ -15,8 +15,10 @@ is shown by its trials with the hidden world's networks; what figures differ by 
 `--again`, by as many further networks of the hidden world's study. `--whole-grid` is another study:
 the grid alone, as shipped, with 605 slides to train on and 132 tests.
 
-Labels are known in steps of 10 ms, the frames' period, and so are latencies. Their medians are
-those of values that lie anywhere within their steps (`statistics.median_grouped`).
+Times count from two onsets: the label's, which is the first frame in which a marker has moved by 2
+pixels, as in the paper; and the change point, when it began to. The decisions are the same. The
+paper's onsets are known in steps of 10 ms, the frames' period, and so are latencies; their medians
+are those of values that lie anywhere within their steps (`statistics.median_grouped`).
 
 FOLDER keeps all stores: a run that was stopped goes on, and more worlds may be added.
 """
@@ -27,6 +29,7 @@ import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from shutil import copytree
 from typing import Any
@@ -36,12 +39,18 @@ import numpy.typing as npt
 import pandas as pd
 
 from benchmarks.twin import BANK, CLEAN, pilot_slides, prior_of
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.detectors.latency import score_trial
+from sliplab.analysis.detectors.onset_references import Decided, decisions_of, references_of
+from sliplab.analysis.detectors.onset_references import Name as Onset
 from sliplab.analysis.evaluation.trials import Judged, judge
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics.intervals import drawn
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import rules_of, wanted_models
-from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.networks.training import Fitted, predict_counts
+from sliplab.analysis.windows.dataset import SampleSet
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration
@@ -53,6 +62,7 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import read_json, write_json
+from sliplab.storage.schema.evaluation import TrialLatency
 from sliplab.storage.trials.store import Store
 
 FloatArray = npt.NDArray[np.float64]
@@ -73,6 +83,9 @@ SPLIT = {"train": 0.35, "validation": 0.075, "test": 0.575}
 the accuracy on the 43 test slides of one repetition is uncertain by 1.7 points (95 %)."""
 TOUCHES = 8
 """Touches whose mean is depth zero."""
+
+
+ONSETS: dict[Onset, str] = {"paper": "2 pixels (paper)", "change_point": "change point"}
 
 
 @dataclass(frozen=True)
@@ -101,8 +114,8 @@ FIGURES = {
 }
 POINTS, SHARE = 1.0, 0.1
 """Largest difference of accuracy and, relative, of each median."""
-STEP_MS = 10
-"""Latencies and leads are known in steps of the frames' period."""
+STEP_MS: dict[Onset, float] = {"paper": 10.0, "change_point": 0.0}
+"""That latencies and leads are known in: the frames' period, or none."""
 
 
 def shipped(
@@ -136,20 +149,26 @@ def protocols(folder: Path, networks: int, whole_grid: bool) -> list[Path]:
     return [shipped(name, folder, count, networks, SPLIT) for name, count in REPETITIONS.items()]
 
 
-def medians_ms(times: FloatArray) -> FloatArray:
-    """Return medians over the last axis of times known in steps of `STEP_MS`, NaN left out.
+def medians_ms(times: FloatArray, step_ms: float = 0.0) -> FloatArray:
+    """Return medians over the last axis of times, NaN left out; NaN of none.
 
-    Within its step, the median lies where as many of the step's values would lie below it as half
-    of all values leave, if they were spread evenly (`statistics.median_grouped`); NaN of none.
+    Args:
+        step_ms: that times are known in. Within its step, the median lies where as many of the
+            step's values would lie below it as half of all values leave, if they were spread
+            evenly (`statistics.median_grouped`).
     """
-    there = np.sort(np.round(times), axis=-1)  # NaN last
+    there = np.sort(np.round(times) if step_ms else times, axis=-1)  # NaN last
     n = np.isfinite(there).sum(axis=-1, keepdims=True)
-    middle = np.take_along_axis(there, np.minimum(n // 2, there.shape[-1] - 1), axis=-1)
+    last = there.shape[-1] - 1
+    middle = np.take_along_axis(there, np.minimum(n // 2, last), axis=-1)
+    if not step_ms:
+        before = np.take_along_axis(there, np.maximum(n - 1, 0) // 2, axis=-1)
+        return (0.5 * (before + middle))[..., 0]
     below, equal = (
         compare(there, middle).sum(axis=-1, keepdims=True) for compare in (np.less, np.equal)
     )
     with np.errstate(invalid="ignore"):  # 0 of 0 values
-        return (middle + STEP_MS * ((n / 2 - below) / equal - 0.5))[..., 0]
+        return (middle + step_ms * ((n / 2 - below) / equal - 0.5))[..., 0]
 
 
 def hidden_rig(folder: Path, assumed: Path, seed: int, number: int) -> Path:
@@ -193,10 +212,30 @@ class Study:
     campaigns: list[Collected]
     networks: list[Fitted]
 
-    def outcome(self, networks: Sequence[Fitted]) -> Outcome:
+    def outcomes(self, networks: Sequence[Fitted]) -> Outcomes:
         """Test networks on the study's test trials, by its protocols' rules."""
         rules = rules_of(self.campaigns, networks[0].network.outputs_per_class)
-        return Outcome.of([judge(it, rules, self.store, self.campaigns) for it in networks])
+        labels = Labels(self.store)
+        references = {
+            (item.name, trial.id): references_of(recording, labels.read(item, recording))
+            for item in self.campaigns
+            for trial, recording in item.of_split("test")
+        }
+        judged = [judge(it, rules, self.store, self.campaigns) for it in networks]
+        decisions = [decisions_of(it.rows, references, rules) for it in judged]
+        return {onset: Outcome.of(judged, decisions, onset) for onset in ONSETS}
+
+    @cached_property
+    def samples(self) -> SampleSet:
+        """The windows of the study's test slides."""
+        return load_samples(Labels(self.store), training_campaigns(self.campaigns), "test")
+
+    def windows(self, networks: Sequence[Fitted]) -> Outcome:
+        """Test networks on the windows of the study's test slides; there are no times."""
+        judged = [
+            Judged(predict_counts(it, self.samples.windows), self.samples, []) for it in networks
+        ]
+        return Outcome.of(judged, [()] * len(judged), "paper")
 
 
 def studied(rig: Path, files: Sequence[Path], folder: Path) -> Study:
@@ -215,14 +254,23 @@ class Outcome:
         values: by figure, a row for each network and a column for each trial: ms, NaN where no time
             is counted; of the accuracy, windows that it classified correctly.
         windows: of each slide.
+        step_ms: that times are known in.
     """
 
     values: dict[str, pd.DataFrame]
     windows: pd.Series[float]
+    step_ms: float
 
     @classmethod
-    def of(cls, judged: Sequence[Judged]) -> Outcome:
-        """Collect what networks made of the trials of one store."""
+    def of(
+        cls, judged: Sequence[Judged], decisions: Sequence[Sequence[Decided]], onset: Onset
+    ) -> Outcome:
+        """Collect what networks made of the trials of one store.
+
+        Args:
+            decisions: of each network on each trial.
+            onset: that times count from.
+        """
         slides = [it.hits_by_trial(False) for it in judged]
         windows = {trial: count for trial, (_, count) in slides[0].items()}
         values = {}
@@ -232,14 +280,14 @@ class Outcome:
             else:
                 rows = [
                     {
-                        row.trial: getattr(row.latency, figure.time, None)
-                        for row in it.rows
+                        row.trial: getattr(latency_of(decided, onset), figure.time, None)
+                        for row, decided in zip(it.rows, decided_by, strict=True)
                         if row.experiment == figure.experiment
                     }
-                    for it in judged
+                    for it, decided_by in zip(judged, decisions, strict=True)
                 ]
             values[name] = pd.DataFrame(rows, dtype=np.float64)
-        return cls(values, pd.Series(windows, dtype=np.float64))
+        return cls(values, pd.Series(windows, dtype=np.float64), STEP_MS[onset])
 
     def drawn(
         self, name: str, trials: pd.Index[str], networks: IntArray, picked: IntArray
@@ -258,7 +306,7 @@ class Outcome:
         if name == "accuracy":
             windows = self.windows.reindex(trials, fill_value=0.0).to_numpy()[picked].sum(axis=1)
             return np.asarray(100.0 * np.nansum(values, axis=2).mean(axis=1) / windows)
-        return np.asarray(medians_ms(values).mean(axis=1))
+        return np.asarray(medians_ms(values, self.step_ms).mean(axis=1))
 
     def figure(self, name: str) -> float:
         """Return a figure of `FIGURES`, the mean over networks; NaN where one has no time."""
@@ -294,6 +342,25 @@ class Outcome:
         return float(low), float(high)
 
 
+Outcomes = Mapping[Onset, Outcome]
+
+
+def latency_of(decided: Decided, onset: Onset) -> TrialLatency | None:
+    """Return the times of decisions on a trial; None where it lacks an onset."""
+    reference = decided.references.get(onset)
+    if reference is None:
+        return None
+    return score_trial(decided.found, reference.slip, decided.false_early_ns)
+
+
+def compared(found: Outcome, own: Outcome) -> dict[str, Any]:
+    """Return the figures of a study, and how far each is from the hidden world's own."""
+    return {
+        "figures": found.figures(),
+        "spans": {name: found.against(own, name) for name in FIGURES},
+    }
+
+
 def within(own: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, bool]:
     """Return which figures of a study are as near to a hidden world's own as they should be."""
     found = {}
@@ -315,7 +382,7 @@ def beyond(spans: Mapping[str, Any]) -> dict[str, bool]:
 
 def world_row(
     asked: argparse.Namespace, number: int, files: Sequence[Path], hidden_files: Sequence[Path],
-    assumed: Study, usual: Outcome,
+    assumed: Study, usual: Outcomes,
 ) -> dict[str, Any]:  # fmt: skip
     """Do everything of one hidden world; return its figures.
 
@@ -331,65 +398,36 @@ def world_row(
     own = studied(hidden, hidden_files, folder / "hidden")
     further = own.networks[asked.networks :]
     own = replace(own, networks=own.networks[: asked.networks])
+    first = own.outcomes(own.networks)
     outcomes = {
-        "hidden": own.outcome(own.networks),
-        "twin": twin.outcome(twin.networks),
+        "twin": twin.outcomes(twin.networks),
         "assumed": usual,
-        "twin, hidden world's networks": twin.outcome(own.networks),
+        "twin, hidden world's networks": twin.outcomes(own.networks),
     }
-    on_hidden = {
-        "twin": own.outcome(twin.networks),
-        "assumed": own.outcome(assumed.networks),
-    }
+    on_hidden = {"twin": own.windows(twin.networks), "assumed": own.windows(assumed.networks)}
     if further:
-        found = own.outcome(further)
-        outcomes["hidden, further networks"] = on_hidden["hidden, further networks"] = found
-    first = outcomes.pop("hidden")
-    rows: dict[str, Any] = {"hidden": {"figures": first.figures()}}
-    for name, found in outcomes.items():
-        spans = {key: found.against(first, key) for key in FIGURES}
-        rows[name] = {"figures": found.figures(), "spans": spans}
-    networks = {
-        name: {"accuracy": it.figure("accuracy"), "span": it.against(first, "accuracy")}
-        for name, it in {"hidden": first, **on_hidden}.items()
+        found = own.outcomes(further)
+        outcomes["hidden, further networks"] = found
+        on_hidden["hidden, further networks"] = found["paper"]
+    studies = {
+        onset: {"hidden": {"figures": first[onset].figures()}}
+        | {name: compared(found[onset], first[onset]) for name, found in outcomes.items()}
+        for onset in ONSETS
     }
-    return {"world": number, "studies": rows, "networks": networks}
+    networks = {
+        name: {"accuracy": it.figure("accuracy"), "span": it.against(first["paper"], "accuracy")}
+        for name, it in {"hidden": first["paper"], **on_hidden}.items()
+    }
+    return {"world": number, "studies": studies, "networks": networks}
 
 
 def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield tables of all worlds in Markdown, and summaries."""
-    every_study = [study["figures"] for row in rows for study in row["studies"].values()]
-    known = [name for name in FIGURES if any(it[name] is not None for it in every_study)]
-    titles = " | ".join(FIGURES[name].title for name in known)
-    yield f"| world | study on | {titles} | within |"
-    yield "| --- | --- |" + " --- |" * (len(known) + 1)
-    near: dict[str, list[dict[str, bool]]] = {}
-    far: dict[str, list[dict[str, bool]]] = {}
-    for row in rows:
-        own = row["studies"]["hidden"]["figures"]
-        for name, study in row["studies"].items():
-            found, said = study["figures"], ""
-            cells = ["-" if found[key] is None else f"{found[key]:.1f}" for key in known]
-            if name != "hidden":
-                near_by = within(own, found)
-                held = {key: near_by[key] for key in known}
-                near.setdefault(name, []).append(held)
-                far.setdefault(name, []).append(beyond(study["spans"]))
-                said = f"{sum(held.values())} of {len(held)}"
-            yield f"| {row['world']} | {name} | {' | '.join(cells)} | {said} |"
-    for title, counted, every in (
-        (f"within {POINTS:g} point, or {100 * SHARE:g} %", near, "all"),
-        ("whole 95 % interval beyond that", far, "none"),
-    ):
+    for onset, title in ONSETS.items():
+        yield f"Times from the onset by: {title}"
         yield ""
-        yield f"| {title} | {titles} | {every} |"
-        yield "| --- |" + " --- |" * (len(known) + 1)
-        for name, worlds in counted.items():
-            counts = [sum(held[key] for held in worlds) for key in known]
-            whole = all if every == "all" else lambda found: not any(found)
-            counts.append(sum(whole(found.values()) for found in worlds))
-            yield f"| {name} | {' | '.join(f'{count} of {len(worlds)}' for count in counts)} |"
-    yield ""
+        yield from tables({row["world"]: row["studies"][onset] for row in rows})
+        yield ""
     yield "| world | networks trained on | accuracy on the hidden world (%) | behind by | 95 % |"
     yield "| --- | --- | --- | --- | --- |"
     for row in rows:
@@ -398,6 +436,41 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             behind, (low, high) = first - network["accuracy"], network["span"]
             text = f"{network['accuracy']:.1f} | {behind:.1f} | {-high:.1f} to {-low:.1f}"
             yield f"| {row['world']} | {name} | {text} |"
+
+
+def tables(worlds: Mapping[int, Mapping[str, Any]]) -> Iterator[str]:
+    """Yield tables of the studies on each world, with times from one onset."""
+    every_study = [study["figures"] for studies in worlds.values() for study in studies.values()]
+    known = [name for name in FIGURES if any(it[name] is not None for it in every_study)]
+    titles = " | ".join(FIGURES[name].title for name in known)
+    yield f"| world | study on | {titles} | within |"
+    yield "| --- | --- |" + " --- |" * (len(known) + 1)
+    near: dict[str, list[dict[str, bool]]] = {}
+    far: dict[str, list[dict[str, bool]]] = {}
+    for number, studies in worlds.items():
+        own = studies["hidden"]["figures"]
+        for name, study in studies.items():
+            found, said = study["figures"], ""
+            cells = ["-" if found[key] is None else f"{found[key]:.1f}" for key in known]
+            if name != "hidden":
+                near_by = within(own, found)
+                held = {key: near_by[key] for key in known}
+                near.setdefault(name, []).append(held)
+                far.setdefault(name, []).append(beyond(study["spans"]))
+                said = f"{sum(held.values())} of {len(held)}"
+            yield f"| {number} | {name} | {' | '.join(cells)} | {said} |"
+    for title, counted, every in (
+        (f"within {POINTS:g} point, or {100 * SHARE:g} %", near, "all"),
+        ("whole 95 % interval beyond that", far, "none"),
+    ):
+        yield ""
+        yield f"| {title} | {titles} | {every} |"
+        yield "| --- |" + " --- |" * (len(known) + 1)
+        for name, each in counted.items():
+            counts = [sum(held[key] for held in each) for key in known]
+            whole = all if every == "all" else lambda found: not any(found)
+            counts.append(sum(whole(found.values()) for found in each))
+            yield f"| {name} | {' | '.join(f'{count} of {len(each)}' for count in counts)} |"
 
 
 def main() -> None:
@@ -421,7 +494,7 @@ def main() -> None:
     kept = asked.folder / "rows.json"
     rows = read_json(kept)["rows"] if kept.exists() else []
     assumed = studied(asked.folder / "assumed.yaml", files, asked.folder / "assumed")
-    usual = assumed.outcome(assumed.networks)
+    usual = assumed.outcomes(assumed.networks)
     for number in range(asked.first, asked.first + asked.worlds):
         if number in [row["world"] for row in rows]:
             continue

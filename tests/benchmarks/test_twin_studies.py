@@ -6,6 +6,7 @@ import statistics
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from benchmarks.twin import CLEAN, pilot_slides, prior_of
 from benchmarks.twin_studies import (
     ASSUMED,
     FIGURES,
+    ONSETS,
     SPLIT,
     FloatArray,
     Outcome,
@@ -26,6 +28,10 @@ from benchmarks.twin_studies import (
     protocols,
     within,
 )
+from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.onset_references import Decided, OnsetReference
+from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.evaluation.trials import Judged
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
@@ -46,7 +52,13 @@ def test_a_figure_that_is_missing_or_too_far_away_does_not_hold() -> None:
     studies["assumed"] = {"figures": other, "spans": dict.fromkeys(FIGURES) | spans}
     networks = {"hidden": {"accuracy": 90.0, "span": (0.0, 0.0)}}
     networks["twin"] = {"accuracy": 89.0, "span": (-1.5, -0.25)}
-    table = list(lines([{"world": 3, "studies": studies, "networks": networks}]))
+    by_change_point = {**studies, "twin": {"figures": own, "spans": dict.fromkeys(FIGURES)}}
+    both = {"paper": studies, "change_point": by_change_point}
+    table = list(lines([{"world": 3, "studies": both, "networks": networks}]))
+    titles = [k for k, line in enumerate(table) if line.startswith("Times from the onset by")]
+    assert [table[k].split(": ")[1] for k in titles] == ["2 pixels (paper)", "change point"]
+    assert any(line.startswith("| twin | 1 of 1") for line in table[titles[1] :])
+    table = table[: titles[1]] + table[-3:]
     near, far = (line for line in table if line.startswith("| twin |"))
     held = near.split(" | ")[1:]
     assert held == ["1 of 1", "1 of 1", "0 of 1", *["1 of 1"] * 4, "0 of 1 |"]
@@ -58,17 +70,20 @@ def test_a_figure_that_is_missing_or_too_far_away_does_not_hold() -> None:
 def test_a_median_lies_within_its_step() -> None:
     # 5 of 12 lie below the step from 14 to 24, which holds 4
     times = np.array([9.0] * 5 + [19.0] * 4 + [29.0] * 3 + [np.nan])
-    assert medians_ms(times) == pytest.approx(14.0 + 10.0 * (6 - 5) / 4)
+    assert medians_ms(times, 10.0) == pytest.approx(14.0 + 10.0 * (6 - 5) / 4)
     # clocks that differ by less than a millisecond leave times in their steps
-    assert medians_ms(times + 3e-4) == medians_ms(times)
+    assert medians_ms(times + 3e-4, 10.0) == medians_ms(times, 10.0)
     rng = np.random.default_rng(3)
     rows = 10.0 * rng.integers(-3, 9, (50, 2, 17)) - 1.0
     rows[rng.random(rows.shape) < 0.6] = np.nan
     rows[7, 1] = np.nan
-    for row, ours in zip(rows.reshape(100, 17), medians_ms(rows).ravel(), strict=True):
+    for row, ours in zip(rows.reshape(100, 17), medians_ms(rows, 10.0).ravel(), strict=True):
         there = row[np.isfinite(row)].tolist()
         known = statistics.median_grouped(there, 10) if there else np.nan
         assert ours == pytest.approx(known, nan_ok=True)
+    plain = pd.DataFrame(rows.reshape(100, 17)).median(axis=1).to_numpy()
+    assert medians_ms(rows).ravel() == pytest.approx(plain, nan_ok=True)
+    assert np.isnan(plain[15])
 
 
 def test_medians_of_rounded_times_come_near_those_of_exact_ones() -> None:
@@ -78,7 +93,7 @@ def test_medians_of_rounded_times_come_near_those_of_exact_ones() -> None:
         times = middle + rng.normal(0.0, 20.0, 501)
         rounded = 10.0 * np.floor(times / 10.0) + 5.0
         errors.append(
-            (medians_ms(rounded) - np.median(times), np.median(rounded) - np.median(times))
+            (medians_ms(rounded, 10.0) - np.median(times), np.median(rounded) - np.median(times))
         )
     ours, single = np.sqrt(np.mean(np.square(errors), axis=0))
     assert ours < 1.0 < 2.0 < single
@@ -91,7 +106,7 @@ def outcome(hits: FloatArray, times: FloatArray) -> Outcome:
         name: pd.DataFrame(hits if figure.time is None else times, columns=trials)
         for name, figure in FIGURES.items()
     }
-    return Outcome(values, pd.Series(50.0, trials))
+    return Outcome(values, pd.Series(50.0, trials), 10.0)
 
 
 def test_a_trial_that_only_one_study_has_leaves_the_others_in_pairs() -> None:
@@ -101,7 +116,7 @@ def test_a_trial_that_only_one_study_has_leaves_the_others_in_pairs() -> None:
     fewer = outcome(np.full((2, 40), 45.0), times)
     for name, values in fewer.values.items():
         fewer.values[name] = values.drop(columns=["trial3", "trial17"])
-    fewer = Outcome(fewer.values, fewer.windows.drop(["trial3", "trial17"]))
+    fewer = Outcome(fewer.values, fewer.windows.drop(["trial3", "trial17"]), 10.0)
     assert fewer.figure("accuracy") == pytest.approx(90.0)
     assert fewer.against(own, "accuracy") == pytest.approx((0.0, 0.0))
     apart = outcome(np.full((2, 40), 45.0), times[:, ::-1])
@@ -121,9 +136,39 @@ def test_a_study_of_slides_alone_has_no_figures_of_others() -> None:
     spans = {name: slides.against(slides, name) for name in FIGURES}
     studies["twin"] = {"figures": slides.figures(), "spans": spans}
     networks = {"hidden": {"accuracy": 90.0, "span": (0.0, 0.0)}}
-    table = list(lines([{"world": 3, "studies": studies, "networks": networks}]))
+    both = dict.fromkeys(ONSETS, studies)
+    table = list(lines([{"world": 3, "studies": both, "networks": networks}]))
     assert "| 3 | twin | 90.0 | 120.0 | 120.0 | 3 of 3 |" in table
     assert "| twin | 1 of 1 | 1 of 1 | 1 of 1 | 1 of 1 |" in table
+
+
+def test_times_count_from_the_onset_that_is_asked_for() -> None:
+    ms = 1_000_000
+    paper = OnsetReference(TrueSlip(500 * ms, 900 * ms, 2000 * ms))
+    point = OnsetReference(TrueSlip(380 * ms, 815 * ms, 2000 * ms))
+    found = Found(600 * ms, 920 * ms)
+    decided = [
+        Decided(found, {"paper": paper, "change_point": point}, 30 * ms),
+        Decided(found, {"paper": paper}, 30 * ms),
+    ]
+    rows: Any = [(SimpleNamespace(trial=name, experiment="kinematic"), None) for name in "ab"]
+    samples: Any = SimpleNamespace(
+        y=np.array([0, 1, 2, 2]),
+        trial=np.array([0, 0, 0, 1]),
+        trials=[("tiny", "a"), ("tiny", "b")],
+    )
+    judged = [Judged(np.array([[9, 0, 0], [0, 9, 0], [0, 9, 0], [0, 0, 9]]), samples, rows)]
+    by_paper, by_point = (Outcome.of(judged, [decided], onset) for onset in ONSETS)
+    assert by_paper.values["kinematic"].to_dict("list") == {"a": [100.0], "b": [100.0]}
+    assert by_paper.values["gross"].to_dict("list") == {"a": [20.0], "b": [20.0]}
+    assert by_point.values["kinematic"]["a"].tolist() == [220.0]
+    assert by_point.values["gross"]["a"].tolist() == [105.0]
+    assert by_point.values["gross"]["b"].isna().all()
+    assert by_paper.figure("accuracy") == by_point.figure("accuracy") == pytest.approx(75.0)
+    assert by_paper.figures()["gravity"] is None
+    of_windows = Outcome.of([Judged(judged[0].counts, samples, [])], [()], "paper")
+    assert of_windows.figure("accuracy") == pytest.approx(75.0)
+    assert of_windows.figures()["kinematic"] is None
 
 
 def test_figures_are_means_over_networks_and_their_intervals_hold() -> None:
