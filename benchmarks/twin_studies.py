@@ -40,7 +40,6 @@ import pandas as pd
 
 from benchmarks.twin import BANK, CLEAN, pilot_slides, prior_of
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.detectors.latency import score_trial
 from sliplab.analysis.detectors.onset_references import Decided, decisions_of, references_of
 from sliplab.analysis.detectors.onset_references import Name as Onset
 from sliplab.analysis.evaluation.trials import Judged, judge
@@ -62,7 +61,6 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.schema.evaluation import TrialLatency
 from sliplab.storage.trials.store import Store
 
 FloatArray = npt.NDArray[np.float64]
@@ -280,7 +278,7 @@ class Outcome:
             else:
                 rows = [
                     {
-                        row.trial: getattr(latency_of(decided, onset), figure.time, None)
+                        row.trial: getattr(decided.latency(onset), figure.time, None)
                         for row, decided in zip(it.rows, decided_by, strict=True)
                         if row.experiment == figure.experiment
                     }
@@ -343,14 +341,6 @@ class Outcome:
 
 
 Outcomes = Mapping[Onset, Outcome]
-
-
-def latency_of(decided: Decided, onset: Onset) -> TrialLatency | None:
-    """Return the times of decisions on a trial; None where it lacks an onset."""
-    reference = decided.references.get(onset)
-    if reference is None:
-        return None
-    return score_trial(decided.found, reference.slip, decided.false_early_ns)
 
 
 def compared(found: Outcome, own: Outcome) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from sliplab.analysis.detectors.smoothing_rule import Found
 from sliplab.analysis.labels.label_errors import true_onset_ns
 from sliplab.analysis.metrics.intervals import exact_interval, interval
 from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import OnsetFigures, Rate, TrialScore
+from sliplab.storage.schema.evaluation import OnsetFigures, Rate, TrialLatency, TrialScore
 from sliplab.storage.schema.label import KINDS, RuleOnsets, TrialLabel
 from sliplab.storage.trials.recording import Recording
 
@@ -59,6 +59,13 @@ class Decided:
     found: Found
     references: References
     false_early_ns: int
+
+    def latency(self, name: Name) -> TrialLatency | None:
+        """Judge the decisions by a reference; None where it lacks an onset."""
+        reference = self.references.get(name)
+        if reference is None:
+            return None
+        return score_trial(self.found, reference.slip, self.false_early_ns)
 
 
 def references_of(recording: Recording, label: TrialLabel) -> References:
@@ -129,7 +136,7 @@ def judge_by_reference(decisions: Sequence[Decided]) -> dict[str, OnsetFigures]:
 
 def _figures(decisions: Sequence[Decided], name: Name) -> OnsetFigures:
     there = [(each, each.references[name]) for each in decisions if name in each.references]
-    scored = [score_trial(each.found, ours.slip, each.false_early_ns) for each, ours in there]
+    scored = [times for each in decisions if (times := each.latency(name)) is not None]
     early = sum(trial.false_early_incipient for trial in scored)
     low, high = exact_interval(early, len(scored))
     by_paper = [
