@@ -36,7 +36,13 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import Claim, Stopping
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.protocols.yaml_file import KeyedError, parse_yaml, validate
+from sliplab.protocols.yaml_file import (
+    KeyedError,
+    input_error,
+    parse_leniently,
+    raise_all,
+    validate,
+)
 from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.schema.claims import TrialFigures
 from sliplab.storage.schema.power import Learning, PowerRecord
@@ -138,12 +144,14 @@ def read_claim(text: str, plan: Plan) -> Claim:
     Raises:
         InputError: it is wrong.
     """
-    claim = validate(Claim, parse_yaml(text, "--claim"), "--claim")
+    claim = validate(Claim, parse_leniently(text, "--claim"), "--claim")
     try:
-        Stopping(claims=(claim,)).check_factors(plan.protocol.collection.all_factors)
+        factors = plan.protocol.collection.all_factors
+        raise_all([lambda: Stopping(claims=(claim,)).factor_faults(factors)])
     except KeyedError as error:
-        key = error.key.removeprefix("collection.stopping.claims[0].")
-        raise InputError("--claim", key, error.value, str(error)) from None
+        below = "collection.stopping.claims[0]."
+        faults = [each.with_key(each.key.removeprefix(below)) for each in error.faults]
+        raise input_error("--claim", KeyedError.joined(faults)) from None
     return claim
 
 
@@ -261,7 +269,7 @@ def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
     try:
         axes, notes = shared_axes(plan, conditions)
     except KeyedError as error:
-        raise InputError(plan.file, error.key, error.value, str(error)) from None
+        raise input_error(plan.file, error) from None
     work = [asked.judge.work(recording, item.name) for item, _, recording in asked.pilot]
     stale = stale_trials(asked.store, figures.STEP, work)
     run_trials(asked.store, figures.STEP, "figures", stale, figures.kept_figures)

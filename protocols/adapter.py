@@ -23,7 +23,7 @@ from sliplab.protocols.adapter_parts import (
     TrialFiles,
 )
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel, load
+from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel, load, rule
 
 CLASSES = "classes"
 """The experiment whose recordings show one of several classes each, instead of a slip."""
@@ -48,7 +48,7 @@ class AdapterSplit(StrictModel):
     validation: Share = 0.15
     test: Share = 0.15
 
-    @model_validator(mode="after")
+    @rule
     def _sums(self) -> AdapterSplit:
         if abs(self.train + self.validation + self.test - 1.0) > 1e-9:
             raise KeyedError(
@@ -102,7 +102,7 @@ class Adapter(StrictModel):
             return data
         return {**data, "analysis": {**analysis, "labelling": {"rule": "given", **labelling}}}
 
-    @model_validator(mode="after")
+    @rule
     def _classes_of_a_kind(self) -> Adapter:
         if self.classes and self.experiment != CLASSES:
             raise KeyedError("classes", list(self.classes), "is for experiment: classes")
@@ -110,7 +110,7 @@ class Adapter(StrictModel):
             raise KeyedError("classes", list(self.classes), "names a class twice")
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _labels_of_a_kind(self) -> Adapter:
         if self.labels.whole is not None and self.experiment != CLASSES:
             raise KeyedError("labels.class", self.labels.whole, "is for experiment: classes")
@@ -122,7 +122,7 @@ class Adapter(StrictModel):
             raise KeyedError("motion", None, "is for experiments of slip")
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _clocks_there(self) -> Adapter:
         for key, part in (
             ("labels.onsets", self.labels.onsets),

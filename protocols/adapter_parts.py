@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from sliplab.protocols.file_pattern import parse_pattern, template_fields
 from sliplab.protocols.units import all_symbols, find_unit
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 BUILT_IN = ("stem", "folder", "path", "id")
 """Fields of every trial: name of its file without the ending, name of the file's folder, path below
@@ -64,7 +64,7 @@ class TrialFiles(StrictModel):
         """The patterns of `files`."""
         return (self.files,) if isinstance(self.files, str) else self.files
 
-    @model_validator(mode="after")
+    @rule
     def _some(self) -> TrialFiles:
         if not self.patterns and self.table is None:
             raise KeyedError(".files", None, "is missing; give it, or 'table'")
@@ -94,7 +94,7 @@ class Factor(StrictModel):
     levels: dict[str, str] = Field(default_factory=dict)
     """Levels by value of the field, such as ``{"0": left}``; others stay as they are."""
 
-    @model_validator(mode="after")
+    @rule
     def _known_unit(self) -> Factor:
         if self.unit is not None and find_unit(self.unit) is None:
             known = ", ".join(all_symbols())
@@ -159,7 +159,7 @@ class EventFiles(StrictModel):
     """Columns and rows of the sensor; of N taxels ``[N, 1]``. Needed where the file does not say
     it: csv and numpy."""
 
-    @model_validator(mode="after")
+    @rule
     def _of_one_format(self) -> EventFiles:
         tables, counts = self.format in {"csv", "numpy"}, self.format == "counts"
         for keys, right, of in (
@@ -224,7 +224,7 @@ class FrameFiles(StrictModel):
     """Frames a second from time 0 on, where there are no times."""
     clock: StreamClock | None = None
 
-    @model_validator(mode="after")
+    @rule
     def _timed(self) -> FrameFiles:
         if (self.times is None) == (self.rate_hz is None):
             raise KeyedError(".rate_hz", self.rate_hz, "give either times or rate_hz")
@@ -308,7 +308,7 @@ class AdaptedStreams(StrictModel):
     scalars: dict[StreamName, ScalarFiles] = Field(default_factory=dict)
     """Further sensors by name, such as ``temperature``."""
 
-    @model_validator(mode="after")
+    @rule
     def _some(self) -> AdaptedStreams:
         if self.events is None and self.frames is None:
             raise KeyedError(".events", None, "is missing; a trial needs events or frames")
@@ -341,7 +341,7 @@ class _LabelTable(StrictModel):
     uncertainty_ms: Milliseconds | None = None
     """Bound of the times' error; unknown by default."""
 
-    @model_validator(mode="after")
+    @rule
     def _matched(self) -> _LabelTable:
         if self.file is not None and "{" not in self.file and not self.match:
             raise KeyedError(
@@ -383,7 +383,7 @@ class Labels(StrictModel):
     onsets: GivenOnsets | None = None
     spans: GivenSpans | None = None
 
-    @model_validator(mode="after")
+    @rule
     def _one(self) -> Labels:
         ways = {"class": self.whole, "onsets": self.onsets, "spans": self.spans}
         given = [key for key, value in ways.items() if value is not None]
@@ -408,7 +408,7 @@ class Markers(StrictModel):
     px_per_mm: Annotated[float, Field(gt=0, le=1e6)]
     """Scale of the frames."""
 
-    @model_validator(mode="after")
+    @rule
     def _one_of_them(self) -> Markers:
         if self.centre >= len(self.places_mm):
             raise KeyedError(

@@ -6,17 +6,17 @@ alike. Which figures there are, their units and statistics are in `FIGURES`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PlainSerializer, WithJsonSchema, field_validator, model_validator
+from pydantic import Field, PlainSerializer, WithJsonSchema, field_validator
 
 from sliplab.protocols.factors import MAX_TRIALS, ContextLevel, Factor, unknown_factor
 from sliplab.protocols.hashing import hash_data
 from sliplab.protocols.quantity import canonical, parse
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 FigureName = Literal[
     "accuracy", "latency_incipient", "latency_gross", "lead", "slip_duration", "first_slip"
@@ -93,7 +93,7 @@ class Claim(StrictModel):
         lambda raw, info: _quantity(info, raw)
     )
 
-    @model_validator(mode="after")
+    @rule
     def _whole(self) -> Claim:
         said = [
             name for name in ("within", "at_least", "at_most") if getattr(self, name) is not None
@@ -181,7 +181,7 @@ class Stopping(StrictModel):
     """File of the network that judges the trials, from the protocol's folder; it was trained on
     other ones. Needed where a claim is about a network's output."""
 
-    @model_validator(mode="after")
+    @rule
     def _ordered(self) -> Stopping:
         if self.most is not None and self.most < self.least:
             raise KeyedError(
@@ -194,28 +194,25 @@ class Stopping(StrictModel):
         """Whether a claim is about the output of a network."""
         return any(FIGURES[claim.figure].network for claim in self.claims)
 
-    def check_factors(self, factors: Mapping[str, Factor]) -> None:
-        """Check that compared levels are in the plan.
-
-        Raises:
-            KeyedError: a factor or a level is unknown.
-        """
+    def factor_faults(self, factors: Mapping[str, Factor]) -> Iterator[KeyedError]:
+        """Return a fault for each compared factor or level that the plan does not have."""
         for number, claim in enumerate(self.claims):
             if claim.between is None:
                 continue
             key = f"collection.stopping.claims[{number}].between"
             name, levels = claim.between.factor, claim.between.levels
             if name not in factors:
-                raise KeyedError(f"{key}.factor", name, unknown_factor(name, factors))
+                yield KeyedError(f"{key}.factor", name, unknown_factor(name, factors))
+                continue
             there = (*factors[name].levels(), *factors[name].optional)
             for place, level in enumerate(levels):
                 if level not in there:
                     texts = ", ".join(factors[name].text(item) for item in there)
-                    raise KeyedError(
+                    yield KeyedError(
                         f"{key}.levels[{place}]", level, f"is not a level of {name}: {texts}"
                     )
             if levels[0] == levels[1]:
-                raise KeyedError(f"{key}.levels", levels[0], "must be two different levels")
+                yield KeyedError(f"{key}.levels", levels[0], "must be two different levels")
 
 
 def section_hash(stopping: Stopping) -> str:

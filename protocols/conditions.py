@@ -5,7 +5,7 @@ from __future__ import annotations
 from decimal import Decimal
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from sliplab.protocols.factors import MAX_TRIALS, ContextLevel
 from sliplab.protocols.quantity import (
@@ -21,7 +21,7 @@ from sliplab.protocols.quantity import (
     PositiveSpeed,
 )
 from sliplab.protocols.timing import SyncGates
-from sliplab.protocols.yaml_file import StrictModel
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 
 class Region(StrictModel):
@@ -54,7 +54,7 @@ class Axis(StrictModel):
     low: Millimetres
     high: Millimetres
 
-    @model_validator(mode="after")
+    @rule
     def _ordered(self) -> Axis:
         if not self.low < self.high:
             raise ValueError("'low' must be below 'high'")

@@ -7,7 +7,7 @@ stores, so that collected trials stay usable (docs/decisions/0069).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from sliplab.protocols.phases import PlateMotion
 from sliplab.protocols.quantity import canonical, check_size
 from sliplab.protocols.settings import Split
 from sliplab.protocols.split import check_split
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.yaml_file import KeyedError, raise_all
 
 FULL_TURN = 360
 
@@ -27,42 +27,47 @@ def check_consistency(protocol: Protocol) -> None:
     """Hold a protocol that a person gives against the rules over several keys.
 
     Raises:
-        KeyedError: the first rule that is broken.
+        KeyedError: the rules that are broken.
     """
-    _check_strata(protocol.analysis.split, protocol.collection.all_factors)
-    _check_held_out(check_split(protocol.analysis.split, protocol.collection.all_factors))
-    _check_directions(protocol.collection)
-    _check_plate(protocol.collection)
-    _check_references(protocol.collection)
+    collection, split = protocol.collection, protocol.analysis.split
+    raise_all(
+        (
+            lambda: _check_strata(split, collection.all_factors),
+            lambda: _check_held_out(check_split(split, collection.all_factors)),
+            lambda: _check_directions(collection),
+            lambda: _check_plate(collection),
+            lambda: _check_references(collection),
+        )
+    )
 
 
-def _check_strata(split: Split, factors: Mapping[str, Factor]) -> None:
+def _check_strata(split: Split, factors: Mapping[str, Factor]) -> Iterator[KeyedError]:
     if "strata" not in split.model_fields_set:  # the default is of the kinematic grid
         return
     for index, name in enumerate(split.strata):
         key = f"analysis.split.strata[{index}]"
         if name not in factors:
-            raise KeyedError(key, name, unknown_factor(name, factors))
-        if name in split.strata[:index]:
-            raise KeyedError(key, name, "appears twice")
+            yield KeyedError(key, name, unknown_factor(name, factors))
+        elif name in split.strata[:index]:
+            yield KeyedError(key, name, "appears twice")
 
 
-def _check_held_out(split: Split) -> None:
+def _check_held_out(split: Split) -> Iterator[KeyedError]:
     if split.method != "leave_conditions_out":
         return
     for part in ("validation_levels", "test_levels"):
         for name, levels in getattr(split, part).items():
             key = f"analysis.split.{part}.{name}"
             if not levels:
-                raise KeyedError(key, "[]", "must name at least one level")
+                yield KeyedError(key, "[]", "must name at least one level")
             for index, level in enumerate(levels):
                 if level in levels[:index]:
-                    raise KeyedError(f"{key}[{index}]", level, "is listed twice as held out")
+                    yield KeyedError(f"{key}[{index}]", level, "is listed twice as held out")
                 if part == "validation_levels" and level in split.test_levels.get(name, ()):
-                    raise KeyedError(key, level, "is already held out for testing")
+                    yield KeyedError(key, level, "is already held out for testing")
 
 
-def _check_directions(collection: Collection) -> None:
+def _check_directions(collection: Collection) -> Iterator[KeyedError]:
     """Two directions that differ by full turns are one condition under two names."""
     directions = {ref.factor for key, ref in collection.bindings() if key.endswith(".direction")}
     for name, factor in collection.factors.items():
@@ -73,7 +78,7 @@ def _check_directions(collection: Collection) -> None:
             assert not isinstance(level, str)  # a factor with a unit has no words
             known = seen.setdefault((level % FULL_TURN + FULL_TURN) % FULL_TURN, level)
             if known is not level:
-                raise KeyedError(
+                yield KeyedError(
                     f"collection.factors.{name}.{factor.place(level)}",
                     level,
                     f"{canonical(level)} deg is the same direction as {canonical(known)} deg",

@@ -18,9 +18,9 @@ from pydantic import (
 )
 
 from sliplab.protocols.quantity import canonical, check_size, number_meant, to_decimal
-from sliplab.protocols.shown import foreign_character
+from sliplab.protocols.shown import did_you_mean, foreign_character
 from sliplab.protocols.units import Unit, all_symbols, canonical_of, faults, find_unit
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 MAX_TRIALS = 1_000_000
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
@@ -48,7 +48,7 @@ class Range(StrictModel):
     stop: Number = Field(alias="to")
     step: Number
 
-    @model_validator(mode="after")
+    @rule
     def _whole(self) -> Range:
         if self.step <= 0:
             raise ValueError(f"step = {canonical(self.step)} must be more than 0")
@@ -198,7 +198,7 @@ class Factor(StrictModel):
             made["range"] = {key: converted(end, found) for key, end in data["range"].items()}
         return made
 
-    @model_validator(mode="after")
+    @rule
     def _levels(self) -> Factor:
         if (self.values is None) == (self.range is None):
             raise ValueError("must have exactly one of 'values' and 'range'")
@@ -260,4 +260,6 @@ def unknown_factor(name: str, factors: Iterable[str]) -> str:
     """The message for a `name` that is none of the defined `factors`."""
     foreign = foreign_character(name)
     hint = f" (holds {foreign})" if foreign else ""
-    return f"unknown factor {name}{hint}; defined factors: {', '.join(factors)}"
+    names = list(factors)
+    close = did_you_mean(name.removeprefix("$"), names)
+    return f"unknown factor {name}{hint}; defined factors: {', '.join(names)}{close}"

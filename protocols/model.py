@@ -8,7 +8,7 @@ Quantities are decimals in the canonical unit of their kind
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -33,8 +33,9 @@ from sliplab.protocols.nuisances import Nuisances
 from sliplab.protocols.phases import Phase
 from sliplab.protocols.quantity import FactorRef
 from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.shown import nearest
 from sliplab.protocols.templates import expand, templates
-from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel
+from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel, rule
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
@@ -165,11 +166,14 @@ class Collection(StrictModel):
         """The key of a factor or of context: ``collection.context.skin``."""
         return f"collection.{'context' if name in self.context else 'factors'}.{name}"
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Collection:
+    @rule
+    def _names_are_distinct(self) -> Iterator[KeyedError]:
         for name in self.context:
             if name in self.factors:
-                raise KeyedError(f"collection.context.{name}", name, "is a factor already")
+                yield KeyedError(f"collection.context.{name}", name, "is a factor already")
+
+    @rule
+    def _few_trials(self) -> None:
         count = self.repetitions
         for name, factor in self.all_factors.items():
             count *= len(factor.levels())
@@ -179,10 +183,6 @@ class Collection(StrictModel):
                     f"{count:,} trials",
                     f"the factorial has more than {MAX_TRIALS:,} trials",
                 )
-        self._check_stopping()
-        self._check_references()
-        self._check_motion()
-        return self
 
     def bindings(self) -> list[tuple[str, FactorRef]]:
         """Each ``$name`` of motion, plate and nuisances, with the key at which it occurs."""
@@ -197,22 +197,24 @@ class Collection(StrictModel):
         """How the next trials are chosen; None where the plan says their order."""
         return (self.choice or Choice()) if self.order == "adaptive" else None
 
-    def _check_stopping(self) -> None:
+    @rule
+    def _stopping_fits(self) -> Iterator[KeyedError]:
         if self.order == "adaptive" and self.stopping is None:
-            raise KeyedError(
+            yield KeyedError(
                 "collection.stopping",
                 None,
                 "is needed by order: adaptive: its claims say what the trials are chosen for",
             )
         if self.choice is not None and self.order != "adaptive":
-            raise KeyedError("collection.choice", None, "is only used by order: adaptive")
+            yield KeyedError("collection.choice", None, "is only used by order: adaptive")
         if self.stopping is not None:
-            self.stopping.check_factors(self.all_factors)
+            yield from self.stopping.factor_faults(self.all_factors)
 
-    def _check_references(self) -> None:
+    @rule
+    def _references_fit(self) -> Iterator[KeyedError]:
         if self.references is None:
             if self.gates.reference is not None:
-                raise KeyedError(
+                yield KeyedError(
                     "collection.gates.reference",
                     None,
                     "needs reference trials, and the protocol defines none: add references",
@@ -221,7 +223,7 @@ class Collection(StrictModel):
         gate = self.gates.reference
         slides = any(step.phase == "slide" for step in self.motion)
         if gate is not None and gate.friction is not None and not slides:
-            raise KeyedError(
+            yield KeyedError(
                 "collection.gates.reference.friction",
                 f"{gate.friction} %",
                 "needs a motion that slides: leave it out",
@@ -230,26 +232,28 @@ class Collection(StrictModel):
         for name, factor in self.all_factors.items():
             key = f"collection.references.condition.{name}"
             if name not in given:
-                raise KeyedError(
+                yield KeyedError(
                     key, None, "is missing: a reference trial must give a level for every factor"
                 )
+                continue
             if isinstance(given[name], str) == (factor.unit is not None):
-                raise KeyedError(key, given[name], f"must be a level in '{factor.unit or 'words'}'")
+                yield KeyedError(key, given[name], f"must be a level in '{factor.unit or 'words'}'")
             if factor.changeover == "person":
-                raise KeyedError(
+                yield KeyedError(
                     key,
                     given[name],
                     "a reference trial cannot require a changeover; remove references",
                 )
         for name in given:
             if name not in self.all_factors:
-                raise KeyedError(
+                yield KeyedError(
                     f"collection.references.condition.{name}",
                     given[name],
                     unknown_factor(name, self.all_factors),
                 )
 
-    def _check_motion(self) -> None:
+    @rule
+    def _phases_are_in_order(self) -> None:
         names = [phase.phase for phase in self.motion]
 
         def fail(expected: str, value: object = None) -> None:
@@ -276,26 +280,37 @@ class Collection(StrictModel):
             fail("must slide or retract between press and release")
         if any(names.index("approach") > i for i, name in enumerate(names) if name == "hold"):
             fail("cannot have a hold before the approach")
-        for name in ("twist", "twist_speed"):
-            if "twist" in names and getattr(self.limits, name) is None:
-                key = f"collection.limits.{name}"
-                raise KeyedError(key, None, "is needed: the motion has a twist")
         if "twist" in names and self.plate is not None:
             fail("cannot twist on a sliding plate")
         if ("plate" in names) != (self.plate is not None):
             fail("a phase 'plate' and the section 'plate' require each other")
+
+    @rule
+    def _twist_is_limited(self) -> Iterator[KeyedError]:
+        if not any(phase.phase == "twist" for phase in self.motion):
+            return
+        for name in ("twist", "twist_speed"):
+            if getattr(self.limits, name) is None:
+                key = f"collection.limits.{name}"
+                yield KeyedError(key, None, "is needed: the motion has a twist")
+
+    @rule
+    def _bindings_are_known(self) -> Iterator[KeyedError]:
         references = self.bindings()
         used = {str(ref) for _, ref in references}
+        used |= {f"${nearest(ref.factor, self.factors)}" for _, ref in references}  # misspelt
         for key, ref in references:
             if ref.factor in self.context:
                 text = "is context, which moves nothing; put it below collection.factors"
-                raise KeyedError(key, ref, text)
-            if ref.factor not in self.factors:
-                raise KeyedError(key, ref, unknown_factor(str(ref), self.factors))
+                yield KeyedError(key, ref, text)
+            elif ref.factor not in self.factors:
+                yield KeyedError(key, ref, unknown_factor(str(ref), self.factors))
         for key, each in references:
+            if each.factor not in self.factors:
+                continue
             unit = self.factors[each.factor].unit
             if unit is not None and unit != each.unit:
-                raise KeyedError(
+                yield KeyedError(
                     f"collection.factors.{each.factor}.unit",
                     unit,
                     f"must be {each.unit or 'left out, with words as levels'} where {each} stands "
@@ -303,7 +318,7 @@ class Collection(StrictModel):
                 )
         for name in self.factors:
             if f"${name}" not in used:
-                raise KeyedError(
+                yield KeyedError(
                     f"collection.factors.{name}",
                     name,
                     f"is not used by any phase; write ${name} as the value of a phase's key, or "

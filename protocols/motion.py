@@ -39,7 +39,7 @@ from sliplab.protocols.phases import (
 )
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step, Twist
 from sliplab.protocols.quantity import FactorRef, canonical, check_least
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.yaml_file import KeyedError, raise_all
 
 Condition = Mapping[str, Level]
 _ByArm = ArmMotion | Rotation | Regrasp
@@ -208,7 +208,7 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
         enabled: the levels taken, by factor.
 
     Raises:
-        KeyedError: the first limit broken, with the key of the level that breaks it.
+        KeyedError: the limits broken, each with the key of the level that breaks it.
     """
     factors = protocol.collection.factors
     written = {
@@ -217,7 +217,7 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
         ]
         for name, factor in factors.items()
     }
-    _check_written(protocol.collection, written)
+    raise_all([lambda: _limit_faults(protocol.collection, written)])
 
 
 def check_reference_limits(collection: Collection) -> None:
@@ -226,10 +226,12 @@ def check_reference_limits(collection: Collection) -> None:
         condition = collection.references.condition
         key = "collection.references.condition"
         written = {name: [(level, f"{key}.{name}")] for name, level in condition.items()}
-        _check_written(collection, written)
+        raise_all([lambda: _limit_faults(collection, written)])
 
 
-def _check_written(collection: Collection, written: Mapping[str, list[tuple[Level, str]]]) -> None:
+def _limit_faults(
+    collection: Collection, written: Mapping[str, list[tuple[Level, str]]]
+) -> Iterator[KeyedError]:
     """Hold levels, each with the key it is written under, against the limits."""
     limits = collection.limits
 
@@ -240,60 +242,73 @@ def _check_written(collection: Collection, written: Mapping[str, list[tuple[Leve
             return
         yield from written[field.factor]
 
-    def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> None:
+    def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> Iterator[KeyedError]:
         for value, where in levels(field, key):
             if value > limit:
-                raise KeyedError(
+                yield KeyedError(
                     where,
                     f"{canonical(value)} {unit}",
                     f"exceeds collection.limits.{name} = {canonical(limit)} {unit}",
                 )
 
-    _check_levels(collection, written)
+    yield from _check_levels(collection, written)
     if collection.nuisances is not None:
-        _check_nuisances(collection.nuisances, levels, limits)
+        yield from _check_nuisances(collection.nuisances, levels, limits)
     for index, phase in enumerate(collection.motion):
         base = f"collection.motion[{index}]"
         if isinstance(phase, TwistPhase):
-            _check_twist(phase, base, levels, limits)
+            yield from _check_twist(phase, base, levels, limits)
         elif not isinstance(phase, (Hold, PlateMotion)):
-            at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+            yield from at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
-            at_most(phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
+            yield from at_most(
+                phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm"
+            )
         if isinstance(phase, Press) and phase.depth is not None:
-            at_most(phase.depth, f"{base}.depth", limits.depth, "depth", "mm")
+            yield from at_most(phase.depth, f"{base}.depth", limits.depth, "depth", "mm")
         if isinstance(phase, Slide):
-            at_most(phase.distance, f"{base}.distance", Decimal(10_000), "workspace", "mm")
-            _check_slide(phase, base, levels, limits)
+            yield from at_most(
+                phase.distance, f"{base}.distance", Decimal(10_000), "workspace", "mm"
+            )
+            yield from _check_slide(phase, base, levels, limits)
         if isinstance(phase, Travel) and phase.to is not None:
-            _check_place(phase.to, f"{base}.to", levels, limits)
+            yield from _check_place(phase.to, f"{base}.to", levels, limits)
         if isinstance(phase, Retract):
-            at_most(phase.distance, f"{base}.distance", Decimal(10_000), "clearance", "mm")
-            _check_retract(phase, base, levels, limits)
+            yield from at_most(
+                phase.distance, f"{base}.distance", Decimal(10_000), "clearance", "mm"
+            )
+            yield from _check_retract(phase, base, levels, limits)
     if collection.maintenance.warm_up is not None:
         warm_up, base = collection.maintenance.warm_up, "collection.maintenance.warm_up"
-        at_most(warm_up.depth, f"{base}.depth", limits.depth, "depth", "mm")
-        at_most(warm_up.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
-        at_most(warm_up.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
+        yield from at_most(warm_up.depth, f"{base}.depth", limits.depth, "depth", "mm")
+        yield from at_most(warm_up.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+        yield from at_most(
+            warm_up.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm"
+        )
     if collection.maintenance.rezero is not None:
         rezero, base = collection.maintenance.rezero, "collection.maintenance.rezero"
-        at_most(rezero.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
-        at_most(rezero.search, f"{base}.search", limits.depth, "depth", "mm")
+        yield from at_most(rezero.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+        yield from at_most(rezero.search, f"{base}.search", limits.depth, "depth", "mm")
     if collection.plate is not None:
-        at_most(collection.plate.mass, "collection.plate.mass", Decimal(5), "mass (fixed)", "kg")
+        yield from at_most(
+            collection.plate.mass, "collection.plate.mass", Decimal(5), "mass (fixed)", "kg"
+        )
 
 
-def _check_levels(collection: Collection, written: Mapping[str, list[tuple[Level, str]]]) -> None:
+def _check_levels(
+    collection: Collection, written: Mapping[str, list[tuple[Level, str]]]
+) -> Iterator[KeyedError]:
     """Check every level against the fields that use it: a number, and in their range."""
     for key, ref in collection.bindings():
         for level, where in written[ref.factor] if ref.unit is not None else ():
             if isinstance(level, str):
-                raise KeyedError(where, level, f"is text, expected a number in {ref.unit} belongs")
+                yield KeyedError(where, level, f"is text, expected a number in {ref.unit} belongs")
+                continue
             try:
                 check_least(level, str(ref.unit), ref.low, ref.strict)
             except ValueError as error:
                 value = f"{canonical(level)} {ref.unit}"
-                raise KeyedError(where, value, f"{error} in {key}") from None
+                yield KeyedError(where, value, f"{error} in {key}")
 
 
 Levels = Callable[[Any, str], Iterator[tuple[Any, str]]]
@@ -309,13 +324,13 @@ def _inside(x: float, y: float, limits: Any) -> str | None:
     return None
 
 
-def _check_place(place: Place, base: str, levels: Levels, limits: Any) -> None:
+def _check_place(place: Place, base: str, levels: Levels, limits: Any) -> Iterator[KeyedError]:
     for name in ("x", "y", "depth"):
         field = getattr(place, name)
         for value, where in () if field is None else levels(field, f"{base}.{name}"):
             x, y, depth = (float(value) if name == axis else 0.0 for axis in ("x", "y", "depth"))
             if broken := _outside(Position(x, y, depth), limits):
-                raise KeyedError(where, f"{canonical(value)} mm", broken)
+                yield KeyedError(where, f"{canonical(value)} mm", broken)
 
 
 def _outside(place: Position, limits: Any) -> str | None:
@@ -332,10 +347,10 @@ def _outside(place: Position, limits: Any) -> str | None:
     return _inside(place.x_mm, place.y_mm, limits)
 
 
-def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> None:
+def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> Iterator[KeyedError]:
     for angle, where in levels(phase.angle, f"{base}.angle"):
         if not 0 < abs(angle) <= limits.twist:
-            raise KeyedError(
+            yield KeyedError(
                 where,
                 f"{canonical(angle)} deg",
                 f"must not be 0, and at most collection.limits.twist = {canonical(limits.twist)} "
@@ -343,14 +358,14 @@ def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> N
             )
     for speed, where in levels(phase.speed, f"{base}.speed"):
         if speed > limits.twist_speed:
-            raise KeyedError(
+            yield KeyedError(
                 where,
                 f"{canonical(speed)} deg/s",
                 f"is over collection.limits.twist_speed = {canonical(limits.twist_speed)} deg/s",
             )
 
 
-def _check_nuisances(nuisances: Nuisances, levels: Levels, limits: Any) -> None:
+def _check_nuisances(nuisances: Nuisances, levels: Levels, limits: Any) -> Iterator[KeyedError]:
     """Hold names and the arm's speeds against what is known, and the limits; see `path_fault`."""
     base, known = "collection.nuisances", nuisances.known
     for name, where in levels(nuisances.apply, f"{base}.apply"):
@@ -361,14 +376,15 @@ def _check_nuisances(nuisances: Nuisances, levels: Levels, limits: Any) -> None:
                 if limits.twist is None or limits.twist_speed is None:
                     missing = "twist" if limits.twist is None else "twist_speed"
                     text = f"is needed: the nuisance '{element}' turns the sensor"
-                    raise KeyedError(f"collection.limits.{missing}", None, text)
+                    yield KeyedError(f"collection.limits.{missing}", None, text)
+                    continue
                 most, limit, unit = limits.twist_speed, "twist_speed", "deg/s"
             elif isinstance(nuisance, ArmMotion | Regrasp):
                 most, limit, unit = limits.speed, "speed", "mm/s"
             else:
                 continue
             if nuisance.speed > most:
-                raise KeyedError(
+                yield KeyedError(
                     key,
                     f"{canonical(nuisance.speed)} {unit}",
                     f"exceeds collection.limits.{limit} = {canonical(most)} {unit}",
@@ -394,7 +410,7 @@ def path_fault(collection: Collection, program: Program) -> str | None:
     return None
 
 
-def _check_slide(phase: Slide, base: str, levels: Levels, limits: Any) -> None:
+def _check_slide(phase: Slide, base: str, levels: Levels, limits: Any) -> Iterator[KeyedError]:
     pairs = product(
         levels(phase.distance, f"{base}.distance"), levels(phase.direction, f"{base}.direction")
     )
@@ -406,32 +422,33 @@ def _check_slide(phase: Slide, base: str, levels: Levels, limits: Any) -> None:
         for sign in (-1, 1):
             broken = _inside(sign * half[0], sign * half[1], limits)
             if broken:
-                raise KeyedError(
+                yield KeyedError(
                     where,
                     f"{canonical(distance)} mm",
                     f"a slide at {canonical(direction)} deg {broken}",
                 )
 
 
-def _check_retract(phase: Retract, base: str, levels: Levels, limits: Any) -> None:
+def _check_retract(phase: Retract, base: str, levels: Levels, limits: Any) -> Iterator[KeyedError]:
     if phase.disturbance is None:
         return
     key = f"{base}.disturbance"
     for side, where in levels(phase.disturbance.side, f"{key}.side"):
         if side not in {"left", "right"}:
-            raise KeyedError(where, side, "must be 'left' or 'right'")
+            yield KeyedError(where, side, "must be 'left' or 'right'")
     for share, where in levels(phase.disturbance.share, f"{key}.share"):
         if isinstance(share, str) or not 0 <= share <= 200:
-            raise KeyedError(where, share, "must be from 0 to 200 percent of the retraction speed")
+            yield KeyedError(where, share, "must be from 0 to 200 percent of the retraction speed")
+            continue
         for distance, _ in levels(phase.distance, f"{base}.distance"):
             reach = float(share) / 100 * float(distance)
             broken = _inside(reach, 0.0, limits) or _inside(-reach, 0.0, limits)
             if broken:
-                raise KeyedError(where, f"{canonical(share)} percent", broken)
+                yield KeyedError(where, f"{canonical(share)} percent", broken)
         for speed, at in levels(phase.speed, f"{base}.speed"):
             total = float(speed) * math.hypot(1.0, float(share) / 100)
             if total > float(limits.speed) + 1e-9:
-                raise KeyedError(
+                yield KeyedError(
                     at,
                     f"{canonical(speed)} mm/s",
                     f"with a disturbance of {canonical(share)} percent makes {total:.3f} mm/s, "

@@ -8,7 +8,7 @@ from __future__ import annotations
 from decimal import Decimal
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
 from sliplab.protocols.quantity import (
     REF_SCHEMA,
@@ -24,7 +24,7 @@ from sliplab.protocols.quantity import (
     SpeedOrRef,
     word_or_ref,
 )
-from sliplab.protocols.yaml_file import StrictModel, register_tags
+from sliplab.protocols.yaml_file import StrictModel, register_tags, rule
 
 
 class Approach(StrictModel):
@@ -45,7 +45,7 @@ class Press(StrictModel):
     """Normal force at which it ends, on a rig with a force sensor."""
     speed: SpeedOrRef
 
-    @model_validator(mode="after")
+    @rule
     def _ends(self) -> Press:
         if self.depth is None and self.force is None:
             raise ValueError("must have a 'depth', or a 'force'")
@@ -120,7 +120,7 @@ class Place(StrictModel):
     depth: AnyMillimetresOrRef | None = None
     """Into the plate: the indentation of the highest papilla, negative clear of the plate."""
 
-    @model_validator(mode="after")
+    @rule
     def _somewhere(self) -> Place:
         if self.x is None and self.y is None and self.depth is None:
             raise ValueError("is empty; give x, y or depth")
@@ -138,7 +138,7 @@ class Travel(StrictModel):
     by: Place | None = None
     speed: SpeedOrRef
 
-    @model_validator(mode="after")
+    @rule
     def _one(self) -> Travel:
         if (self.to is None) == (self.by is None):
             raise ValueError("must have either 'to' or 'by'")

@@ -30,7 +30,14 @@ from sliplab.protocols.shipped import protocol_path
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.templates import in_terms_of_template
 from sliplab.protocols.units import file_text
-from sliplab.protocols.yaml_file import KeyedError, parse_yaml, read_text, validate
+from sliplab.protocols.yaml_file import (
+    KeyedError,
+    input_error,
+    parse_leniently,
+    raise_all,
+    read_text,
+    validate,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -328,17 +335,22 @@ def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -
         InputError: anything wrong, with file, key, value and what would be right.
     """
     path = path if stored else protocol_path(path)
-    document = parse_yaml(read_text(path, "protocol"), path)
+    document = parse_leniently(read_text(path, "protocol"), path)
     try:
         protocol = validate(Protocol, document, path)
         if not stored:
+            levels = _levels(protocol)
             try:
-                check_consistency(protocol)
+                raise_all(
+                    (lambda: check_consistency(protocol), lambda: check_limits(protocol, levels))
+                )
             except KeyedError as error:
-                raise InputError(path, error.key, error.value, str(error)) from None
+                raise input_error(path, error) from None
         return make_plan(protocol, str(path), enable)
     except InputError as error:
-        raise in_terms_of_template(error, document) from None
+        raise InputError.joined(
+            in_terms_of_template(each, document) for each in error.faults
+        ) from None
 
 
 def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan:
@@ -348,7 +360,7 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
         check_limits(protocol, levels)
         split = check_split(protocol.analysis.split, protocol.collection.all_factors)
     except KeyedError as error:
-        raise InputError(file, error.key, error.value, str(error)) from None
+        raise input_error(file, error) from None
     analysis = protocol.analysis.model_copy(update={"split": split})
     protocol = protocol.model_copy(update={"analysis": analysis})
     plan = Plan(protocol, file, levels, tuple(_expand(protocol, levels)))
@@ -376,8 +388,7 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
 
 
 def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level, ...]]:
-    factors = protocol.collection.all_factors
-    levels = {name: factor.levels() for name, factor in factors.items()}
+    factors, levels = protocol.collection.all_factors, _levels(protocol)
     for text in enable:
         name, _, raw = text.partition("=")
         if name not in factors:
@@ -395,6 +406,10 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
         if level not in levels[name]:
             levels[name] = (*levels[name], level)
     return levels
+
+
+def _levels(protocol: Protocol) -> dict[str, tuple[Level, ...]]:
+    return {name: each.levels() for name, each in protocol.collection.all_factors.items()}
 
 
 def _number(raw: str, unit: str) -> Decimal:

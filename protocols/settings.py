@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from sliplab.protocols.presets import COMPARED, PAPER, Value, at, expanded
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 Scale = Annotated[float, Field(ge=0, le=1e6)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -55,7 +55,7 @@ class Windows(StrictModel):
     """Taxels of a sensor that has no image: each is a channel, of each polarity one, and a sample
     has a single cell. `crop_px` and `pool_px` are then left out. null: the square crop."""
 
-    @model_validator(mode="after")
+    @rule
     def _fits(self) -> Windows:
         if self.length_ms % self.step_ms:
             raise KeyedError("analysis.windows.step_ms", self.step_ms, "must divide length_ms")
@@ -118,7 +118,7 @@ class Split(StrictModel):
     validation_levels: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     test_levels: dict[str, tuple[str, ...]] = Field(default_factory=dict)
 
-    @model_validator(mode="after")
+    @rule
     def _sums(self) -> Split:
         if abs(self.train + self.validation + self.test - 1.0) > 1e-9:
             raise KeyedError(
@@ -308,7 +308,7 @@ class AnalysisSettings(StrictModel):
             object.__setattr__(self, name, found)  # frozen for all others
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _strides(self) -> AnalysisSettings:
         length = self.windows.length_ms
         stride = self.detection.stride_ms

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from itertools import islice
 from pathlib import Path
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import did_you_mean
 
 
 def shipped_files(folder: Path) -> dict[str, Path]:
@@ -37,4 +40,14 @@ def protocol_path(given: Path) -> Path:
     if (found := find_shipped(given, known := shipped_protocols())) is not None:
         return found
     text = f"no such file, and no built-in protocol of this name; built-in: {', '.join(known)}"
-    raise InputError(str(given), "", None, text)
+    near = did_you_mean(given.name, [*known, *neighbours(given)])
+    raise InputError(str(given), "", None, f"{text}{near}")
+
+
+def neighbours(given: Path, most: int = 1000) -> list[str]:
+    """Return the names in a path's folder, at most so many, for the nearest to a missing one."""
+    try:
+        with os.scandir(given.parent) as entries:
+            return sorted(each.name for each in islice(entries, most))
+    except OSError:
+        return []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import re
 import unicodedata
+from collections.abc import Iterable
 from datetime import date
 from decimal import Decimal
 
@@ -66,6 +67,19 @@ def foreign_character(text: str) -> str:
         if not character.isascii():
             return f"U+{ord(character):04X} {unicodedata.name(character, 'without a name')}"
     return ""
+
+
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """Return the one of some names that a misspelt one is close to, if any."""
+    known = {each.casefold().replace("-", "_"): each for each in names}
+    close = difflib.get_close_matches(name.casefold().replace("-", "_"), known, n=1)
+    return known[close[0]] if close else None
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """Return ``; did you mean 'depth'?`` for a name that is close to a known one, else nothing."""
+    close = nearest(name, names)
+    return f"; did you mean '{close}'?" if close else ""
 
 
 def printable(text: str) -> str:

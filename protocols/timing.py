@@ -10,10 +10,10 @@ from __future__ import annotations
 from decimal import Decimal
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sliplab.protocols.quantity import PositiveSeconds
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 Code = Literal["lfsr", "irregular", "regular"]
 """Pulses of the box: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""
@@ -48,7 +48,7 @@ class Delay(StrictModel):
     shortest_us: float = Field(ge=0, le=10_000_000)
     longest_us: float = Field(gt=0, le=10_000_000)
 
-    @model_validator(mode="after")
+    @rule
     def _ordered(self) -> Delay:
         if not self.shortest_us < self.longest_us:
             raise KeyedError(".longest_us", self.longest_us, "must be above shortest_us")

@@ -8,25 +8,38 @@ their decimal digits.
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import stat
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.quantity import number_meant
-from sliplab.protocols.shown import MASK, foreign_character, holds_secret, is_secret
+from sliplab.protocols.shipped import neighbours
+from sliplab.protocols.shown import (
+    MASK,
+    did_you_mean,
+    foreign_character,
+    holds_secret,
+    is_secret,
+    nearest,
+)
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
@@ -41,16 +54,84 @@ class StrictModel(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _of_their_own_kind(cls, data: Any) -> Any:
-        for name, value in data.items() if isinstance(data, dict) else ():
-            leaves = _leaves(cls).get(name, _NOTHING)
-            if bool not in leaves and leaves & _NUMBERS:
-                _refuse_switch(value, f".{name}")
-            if date in leaves and (isinstance(value, int | float | Decimal) or _is_number(value)):
-                raise KeyedError(f".{name}", value, "must be a date, such as 2026-11-23")
-        return data
+    def _of_their_own_kind(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        found = list(_kind_faults(cls, data)) if isinstance(data, dict) else []
+        if not found:
+            return handler(data)
+        known = {fault.key for fault in found}
+        try:
+            handler(data)
+        except ValidationError as error:
+            found += [each for each in _faults(cls, error) if each.key not in known]
+        raise KeyedError.joined(found)
+
+    @model_validator(mode="after")
+    def _obey_rules(self) -> Self:
+        """Check the methods marked by `rule`, all of them."""
+        raise_all(getattr(self, name) for name in _rules(type(self)))
+        return self
+
+
+_Rule = TypeVar("_Rule", bound=Callable[..., Any])
+
+
+def rule(method: _Rule) -> _Rule:
+    """Mark a method of a `StrictModel` that checks several keys together.
+
+    It raises a ValueError (a `KeyedError` names the key), or yields one `KeyedError` a fault. A
+    rule that fails does not keep the others of its model from being checked.
+    """
+    method.__dict__["is_rule"] = True
+    return method
+
+
+@cache
+def _rules(model: type[BaseModel]) -> tuple[str, ...]:
+    found: dict[str, None] = {}
+    for each in reversed(model.__mro__):
+        for name, method in vars(each).items():
+            if getattr(method, "is_rule", False):
+                found.setdefault(name)
+    return tuple(found)
+
+
+def raise_all(checks: Iterable[Callable[[], Any]]) -> None:
+    """Make every check, and raise all the faults together that they raise or yield.
+
+    Raises:
+        KeyedError: the first fault, with the others.
+        ValueError: the only one, where it names no key.
+    """
+    found: list[ValueError] = []
+    for check in checks:
+        try:
+            made = check()
+            for fault in made if isinstance(made, Iterator) else ():
+                found.append(fault)  # one by one: those before an error count
+        except ValueError as error:
+            found.append(error)
+        except Exception:
+            if not found:  # a check may rely on those before it
+                raise
+    if len(found) == 1:
+        raise found[0]
+    if found:
+        keyed = [e if isinstance(e, KeyedError) else KeyedError("", None, str(e)) for e in found]
+        by_key: dict[str, KeyedError] = {}
+        for each in KeyedError.joined(keyed).faults:
+            by_key.setdefault(each.key, each)
+        raise KeyedError.joined(by_key.values())
+
+
+def _kind_faults(model: type[BaseModel], data: Mapping[Any, Any]) -> Iterator[KeyedError]:
+    for name, value in data.items():
+        leaves = _leaves(model).get(name, _NOTHING)
+        if bool not in leaves and leaves & _NUMBERS:
+            yield from _switches(value, f".{name}")
+        if date in leaves and (isinstance(value, int | float | Decimal) or _is_number(value)):
+            yield KeyedError(f".{name}", value, "must be a date, such as 2026-11-23")
 
 
 _NOTHING: frozenset[Any] = frozenset()
@@ -74,12 +155,12 @@ def _leaves(model: type[BaseModel]) -> dict[str, frozenset[Any]]:
     return kinds
 
 
-def _refuse_switch(value: Any, key: str) -> None:
+def _switches(value: Any, key: str) -> Iterator[KeyedError]:
     if isinstance(value, bool):
-        raise KeyedError(key, value, "must be a number")
+        yield KeyedError(key, value, "must be a number")
     if isinstance(value, list | tuple):
         for index, item in enumerate(value):
-            _refuse_switch(item, f"{key}[{index}]")
+            yield from _switches(item, f"{key}[{index}]")
 
 
 def _is_number(value: Any) -> bool:
@@ -94,11 +175,18 @@ class Document(dict[str, Any]):
 
     Attributes:
         written: such as ``{"collection.repetitions": "yes"}``, for messages.
+        faults: of the text itself; the values of their keys are left out.
     """
 
-    def __init__(self, data: Mapping[str, Any], written: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        data: Mapping[str, Any],
+        written: Mapping[str, str],
+        faults: Iterable[InputError] = (),
+    ) -> None:
         super().__init__(data)
         self.written = dict(written)
+        self.faults = tuple(faults)
 
 
 _ALIAS, _TAG = "!alias", "tag:yaml.org,2002:"
@@ -127,41 +215,57 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
         return node
 
 
+_LEFT_OUT = object()
+"""In place of a value that cannot be read."""
+
+
 class _Builder:
     """Plain data from nodes, with the key of whatever is wrong."""
 
     def __init__(self, loader: _Loader, path: str | Path) -> None:
         self.written: dict[str, str] = {}
+        self.faults: list[InputError] = []
         self._loader, self._path = loader, path
 
     def build(self, node: Any, key: str) -> Any:
         """The data of a node; `key` is its location."""
-        if isinstance(node, yaml.MappingNode) and node.tag == f"{_TAG}map":
-            return self._mapping(node, key)
-        if isinstance(node, yaml.SequenceNode) and node.tag == f"{_TAG}seq":
-            return [self.build(item, f"{key}[{index}]") for index, item in enumerate(node.value)]
-        if isinstance(node, yaml.ScalarNode):
-            return self._scalar(node, key)
-        raise self._wrong(node, key, None, _unread(node.tag))
+        try:
+            if isinstance(node, yaml.MappingNode) and node.tag == f"{_TAG}map":
+                return self._mapping(node, key)
+            if isinstance(node, yaml.SequenceNode) and node.tag == f"{_TAG}seq":
+                return [self.build(item, f"{key}[{k}]") for k, item in enumerate(node.value)]
+            if isinstance(node, yaml.ScalarNode):
+                return self._scalar(node, key)
+            raise self._wrong(node, key, None, _unread(node.tag))
+        except InputError as error:
+            self.faults.append(error)
+            return _LEFT_OUT
 
     def _mapping(self, node: Any, key: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
         before: Any = None
         for key_node, value_node in node.value:
-            if key_node.tag == f"{_TAG}merge":
-                text = "cannot be read: merge keys ('<<') are not supported; write the keys out"
-                raise self._wrong(key_node, f"{key}.<<" if key else "<<", None, text)
-            if _is_rest(key_node, value_node, before):
-                last, number = before[0].value, f"{before[1].value},{key_node.value}"
-                text = f"has a decimal comma; write {number.replace(',', '.', 1)}"
-                raise self._wrong(key_node, f"{key}.{last}" if key else last, number, text)
-            name = self._name(key_node, key)
-            inner = f"{key}.{name}" if key else name
-            if name in found:
-                raise self._wrong(key_node, inner, None, "cannot be read: duplicate key")
+            try:
+                name = self._checked_name(key_node, value_node, key, before)
+                inner = f"{key}.{name}" if key else name
+                if name in found:
+                    raise self._wrong(key_node, inner, None, "cannot be read: duplicate key")
+            except InputError as error:
+                self.faults.append(error)
+                continue
             found[name] = self.build(value_node, inner)
             before = key_node, value_node
-        return found
+        return {name: value for name, value in found.items() if value is not _LEFT_OUT}
+
+    def _checked_name(self, key_node: Any, value_node: Any, key: str, before: Any) -> str:
+        if key_node.tag == f"{_TAG}merge":
+            text = "cannot be read: merge keys ('<<') are not supported; write the keys out"
+            raise self._wrong(key_node, f"{key}.<<" if key else "<<", None, text)
+        if _is_rest(key_node, value_node, before):
+            last, number = before[0].value, f"{before[1].value},{key_node.value}"
+            text = f"has a decimal comma; write {number.replace(',', '.', 1)}"
+            raise self._wrong(key_node, f"{key}.{last}" if key else last, number, text)
+        return self._name(key_node, key)
 
     def _name(self, node: Any, key: str) -> str:
         is_text = isinstance(node, yaml.ScalarNode) and node.tag in {f"{_TAG}str", f"{_TAG}value"}
@@ -254,7 +358,8 @@ def read_text(path: Path, what: str) -> str:
                 raise InputError(path, "", None, f"is not a regular file; {of_one}")
             data = handle.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise InputError(path, "", None, f"no such file; {of_one}") from None
+        near = did_you_mean(path.name, neighbours(path))
+        raise InputError(path, "", None, f"no such file; {of_one}{near}") from None
     except IsADirectoryError:
         raise InputError(path, "", None, f"is a folder; {of_one}") from None
     except OSError as error:
@@ -285,6 +390,18 @@ def parse_yaml(text: str, path: str | Path) -> Document:
     Raises:
         InputError: not YAML, not a mapping, an alias, a tag, a key twice, nested too deep.
     """
+    document = parse_leniently(text, path)
+    if document.faults:
+        raise InputError.joined(document.faults)
+    return document
+
+
+def parse_leniently(text: str, path: str | Path) -> Document:
+    """YAML text as `parse_yaml` reads it, for `validate`: it raises the document's faults, too.
+
+    Raises:
+        InputError: not YAML, not a mapping, nested too deep.
+    """
     try:
         loader = _Loader(text)
         builder = _Builder(loader, path)
@@ -300,9 +417,11 @@ def parse_yaml(text: str, path: str | Path) -> Document:
     except (yaml.YAMLError, RecursionError) as error:
         raise InputError(path, "", None, f"is not YAML: {error}") from None
     if not isinstance(data, dict):
+        if builder.faults:
+            raise InputError.joined(builder.faults)
         found = "nothing" if data is None else f"a {type(data).__name__}"
         raise InputError(path, "", None, f"holds {found} instead of a mapping (key: value)")
-    return Document(data, builder.written)
+    return Document(data, builder.written, builder.faults)
 
 
 def mask_secrets(text: str) -> str:
@@ -340,25 +459,47 @@ def without_secrets(data: Any) -> Any:
 
 
 def validate(model: type[ModelT], data: dict[str, Any], path: str | Path) -> ModelT:
-    """`data` as a `model`; the first fault found is raised as an `InputError`."""
+    """`data` as a `model`.
+
+    Raises:
+        InputError: all that is wrong with it.
+    """
+    document = data if isinstance(data, Document) else Document(data, {})
+    found = list(document.faults)
+    unread = [fault.key for fault in found]
     try:
-        return model.model_validate(data)
+        made = model.model_validate(data)
     except ValidationError as error:
-        found = _explain(model, error, path)
-    written = data.written.get(found.key) if isinstance(data, Document) else None
-    if written and found.value is not None:
-        found = InputError(path, found.key, written, found.expected)
-    raise found
+        found += [
+            InputError(path, each.key, _as_written(document, each), str(each))
+            for each in faults_of(model, error)
+            if not any(_at_or_around(each.key, key) for key in unread)
+        ]
+        raise InputError.joined(found) from None
+    if found:
+        raise InputError.joined(found)
+    return made
+
+
+def _as_written(document: Document, fault: KeyedError) -> object:
+    return fault.value if fault.value is None else document.written.get(fault.key) or fault.value
+
+
+def _at_or_around(key: str, unread: str) -> bool:
+    """Return whether a fault at `key` may come from the value at `unread`, which was left out."""
+    return f"{unread}.".startswith(f"{key}.") or f"{unread}[".startswith(f"{key}[")
 
 
 def load(model: type[ModelT], path: Path, what: str) -> ModelT:
     """The file at `path` read, parsed and checked as a `model`."""
-    return validate(model, parse_yaml(read_text(path, what), path), path)
+    return validate(model, parse_leniently(read_text(path, what), path), path)
 
 
-def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -> InputError:
-    fault = first_fault(model, error)
-    return InputError(path, fault.key, fault.value, str(fault))
+def input_error(file: str | Path, fault: KeyedError) -> InputError:
+    """Return a fault, and those that were found with it, as an error of a file."""
+    return InputError.joined(
+        InputError(file, each.key, each.value, str(each)) for each in fault.faults
+    )
 
 
 class ChosenModel(ABC):
@@ -374,8 +515,8 @@ class ChosenModel(ABC):
         try:
             return model.model_validate(value)
         except ValidationError as error:
-            fault = first_fault(model, error)
-        raise KeyedError(f".{fault.key}" if fault.key else "", fault.value, str(fault))
+            found = _faults(model, error)
+        raise KeyedError.joined(found)
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: Callable[[Any], CoreSchema]
@@ -388,27 +529,60 @@ class ChosenModel(ABC):
         )
 
 
-def first_fault(model: type[BaseModel], error: ValidationError) -> KeyedError:
-    """Return the fault of `error` that is said to a person: its key, the value and what is right.
+def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
+    """Return the faults of `error` as a person needs them: key, value and what is right.
+
+    Unknown keys come first: one that is misspelt is the cause of a missing one, which is left out.
+    """
+    return [each.with_key(each.key.removeprefix(".")) for each in _faults(model, error)]
+
+
+def _faults(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
+    """Return the faults of `error`, their keys below `model` as `KeyedError` has them."""
+    items = sorted(_of_one_choice(error.errors()), key=lambda i: i["type"] != "extra_forbidden")
+    meant = {_key((*item["loc"][:-1], close)) for item in items if (close := _close(model, item))}
+    found: dict[str, KeyedError] = {}
+    for item in items:
+        if not (item["type"] == "missing" and _key(item["loc"]) in meant):
+            for each in _fault(model, item).faults:
+                found.setdefault(each.key, each)
+    return list(found.values())
+
+
+def _of_one_choice(items: Sequence[Any]) -> Iterator[Any]:
+    """Leave out what pydantic says of the other types that a value may have."""
+    first: dict[tuple[int | str, ...], int | str] = {}
+    for item in items:
+        loc = item["loc"]
+        choices = [k for k, part in enumerate(loc) if _WAY_OF_UNION.fullmatch(str(part))]
+        if all(first.setdefault(loc[:k], loc[k]) == loc[k] for k in choices):
+            yield item
+
+
+def _close(model: type[BaseModel], item: Any) -> str | None:
+    """Return the known name that an unknown key is close to, if any."""
+    if item["type"] != "extra_forbidden":
+        return None
+    return nearest(str(item["loc"][-1]), _fields_at(model, item["loc"][:-1]))
+
+
+def _fault(model: type[BaseModel], item: Any) -> KeyedError:
+    """Return one fault of pydantic's, with those that were found with it.
 
     A model that is chosen by what is in it (a device by its driver) is validated by itself, and
-    its fault continues from the key where it stands: `KeyedError` with a ``.`` before the key.
+    its faults continue from the key where it stands: `KeyedError` with a ``.`` before the key.
     """
-    # An unknown key is most often the cause of a missing one beside it: say it first.
-    first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
-    loc = first["loc"]
-    value: object | None = first.get("input")
-    kind, context = first["type"], first.get("ctx", {})
-    key = _key(loc)
+    value: object | None = item.get("input")
+    loc, kind, context = item["loc"], item["type"], item.get("ctx", {})
+    key = f".{_key(loc)}" if loc else ""
     if kind == "value_error" and isinstance(context.get("error"), KeyedError):
-        keyed = context["error"]
-        below = keyed.key == "" or keyed.key[0] in ".["
-        whole = (key + keyed.key).lstrip(".") if below else keyed.key
-        return KeyedError(whole, keyed.value, str(keyed))
+        return KeyedError.joined(
+            each.with_key(key + each.key) if each.below else each
+            for each in context["error"].faults
+        )
     if kind == "extra_forbidden":
         names = _fields_at(model, loc[:-1])
-        close = difflib.get_close_matches(str(loc[-1]), names, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
+        hint = did_you_mean(str(loc[-1]), names)
         known = f" (known here: {', '.join(names)})" if names else ""
         foreign = foreign_character(str(loc[-1]))
         hint = (f" (holds {foreign})" if foreign else "") + hint
@@ -421,8 +595,9 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> KeyedError:
         tags = str(context.get("expected_tags", "")).replace("'", "")
         tag = str(context.get("discriminator", "'kind'")).strip("'")
         found = value.get(tag) if isinstance(value, dict) else value
-        return KeyedError(f"{key}.{tag}", found, f"must be one of {tags}")
-    message = re.sub("^Input should", "must", first["msg"])
+        hint = did_you_mean(str(found), tags.split(", ")) if found is not None else ""
+        return KeyedError(f"{key}.{tag}", found, f"must be one of {tags}{hint}")
+    message = re.sub("^Input should", "must", item["msg"])
     expected = _EXPECTED.get(kind, message[0].lower() + message[1:])
     if value is None:
         return KeyedError(key, None, f"is empty; {expected}")
@@ -467,12 +642,38 @@ class KeyedError(ValueError):
 
     Its key is a whole one, or begins with ``.`` or ``[`` and continues from the model or field that
     raises it.
+
+    Attributes:
+        more: further faults that were found together with this one.
     """
 
-    def __init__(self, key: str, value: object, expected: str) -> None:
+    def __init__(
+        self, key: str, value: object, expected: str, more: Iterable[KeyedError] = ()
+    ) -> None:
         super().__init__(expected)
         self.key = key
         self.value = value
+        self.more = tuple(more)
+
+    @classmethod
+    def joined(cls, faults: Iterable[KeyedError]) -> KeyedError:
+        """Return the first of some faults, with all others as those found with it."""
+        first, *others = (each for fault in faults for each in fault.faults)
+        return KeyedError(first.key, first.value, str(first), others)
+
+    @property
+    def faults(self) -> tuple[KeyedError, ...]:
+        """This fault by itself, then each of the others."""
+        return KeyedError(self.key, self.value, str(self)), *self.more
+
+    @property
+    def below(self) -> bool:
+        """True if the key continues from the model or field that raises it."""
+        return self.key == "" or self.key[0] in ".["
+
+    def with_key(self, key: str) -> KeyedError:
+        """Return the same fault of another key."""
+        return KeyedError(key, self.value, str(self))
 
 
 def _key(loc: tuple[int | str, ...]) -> str:

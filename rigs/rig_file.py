@@ -9,7 +9,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
@@ -28,8 +28,11 @@ from sliplab.protocols.yaml_file import (
     NAME_PATTERN,
     KeyedError,
     StrictModel,
+    input_error,
     mask_secrets,
     parse_yaml,
+    raise_all,
+    rule,
     validate,
     without_secrets,
 )
@@ -45,9 +48,9 @@ from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
     check_distinct,
-    check_streams,
     named_drivers,
     stream_drivers,
+    stream_faults,
 )
 from sliplab.rigs.twin import TwinRecord
 
@@ -181,8 +184,8 @@ class RigFile(StrictModel):
             raise ValueError("must hold 'events' or 'frames' or both, none twice")
         return cameras
 
-    @model_validator(mode="after")
-    def _has_its_sections(self) -> RigFile:
+    @rule
+    def _has_its_sections(self) -> Iterator[KeyedError]:
         wanted = {
             "mock": self.driver != "devices",
             "devices": self.driver != "mock",
@@ -190,43 +193,43 @@ class RigFile(StrictModel):
         for name, needed in wanted.items():
             found = getattr(self, name)
             if needed and found is None:
-                raise KeyedError(name, None, f"is needed by driver: {self.driver}")
+                yield KeyedError(name, None, f"is needed by driver: {self.driver}")
             if not needed and found is not None:
-                raise KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
+                yield KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
         if self.twin is not None and self.mock is None:
-            raise KeyedError("twin", "...", f"has no meaning with driver: {self.driver}")
+            yield KeyedError("twin", "...", f"has no meaning with driver: {self.driver}")
         if self.driver == "devices" and self.devices is not None and self.devices.sync_box is None:
-            raise KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
+            yield KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
         if self.devices is not None:
             for name, words in CAMERAS.items():
                 key = words.replace(" ", "_")
                 named = getattr(self.devices, key) is not None
                 if not named and name in self.cameras:
-                    raise KeyedError(f"devices.{key}", None, "is missing")
+                    yield KeyedError(f"devices.{key}", None, "is missing")
                 if named and name not in self.cameras:
                     text = f"must be null: the rig has no {words} (cameras)"
-                    raise KeyedError(f"devices.{key}", "...", text)
-        return self
+                    yield KeyedError(f"devices.{key}", "...", text)
 
-    @model_validator(mode="after")
-    def _streams_are_complete(self) -> RigFile:
-        check_streams(self.streams, self.driver, None if self.mock is None else self.mock.clocks)
+    @rule
+    def _streams_are_complete(self) -> Iterator[KeyedError]:
+        yield from stream_faults(
+            self.streams, self.driver, None if self.mock is None else self.mock.clocks
+        )
         if self.driver == "devices":
             check_distinct(self.devices, self.streams)
         for index, fault in enumerate(() if self.mock is None else self.mock.faults):
             if isinstance(fault, StreamGone) and fault.stream not in self.streams:
                 known = ", ".join(self.streams) or "none"
                 text = f"is no further device of the rig; it has: {known}"
-                raise KeyedError(f"mock.faults[{index}].stream", fault.stream, text)
-        return self
+                yield KeyedError(f"mock.faults[{index}].stream", fault.stream, text)
 
-    @model_validator(mode="after")
-    def _loopback_can_show_it(self) -> RigFile:
+    @rule
+    def _loopback_can_show_it(self) -> Iterator[KeyedError]:
         if self.driver != "loopback" or self.mock is None or self.devices is None:
-            return self
+            return
         if set(self.cameras) != set(CAMERAS):
             text = "must hold events and frames: a loopback rig has both cameras"
-            raise KeyedError("cameras", list(self.cameras), text)
+            yield KeyedError("cameras", list(self.cameras), text)
         assert self.devices.frame_camera is not None
         exposure_us = self.mock.frame_camera.exposure_us
         for key, value, right in (
@@ -239,7 +242,7 @@ class RigFile(StrictModel):
             ("mock.frame_camera.level", self.mock.frame_camera.level, "video"),
         ):
             if value != right:
-                raise KeyedError(key, value, f"must be {right}, which is what the fakes simulate")
+                yield KeyedError(key, value, f"must be {right}, which is what the fakes simulate")
         fakes: dict[str, Any] = {
             "arm": self.devices.arm_driver.fake,
             "event_camera": self.devices.event_camera_driver.reach,
@@ -250,93 +253,87 @@ class RigFile(StrictModel):
             fakes["force_sensor"] = sensor.of_arm or sensor.fake
             if self.mock.force is None:
                 text = "is needed: it is what the fake of devices.force_sensor shows"
-                raise KeyedError("mock.force", None, text)
+                yield KeyedError("mock.force", None, text)
         if (gripper := self.devices.gripper_driver) is not None:
             fakes["gripper"] = gripper.fake
             fingers, opening = self.mock.gripper, self.grip_opening_mm
             found = None if fingers is None else fingers.opening_mm
             if found != opening:
                 text = f"must be {opening:g}: the fake of devices.gripper moves these fingers"
-                raise KeyedError("mock.gripper.opening_mm", found, text)
+                yield KeyedError("mock.gripper.opening_mm", found, text)
         text = "has no fake for a loopback rig: write driver: devices"
         for name, fake in fakes.items():
             if fake is None:
                 found = getattr(self.devices, name).driver
-                raise KeyedError(f"devices.{name}.driver", found, text)
+                yield KeyedError(f"devices.{name}.driver", found, text)
         for name, driver, _ in stream_drivers(self.streams):
             if not isinstance(driver, EventCameraDriver) or driver.reach is None:
-                raise KeyedError(f"streams.{name}.device.driver", driver.name, text)
-        return self
+                yield KeyedError(f"streams.{name}.device.driver", driver.name, text)
 
-    @model_validator(mode="after")
-    def _limited_force_is_measured(self) -> RigFile:
+    @rule
+    def _limited_force_is_measured(self) -> Iterator[KeyedError]:
         if self.limits.force is not None and not self.has_force:
             text = "needs a force sensor, and this rig has none"
-            raise KeyedError("limits.force", f"{self.limits.force} N", text)
-        return self
+            yield KeyedError("limits.force", f"{self.limits.force} N", text)
 
-    @model_validator(mode="after")
-    def _safe_state_can_be_reached(self) -> RigFile:
+    @rule
+    def _safe_state_can_be_reached(self) -> Iterator[KeyedError]:
         wanted, allowed = self.reflex, self.gripper_range
         if wanted is None:
-            return self
+            return
         if wanted.safe_state == "grip":
             if allowed is None:
                 text = "needs a gripper, and this rig has none; write safe_state: stop"
-                raise KeyedError("reflex.safe_state", "grip", text)
+                yield KeyedError("reflex.safe_state", "grip", text)
             if wanted.grip is None:
                 text = "is needed by safe_state: grip, such as 0.4 mm"
-                raise KeyedError("reflex.grip", None, text)
-        if wanted.force is not None:
-            if allowed is None:
-                text = "needs a gripper, and this rig has none; leave it out"
-                raise KeyedError("reflex.force", f"{wanted.force} N", text)
+                yield KeyedError("reflex.grip", None, text)
+        if wanted.force is not None and allowed is None:
+            text = "needs a gripper, and this rig has none; leave it out"
+            yield KeyedError("reflex.force", f"{wanted.force} N", text)
+        elif wanted.force is not None and allowed is not None:
             low, high = allowed.force_n
             if not low <= wanted.force <= high:
                 text = f"must be from {low:g} to {high:g} N, which the gripper can be set to"
-                raise KeyedError("reflex.force", f"{wanted.force} N", text)
+                yield KeyedError("reflex.force", f"{wanted.force} N", text)
         block_ms = 0 if self.mock is None else self.mock.event_camera.block_ms
         if wanted.stream_timeout * 1000 <= block_ms:
             text = f"must be over {block_ms} ms, the camera's blocks"
-            raise KeyedError("reflex.stream_timeout", f"{wanted.stream_timeout} s", text)
-        return self
+            yield KeyedError("reflex.stream_timeout", f"{wanted.stream_timeout} s", text)
 
-    @model_validator(mode="after")
-    def _poll_is_short(self) -> RigFile:
+    @rule
+    def _poll_is_short(self) -> Iterator[KeyedError]:
         if self.poll > 1:
-            raise KeyedError("poll", self.poll, "must be at most 1 s: a stop waits that long")
-        return self
+            yield KeyedError("poll", self.poll, "must be at most 1 s: a stop waits that long")
 
-    @model_validator(mode="after")
-    def _scales_agree(self) -> RigFile:
+    @rule
+    def _scales_agree(self) -> Iterator[KeyedError]:
         """Check that the simulated camera renders at the scale that the rig file states."""
         if self.mock is None:
-            return self
+            return
         stated, rendered = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
         if abs(stated - rendered) > SCALE_ERROR * rendered:
-            raise KeyedError(
+            yield KeyedError(
                 "frame_camera.scale_px_per_mm",
                 stated,
                 f"must be mock.frame_camera.px_per_mm = {rendered:g}",
             )
-        return self
 
-    @model_validator(mode="after")
-    def _rates_agree(self) -> RigFile:
+    @rule
+    def _rates_agree(self) -> Iterator[KeyedError]:
         """Check the stated rate of a camera that runs by itself."""
         stated = self.frame_camera.rate_hz
         if stated is None:
-            return self
+            return
         key = "frame_camera.rate_hz"
         if self.timing.frames == "hardware trigger":
             text = "must be left out with timing.frames: hardware trigger, the sync box's ticks"
-            raise KeyedError(key, stated, text)
+            yield KeyedError(key, stated, text)
         if self.mock is not None and self.mock.frame_camera.rate_hz != stated:
             text = f"must be mock.frame_camera.rate_hz = {self.mock.frame_camera.rate_hz:g}"
-            raise KeyedError(key, stated, text)
-        return self
+            yield KeyedError(key, stated, text)
 
-    @model_validator(mode="after")
+    @rule
     def _clocks_meet_timing(self) -> RigFile:
         """Check that the simulated clocks are no worse than `timing` states."""
         if self.mock is not None:
@@ -443,18 +440,22 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
     found = read_rig(rig_path(path))
     try:
         rig = validate(RigFile, found.data, found.path)
-        if rig.devices is not None and not stored:
+        arm = None if rig.devices is None else rig.devices.arm
+        if arm is not None and not stored:
             try:
-                check_units(rig.devices.arm)
-                _check_secrets(rig)
+                raise_all((lambda: check_units(arm), lambda: _masked_secrets(rig)))
             except KeyedError as error:
-                raise InputError(found.path, error.key, error.value, str(error)) from None
+                raise input_error(found.path, error) from None
         return rig, found.text
     except InputError as error:
-        raise error.in_file(found.blame(error.key)) from None
+        unread = {each.key for each in found.data.faults}  # these name their file already
+        raise InputError.joined(
+            each if each.key in unread else each.replaced(file=str(found.blame(each.key)))
+            for each in error.faults
+        ) from None
 
 
-def _check_secrets(rig: RigFile) -> None:
+def _masked_secrets(rig: RigFile) -> Iterator[KeyedError]:
     if rig.simulated or rig.devices is None:
         return
     further = [(f"streams.{name}.device", *found) for name, *found in stream_drivers(rig.streams)]
@@ -467,7 +468,7 @@ def _check_secrets(rig: RigFile) -> None:
             if is_secret(name) and getattr(settings, name) == MASK:
                 key = f"{where}.{name}"
                 text = "is masked, as in a store's copy of a rig file: write the rig's password"
-                raise KeyedError(key, MASK, text)
+                yield KeyedError(key, MASK, text)
 
 
 def rig_hash(text: str) -> str:
@@ -503,7 +504,7 @@ def _lasting(data: dict[str, Any]) -> dict[str, Any]:
     return without_taught(kept)
 
 
-def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
+def _check_exposure(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
     """Check that exposures end before the next tick, where every tick triggers a frame."""
     rate = plan.protocol.collection.recording.sync_rate
     triggered: dict[str, Any] = {}
@@ -520,7 +521,7 @@ def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
             }
     for name, camera in triggered.items():
         if camera is not None and camera.exposure_us * rate > 1e6:
-            raise InputError(
+            yield InputError(
                 file,
                 f"{name}.exposure_us",
                 f"{camera.exposure_us:g}",
@@ -529,7 +530,7 @@ def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
             )
 
 
-def _check_cameras(rig: RigFile, plan: Plan) -> None:
+def _check_cameras(rig: RigFile, plan: Plan) -> Iterator[InputError]:
     """Hold the streams that a protocol names against the rig; it need not name any."""
     recording = plan.protocol.collection.recording
     if "streams" not in recording.model_fields_set:
@@ -539,22 +540,22 @@ def _check_cameras(rig: RigFile, plan: Plan) -> None:
             text = (
                 f"the rig {rig.name} has no {words}; leave out 'streams' to record what a rig has"
             )
-            raise InputError(plan.file, "collection.recording.streams", name, text)
+            yield InputError(plan.file, "collection.recording.streams", name, text)
 
 
-def _check_force(rig: RigFile, plan: Plan) -> None:
+def _check_force(rig: RigFile, plan: Plan) -> Iterator[InputError]:
     """Check that a protocol that asks for forces has a rig that measures them."""
     gates = plan.protocol.collection.gates
     for name in ("normal_force", "hold_force"):
         value = getattr(gates, name)
         if value is not None and not rig.has_force:
             text = f"needs a force sensor, and the rig {rig.name} has none: leave the gate out"
-            raise InputError(plan.file, f"collection.gates.{name}", f"{value} N", text)
+            yield InputError(plan.file, f"collection.gates.{name}", f"{value} N", text)
     reference = gates.reference
     if reference is not None and reference.friction is not None and not rig.has_force:
         text = f"needs a force sensor, and the rig {rig.name} has none: leave the gate out"
         key = "collection.gates.reference.friction"
-        raise InputError(plan.file, key, f"{reference.friction} %", text)
+        yield InputError(plan.file, key, f"{reference.friction} %", text)
     presses = [
         step.until_force_n
         for trial in plan
@@ -565,19 +566,27 @@ def _check_force(rig: RigFile, plan: Plan) -> None:
         return
     if not rig.has_force:
         text = f"needs a force sensor, and the rig {rig.name} has none: press to a depth"
-        raise InputError(plan.file, "collection.motion: press.force", f"{max(presses):g} N", text)
+        yield InputError(plan.file, "collection.motion: press.force", f"{max(presses):g} N", text)
     limit = rig.limits.force
     if limit is not None and max(presses) > limit:
         text = f"exceeds limits.force = {limit} N of the rig {rig.name}"
-        raise InputError(plan.file, "collection.motion: press.force", f"{max(presses):g} N", text)
+        yield InputError(plan.file, "collection.motion: press.force", f"{max(presses):g} N", text)
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     """Check every motion of a plan against the rig's limits.
 
     Raises:
-        InputError: the first move beyond a limit.
+        InputError: what the rig lacks or forbids, one fault a key.
     """
+    found: dict[tuple[str, str], InputError] = {}
+    for fault in _plan_faults(rig, plan, file):
+        found.setdefault((fault.file, fault.key), fault)
+    if found:
+        raise InputError.joined(found.values())
+
+
+def _plan_faults(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
     most_us = 1e6 / 4 / plan.protocol.collection.recording.sync_rate
     clocks: dict[str, DeviceClock] = {
         f"timing.{name}": getattr(rig.timing, name)
@@ -587,83 +596,86 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     for name, clock in clocks.items():
         jitter_us = clock.jitter_us
         if jitter_us > most_us:
-            raise InputError(
+            yield InputError(
                 file,
                 f"{name}.jitter_us",
                 f"{jitter_us:g}",
                 f"must be at most {most_us:g}, a quarter of a tick of {plan.file}'s sync_rate: "
                 "pulses could not be distinguished",
             )
-    _check_cameras(rig, plan)
-    _check_exposure(rig, plan, file)
-    _check_force(rig, plan)
-    _check_twist(rig, plan, file)
-    _check_flicker(rig, plan, file)
+    yield from _check_cameras(rig, plan)
+    yield from _check_exposure(rig, plan, file)
+    yield from _check_force(rig, plan)
+    yield from _check_twist(rig, plan, file)
+    yield from _check_flicker(rig, plan, file)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")
         if frame_px is not None and frame_px[axis] > available:
-            raise InputError(
+            yield InputError(
                 file,
                 f"frame_camera.{side}_px",
                 available,
                 f"the region of {plan.file} needs {frame_px[axis]} px",
             )
+    over: set[str] = set()
+    for name, value, who in _extents(plan):
+        limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
+        if value > limit + 1e-9 and name not in over:
+            over.add(name)
+            text = f"{who[0]} needs {value:g} {unit} {who[1]}"
+            yield InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)
+
+
+def _extents(plan: Plan) -> Iterator[tuple[str, float, tuple[str, str]]]:
+    """Yield every depth, speed and reach of a plan, and what needs it."""
     for trial in plan:
         for step in plan.program(trial).steps:
             if isinstance(step, Move):
                 reach = (step.to.x_mm**2 + step.to.y_mm**2) ** 0.5
                 who = f"trial {trial.id} of {plan.file}", f"in its phase '{step.phase}'"
-                _check_limit(rig, file, who, "depth", step.to.depth_mm)
-                _check_limit(rig, file, who, "speed", step.speed_mm_s)
-                _check_limit(rig, file, who, "reach", reach)
+                yield "depth", step.to.depth_mm, who
+                yield "speed", step.speed_mm_s, who
+                yield "reach", reach, who
     upkeep = plan.protocol.collection.maintenance
     if upkeep.warm_up is not None:
         who = plan.file, "in collection.maintenance.warm_up"
-        _check_limit(rig, file, who, "depth", float(upkeep.warm_up.depth))
-        _check_limit(rig, file, who, "speed", float(upkeep.warm_up.speed))
+        yield "depth", float(upkeep.warm_up.depth), who
+        yield "speed", float(upkeep.warm_up.speed), who
     if upkeep.rezero is not None:
         who = plan.file, "in collection.maintenance.rezero"
-        _check_limit(rig, file, who, "depth", float(upkeep.rezero.search))
-        _check_limit(rig, file, who, "speed", float(upkeep.rezero.speed))
+        yield "depth", float(upkeep.rezero.search), who
+        yield "speed", float(upkeep.rezero.speed), who
 
 
-def _check_twist(rig: RigFile, plan: Plan, file: str) -> None:
+def _check_twist(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
     """Check that the arm can twist, if the plan does."""
     if rig.devices is None or rig.devices.arm_driver.twists:
         return
     for trial in plan:
         if any(isinstance(step, Twist) for step in plan.program(trial).steps):
             driver = rig.devices.arm_driver
-            raise InputError(
+            yield InputError(
                 file,
                 "devices.arm.driver",
                 driver.name,
                 f"cannot turn the tool evenly on the spot, and trial {trial.id} of {plan.file} "
                 "does; use another driver, such as 'abb'",
             )
+            return
 
 
-def _check_flicker(rig: RigFile, plan: Plan, file: str) -> None:
+def _check_flicker(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
     """Check that simulated pixels can see a flickering light, if the plan has one."""
     if not rig.simulated or rig.scene.event_camera.cutoff_hz == 0:
         return
     for trial in plan:
         if any(isinstance(each, Flicker) for each in plan.program(trial).nuisances):
-            raise InputError(
+            yield InputError(
                 file,
                 "mock.event_camera.cutoff_hz",
                 rig.scene.event_camera.cutoff_hz,
                 f"must be 0 for the flicker of trial {trial.id} of {plan.file}: behind a low pass "
                 "it is not computed",
             )
-
-
-def _check_limit(
-    rig: RigFile, file: str, who: tuple[str, str], name: Literal["depth", "speed", "reach"],
-    value: float,
-) -> None:  # fmt: skip
-    limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
-    if value > limit + 1e-9:
-        text = f"{who[0]} needs {value:g} {unit} {who[1]}"
-        raise InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)
+            return

@@ -15,8 +15,9 @@ from typing import Any
 import yaml
 
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.shipped import find_shipped, shipped_files
-from sliplab.protocols.yaml_file import Document, parse_yaml, read_text
+from sliplab.protocols.shipped import find_shipped, neighbours, shipped_files
+from sliplab.protocols.shown import did_you_mean
+from sliplab.protocols.yaml_file import Document, parse_leniently, read_text
 
 KEY = "extends"
 _DEEPEST = 8
@@ -27,7 +28,7 @@ class RigSource:
     """A rig file as read, with the files that it extends."""
 
     path: Path
-    data: dict[str, Any]
+    data: Document
     """Merged content."""
     text: str
     """The file's own text if it extends nothing, else the merged content as YAML."""
@@ -54,7 +55,8 @@ def rig_path(given: Path) -> Path:
     """
     if (found := find_shipped(given, known := shipped_rigs())) is not None:
         return found
-    text = f"no such file, and not one of the shipped rigs: {', '.join(known)}"
+    near = did_you_mean(given.name, [*known, *neighbours(given)])
+    text = f"no such file, and not one of the shipped rigs: {', '.join(known)}{near}"
     raise InputError("--rig", "", str(given), text)
 
 
@@ -71,7 +73,7 @@ def read_rig(path: Path) -> RigSource:
     text, here = read_text(path, "rig file"), path
     own = text
     while True:
-        data = parse_yaml(own, here)
+        data = parse_leniently(own, here)
         parent = data.pop(KEY, None)
         parts.append((here, data))
         if parent is None:
@@ -80,8 +82,10 @@ def read_rig(path: Path) -> RigSource:
             raise InputError(here, KEY, parent, "must be the path of a rig file")
         there = _parent_file(here, parent)
         if not there.exists():
-            known = ", ".join(shipped_rigs())
-            raise InputError(here, KEY, parent, f"no such file, nor a shipped rig ({known})")
+            known = shipped_rigs()
+            near = did_you_mean(there.name, [*known, *neighbours(there)])
+            text = f"no such file, nor a shipped rig ({', '.join(known)}){near}"
+            raise InputError(here, KEY, parent, text)
         if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:
             raise InputError(here, KEY, parent, "is circular, or a chain of more than 8 files")
         try:
@@ -96,7 +100,8 @@ def read_rig(path: Path) -> RigSource:
         names = " on ".join(file.name for file, _ in parts)
         text = f"# Merged: {names}\n" + rig_yaml(merged)
     written = {key: each for _, data in reversed(parts) for key, each in data.written.items()}
-    return RigSource(path, Document(merged, written), text, tuple(parts))
+    faults = [fault for _, data in parts for fault in data.faults]
+    return RigSource(path, Document(merged, written, faults), text, tuple(parts))
 
 
 def _parent_file(here: Path, parent: str) -> Path:

@@ -25,8 +25,9 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from sliplab.protocols.shown import did_you_mean
 from sliplab.protocols.timing import StreamGrade, StreamTiming
-from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel
+from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel, rule
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
 from sliplab.rigs.core.driver import (
     Driver,
@@ -79,14 +80,14 @@ class _Stream(StrictModel):
             return {**data, "timing": {"grade": cls.GRADES[0], **cls.TIMING, **timing}}
         return data
 
-    @model_validator(mode="after")
+    @rule
     def _has_the_grade(self) -> Self:
         if self.timing.grade not in self.GRADES:
             text = f"must be {' or '.join(self.GRADES)}, for this kind of device"
             raise KeyedError(".timing.grade", self.timing.grade, text)
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _mock_keeps_its_promises(self) -> Self:
         """Check that the simulated clock and delays are no worse than `timing` states."""
         mock: Further | None = getattr(self, "mock", None)
@@ -149,7 +150,7 @@ class FrameStream(_Stream):
     device: Annotated[FrameCameraSettings, OfKind(FrameCameraDriver, "basler")] | None = None
     mock: FurtherFrameCamera | None = None
 
-    @model_validator(mode="after")
+    @rule
     def _rate_of_its_own(self) -> Self:
         by_itself = self.timing.grade != "hardware trigger"
         if by_itself and self.rate_hz is None:
@@ -160,7 +161,7 @@ class FrameStream(_Stream):
             raise KeyedError(".rate_hz", self.rate_hz, text)
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _mock_meets_it(self) -> Self:
         if self.mock is None:
             return self
@@ -230,7 +231,8 @@ class _ByKind(ChosenModel):
             raise ValueError("must be a mapping (key: value)")
         kind = value.get("kind")
         if not isinstance(kind, str) or kind not in KINDS:
-            raise KeyedError(".kind", kind, f"must be one of {', '.join(KINDS)}")
+            hint = did_you_mean(str(kind), KINDS) if kind is not None else ""
+            raise KeyedError(".kind", kind, f"must be one of {', '.join(KINDS)}{hint}")
         return self.checked(KINDS[kind], value)
 
     def __get_pydantic_json_schema__(
@@ -244,37 +246,34 @@ Streams = Annotated[dict[str, Annotated[Stream, _ByKind()]], Field(max_length=MO
 """The `streams:` section of a rig file."""
 
 
-def check_streams(
+def stream_faults(
     streams: Mapping[str, Stream], rig_driver: str, clocks: Clocks | None = None
-) -> None:
-    """Check names, and that each device has what the rig's driver needs.
+) -> Iterator[KeyedError]:
+    """Return what is wrong with names, and what each device lacks that the rig's driver needs.
 
     Args:
         clocks: of a simulated rig.
-
-    Raises:
-        KeyedError: the first that is wrong.
     """
     for name, stream in streams.items():
         key = f"streams.{name}"
         if not NAME.fullmatch(name):
-            raise KeyedError(key, name, f"a stream's name must match {NAME.pattern}")
+            yield KeyedError(key, name, f"a stream's name must match {NAME.pattern}")
         if name in RESERVED:
-            raise KeyedError(key, name, "is the name of one of a rig's first devices")
+            yield KeyedError(key, name, "is the name of one of a rig's first devices")
         for part, needed in (("mock", rig_driver != "devices"), ("device", rig_driver != "mock")):
             found = getattr(stream, part)
             if needed and found is None:
-                raise KeyedError(f"{key}.{part}", None, f"is needed by driver: {rig_driver}")
+                yield KeyedError(f"{key}.{part}", None, f"is needed by driver: {rig_driver}")
             if not needed and found is not None:
                 text = f"has no meaning with driver: {rig_driver}"
-                raise KeyedError(f"{key}.{part}", "...", text)
+                yield KeyedError(f"{key}.{part}", "...", text)
         jitter = {"events": "pulse_jitter_us", "frames": "frame_jitter_us"}.get(stream.kind)
         if clocks is None or jitter is None or stream.timing.grade == "host arrival":
             continue
         promised = stream.timing.jitter_us
         if getattr(clocks, jitter) > promised:
             text = f"must be at most {key}.timing.jitter_us = {promised:g}"
-            raise KeyedError(f"mock.clocks.{jitter}", getattr(clocks, jitter), text)
+            yield KeyedError(f"mock.clocks.{jitter}", getattr(clocks, jitter), text)
 
 
 def check_distinct(devices: DeviceSettings | None, streams: Mapping[str, Stream]) -> None:

@@ -34,7 +34,7 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Network, Windows
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, load, register_tags
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, input_error, load, register_tags
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Side = Annotated[int, Field(ge=1, le=512)]
@@ -243,7 +243,7 @@ def load_external(path: Path) -> ExternalModel:
     try:
         _assemble(description, _tensors(data))
     except KeyedError as error:
-        raise InputError(path, error.key, error.value, str(error)) from None
+        raise input_error(path, error) from None
     except EntryError as error:
         raise InputError(file, error.entry, error.shape, str(error)) from None
     except ValueError as error:

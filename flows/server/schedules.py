@@ -23,7 +23,13 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from sliplab.protocols import InputError
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, parse_yaml, read_text, validate
+from sliplab.protocols.yaml_file import (
+    KeyedError,
+    StrictModel,
+    parse_leniently,
+    read_text,
+    validate,
+)
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _CLOCK = r"([01]\d|2[0-3]):([0-5]\d)"
@@ -252,19 +258,24 @@ def load_schedules(path: Path) -> list[Scheduled]:
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
-    read = parse_yaml(read_text(path, "schedule file"), path)
+    read = parse_leniently(read_text(path, "schedule file"), path)
     file = validate(_File, read, path)
     made: list[Scheduled] = []
+    faults: list[InputError] = []
     for number, data in enumerate(file.schedules):
         where = f"schedules[{number}]"
         try:
             made.append(_one(data, file.timezone, path))
         except InputError as error:
-            key = f"{where}.{error.key}" if error.key else where
-            value = error.value and read.written.get(key, error.value)
-            raise InputError(path, key, value, error.expected) from None
+            for each in error.faults:
+                key = f"{where}.{each.key}" if each.key else where
+                value = each.value and read.written.get(key, each.value)
+                faults.append(InputError(path, key, value, each.expected))
+            continue
         if made[-1].name in {item.name for item in made[:-1]}:
-            raise InputError(path, f"{where}.name", made[-1].name, "is used twice")
+            faults.append(InputError(path, f"{where}.name", made[-1].name, "is used twice"))
+    if faults:
+        raise InputError.joined(faults)
     return made
 
 

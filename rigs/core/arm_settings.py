@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 from sliplab.rigs.core.address import Host
 from sliplab.rigs.core.device_settings import DriverSettings
 
@@ -47,7 +47,7 @@ class Limits(StrictModel):
     singular_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
     """Smallest allowed angle of wrist 2 (UR) or joint 5 (ABB) from the singularity."""
 
-    @model_validator(mode="after")
+    @rule
     def _makes_sense(self) -> Limits:
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:

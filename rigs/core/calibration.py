@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from datetime import date
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from sliplab.protocols.quantity import parse, quantity_schema
-from sliplab.protocols.yaml_file import StrictModel
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 
 def _mm(raw: object) -> float:
@@ -67,7 +67,7 @@ class ContactPlane(StrictModel):
     """Distance of a fourth touch from the plane of the three."""
     method: Method | None = None
 
-    @model_validator(mode="after")
+    @rule
     def _spans(self) -> ContactPlane:
         """Check that the points span a plane; `rigs.core.plate_frame` builds the frame."""
         right, above = (

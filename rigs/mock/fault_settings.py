@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags, rule
 
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
@@ -42,7 +42,7 @@ class ArmProtectiveStop(_TimedFault):
     at_mm: Annotated[float, Field(gt=0, le=10_000)] | None = None
     """A distance instead of a time: the path length of the tool since `since`, mm."""
 
-    @model_validator(mode="after")
+    @rule
     def _one_moment(self) -> ArmProtectiveStop:
         if self.at_mm is not None and "at_s" in self.model_fields_set:
             raise ValueError("needs a time (at_s) or a point (at_mm), not both")
@@ -170,7 +170,7 @@ class MarkerOccluded(_TimedFault):
     """True for the plate's ArUco marker instead."""
     seconds: Seconds = 0.3
 
-    @model_validator(mode="after")
+    @rule
     def _one_marker(self) -> MarkerOccluded:
         if self.plate == (self.papilla is not None):
             raise ValueError("needs either a papilla (its number) or plate: true")
@@ -261,7 +261,7 @@ class Shaking(_TimedFault):
     high_hz: Annotated[float, Field(ge=0.1, le=250)] = 200.0
     sweep_s: Seconds = 10.0
 
-    @model_validator(mode="after")
+    @rule
     def _rises(self) -> Shaking:
         if self.high_hz <= self.low_hz:
             raise ValueError(f"high_hz must be over low_hz = {self.low_hz:g}")

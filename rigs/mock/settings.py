@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sliplab.protocols.timing import Delay, ForceTiming, Timing
-from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 from sliplab.rigs.mock.fault_settings import Fault, check_papillae, check_single
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Skin(StrictModel):
     """Every papilla as measured, from the centre outwards and counterclockwise from +x; null: drawn
     by the seed with the scatters above."""
 
-    @model_validator(mode="after")
+    @rule
     def _layers(self) -> Skin:
         if self.papillae is not None and len(self.papillae) != sum(self.ring_counts):
             raise KeyedError(
@@ -131,7 +131,7 @@ class Contact(StrictModel):
     offset_mm: Finite = 0.35
     """Distance of the true surface behind the nominal one, along its normal."""
 
-    @model_validator(mode="after")
+    @rule
     def _turn(self) -> Contact:
         if math.hypot(*self.nominal_rotvec_deg) > 360.0:
             raise KeyedError(
@@ -205,7 +205,7 @@ class EventCamera(StrictModel):
     path: Literal["cubic", "chord"] = "cubic"
     """Interpolation of markers between two steps of the contact: smooth, or straight."""
 
-    @model_validator(mode="after")
+    @rule
     def _scans(self) -> EventCamera:
         if 0 < self.readout_hz < 1000:
             raise KeyedError(
@@ -355,7 +355,7 @@ class Gripper(StrictModel):
     reaction_us: Annotated[int, Field(ge=0, le=1_000_000)] = 8000
     """From a command to the beginning of its motion."""
 
-    @model_validator(mode="after")
+    @rule
     def _in_range(self) -> Gripper:
         for name in ("range_mm", "speed_mm_s", "force_n"):
             low, high = getattr(self, name)
@@ -390,7 +390,7 @@ class Clocks(StrictModel):
     read_longest_us: NonNegative = 5000.0
     """Limit at which this time is clipped."""
 
-    @model_validator(mode="after")
+    @rule
     def _reads(self) -> Clocks:
         if self.read_longest_us < self.read_shortest_us:
             raise KeyedError(
@@ -418,7 +418,7 @@ class MockSettings(StrictModel):
     faults: tuple[Fault, ...] = ()
     """Faults to inject; docs/faults.md lists the kinds."""
 
-    @model_validator(mode="after")
+    @rule
     def _faults(self) -> MockSettings:
         check_papillae(self.faults, sum(self.scene.skin.ring_counts))
         check_single(self.faults, self.event_camera.cutoff_hz)

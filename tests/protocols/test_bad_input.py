@@ -539,7 +539,7 @@ LEAVES = [(name, path) for name, data in SHIPPED.items() for path in _leaves(dat
 
 
 def is_taken_or_named(where: Any, text: str) -> None:
-    """Any text at any key: a plan, or one message in one line that names a key of the file."""
+    """Any text at any key: a plan, or messages of one line each that name a key of the file."""
     name, path = where
     data = copy.deepcopy(SHIPPED[name])
     _set(*path, to=PLACE)(data)
@@ -549,11 +549,11 @@ def is_taken_or_named(where: Any, text: str) -> None:
         make_plan(validate(Protocol, parse_yaml(written, "p.yaml"), "p.yaml"), "p.yaml")
     except InputError as found:
         error = found
-    if error is not None:
-        assert error.message.startswith("p.yaml: ")
-        assert not re.search(r"[\x00-\x1f\x7f-\x9f\u202e]|Decimal\(|datetime", error.message)
-        assert error.key.startswith((str(path[0]), "collection", "analysis")), error.message
-        assert error.expected
+    for each in () if error is None else error.faults:
+        assert each.message.startswith("p.yaml: ")
+        assert not re.search(r"[\x00-\x1f\x7f-\x9f\u202e]|Decimal\(|datetime", each.message)
+        assert each.key.startswith((str(path[0]), "collection", "analysis")), each.message
+        assert each.expected
 
 
 ANYWHERE = given(st.sampled_from(LEAVES), st.sampled_from(TEXTS))

@@ -90,7 +90,7 @@ SEEN = re.compile(r"[^\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u
 def test_no_message_steers_a_terminal(file: str, key: str, value: object, expected: str) -> None:
     error = InputError(file, key, value, expected)
     assert SEEN.fullmatch(error.message)
-    again = error.in_file(file)
+    again = error.replaced(file=file)
     assert again.message == error.message
     assert "Decimal(" not in shown(value).replace(str(value), "")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.yaml_file import KeyedError, rule
 from sliplab.rigs.core.device_settings import DriverSettings
 
 Angle = Annotated[float, Field(ge=-360, le=360)]
@@ -52,7 +52,7 @@ class AtiNetFtSettings(DriverSettings):
     silence_s: float = Field(default=0.5, gt=0, le=60)
     """A stream of which nothing comes for so long has failed."""
 
-    @model_validator(mode="after")
+    @rule
     def _calibration(self) -> AtiNetFtSettings:
         given = [self.counts_per_n is not None, self.counts_per_nm is not None]
         if any(given) and not all(given):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.yaml_file import KeyedError, rule
 from sliplab.rigs.core.device_settings import FrameCameraSettings
 
 FrameTrigger = Literal["hardware", "software", "free run"]
@@ -46,7 +46,7 @@ class BaslerSettings(FrameCameraSettings):
     stall_s: float = Field(default=1.0, ge=0.2, le=60)
     """Timeout for each later frame, seconds."""
 
-    @model_validator(mode="after")
+    @rule
     def _exposure_fits(self) -> BaslerSettings:
         if self.exposure_us * self.rate_hz > 1e6:
             raise KeyedError(
@@ -56,7 +56,7 @@ class BaslerSettings(FrameCameraSettings):
             )
         return self
 
-    @model_validator(mode="after")
+    @rule
     def _lines_differ(self) -> BaslerSettings:
         inputs = {"sync_line": f"Line{self.sync_line}"}
         if self.trigger == "hardware":

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.yaml_file import KeyedError, rule
 from sliplab.rigs.core.device_settings import FrameCameraSettings
 
 
@@ -43,7 +43,7 @@ class UvcSettings(FrameCameraSettings):
     stall_s: float = Field(default=1.0, ge=0.2, le=60)
     """Timeout for each later frame, seconds."""
 
-    @model_validator(mode="after")
+    @rule
     def _exposure_fits(self) -> UvcSettings:
         if self.exposure_us * self.rate_hz > 1e6:
             raise KeyedError(
