@@ -183,7 +183,8 @@ def commands() -> str:
         "store is wrong input),",
         "130 interrupted. With `--json` a command that ends before it has a result prints",
         '`{"error": {"file", "key", "value", "message", "exit_code"}}`, null where nothing is',
-        "known; `key` is the option or argument where no file is wrong.",
+        "known; `key` is the option or argument where no file is wrong. Where several faults were",
+        "found together, `faults` lists each with its file, key, value and message.",
         "",
     ]
     for words, command in _walk("sliplab", typer.main.get_command(app)):

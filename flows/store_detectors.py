@@ -24,6 +24,7 @@ from sliplab.analysis.networks.models import (
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
+from sliplab.protocols.shown import one_of
 from sliplab.storage.trials.store import Store, StoreError
 
 OWN = "own"
@@ -107,7 +108,12 @@ def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
     found = _of_store(place, names) if place.is_dir() else {place.stem: Chosen(place)}
     unknown = next((name for name in names if name not in found), None)
     if unknown is not None:
-        raise InputError("--detector", "", unknown, f"must be one of {', '.join(found)}")
+        raise InputError(
+            "--detector",
+            "",
+            unknown,
+            one_of(unknown, found),
+        )
     return {name: found[name] for name in names or found}
 
 

@@ -49,7 +49,7 @@ class InputError(ValueError):
     def joined(cls, faults: Iterable[InputError]) -> InputError:
         """Return the first of some errors, with all others as its further faults."""
         first, *others = (each for fault in faults for each in fault.faults)
-        return first.replaced(more=others)
+        return first.replaced(more=others) if others else first
 
     @property
     def faults(self) -> tuple[InputError, ...]:
@@ -59,7 +59,9 @@ class InputError(ValueError):
     def replaced(self, **changed: Any) -> InputError:
         """Return the same error with some of its attributes changed."""
         names = ("file", "key", "value", "expected", "more")
-        return type(self)(**{name: getattr(self, name) for name in names} | changed)
+        made = type(self).__new__(type(self))  # a subclass may have other arguments
+        InputError.__init__(made, **{name: getattr(self, name) for name in names} | changed)
+        return made
 
     def __reduce__(self) -> tuple[type[InputError], tuple[Any, ...]]:
         """Its own arguments: it may come from another process."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from decimal import Decimal
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,9 +17,9 @@ from pydantic import (
     model_validator,
 )
 
-from sliplab.protocols.quantity import canonical, check_size, number_meant, to_decimal
+from sliplab.protocols.quantity import canonical, check_size, number_meant, parse, to_decimal
 from sliplab.protocols.shown import did_you_mean, foreign_character
-from sliplab.protocols.units import Unit, all_symbols, canonical_of, faults, find_unit
+from sliplab.protocols.units import all_symbols, canonical_of, faults, find_unit
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 MAX_TRIALS = 1_000_000
@@ -33,11 +33,17 @@ def _number(raw: object) -> Decimal:
     return to_decimal(raw)
 
 
+_DIGITS = r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
+_QUANTITY = {
+    "type": "string",
+    "pattern": rf"^\s*{_DIGITS}\s*[A-Za-z%/][A-Za-z0-9%/]*\s*$",
+    "patternErrorMessage": "must be a number, which may have a unit: 2.4 or 2.4 mm",
+}
 Number = Annotated[
     Decimal,
     BeforeValidator(_number),
     PlainSerializer(canonical),
-    WithJsonSchema({"type": "number"}),
+    WithJsonSchema({"anyOf": [{"type": "number"}, _QUANTITY]}),
 ]
 
 
@@ -81,7 +87,7 @@ def _level(raw: object) -> Level:
             if re.fullmatch(r"[+-]?[\d.]+([eE][+-]?\d+)?", raw):
                 raise ValueError(f"reads as text; write {canonical(to_decimal(raw))}")
             raise ValueError(
-                "must be a number (its unit belongs in 'unit') or a word of letters, "
+                "must be a number (with a unit only where 'unit' is given) or a word of letters, "
                 "digits, '_' and '-'"
             )
         return raw
@@ -97,7 +103,13 @@ LevelField = Annotated[
     BeforeValidator(_level),
     PlainSerializer(_write_level),
     WithJsonSchema(
-        {"anyOf": [{"type": "number"}, {"type": "string", "pattern": f"^{_WORD.pattern}$"}]}
+        {
+            "anyOf": [
+                {"type": "number"},
+                _QUANTITY,
+                {"type": "string", "pattern": f"^{_WORD.pattern}$"},
+            ]
+        }
     ),
 ]
 
@@ -119,7 +131,13 @@ ContextLevel = Annotated[
     BeforeValidator(_named),
     PlainSerializer(_write_level),
     WithJsonSchema(
-        {"anyOf": [{"type": "number"}, {"type": "string", "pattern": f"^{_NAME.pattern}$"}]}
+        {
+            "anyOf": [
+                {"type": "number"},
+                _QUANTITY,
+                {"type": "string", "pattern": f"^{_NAME.pattern}$"},
+            ]
+        }
     ),
 ]
 
@@ -128,35 +146,61 @@ def _list_units(schema: dict[str, Any]) -> None:
     schema["enum"] = [*all_symbols(), None]
 
 
-def _other_unit(symbol: object) -> Unit | None:
-    """The unit of a symbol that is not canonical; None for others, and for what is not a unit."""
-    found = find_unit(symbol) if isinstance(symbol, str) else None
-    return None if found is None or canonical_of(found) == symbol else found
+_WITH_UNIT = re.compile(r"\s*[+-]?[\d.].*[A-Za-z%]\d?\s*")
 
 
-def converted(level: Any, unit: Unit) -> Any:
-    """A level in a unit as a number in its canonical one; what is not a number stays unchanged."""
+def in_canonical_unit(level: Any, symbol: object) -> Any:
+    """Return a level as a number in the canonical unit of its factor.
+
+    Args:
+        level: a number in the factor's unit, or text with any unit of its dimension.
+        symbol: the factor's unit, as a file gives it.
+
+    Returns:
+        the number; a level that is none, or has no unit to be read in, as it is.
+
+    Raises:
+        ValueError: the unit is of another dimension.
+    """
+    unit = find_unit(symbol) if isinstance(symbol, str) else None
+    if unit is None:
+        return level
+    if isinstance(level, str) and _WITH_UNIT.fullmatch(level):
+        return parse(level, canonical_of(unit))
     try:
-        return to_decimal(level) * unit.factor
+        return level if unit.factor == 1 else to_decimal(level) * unit.factor
     except ValueError:
         return level
 
 
-def in_canonical_units(condition: Any, *sections: Any) -> Any:
-    """A condition as a file gives it, its levels in the canonical units of their factors.
+def written_units(*sections: Any) -> dict[str, Any]:
+    """Return the unit of each factor, as the sections of a file have them."""
+    return {
+        name: each.get("unit") for part in sections if isinstance(part, dict)
+        for name, each in part.items() if isinstance(each, dict)
+    }  # fmt: skip
+
+
+def levels_in_canonical_units(
+    levels: Any, key: str, unit_of: Callable[[Any], object], faults: list[KeyedError]
+) -> Any:
+    """Return a list or mapping of levels as a file gives them, by `in_canonical_unit`.
 
     Args:
-        sections: `factors` and `context`, as the file gives them.
+        key: of the levels.
+        unit_of: returns the unit of a level's place: its index or name.
+        faults: gets those of units.
     """
-    factors = {name: each for part in sections if isinstance(part, dict)
-               for name, each in part.items() if isinstance(each, dict)}  # fmt: skip
-    if not isinstance(condition, dict):
-        return condition
-    units = {name: _other_unit(factors.get(name, {}).get("unit")) for name in condition}
-    return {
-        name: level if (unit := units[name]) is None else converted(level, unit)
-        for name, level in condition.items()
-    }
+    if not isinstance(levels, dict | list | tuple):
+        return levels
+    found: dict[Any, Any] = {}
+    for place, level in levels.items() if isinstance(levels, dict) else enumerate(levels):
+        try:
+            found[place] = in_canonical_unit(level, unit_of(place))
+        except ValueError as error:
+            below = f".{place}" if isinstance(levels, dict) else f"[{place}]"
+            faults.append(KeyedError(f"{key}{below}", level, str(error)))
+    return found if isinstance(levels, dict) else list(found.values())
 
 
 class Factor(StrictModel):
@@ -188,14 +232,18 @@ class Factor(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _in_canonical_unit(cls, data: Any) -> Any:
-        if not isinstance(data, dict) or (found := _other_unit(data.get("unit"))) is None:
+        if not isinstance(data, dict) or not isinstance(symbol := data.get("unit"), str):
             return data
-        made = {**data, "unit": canonical_of(found)}
-        for key in ("values", "optional"):
-            if isinstance(data.get(key), list | tuple):
-                made[key] = [converted(level, found) for level in data[key]]
-        if isinstance(data.get("range"), dict):
-            made["range"] = {key: converted(end, found) for key, end in data["range"].items()}
+        if (unit := find_unit(symbol)) is None:
+            return data
+        made, faults = {**data, "unit": canonical_of(unit)}, list[KeyedError]()
+        for key in ("values", "optional", "range"):
+            if key in data:
+                made[key] = levels_in_canonical_units(
+                    data[key], f".{key}", lambda _: symbol, faults
+                )
+        if faults:
+            raise KeyedError.joined(faults)
         return made
 
     @rule

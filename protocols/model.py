@@ -8,7 +8,8 @@ Quantities are decimals in the canonical unit of their kind
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from decimal import Decimal
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -26,8 +27,9 @@ from sliplab.protocols.factors import (
     MAX_TRIALS,
     Context,
     Factor,
-    in_canonical_units,
+    levels_in_canonical_units,
     unknown_factor,
+    written_units,
 )
 from sliplab.protocols.nuisances import Nuisances
 from sliplab.protocols.phases import Phase
@@ -119,14 +121,24 @@ class Collection(StrictModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _references_in_canonical_units(cls, data: Any) -> Any:
-        references = data.get("references") if isinstance(data, dict) else None
-        if not isinstance(references, dict):
+    def _levels_in_canonical_units(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
             return data
-        condition = in_canonical_units(
-            references.get("condition"), data.get("factors"), data.get("context")
-        )
-        return {**data, "references": {**references, "condition": condition}}
+        units, faults = written_units(data.get("factors"), data.get("context")), list[KeyedError]()
+        made = dict(data)
+        if isinstance(references := data.get("references"), dict) and "condition" in references:
+            key = "collection.references.condition"
+            condition = levels_in_canonical_units(references["condition"], key, units.get, faults)
+            made["references"] = {**references, "condition": condition}
+        stopping = data.get("stopping")
+        if isinstance(stopping, dict) and isinstance(claims := stopping.get("claims"), list):
+            made["stopping"] = {**stopping, "claims": [
+                _claim_in_canonical_units(claim, f"collection.stopping.claims[{k}]", units, faults)
+                for k, claim in enumerate(claims)
+            ]}  # fmt: skip
+        if faults:
+            raise KeyedError.joined(faults)
+        return made
 
     @field_validator("factors")
     @classmethod
@@ -326,6 +338,19 @@ class Collection(StrictModel):
                 )
 
 
+def _claim_in_canonical_units(
+    claim: Any, key: str, units: Mapping[str, Any], faults: list[KeyedError]
+) -> Any:
+    between = claim.get("between") if isinstance(claim, dict) else None
+    if not isinstance(between, dict) or not isinstance(between.get("factor"), str):
+        return claim
+    unit = units.get(between["factor"])
+    levels = levels_in_canonical_units(
+        between.get("levels"), f"{key}.between.levels", lambda _: unit, faults
+    )
+    return {**claim, "between": {**between, "levels": levels}}
+
+
 def _references_in(part: Any, key: str) -> list[tuple[str, FactorRef]]:
     """Each reference to a factor in `part`, with the key at which it occurs."""
     if isinstance(part, FactorRef):
@@ -347,3 +372,32 @@ class Protocol(StrictModel):
     title: Annotated[str, Field(max_length=200)] = ""
     collection: Collection
     analysis: AnalysisSettings = AnalysisSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _held_out_levels_as_text(cls, data: Any) -> Any:
+        """Levels of the split may be numbers in the unit of their factor, too."""
+        collection, analysis = (
+            data.get(name) if isinstance(data, dict) else None
+            for name in ("collection", "analysis")
+        )
+        split = analysis.get("split") if isinstance(analysis, dict) else None
+        if not isinstance(collection, dict) or not isinstance(split, dict):
+            return data
+        units = written_units(collection.get("factors"), collection.get("context"))
+        made = {
+            part: {name: _as_text(levels, units.get(name)) for name, levels in split[part].items()}
+            for part in ("validation_levels", "test_levels") if isinstance(split.get(part), dict)
+        }  # fmt: skip
+        return {**data, "analysis": {**analysis, "split": {**split, **made}}}
+
+
+def _as_text(levels: Any, symbol: object) -> Any:
+    """Return levels with numbers as text in their unit, ``2.4 mm``."""
+    if not isinstance(symbol, str) or not isinstance(levels, list):
+        return levels
+    return [
+        f"{level} {symbol}" if isinstance(level, int | Decimal) and not isinstance(level, bool)
+        else level
+        for level in levels
+    ]  # fmt: skip

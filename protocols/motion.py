@@ -240,7 +240,7 @@ def _limit_faults(
         if not isinstance(field, FactorRef):
             yield field, key
             return
-        yield from written[field.factor]
+        yield from written.get(field.factor, ())  # an unknown factor is named by another rule
 
     def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> Iterator[KeyedError]:
         for value, where in levels(field, key):
@@ -300,7 +300,7 @@ def _check_levels(
 ) -> Iterator[KeyedError]:
     """Check every level against the fields that use it: a number, and in their range."""
     for key, ref in collection.bindings():
-        for level, where in written[ref.factor] if ref.unit is not None else ():
+        for level, where in written.get(ref.factor, ()) if ref.unit is not None else ():
             if isinstance(level, str):
                 yield KeyedError(where, level, f"is text, expected a number in {ref.unit} belongs")
                 continue

@@ -35,6 +35,7 @@ from sliplab.protocols.quantity import (
     canonical,
     word_or_ref,
 )
+from sliplab.protocols.shown import one_of
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
 
 NONE, MIX = "none", "mix"
@@ -292,7 +293,7 @@ class Nuisances(StrictModel):
         """
         names = [NONE, MIX, *self.known]
         if name not in names:
-            raise KeyedError(key, name, f"must be one of {', '.join(names)}")
+            raise KeyedError(key, name, one_of(name, names))
 
     def applied(self, condition: Mapping[str, Any]) -> tuple[str, Decimal]:
         """The name that applies in a trial with this condition, and its strength in percent."""

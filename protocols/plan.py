@@ -7,7 +7,6 @@ that were there already.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -19,14 +18,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.consistency import check_consistency
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.factors import Level, unknown_factor
+from sliplab.protocols.factors import Level, in_canonical_unit, unknown_factor
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits, path_fault
 from sliplab.protocols.nuisances import requests
 from sliplab.protocols.program import Dwell, Program
-from sliplab.protocols.quantity import FactorRef, canonical, parse, to_decimal
+from sliplab.protocols.quantity import FactorRef, canonical, to_decimal
 from sliplab.protocols.shipped import protocol_path
+from sliplab.protocols.shown import did_you_mean
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.templates import in_terms_of_template
 from sliplab.protocols.units import file_text
@@ -337,20 +337,22 @@ def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -
     path = path if stored else protocol_path(path)
     document = parse_leniently(read_text(path, "protocol"), path)
     try:
-        protocol = validate(Protocol, document, path)
-        if not stored:
-            levels = _levels(protocol)
-            try:
-                raise_all(
-                    (lambda: check_consistency(protocol), lambda: check_limits(protocol, levels))
-                )
-            except KeyedError as error:
-                raise input_error(path, error) from None
+        protocol = validate(Protocol, document, path, None if stored else _check)
         return make_plan(protocol, str(path), enable)
     except InputError as error:
         raise InputError.joined(
             in_terms_of_template(each, document) for each in error.faults
         ) from None
+
+
+def _check(protocol: Protocol) -> None:
+    """Check a protocol that a person gives. Raises KeyedError, all that is wrong."""
+    raise_all(
+        (
+            lambda: check_consistency(protocol),
+            lambda: check_limits(protocol, _levels(protocol)),
+        )
+    )
 
 
 def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan:
@@ -401,7 +403,11 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
         if level not in (*factor.levels(), *factor.optional):
             optional = ", ".join(factor.text(item) for item in factor.optional) or "none"
             raise InputError(
-                "--enable", name, raw, f"is not an optional level; optional levels: {optional}"
+                "--enable",
+                name,
+                raw,
+                f"is not an optional level; optional levels: {optional}"
+                f"{did_you_mean(raw, optional.split(', '))}",
             )
         if level not in levels[name]:
             levels[name] = (*levels[name], level)
@@ -414,8 +420,7 @@ def _levels(protocol: Protocol) -> dict[str, tuple[Level, ...]]:
 
 def _number(raw: str, unit: str) -> Decimal:
     """A level as a number in a canonical unit, or with any unit of its dimension."""
-    with_unit = re.match(r"[+-]?[\d.].*[A-Za-z%]\d?$", raw) is not None
-    return parse(raw, unit) if with_unit else to_decimal(raw)
+    return to_decimal(in_canonical_unit(raw, unit))
 
 
 def condition_id(protocol: Protocol, condition: Mapping[str, Level]) -> str:

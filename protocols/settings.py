@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, WithJsonSchema, field_validator, model_validator
 
 from sliplab.protocols.presets import COMPARED, PAPER, Value, at, expanded
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
@@ -103,6 +103,10 @@ class Samples(StrictModel):
     that was recorded before."""
 
 
+HeldOut = Annotated[str, WithJsonSchema({"type": ["string", "number"]})]
+"""A level; a number without a unit is in its factor's, see `protocols.model`."""
+
+
 class Split(StrictModel):
     """Trials that train, choose the model, and test it.
 
@@ -115,8 +119,8 @@ class Split(StrictModel):
     validation: float = Field(default=0.15, ge=0, le=1)
     test: float = Field(default=0.15, ge=0, le=1)
     strata: tuple[str, ...] = ("depth", "speed")
-    validation_levels: dict[str, tuple[str, ...]] = Field(default_factory=dict)
-    test_levels: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    validation_levels: dict[str, tuple[HeldOut, ...]] = Field(default_factory=dict)
+    test_levels: dict[str, tuple[HeldOut, ...]] = Field(default_factory=dict)
 
     @rule
     def _sums(self) -> Split:

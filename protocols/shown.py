@@ -82,6 +82,12 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     return f"; did you mean '{close}'?" if close else ""
 
 
+def one_of(name: object, names: Iterable[str]) -> str:
+    """Return ``must be one of a, b``, with the nearest of them for a misspelt name."""
+    known = list(names)
+    return f"must be one of {', '.join(known)}{did_you_mean(str(name), known)}"
+
+
 def printable(text: str) -> str:
     """`text` with control codes written out (``\\x1b``); line breaks and tabs stay."""
     return CONTROL.sub(lambda found: _escaped(found[0]), text)

@@ -15,6 +15,7 @@ from sliplab.protocols.factors import Factor, Level, unknown_factor
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.quantity import canonical, parse
 from sliplab.protocols.settings import Split
+from sliplab.protocols.shown import did_you_mean
 from sliplab.protocols.yaml_file import KeyedError
 
 GOLDEN = 0.6180339887498949
@@ -91,7 +92,11 @@ def check_split(split: Split, factors: Mapping[str, Factor]) -> Split:
                     except ValueError as error:
                         raise KeyedError(key, level, str(error)) from None
                 if text not in known:
-                    raise KeyedError(key, level, f"is not one of its levels: {sorted(known)}")
+                    raise KeyedError(
+                        key,
+                        level,
+                        f"is not one of its levels: {sorted(known)}{did_you_mean(text, known)}",
+                    )
                 texts.append(text)
             fixed[part][name] = tuple(texts)
     return split.model_copy(update=fixed)

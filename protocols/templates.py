@@ -25,6 +25,7 @@ import yaml
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.quantity import parse_or_ref
 from sliplab.protocols.shipped import shipped_files
+from sliplab.protocols.shown import one_of
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, load, parse_yaml
 
 FOLDER = Path(__file__).parent / "templates"
@@ -129,7 +130,11 @@ def _uses_template(motion: Any) -> bool:
 def _template_of(motion: Mapping[str, Any]) -> Template:
     name, known = motion["template"], templates()
     if not isinstance(name, str) or name not in known:
-        raise KeyedError(f"{KEY}.template", name, f"must be one of {', '.join(known)}")
+        raise KeyedError(
+            f"{KEY}.template",
+            name,
+            one_of(name, known),
+        )
     return known[name]
 
 

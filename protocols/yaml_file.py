@@ -25,6 +25,7 @@ from pydantic import (
     ConfigDict,
     ModelWrapValidatorHandler,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 from pydantic_core import CoreSchema, core_schema
@@ -68,9 +69,20 @@ class StrictModel(BaseModel):
         raise KeyedError.joined(found)
 
     @model_validator(mode="after")
-    def _obey_rules(self) -> Self:
-        """Check the methods marked by `rule`, all of them."""
-        raise_all(getattr(self, name) for name in _rules(type(self)))
+    def _obey_rules(self, info: ValidationInfo) -> Self:
+        """Check the methods marked by `rule`, all of them.
+
+        `validate` gets faults with a whole key in the context's list, so that what is outside of
+        this model is checked, too.
+        """
+        try:
+            raise_all(getattr(self, name) for name in _rules(type(self)))
+        except KeyedError as error:
+            if not isinstance(info.context, list):
+                raise
+            info.context.extend(fault for fault in error.faults if not fault.below)
+            if below := [fault for fault in error.faults if fault.below]:
+                raise KeyedError.joined(below) from None
         return self
 
 
@@ -458,26 +470,46 @@ def without_secrets(data: Any) -> Any:
     return [without_secrets(part) for part in data] if isinstance(data, list) else data
 
 
-def validate(model: type[ModelT], data: dict[str, Any], path: str | Path) -> ModelT:
+def validate(
+    model: type[ModelT],
+    data: dict[str, Any],
+    path: str | Path,
+    check: Callable[[ModelT], None] | None = None,
+) -> ModelT:
     """`data` as a `model`.
+
+    Args:
+        check: what else must hold for the model; raises KeyedError.
 
     Raises:
         InputError: all that is wrong with it.
     """
     document = data if isinstance(data, Document) else Document(data, {})
-    found = list(document.faults)
-    unread = [fault.key for fault in found]
+    unread = [fault.key for fault in document.faults]
+    found: list[KeyedError] = []
+    checked: Sequence[KeyedError] = ()
+    made: ModelT | None = None
     try:
-        made = model.model_validate(data)
+        made = model.model_validate(data, context=found)
+        if check is not None:
+            check(made)
     except ValidationError as error:
-        found += [
-            InputError(path, each.key, _as_written(document, each), str(each))
-            for each in faults_of(model, error)
-            if not any(_at_or_around(each.key, key) for key in unread)
-        ]
-        raise InputError.joined(found) from None
-    if found:
-        raise InputError.joined(found)
+        found = [*faults_of(model, error), *found]
+    except KeyedError as error:
+        checked = error.faults
+    except Exception:
+        if not found:  # a check may rely on the model's rules
+            raise
+    by_key: dict[str, InputError] = {fault.key: fault for fault in document.faults}
+    for each, value in (
+        *((fault, _as_written(document, fault)) for fault in found),
+        *((fault, fault.value) for fault in checked),
+    ):
+        if not any(_at_or_around(each.key, key) for key in unread):
+            by_key.setdefault(each.key, InputError(path, each.key, value, str(each)))
+    if by_key:
+        raise InputError.joined(by_key.values())
+    assert made is not None
     return made
 
 
@@ -608,6 +640,8 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
             reads = "a switch" if isinstance(value, bool) else "a day"
             reads = "a number" if isinstance(value, int | Decimal) and reads == "a day" else reads
             expected += f" and reads as {reads}: quote it"
+    if kind == "literal_error" and isinstance(value, str):
+        expected += did_you_mean(value, re.findall("'([^']*)'", expected))
     if context.get("pattern") == NAME_PATTERN:
         expected = f"must be {NAME_WORDS} (pattern {NAME_PATTERN})"
     return KeyedError(key, value, expected)

@@ -28,7 +28,6 @@ from sliplab.protocols.yaml_file import (
     NAME_PATTERN,
     KeyedError,
     StrictModel,
-    input_error,
     mask_secrets,
     parse_yaml,
     raise_all,
@@ -439,13 +438,7 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
     """
     found = read_rig(rig_path(path))
     try:
-        rig = validate(RigFile, found.data, found.path)
-        arm = None if rig.devices is None else rig.devices.arm
-        if arm is not None and not stored:
-            try:
-                raise_all((lambda: check_units(arm), lambda: _masked_secrets(rig)))
-            except KeyedError as error:
-                raise input_error(found.path, error) from None
+        rig = validate(RigFile, found.data, found.path, None if stored else _check)
         return rig, found.text
     except InputError as error:
         unread = {each.key for each in found.data.faults}  # these name their file already
@@ -453,6 +446,13 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
             each if each.key in unread else each.replaced(file=str(found.blame(each.key)))
             for each in error.faults
         ) from None
+
+
+def _check(rig: RigFile) -> None:
+    """Check a rig file that a person gives. Raises KeyedError, all that is wrong."""
+    if rig.devices is not None:
+        arm = rig.devices.arm
+        raise_all((lambda: check_units(arm), lambda: _masked_secrets(rig)))
 
 
 def _masked_secrets(rig: RigFile) -> Iterator[KeyedError]:

@@ -10,7 +10,6 @@ A detector is named by
 
 from __future__ import annotations
 
-import difflib
 import os
 import shlex
 import sys
@@ -22,6 +21,7 @@ from pathlib import Path
 
 from sliplab.analysis.bench.interface import Detector
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import did_you_mean
 
 GROUP = "sliplab.detectors"
 _ENTRIES = "sliplab.analysis.bench.entries"
@@ -80,8 +80,7 @@ def make_detector(name: str) -> Detector:
         return OnnxModel(name)
     names = known()
     if name not in names and ":" not in name:
-        close = difflib.get_close_matches(name, names, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
+        hint = did_you_mean(name, names)
         raise InputError(
             _KEY, "", name,
             f"must be one of {', '.join(names)}, MODULE:ATTRIBUTE, a file that ends in {ONNX}, or "

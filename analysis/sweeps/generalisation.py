@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,9 +34,11 @@ from sliplab.analysis.windows.sample_sets import (
     split_trials,
 )
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.factors import in_canonical_unit
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.quantity import level_order
 from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.shown import did_you_mean
 from sliplab.storage.files import make_folder, write_bytes, write_text
 from sliplab.storage.schema.document import Part
 from sliplab.storage.schema.sweeps import GeneralisationResults, NotTrained, UnseenScores
@@ -219,12 +222,14 @@ class Generalisation:
         known = [
             (factor, level) for factor in factors or self.factors() for level in self.levels(factor)
         ]
-        unknown = set(levels) - {level for _, level in known}
+        texts = [level for _, level in known]
+        wanted = {each for level in levels for each in _same_level(level, texts)}
+        unknown = [level for level in levels if not _same_level(level, texts)]
         if unknown:
-            there = ", ".join(level for _, level in known)
-            raise InputError("--level", "", min(unknown), f"must be one of {there}")
+            text = f"must be one of {', '.join(texts)}{did_you_mean(min(unknown), texts)}"
+            raise InputError("--level", "", min(unknown), text)
         if levels:
-            return [pair for pair in known if pair[1] in levels]
+            return [pair for pair in known if pair[1] in wanted]
         return [pair for pair in known if every or pair[1] == self.levels(pair[0])[0]]
 
     def without(self, factor: str, level: str, say: Callable[[str], None]) -> Task:
@@ -261,3 +266,17 @@ def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, li
     joined = SampleSet.join(parts, campaigns[0].settings.windows)
     found = by_id([ref for split in SPLITS for ref in split_trials(campaigns, split)])
     return joined, [found[name] for name in joined.trials]
+
+
+def _same_level(given: str, texts: Sequence[str]) -> list[str]:
+    """Return the levels, as text, that one stands for: with their unit, another one, or none."""
+    found = []
+    for text in texts:
+        number, _, unit = text.partition(" ")
+        try:
+            same = bool(unit) and Decimal(str(in_canonical_unit(given, unit))) == Decimal(number)
+        except (ValueError, InvalidOperation):
+            same = False
+        if same or given == text:
+            found.append(text)
+    return found

@@ -2,7 +2,8 @@
 
 Without ``--json`` an error is one message on standard error. With it, one object goes to standard
 output as well, unless the command had already printed its result before it failed:
-``{"error": {"file", "key", "value", "message", "exit_code"}}``, null where unknown.
+``{"error": {"file", "key", "value", "message", "exit_code"}}``, null where unknown. Where several
+faults were found, ``"faults"`` lists each with its file, key, value and message.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ class Failure:
         key: the key inside it, or the option or argument.
         value: the offending value, as written.
         trace: the traceback, if the error is a bug in the program.
+        faults: each fault of the input, where there are several.
     """
 
     message: str
@@ -51,6 +53,7 @@ class Failure:
     key: str | None = None
     value: str | None = None
     trace: str = ""
+    faults: tuple[InputError, ...] = ()
 
     def report(self) -> int:
         """Print the message, and with ``--json`` the error object; return the exit code."""
@@ -59,8 +62,12 @@ class Failure:
         if self.message:
             console.say(self.message if self.interrupted else f"error: {self.message}")
         named = {"file": self.file, "key": self.key, "value": self.value}
+        faults = [
+            {"file": f.file, "key": f.key or None, "value": f.value, "message": f.message}
+            for f in self.faults
+        ]
         with suppress(OutputLost):  # it was said on standard error
-            console.print_error({**named, "message": self.message}, self.exit_code)
+            console.print_error({**named, "message": self.message}, self.exit_code, faults)
         return self.exit_code
 
     @property
@@ -122,7 +129,8 @@ def _wrong_input(error: InputError) -> Failure:
     if _OPTION.fullmatch(file):
         file, key = "", f"{file} {key}".strip()
     code = console.FAILED if isinstance(error, DamagedFile) else console.WRONG_INPUT
-    return Failure(error.message, code, file or None, key or None, error.value)
+    faults = error.faults if error.more else ()
+    return Failure(error.message, code, file or None, key or None, error.value, faults=faults)
 
 
 def _wrong_usage(error: TyperException) -> Failure:

@@ -11,6 +11,7 @@ from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, 
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
 
 if TYPE_CHECKING:
     from sliplab.flows.export_model import Exported
@@ -82,7 +83,7 @@ def import_(
     where = of_one_campaign(Path(kind_or_path) if path is None else path)
     kind = kind_of(where) if path is None else kind_or_path
     if path is not None and kind not in KINDS:
-        raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
+        raise InputError("KIND", "", kind, one_of(kind, KINDS))
     try:
         safe_name(name)
     except StoreError as error:
@@ -151,7 +152,12 @@ def export(
         finish({"labels": len(table), "output": str(output)}, f"labels of {what}", as_json)
         return
     if form not in SUFFIXES:
-        raise InputError("--format", "", form, f"must be one of {', '.join(SUFFIXES)}")
+        raise InputError(
+            "--format",
+            "",
+            form,
+            one_of(form, SUFFIXES),
+        )
     recordings = [campaign.recording(name) for name in names]
     for recording in recordings:
         if stream not in recording.streams("events") and stream != "events":

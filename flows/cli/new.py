@@ -9,6 +9,7 @@ import typer
 
 from sliplab.flows.cli.common import JsonOption, finish
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
 
 app = typer.Typer()
 new_app = typer.Typer(
@@ -42,7 +43,7 @@ def driver(
     from sliplab.rigs.testing.new_package import KINDS, name_fault, write_package
 
     if kind not in KINDS:
-        raise InputError("--kind", "", kind, f"must be one of {', '.join(KINDS)}")
+        raise InputError("--kind", "", kind, one_of(kind, KINDS))
     if fault := name_fault(name):
         raise InputError("NAME", "", name, fault)
     folder = into / name.replace("_", "-")

@@ -11,6 +11,7 @@ import typer
 from sliplab.flows.cli.common import CampaignOption, JsonOption, PlaceArgument, finish, located
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import did_you_mean, one_of
 
 if TYPE_CHECKING:
     from sliplab.storage.formats.publication import Publication
@@ -44,7 +45,7 @@ def publish(
     from sliplab.storage.remote.mirror import open_store
 
     if form not in FORMATS:
-        raise InputError("--as", "", form, f"must be one of {', '.join(FORMATS)}")
+        raise InputError("--as", "", form, one_of(form, FORMATS))
     opened = open_store(located(store))
     campaigns = _campaigns(opened, campaign)
     names = ", ".join(item.name for item in campaigns)
@@ -72,7 +73,12 @@ def _campaigns(store: Store, names: Sequence[str] | None) -> tuple[Campaign, ...
     for name in names or ():
         if name not in known:
             there = ", ".join(known) or "none"
-            raise InputError("--campaign", "", name, f"must be a campaign of the store: {there}")
+            raise InputError(
+                "--campaign",
+                "",
+                name,
+                f"must be a campaign of the store: {there}{did_you_mean(name, known)}",
+            )
     return tuple(known[name] for name in sorted(set(names or known)))
 
 

@@ -10,6 +10,7 @@ import typer
 from sliplab.flows.cli.common import JsonOption, finish
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
 
 app = typer.Typer()
 
@@ -30,7 +31,7 @@ def schema(
     from sliplab.storage.files import write_json
 
     if kind not in KINDS:
-        raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
+        raise InputError("KIND", "", kind, one_of(kind, KINDS))
     made = file_schema(kind)
     if out is None:
         console.print_json(made)

@@ -17,6 +17,7 @@ from sliplab.flows.cli.common import (
 )
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import did_you_mean
 
 if TYPE_CHECKING:
     from sliplab.storage.trials.store import Campaign, Store
@@ -306,6 +307,7 @@ def _chosen(store: Store, names: list[str] | None) -> list[Campaign]:
     for name in names or ():
         if name not in there:
             text = f"is not in {store.folder}; there are {', '.join(there)}"
+            text += did_you_mean(name, there)
             raise InputError("--campaign", "", name, text)
     return [there[name] for name in (names or there)]
 

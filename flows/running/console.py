@@ -84,15 +84,23 @@ def printed() -> bool:
     return _printed
 
 
-def print_error(named: Mapping[str, str | None], exit_code: int) -> None:
+def print_error(
+    named: Mapping[str, str | None],
+    exit_code: int,
+    faults: Sequence[Mapping[str, str | None]] = (),
+) -> None:
     """The error as the one JSON object of a command that was asked for one and has none yet.
 
     Args:
         named: ``file``, ``key``, ``value`` and ``message``.
+        faults: the same of each fault, where there are several.
     """
     if _as_json and not _printed:
         shown = {name: text and masked(text) for name, text in named.items()}
-        print_json({"error": {**shown, "exit_code": exit_code}})
+        error: dict[str, Any] = {**shown, "exit_code": exit_code}
+        if faults:
+            error["faults"] = [{k: text and masked(text) for k, text in f.items()} for f in faults]
+        print_json({"error": error})
 
 
 def plain(value: Any) -> Any:

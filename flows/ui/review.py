@@ -20,6 +20,7 @@ from sliplab.analysis.review.doubt import reasons_for_doubt, suggested_onsets
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.adapter import CLASSES
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import did_you_mean
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import F64, I64, U8
@@ -147,7 +148,7 @@ class TrialList:
         found = {item.name: item for item in self.store.campaigns()}
         for name in self._names:
             if name not in found:
-                there = ", ".join(found) or "none"
+                there = (", ".join(found) or "none") + did_you_mean(name, found)
                 raise InputError(
                     "--campaign", "", name, f"is not in {self.store.folder}; there are {there}"
                 )

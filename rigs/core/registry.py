@@ -11,7 +11,6 @@ cannot be imported does not affect others; the error is reported when its driver
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -19,6 +18,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from sliplab.protocols.shown import one_of
 from sliplab.rigs.core.driver import Driver
 
 DriverT = TypeVar("DriverT", bound=Driver[Any])
@@ -100,9 +100,7 @@ def _unknown(name: str, kind: type[Driver[Any]]) -> str:
                 names.append(item.name)
         except DriverError as error:
             broken.append(str(error))
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean '{close[0]}'?" if close else ""
-    return "; ".join([f"must be one of {', '.join(names)}{hint}", *broken])
+    return "; ".join([one_of(name, names), *broken])
 
 
 @cache

@@ -156,7 +156,7 @@ WRONG_PROTOCOLS = {
     "both levels and range": _put(
         "collection", "factors", "depth", "range", to={"from": 1, "to": 2, "step": 1}
     ),
-    "a level with a unit": _put("collection", "factors", "depth", "values", 0, to="2.4 mm"),
+    "a level with a comma": _put("collection", "factors", "depth", "values", 0, to="2,4 mm"),
     "no factors": _put("collection", "factors", to={}),
     "repetitions": _put("collection", "repetitions", to=0),
     "a seed as text": _put("collection", "seed", to="one"),

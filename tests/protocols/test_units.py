@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.protocols import InputError, Plan, units
+from sliplab.protocols import InputError, Plan, load_plan, units
 from sliplab.protocols.quantity import parse
 from sliplab.protocols.units import TABLE, file_text, find_unit, symbols_of
 from tests.conftest import ROOT, SMALL
@@ -208,3 +208,69 @@ def test_the_schema_for_editors_knows_units_of_packages(install: Any, tmp_path: 
     models = json.loads(done.stdout)["definitions"]
     assert "inch" in models["Factor"]["properties"]["unit"]["enum"]
     assert "|inch)" in json.dumps(models["Press"]["properties"]["depth"])
+
+
+WRITTEN = [
+    ("values: [2.4, 2.8, 3.4]", "values: [2.4 mm, '2.80 mm', 0.34 cm]"),
+    ("unit: mm, values: [2.4, 2.8, 3.4]", "unit: cm, values: [0.24, 2.8 mm, 0.34 cm]"),
+]
+
+
+@pytest.mark.parametrize("change", WRITTEN, ids=["canonical", "centimetres"])
+def test_levels_with_and_without_unit_give_the_same_trials(
+    tmp_path: Path, change: tuple[str, str]
+) -> None:
+    text = (ROOT / "protocols" / "pilot.yaml").read_text()
+    path = tmp_path / "pilot.yaml"
+    path.write_text(text.replace(*change))
+    assert [(t.id, t.seed) for t in load_plan(path)] == [
+        (t.id, t.seed) for t in load_plan(Path("pilot"))
+    ]
+
+
+def _with(tmp_path: Path, *changes: tuple[str, str]) -> Path:
+    text = (ROOT / "protocols" / "pilot.yaml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("level", ["2.4", "2.4 mm", "0.24 cm"])
+def test_held_out_reference_and_claimed_levels_take_a_unit_or_none(
+    tmp_path: Path, level: str
+) -> None:
+    split = (
+        "split: {method: ranked, train: 0.70, validation: 0.15, test: 0.15, strata: [depth, speed]}"
+    )
+    plan = load_plan(
+        _with(
+            tmp_path,
+            (split, f"split: {{method: leave_conditions_out, test_levels: {{depth: [{level}]}}}}"),
+            (
+                "  repetitions: 1",
+                f"  references: {{every: 9, condition: {{depth: {level}, speed: 1, direction: 0}}}}"
+                "\n  stopping: {claims: [{figure: slip_duration, at_most: 90 ms, between: "
+                f"{{factor: depth, levels: [{level}, 3.4 mm]}}}}]}}\n  repetitions: 1",
+            ),
+        )
+    )
+    analysis, collection = plan.protocol.analysis, plan.protocol.collection
+    assert analysis.split.test_levels == {"depth": ("2.4 mm",)}
+    assert collection.references is not None
+    assert collection.references.condition["depth"] == Decimal("2.4")
+    assert collection.stopping is not None
+    between = collection.stopping.claims[0].between
+    assert between is not None
+    assert between.levels == (Decimal("2.4"), Decimal("3.4"))
+
+
+def test_every_level_in_a_wrong_unit_is_named(tmp_path: Path) -> None:
+    path = _with(tmp_path, ("values: [2.4, 2.8, 3.4]", "values: [2.4 s, 2.8, 3.4 kg]"))
+    with pytest.raises(InputError) as caught:
+        load_plan(path)
+    keys = [each.key for each in caught.value.faults]
+    assert keys == ["collection.factors.depth.values[0]", "collection.factors.depth.values[2]"]
+    assert "must be one of: mm" in caught.value.expected
