@@ -43,8 +43,11 @@ SPEED_OVER_S = 900.0
 """Time over which speed is averaged to estimate the time left, s. With rich's default of 30,
 steps of other kinds, counted by the same bar, changed the estimate from minutes to an hour."""
 
-_LINE = 10_000
-"""Characters of a line where there is no terminal: nothing is folded in a file or a pipe."""
+WIDTH = 120
+"""Columns of a table where there is no terminal: in a file, a pipe or a log."""
+
+_FEWEST = 16
+"""Width to which columns are folded inside a word, outside of a terminal."""
 
 _FOLDED = 30
 """Width to which columns are folded in a table that is too wide all the same."""
@@ -53,7 +56,7 @@ _FOLDED = 30
 def results_width() -> int | None:
     """Return how wide results may be; None where the terminal says so."""
     terminal = sys.stdout is not None and sys.stdout.isatty()
-    return None if terminal or "COLUMNS" in os.environ else _LINE
+    return None if terminal or "COLUMNS" in os.environ else WIDTH
 
 
 messages = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
@@ -138,8 +141,8 @@ def print_table(
 ) -> None:
     """Print a table. No word is broken: an id or a path can be copied and searched for.
 
-    Cells are folded between words where the terminal is too narrow; where that is not enough lines
-    are longer than the terminal. Without a terminal each row is one line.
+    Cells are folded between words where they are too wide. Where that is not enough, lines are
+    longer than a terminal; outside of a terminal the longest words are folded, too.
 
     Args:
         limit: rows; the middle of a longer table is left out and counted.
@@ -157,13 +160,21 @@ def _print(
 ) -> None:
     by_column = list(zip(columns, *cells, strict=True))
     widths, gap = _layout(by_column, results.width, spare)
+    if table.show_header and not results.is_terminal:
+        _fold_words(widths, gap, max(results.width, WIDTH))
     table.title_justify, table.padding = "left", (0, 1 if gap == 3 else 0, 0, 1)
     table.width = _table_width(widths, gap)
     for column, width in zip(columns, widths, strict=False):
-        table.add_column(escape(_clean(column)), width=width)
+        table.add_column(escape(_clean(column)), width=width, overflow="fold")
     for row in cells:
         table.add_row(*map(Text, row[: len(widths)]))
-    results.print(table, crop=False)
+    if results.is_terminal:
+        results.print(table, crop=False)
+        return
+    with results.capture() as captured:
+        results.print(table, crop=False)
+    lines = "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines())
+    results.print(lines, end="", markup=False, soft_wrap=True)
 
 
 def _layout(by_column: Sequence[Sequence[str]], room: int, spare: int) -> tuple[list[int], int]:
@@ -191,6 +202,17 @@ def _layout(by_column: Sequence[Sequence[str]], room: int, spare: int) -> tuple[
         foldable = [number for number, width in enumerate(widths) if width > words[number]]
         widths[max(foldable, key=widths.__getitem__)] -= 1
     return widths, gap
+
+
+def _fold_words(widths: list[int], gap: int, room: int) -> None:
+    """Narrow the widest columns until a table fits, though words are folded: few ones if possible.
+
+    Args:
+        widths: of the columns; changed in place.
+    """
+    for column in sorted(range(len(widths)), key=widths.__getitem__, reverse=True):
+        over = _table_width(widths, gap) - room
+        widths[column] -= min(max(over, 0), max(widths[column] - _FEWEST, 0))
 
 
 def _table_width(widths: Sequence[int], gap: int) -> int:

@@ -84,11 +84,45 @@ def test_columns_are_left_out_so_that_rows_fit(
     assert all(len(line) <= width for line in lines)
 
 
-def test_without_a_terminal_a_row_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def outside(monkeypatch: pytest.MonkeyPatch, cells: list[list[object]], spare: int = 0) -> str:
+    """Print a table where there is no terminal, and return the text."""
     monkeypatch.delenv("COLUMNS", raising=False)
-    monkeypatch.setattr("sys.stdout", io.StringIO())
-    *_, row = table(monkeypatch, console.results_width(), spare=3)
-    assert row.split() == " ".join(map(str, [*ROW[:2], 17, *ROW[3:]])).split()
+    out = io.StringIO()
+    monkeypatch.setattr("sys.stdout", out)
+    width = console.results_width()
+    monkeypatch.setattr(console, "results", Console(file=out, width=width, color_system=None))
+    console.print_table("trials " + "of a store " * 20, COLUMNS, cells, spare=spare)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        ROW,
+        [*ROW[:4], "a cause of many words " * 60],
+        [*ROW[:4], "/data/" + "campaign/" * 90],
+        ["campaign" * 9, ID * 3, 17.0, 216982, "campaign/" * 20],
+    ],
+    ids=["short", "many words", "a long path", "three long words"],
+)
+def test_tables_outside_a_terminal_have_120_columns_and_no_trailing_blanks(
+    monkeypatch: pytest.MonkeyPatch, row: list[object]
+) -> None:
+    text = outside(monkeypatch, [row] * 2)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= console.WIDTH == 120
+    assert [line for line in lines if line != line.rstrip()] == []
+    for cell in row:  # nothing is left out
+        assert (str(cell)[:4] if isinstance(cell, str) else f"{cell:.0f}") in text
+    assert sum(c in "abcdefg" for c in text) >= 2 * sum(
+        c in "abcdefg" for c in "".join(map(str, row))
+    )
+
+
+def test_spare_columns_are_left_out_outside_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = outside(monkeypatch, [[*ROW[:4], "campaign/" * 20]], spare=1)
+    assert ID in text
+    assert "cause" not in text
 
 
 def test_no_path_of_a_result_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
