@@ -290,23 +290,28 @@ def _sync_gates(
     devices: Sequence[str],
 ) -> dict[str, Gate]:
     """Check that every device has a clock map, good for its grade and all of the recording."""
-    limits = gates.sync_uncertainty
-    results: dict[str, Gate] = {}
-    for device in devices:
-        name = f"sync_uncertainty_{device}_s"
-        known = sync.devices.get(device)
-        if known is None:
-            results[name] = Gate(value=sync.refused[device], limit=None, passed=False)
-            continue
-        grade = "digital input" if known.grade == "trigger input" else known.grade
-        grade = timing.arm if grade == "arm clock" else grade
-        # a latency is a difference: both maps count, where there are events
-        both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
-        value = (known.uncertainty_ns if both is None else both) / 1e9
-        limit = limits.limit_s(grade)
-        results[name] = Gate(value=value, limit=limit, grade=known.grade, passed=value <= limit)
+    results = {
+        f"sync_uncertainty_{device}_s": sync_gate(device, sync, gates, timing) for device in devices
+    }
     results["sync_unvouched_s"] = _gate(_unvouched_s(sync, recorded_ns), UNVOUCHED_S)
     return results
+
+
+def gated_as(grade: str, timing: Timing) -> str:
+    """Return the grade whose gate a clock has to pass."""
+    return {"trigger input": "digital input", "arm clock": timing.arm}.get(grade, grade)
+
+
+def sync_gate(device: str, sync: TrialSync, gates: Gates, timing: Timing) -> Gate:
+    """Apply the protocol's gate of a device's grade to the uncertainty of its clock, s."""
+    known = sync.devices.get(device)
+    if known is None:
+        return Gate(value=sync.refused[device], limit=None, passed=False)
+    # a latency is a difference: both maps count, where there are events
+    both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
+    value = (known.uncertainty_ns if both is None else both) / 1e9
+    limit = gates.sync_uncertainty.limit_s(gated_as(known.grade, timing))
+    return Gate(value=value, limit=limit, grade=known.grade, passed=value <= limit)
 
 
 def _unvouched_s(sync: TrialSync, recorded_ns: tuple[int, int]) -> float:

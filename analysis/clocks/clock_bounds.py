@@ -37,6 +37,8 @@ class BoundedClock:
         drift_ppm, drift_error_ppm: middle and half of the range of drifts that is possible.
         pairs: how many pairs of bounds there were.
         tightest_ns: width of the narrowest of them.
+        widest_ns: width of the widest.
+        slowest_ns: delay of the slowest message, more than that of the fastest.
     """
 
     map: ClockMap
@@ -45,6 +47,8 @@ class BoundedClock:
     drift_error_ppm: float
     pairs: int
     tightest_ns: int
+    widest_ns: int
+    slowest_ns: int
 
 
 def fit_bounds(
@@ -73,6 +77,7 @@ def fit_bounds(
             "check the delays in the rig file, and that nothing sets the host's clock"
         )
     origin, image = int(device.min()), int(low[0])
+    widest, slowest = int((high - low).max()), int(np.ptp(high - device))
     x = (device - origin).astype(np.float64) * 1e-9
     least = (low - image - (device - origin)).astype(np.float64) * 1e-3
     most = (high - image - (device - origin)).astype(np.float64) * 1e-3
@@ -98,8 +103,9 @@ def fit_bounds(
                 raise BoundsContradictError(
                     f"no clock that drifts by at most {max_drift_ppm:g} ppm lies between the "
                     f"bounds of all {device.size} instants: it jumped, or a message took longer "
-                    "than the rig file says; let nothing set a clock, or raise drift_ppm or the "
-                    "longest delay"
+                    f"than the rig file says. The slowest took {slowest / 1e3:.0f} us more than "
+                    f"the fastest, the bounds allow {widest / 1e3:.0f} us. Let nothing set a "
+                    "clock, or raise drift_ppm or the longest delay"
                 )
             ends.append(sign * float(found.fun))
         ranges.append((0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])))
@@ -112,6 +118,8 @@ def fit_bounds(
         drift_error_ppm=spread_drift,
         pairs=int(device.size),
         tightest_ns=int((high - low).min()),
+        widest_ns=widest,
+        slowest_ns=slowest,
     )
 
 

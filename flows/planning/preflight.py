@@ -26,7 +26,10 @@ from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
+    from sliplab.analysis.clocks.synchronise import DeviceSync
+    from sliplab.protocols.timing import Timing
     from sliplab.rigs.core.rig import Rig
+    from sliplab.storage.schema.trial import Gate
 
 LISTEN_S = 3.0
 """Duration of the pulses' recording to fit the clocks, s."""
@@ -222,6 +225,7 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
 def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's clocks are fitted."""
     from sliplab.analysis.clocks.synchronise import further_clocks, streams_of, synchronise
+    from sliplab.analysis.quality import sync_gate
     from sliplab.storage.trials.checksums import DATA
     from sliplab.storage.trials.hdf5_reader import StreamReader
     from sliplab.storage.trials.writer import TrialWriter
@@ -236,16 +240,38 @@ def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
         with StreamReader(sealed / DATA) as reader:
             streams = streams_of(reader, None, further)
     fitted = synchronise(streams, rig.timing, rate)
-    found = [
-        Check(
-            f"clock: {name}",
-            True,
+    gates = run_request.plan.protocol.collection.gates
+    found = []
+    for name, device in fitted.devices.items():
+        gate = sync_gate(name, fitted, gates, rig.timing)
+        text = (
             f"{device.map.drift_ppm():+.1f} ppm, within {device.uncertainty_ns / 1000:.1f} us "
-            f"({device.grade})",
+            f"({device.grade})"
         )
-        for name, device in fitted.devices.items()
-    ]
+        found.append(
+            Check(f"clock: {name}", gate.passed, text + _beyond_gate(gate, device, rig.timing))
+        )
     return found + [Check(f"clock: {name}", False, why) for name, why in fitted.refused.items()]
+
+
+def _beyond_gate(gate: Gate, device: DeviceSync, timing: Timing) -> str:
+    """Return how a clock fails the protocol's gate, with the delays that were seen; or nothing."""
+    from sliplab.analysis.quality import gated_as
+
+    if gate.passed or gate.limit is None or isinstance(gate.value, str | None):
+        return ""
+    key = f"gates.sync_uncertainty.{gated_as(device.grade, timing).replace(' ', '_')}"
+    text = (
+        f"; the protocol's gate {key} is {gate.limit * 1e6:.0f} us, and this is "
+        f"{gate.value * 1e6:.0f} us against the events: every trial would be rejected"
+    )
+    if device.bounds is not None:
+        slowest, widest = (ns / 1e3 for ns in (device.bounds.slowest_ns, device.bounds.widest_ns))
+        text += (
+            f". The slowest message took {slowest:.0f} us more than the fastest, and the rig file "
+            f"allows {widest:.0f} us: bound the delay in `timing` more closely, or use a wire"
+        )
+    return text
 
 
 def _health_text(device: DeviceHealth) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,27 @@ def test_a_clock_that_cannot_be_fitted_fails_by_name(tmp_path: Path) -> None:
     found = {item.name: item for item in check_devices(run_request)}
     assert found["clock: events"].passed
     assert not found["clock: arm"].passed
+
+
+WEAK = {"timing": {"arm": "host time", "pose_delay": {"shortest_us": 0, "longest_us": 1_300_000}}}
+
+
+def test_a_clock_beyond_the_protocols_gate_fails_with_gate_and_delays(tmp_path: Path) -> None:
+    found = {item.name: item for item in check_devices(request_of(tmp_path, WEAK))}
+    arm = found["clock: arm"]
+    assert not arm.passed
+    assert "gates.sync_uncertainty.host_time is 15000 us" in arm.finding
+    seen = re.search(r"took (\d+) us more than the fastest, .* allows (\d+) us", arm.finding)
+    assert seen is not None
+    assert 0 < int(seen[1]) < 20_000  # what the simulated arm's poses take
+    assert int(seen[2]) == 1_300_000
+    assert found["clock: events"].passed
+
+
+def test_a_clock_within_its_gate_passes_as_the_trials_do(tmp_path: Path) -> None:
+    delay = {"pose_delay": {"shortest_us": 0, "longest_us": 20_000}, "arm": "host time"}
+    found = {item.name: item for item in check_devices(request_of(tmp_path, {"timing": delay}))}
+    assert found["clock: arm"].passed
 
 
 def test_scatter_beyond_a_quarter_of_a_tick_is_refused_before_anything_runs(tmp_path: Path) -> None:
