@@ -22,6 +22,8 @@ from decimal import Decimal, InvalidOperation
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+from sliplab.protocols.plugins import PluginError, import_foreign
+
 GROUP = "sliplab.units"
 _SYMBOL = re.compile(r"[A-Za-z%/][A-Za-z0-9%/]{0,15}")
 _DIMENSION = re.compile(r"[a-z][a-z ]{0,31}")
@@ -120,11 +122,10 @@ def load_packages() -> None:
     _known.faults = []
     for point in sorted(entry_points(group=GROUP), key=lambda each: (each.name, each.value)):
         try:
-            _take(point.load())
-        except Exception as error:  # a package's own code: whatever it raises
+            _take(import_foreign(point.value))
+        except (PluginError, UnitError) as error:
             text = " ".join(str(error).split())
-            kind = "" if isinstance(error, UnitError) else f"{type(error).__name__}: "
-            _known.faults.append(f"the units of {_owner(point)} cannot be used: {kind}{text}")
+            _known.faults.append(f"the units of {_owner(point)} cannot be used: {text}")
 
 
 def forget_packages() -> None:

@@ -10,11 +10,13 @@ that `sweep_temporary` can delete the files of dead processes.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
 import os
 import re
+import stat
 import threading
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -23,6 +25,8 @@ from typing import Any
 
 from sliplab.storage.errors import StoreError
 
+MOST_BYTES = 1 << 30
+"""Of a file that `read_plain` reads: far more than any model has."""
 _BLOCK = 1 << 20
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
 _NAME_BYTES = 200
@@ -96,6 +100,24 @@ def read_blocks(path: Path) -> Iterator[bytes]:
     with path.open("rb") as handle:
         while block := handle.read(_BLOCK):
             yield block
+
+
+def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Return the bytes of a file that somebody names: of a device or a pipe there is no end.
+
+    Args:
+        most: bytes; a larger file is refused before it is read.
+
+    Raises:
+        OSError: it is missing, no regular file, too large, or cannot be read.
+    """
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+        if about.st_size > most:
+            raise OSError(errno.EFBIG, f"it is over {most >> 20} MiB", str(path))
+        return file.read(most)
 
 
 def write_new_json(path: Path, data: Any) -> bool:

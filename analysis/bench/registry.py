@@ -21,6 +21,7 @@ from pathlib import Path
 
 from sliplab.analysis.bench.interface import Detector
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugins import PluginError, foreign_code
 from sliplab.protocols.shown import did_you_mean
 
 GROUP = "sliplab.detectors"
@@ -96,14 +97,14 @@ def _imported(name: str, place: str) -> Detector:
     if here not in sys.path:
         sys.path.append(here)
     try:
-        made = getattr(import_module(module), attribute)()
+        with foreign_code():
+            made = getattr(import_module(module), attribute)()
     except ModuleNotFoundError as error:
         if place == SHIPPED.get(name) or error.name != module:
             raise  # the extra that is missing is named where the command ends
         raise InputError(_KEY, "", name, f"no module {module} to import") from None
-    except Exception as error:  # a third-party class may raise anything
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise InputError(_KEY, "", name, f"cannot be made: {reason}") from None
+    except PluginError as error:
+        raise InputError(_KEY, "", name, f"cannot be made: {error}") from None
     if not isinstance(made, Detector):
         text = f"{place}() is a {type(made).__name__}, not a sliplab.analysis.bench Detector"
         raise InputError(_KEY, "", name, text)

@@ -35,6 +35,7 @@ from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows
+from sliplab.storage.files import read_plain
 from sliplab.storage.schema.evaluation import OtherEvaluation, OtherWindowScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.streams import Json
@@ -105,7 +106,7 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
     if path.suffix in {".yaml", ".yml", ".json"}:
         return _described(path, engine)
     try:
-        content = path.read_bytes()
+        content = read_plain(path)
     except OSError as error:
         raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
     try:

@@ -35,6 +35,7 @@ from sliplab.analysis.networks.network import (
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Network, Windows
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, input_error, load, register_tags
+from sliplab.storage.files import read_plain
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Side = Annotated[int, Field(ge=1, le=512)]
@@ -236,7 +237,7 @@ def load_external(path: Path) -> ExternalModel:
     description = load(Description, path, "description of a model")
     file = path.parent / description.weights
     try:
-        data = file.read_bytes()
+        data = read_plain(file)
     except OSError as error:
         reason = f"cannot be read: {error.strerror}"
         raise InputError(path, "weights", description.weights, reason) from None

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.training import EpochRecord, Fitted, check_classes, restore
 from sliplab.protocols.settings import Network, Training, Windows
-from sliplab.storage.files import write_bytes
+from sliplab.storage.files import MOST_BYTES, read_plain, write_bytes
 
 FORMAT = "sliplab-model-1"
 
@@ -59,7 +59,7 @@ def load(path: Path) -> Fitted:
         OSError: it does not exist, or it cannot be read.
         ValueError: it is not a model file, is damaged, or its weights do not fit its settings.
     """
-    return parse(path.read_bytes(), str(path))
+    return parse(read_plain(path), str(path))
 
 
 def parse(data: bytes, name: str) -> Fitted:
@@ -73,6 +73,8 @@ def parse(data: bytes, name: str) -> Fitted:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
+                raise ValueError(f"it unpacks to over {MOST_BYTES >> 20} MiB")
             spoilt = archive.testzip()  # torch does not check the checksums
         if spoilt is not None:
             raise ValueError(f"{spoilt} in it is damaged")

@@ -20,6 +20,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import StopRequested
 from sliplab.rigs.core.teaching import grab_frames, press_in_circles
+from sliplab.storage.files import make_folder
 
 if TYPE_CHECKING:
     from sliplab.analysis.calibration.charuco import Board
@@ -216,6 +217,7 @@ def print_board(board: Board, path: Path) -> dict[str, float]:
         f"together {width:g} x {height:g} mm"
     )
     axes.text(left, y - 4, text, fontsize=6, va="top")
+    make_folder(path.parent)
     dpi = PNG_PX_PER_MM * _MM_PER_INCH
     if path.suffix == ".pdf":
         figure.savefig(path, format="pdf", metadata={"CreationDate": None})

@@ -100,6 +100,9 @@ def failure(error: Exception) -> Failure:
         return Failure(said, console.WRONG_INPUT)
     if isinstance(error, TyperException):
         return _wrong_usage(error)
+    if isinstance(error, FileNotFoundError | NotADirectoryError) and error.filename:
+        place = os.fsdecode(error.filename)
+        return Failure(f"{place}: {os.strerror(error.errno or 0).lower()}", console.FAILED, place)
     if isinstance(error, OSError) and error.filename:
         error = disk_error(Path(os.fsdecode(error.filename)), error) or error
     elif isinstance(error, OSError) and (fault := disk_fault(error)):

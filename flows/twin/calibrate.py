@@ -47,7 +47,7 @@ from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
 from sliplab.rigs.twin import FittedValue, Range, TwinRecord
-from sliplab.storage.files import write_json, write_text
+from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.schema.twin import ParameterFit, QuantityCompared, StatisticSeen, TwinFit
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
@@ -256,6 +256,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     write_json(wanted.out.with_suffix(".json"), fit.to_json())
     rings = ring_of(wanted.rig)
     text = page.render(fit, wanted.out.stem, *shown, rings, pilot.streams)
+    make_folder(wanted.out.parent)
     write_text(wanted.out.with_suffix(".html"), text)
     return fit
 
@@ -394,6 +395,7 @@ def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None
         "twin": record.model_dump(mode="json"),
     }
     text = f"# Written by `sliplab calibrate scene`: {extends}, fitted to '{record.campaign}'.\n"
+    make_folder(wanted.out.parent)
     write_text(wanted.out, text + rig_yaml(data))
 
 

@@ -43,6 +43,7 @@ from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import event_rate
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
+from sliplab.storage.files import make_folder
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import (
     EVENTS_KIND,
@@ -107,6 +108,7 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
     library = rerun()
     library.set_strict_mode(True)  # what cannot be written is an error, not a warning
 
+    make_folder(path.parent)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         stream = library.RecordingStream(

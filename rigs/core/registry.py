@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import one_of
 from sliplab.rigs.core.driver import Driver
 
@@ -110,12 +110,10 @@ def load_driver(item: Listed) -> Driver[Any]:
     Raises:
         DriverError: its module raises an error, or has no driver of that name.
     """
-    module, _, attribute = item.place.partition(":")
     try:
-        driver = getattr(import_module(module), attribute)
-    except Exception as error:  # a third-party package may raise anything
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise DriverError(f"{item.name} of {item.package} cannot be imported: {reason}") from None
+        driver = import_foreign(item.place)
+    except PluginError as error:
+        raise DriverError(f"{item.name} of {item.package} cannot be imported: {error}") from None
     if not isinstance(driver, Driver):
         text = f"{item.place} is a {type(driver).__name__}, not a Driver"
         raise DriverError(f"{item.name} of {item.package} cannot be used: {text}")

@@ -37,6 +37,10 @@ class Papilla(StrictModel):
     """From its place in the layout."""
 
 
+MOST_PAPILLAE = 1_000
+"""Of a simulated skin: memory and time grow with the square; sensors have up to some hundred."""
+
+
 class Skin(StrictModel):
     """The papillae: a centre and two rings, lower towards the outside."""
 
@@ -66,6 +70,12 @@ class Skin(StrictModel):
     papillae: tuple[Papilla, ...] | None = None
     """Every papilla as measured, from the centre outwards and counterclockwise from +x; null: drawn
     by the seed with the scatters above."""
+
+    @rule
+    def _few(self) -> None:
+        if (count := sum(self.ring_counts)) > MOST_PAPILLAE:
+            text = f"are {count:,} papillae; at most {MOST_PAPILLAE:,} can be simulated"
+            raise KeyedError(".ring_counts", f"{len(self.ring_counts)} layers", text)
 
     @rule
     def _layers(self) -> Skin:

@@ -10,10 +10,12 @@ this module is rebuilt; it is among the derived results and may be deleted at an
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import io
 import json
 import os
+import re
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -84,13 +86,61 @@ def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
     Raises:
         ValueError: the expression cannot be read, or names something besides columns.
     """
-    if "@" in expression or "__" in expression:
-        raise ValueError("may contain only columns, numbers, text and operators")
+    if fault := _expression_fault(expression):
+        raise ValueError(fault)
     try:
         return table.query(expression, engine="python", local_dict={}, global_dict={})
     except Exception as error:
         columns = ", ".join(map(str, table.columns))
         raise ValueError(f"cannot be read ({error}); the columns are {columns}") from None
+
+
+_LONGEST = 1000
+"""Characters of an expression; with what it may contain, that bounds its time and memory."""
+_ALLOWED = (
+    ast.Expression, ast.BoolOp, ast.boolop, ast.UnaryOp, ast.unaryop, ast.BinOp, ast.Add, ast.Sub,
+    ast.Mult, ast.Div, ast.FloorDiv, ast.Mod, ast.BitAnd, ast.BitOr, ast.Compare, ast.cmpop,
+    ast.Name, ast.Load, ast.Constant, ast.List, ast.Tuple, ast.Call, ast.Attribute,
+)  # fmt: skip
+_METHODS = frozenset(
+    {"str", "startswith", "endswith", "contains", "isin", "isna", "notna", "isnull", "notnull"}
+)
+_REPEATS = frozenset("*+{")
+"""In a pattern; nested ones may take for ever."""
+
+
+def _expression_fault(expression: str) -> str | None:
+    """Return what an expression must not contain, if it does: it may come from anywhere."""
+    if len(expression) > _LONGEST:
+        return f"must have at most {_LONGEST} characters"
+    if "@" not in expression and "__" not in expression:
+        try:
+            tree = ast.parse(re.sub("`[^`]*`", "name", expression.strip()), mode="eval")
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            return f"cannot be read ({error})"
+        if all(map(_may_stand, ast.walk(tree))):
+            return None
+    return (
+        "may contain only columns, numbers, text, + - * / // %, comparisons, in, and, or, not, "
+        f"and the methods {', '.join(sorted(_METHODS))}"
+    )
+
+
+def _may_stand(node: ast.AST) -> bool:
+    if not isinstance(node, _ALLOWED):
+        return False
+    if isinstance(node, ast.BinOp):  # text and lists times a number grow without bound
+        return not any(
+            isinstance(side, ast.List | ast.Tuple)
+            or (isinstance(side, ast.Constant) and isinstance(side.value, str | bytes))
+            for side in (node.left, node.right)
+        )
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Attribute) and not node.keywords and not (
+            node.func.attr == "contains"
+            and any(_REPEATS & set(ast.unparse(each)) for each in node.args)
+        )  # fmt: skip
+    return not isinstance(node, ast.Attribute) or node.attr in _METHODS
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
@@ -106,6 +156,7 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
     }
     if path.suffix not in kinds:
         raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
+    make_folder(path.parent)
     write_bytes(path, kinds[path.suffix]())
 
 

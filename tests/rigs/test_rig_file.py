@@ -210,3 +210,11 @@ def test_a_default_that_is_written_out_is_the_same_rig() -> None:
     stiff = {"base_normal_n_per_m": None}
     data["mock"]["scene"] = {**data["mock"].get("scene", {}), "skin": stiff}
     assert not same_rig(MOCK, yaml.safe_dump(data))
+
+
+def test_a_skin_of_too_many_papillae_to_simulate_is_refused(tmp_path: Path) -> None:
+    rings = ", ".join(["1"] + ["48"] * 416)
+    path = tmp_path / "big.yaml"
+    path.write_text(f"extends: mock\nmock: {{scene: {{skin: {{ring_counts: [{rings}]}}}}}}\n")
+    with pytest.raises(InputError, match=r"ring_counts.*19,969 papillae; at most 1,000"):
+        load_rig_file(path)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.storage.files import json_text, read_json, write_json
+from sliplab.storage.files import json_text, read_json, read_plain, write_json
 
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 FINITE = LEAVES.filter(lambda value: value not in (float("inf"), float("-inf")))
@@ -49,3 +50,15 @@ def test_no_file_brings_in_what_no_file_may_hold(tmp_path: Path, text: str) -> N
     path.write_text(f'{{"a": {text}}}')
     with pytest.raises(ValueError, match=r"a\.json: is not JSON: .*number"):
         read_json(path)
+
+
+def test_only_a_regular_file_of_bounded_size_is_read_as_a_whole(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    path.write_bytes(b"12345")
+    assert read_plain(path) == b"12345"
+    with pytest.raises(OSError, match="over 0 MiB"):
+        read_plain(path, most=4)
+    os.mkfifo(tmp_path / "pipe")
+    for wrong in (Path("/dev/zero"), tmp_path / "pipe"):
+        with pytest.raises(OSError, match="not a regular file"):
+            read_plain(wrong)

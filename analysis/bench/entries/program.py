@@ -20,9 +20,10 @@ import shlex
 import signal
 import struct
 import subprocess
-import tempfile
+import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
@@ -55,25 +56,27 @@ class Program(Detector):
         if not words:
             raise InputError("DETECTOR", "", "run:", "must name a command, such as run:./detector")
         self._command, self._answer_s, self._end_s = command, answer_s, end_s
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
+        self._open = True
         try:
             self._process = subprocess.Popen(
                 words,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=self._said,
+                stderr=subprocess.PIPE,
                 start_new_session=True,  # Ctrl-C ends it by `close`
             )
         except OSError as error:
-            self._said.close()
             text = f"cannot be started: {error.strerror}"
             raise InputError("DETECTOR", "", f"run:{command}", text) from None
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._input, self._output = self._process.stdin.fileno(), self._process.stdout.fileno()
-        os.set_blocking(self._input, False)
-        os.set_blocking(self._output, False)
+        assert self._process.stderr is not None
+        self._pipes = self._process.stdin, self._process.stdout, self._process.stderr
+        self._input, self._output, self._errors = (pipe.fileno() for pipe in self._pipes)
+        for number in (self._input, self._output, self._errors):
+            os.set_blocking(number, False)
         self._read = bytearray()
+        self._last_errors = b""
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`."""
@@ -103,18 +106,25 @@ class Program(Detector):
         left, until_s = memoryview(sent), time.monotonic() + self._answer_s
         with selectors.DefaultSelector() as waiting:
             waiting.register(self._output, selectors.EVENT_READ)
+            waiting.register(self._errors, selectors.EVENT_READ)
             if left:
                 waiting.register(self._input, selectors.EVENT_WRITE)
             while left or len(self._read) < wanted:
                 ready = waiting.select(max(until_s - time.monotonic(), 0.0))
-                if not ready:
+                if not ready or time.monotonic() > until_s:
                     self.close()
                     raise BenchError(
                         f"{self._command}: has not answered in {self._answer_s:g} s, and was killed"
                     )
+                if len(self._read) > MOST * ANSWER.itemsize + HEAD.size:
+                    self.close()
+                    raise BenchError(f"{self._command}: writes without end, and was killed")
                 for key, _ in ready:
                     if key.fd == self._output:
                         self._take()
+                    elif key.fd == self._errors:
+                        if not self._take_errors():
+                            waiting.unregister(self._errors)
                     else:
                         try:
                             left = left[os.write(self._input, left[:_PIPE]) :]
@@ -132,29 +142,76 @@ class Program(Detector):
         if found:
             self._read += found
             return
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(self._end_s)
-        code = self._process.poll()
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        ended = self._wait()
+        while self._take_errors():
+            pass
+        lines = self._last_errors.decode(errors="replace").strip().splitlines()
         last = f": {lines[-1]}" if lines else ""
-        ended = "closed its output" if code is None else f"ended with exit code {code}"
         self.close()
-        raise BenchError(f"{self._command}: {ended}{last}")
+        code = self._process.returncode
+        how = f"ended with exit code {code}" if ended else "closed its output"
+        raise BenchError(f"{self._command}: {how}{last}")
+
+    def _wait(self) -> bool:
+        """Wait for the end of the process, bounded; return whether it has ended."""
+        until_s = time.monotonic() + self._end_s
+        while not (ended := _ended(self._process.pid)) and time.monotonic() < until_s:
+            threading.Event().wait(0.01)
+        return ended
+
+    def _take_errors(self) -> bool:
+        """Read what the program says of errors, and keep its end; False at the end, or if none."""
+        try:
+            found = os.read(self._errors, _PIPE)
+        except BlockingIOError:
+            return False
+        self._last_errors = (self._last_errors + found)[-_PIPE:]
+        return bool(found)
 
     def close(self) -> None:
-        """End the process, and kill it with its children where it does not end."""
-        if self._said.closed:
+        """End the process, and kill what is left of it and of the processes that it started."""
+        if not self._open:
             return
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
+        self._open = False
+        started = _descendants(self._process.pid)
         with suppress(OSError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(self._end_s)
-        except subprocess.TimeoutExpired:
-            with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
-        self._process.stdout.close()
-        self._said.close()
+            self._pipes[0].close()
+        self._wait()
+        started |= _descendants(self._process.pid)
+        with suppress(ProcessLookupError):  # before it is reaped: its number is not reused yet
+            os.killpg(self._process.pid, signal.SIGKILL)
+        for pid, began in started:
+            if _began(pid) == began:  # the same process still
+                with suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
+        self._process.wait()
+        for pipe in self._pipes[1:]:
+            pipe.close()
+
+
+def _ended(pid: int) -> bool:
+    """Return whether a child has ended; it stays to be reaped."""
+    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+
+def _began(pid: int) -> str | None:
+    """Return the start time of a process as the kernel counts it; None if there is none."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    return stat.rpartition(")")[2].split()[19]
+
+
+def _descendants(pid: int) -> set[tuple[int, str]]:
+    """Return the processes that a process has started, and those started by them, with times."""
+    found: set[tuple[int, str]] = set()
+    todo = [pid]
+    while todo:
+        for children in Path(f"/proc/{todo.pop()}/task").glob("*/children"):
+            with suppress(OSError):
+                for child in map(int, children.read_text().split()):
+                    if (began := _began(child)) is not None and (child, began) not in found:
+                        found.add((child, began))
+                        todo.append(child)
+    return found

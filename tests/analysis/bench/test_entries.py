@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from scipy.special import softmax
 from sliplab.analysis.bench.entries.hyperdimensional import Hyperdimensional
 from sliplab.analysis.bench.entries.network import Paper
 from sliplab.analysis.bench.entries.onnx_model import OnnxModel
-from sliplab.analysis.bench.entries.program import Program
+from sliplab.analysis.bench.entries.program import ANSWER, MOST, Program
 from sliplab.analysis.bench.entries.thresholds import Fall, motions
 from sliplab.analysis.bench.entries.trivial import Random
 from sliplab.analysis.bench.feeding import BenchError, audit, feed
@@ -78,6 +80,75 @@ def test_a_program_that_writes_before_it_reads_blocks_nobody(one: Scene, tmp_pat
     detector = Program(program(tmp_path, text), answer_s=30.0, end_s=0.5)
     with pytest.raises(BenchError, match="answered"):
         feed(detector, one)
+    detector.close()
+
+
+ANSWERS = """
+import os, struct, subprocess, sys
+{before}
+while head := sys.stdin.buffer.read(16):
+    kind, n, value = struct.unpack("<4sIq", head)
+    if kind == b"EVTS":
+        sys.stdin.buffer.read(16 * n)
+        sys.stdout.buffer.write(struct.pack("<4sIq", b"EVID", 1, 0))
+        sys.stdout.buffer.write(struct.pack("<qdii", value, {value}, -1, 0))
+        sys.stdout.flush()
+"""
+
+
+@pytest.mark.parametrize("value", ["float('nan')", "float('inf')"])
+def test_a_program_whose_evidence_is_no_number_is_refused(
+    value: str, one: Scene, tmp_path: Path
+) -> None:
+    text = ANSWERS.format(before="", value=value)
+    detector = Program(program(tmp_path, text), answer_s=30.0)
+    with pytest.raises(BenchError, match="must be finite or -inf"):
+        feed(detector, one)
+    detector.close()
+
+
+@pytest.mark.parametrize("own_session", [False, True])
+def test_children_of_a_program_end_with_it(own_session: bool, one: Scene, tmp_path: Path) -> None:
+    pids = tmp_path / "pid"
+    before = (
+        "child = subprocess.Popen([sys.executable, '-c', 'import signal; signal.pause()'], "
+        f"start_new_session={own_session})\n"
+        f"open({str(pids)!r}, 'w').write(str(child.pid))"
+    )
+    detector = Program(program(tmp_path, ANSWERS.format(before=before, value="1.0")), 30.0, 5.0)
+    feed(detector, one)
+    child = int(pids.read_text())
+    os.kill(child, 0)
+    detector.close()
+    until_s = time.monotonic() + 30.0
+    while alive(child):
+        assert time.monotonic() < until_s
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs: one that has ended may still be there to be reaped."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("import os\nwhile True: os.write(1, bytes(65536))", "writes without end|answered b"),
+        ("import os\nwhile True: os.write(2, bytes(65536))", "has not answered in 2 s"),
+    ],
+    ids=["output", "errors"],
+)
+def test_a_program_that_floods_its_output_is_bounded(
+    text: str, said: str, one: Scene, tmp_path: Path
+) -> None:
+    detector = Program(program(tmp_path, text), answer_s=2.0, end_s=0.2)
+    with pytest.raises(BenchError, match=said):
+        feed(detector, one)
+    assert len(detector._read) <= MOST * ANSWER.itemsize + (1 << 17)
+    assert len(detector._last_errors) <= 1 << 16
     detector.close()
 
 

@@ -500,3 +500,15 @@ def test_what_is_made_for_slip_refuses_other_classes(fitted: Fitted) -> None:
 def test_classes_are_two_or_more(classes: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="expected 2 or more, distinct"):
         fit(*TRAIN, *VAL, NETWORK, WINDOWS, TRAINING, 0, classes=classes)
+
+
+def test_a_model_file_that_unpacks_without_bound_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "zeros.pt"
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("archive/data/0", "w", force_zip64=True) as entry,
+    ):
+        for _ in range(1025):
+            entry.write(bytes(1 << 20))
+    with pytest.raises(ValueError, match="unpacks to over 1024 MiB"):
+        load(path)

@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.storage.files import make_folder, write_json
 from sliplab.storage.trials import catalogue as module
-from sliplab.storage.trials.catalogue import catalogue, query
+from sliplab.storage.trials.catalogue import catalogue, query, write_table
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from tests.storage.trial_files import IDENTITY, campaign, commit
@@ -177,6 +177,53 @@ def test_expressions_that_are_no_query_are_refused(expression: str, tmp_path: Pa
     commit(where, "a")
     with pytest.raises(ValueError, match=r"may contain only columns|cannot be read"):
         query(catalogue(Store.open(tmp_path / "s")), expression)
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "events == 9**9**9", "events < 2 ** (2 ** 40)", "events == 1 << 10**12",
+        "trial == 'a' * 10**10", "events in [1] * 10**9", "events == (1, 2) * 10**9",
+        "events == " + "1 + " * 1000 + "1", "trial.str.contains('(a+)+$')",
+        "trial.str.repeat(10**9) == 'a'", "(lambda: 1)() == events", "[x for x in trial]",
+        "(" * 300 + "events" + ")" * 300,
+    ],
+)  # fmt: skip
+def test_expressions_without_bound_are_refused_unevaluated(
+    expression: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = pd.DataFrame({"trial": ["a"], "events": [1]})
+    monkeypatch.setattr(pd.DataFrame, "query", None)  # it is not asked
+    with pytest.raises(ValueError, match=r"may contain only|at most 1000 characters|cannot be"):
+        query(table, expression)
+
+
+@pytest.mark.parametrize(
+    ("expression", "found"),
+    [
+        ("depth_mm * 2 - 1 >= 4.8 and not side == 'left'", ["b"]),
+        ("side in ['left', 'up'] or depth_mm > 9", ["a"]),
+        ("(depth_mm / 2 > 1) & (events % 2 == 0) | (events // 3 == -1)", ["a", "b"]),
+        ("trial.str.startswith('a')", ["a"]),
+        ("side.str.contains('igh')", ["b"]),
+        ("`depth_mm` == 3.4", ["b"]),
+        ("side.isin(['left'])", ["a"]),
+    ],
+)
+def test_expressions_of_columns_numbers_and_text_select_rows(
+    expression: str, found: list[str]
+) -> None:
+    table = pd.DataFrame(
+        {"trial": ["a", "b"], "depth_mm": [2.4, 3.4], "side": ["left", "right"], "events": [4, 6]}
+    )
+    assert list(query(table, expression)["trial"]) == found
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".json"])
+def test_table_is_written_into_a_folder_that_is_missing(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / f"trials{suffix}"
+    write_table(pd.DataFrame({"trial": ["a"]}), path)
+    assert path.stat().st_size > 0
 
 
 def test_an_empty_store_has_an_empty_catalogue(tmp_path: Path) -> None:
