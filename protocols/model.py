@@ -377,12 +377,11 @@ class Protocol(StrictModel):
     @classmethod
     def _held_out_levels_as_text(cls, data: Any) -> Any:
         """Levels of the split may be numbers in the unit of their factor, too."""
-        collection, analysis = (
-            data.get(name) if isinstance(data, dict) else None
-            for name in ("collection", "analysis")
-        )
-        split = analysis.get("split") if isinstance(analysis, dict) else None
-        if not isinstance(collection, dict) or not isinstance(split, dict):
+        sections = data if isinstance(data, dict) else {}
+        collection, analysis = sections.get("collection"), sections.get("analysis")
+        if not isinstance(collection, dict) or not isinstance(analysis, dict):
+            return data
+        if not isinstance(split := analysis.get("split"), dict):
             return data
         units = written_units(collection.get("factors"), collection.get("context"))
         made = {
