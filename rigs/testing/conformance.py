@@ -26,7 +26,7 @@ from sliplab.rigs.core.driver import (
     GripperDriver,
     SyncBoxDriver,
 )
-from sliplab.rigs.testing import arm_rules, gripper_rules, stream_rules
+from sliplab.rigs.testing import arm_rules, gripper_rules, motion_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
 from sliplab.rigs.testing.camera_benches import EventBench, FrameBench
 from sliplab.rigs.testing.gripper_bench import GripperBench
@@ -85,7 +85,7 @@ def cases(
 
     if isinstance(driver, ArmDriver):
         own = cast(BaseArmSettings, settings)
-        return of(lambda: ArmBench(driver, own, limits), arm_rules.RULES)
+        return of(lambda: ArmBench(driver, own, limits), arm_rules.RULES, motion_rules.RULES)
     if isinstance(driver, EventCameraDriver):
         return of(lambda: EventBench(driver, settings, limits), common)
     if isinstance(driver, FrameCameraDriver):
