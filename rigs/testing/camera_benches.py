@@ -81,6 +81,20 @@ class EventBench(StreamBench):
         if found != self.fed_pulses:
             raise Seen(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
 
+    def forget(self) -> None:
+        """Forget what was fed and what came."""
+        super().forget()
+        self.fed_pulses.clear()
+        self.pulses.clear()
+
+    def check_steps(self) -> None:
+        """Raise Seen if the times of events or pulses came with other differences."""
+        super().check_steps()
+        self.quiet()
+        sent, found = np.diff(self.fed_pulses), np.diff(self.pulses)
+        if sent.tolist() != found.tolist():
+            raise Seen(f"pulses {sent.tolist()} ns apart came {found.tolist()} ns apart")
+
     def silence(self) -> None:
         """Stall the fake."""
         self.fake.stall()

@@ -30,6 +30,8 @@ OTHER_SIZE = 40, 56
 AT_ONCE_S = 0.25
 """Longest duration of a read, s: it does not wait for data."""
 READS = 5
+WRAP_S = 0.015
+"""Time before a wrap at which batches of 10 ms begin, s."""
 HOST_WAIT_S, HOST_LATE_S = 0.3, 0.2
 """Time from data to their read, and longest time to their reception, s."""
 COLUMNS: dict[str, tuple[str, int]] = {
@@ -236,17 +238,12 @@ def _close(bench: StreamBench) -> None:
     "counter wraps", "times go on where a counter of the device wraps, as one of 32 bits does"
 )
 def _wraps(bench: StreamBench) -> None:
-    before_ns = 15_000_000
     wraps_s = sorted(bench.wraps_s)
     bench.connect()
     for wrap_s in wraps_s:
-        wrap_ns = round(wrap_s * 1e9)
-        bench.seek(wrap_ns - 1_000_000_000)
+        bench.seek(round((wrap_s - 1.0) * 1e9))
         bench.start()
-        bench.gather()
-        bench.seek(wrap_ns - before_ns)
-        bench.came.clear()
-        _check_order(bench.gather())
+        _check_order(bench.flow(round((wrap_s - WRAP_S) * 1e9)))
         bench.check_steps()
         bench.stop()
 
