@@ -74,6 +74,11 @@ class EventBench(StreamBench):
         pulses = bool(self.pulses) and self.pulses[-1] >= self.fed_pulses[-1]
         return pulses and super().complete(times)
 
+    def missing(self, times: Sequence[int]) -> str:
+        """Return in words what was sent last, and what came."""
+        pulses = f"pulses up to {self.fed_pulses[-1]} ns, up to {max(self.pulses, default=0)} ns"
+        return f"{super().missing(times)}; {pulses} came"
+
     def check_content(self) -> None:
         """Raise Seen if events or pulses came otherwise than they were sent."""
         super().check_content()
@@ -138,6 +143,12 @@ class FrameBench(StreamBench):
     def _check_clock(self) -> None:
         if self._by_arrival:
             raise NotTried("its frames are timed by their arrival")
+
+    def lose(self, count: int) -> None:
+        """Lose the next frames: their numbers are missing. Raises NotTried: it has no numbers."""
+        if self._by_arrival:
+            raise NotTried("a camera whose frames are timed by their arrival does not number them")
+        self._number += count
 
     def check_sync(self) -> None:
         """Raise Seen if levels of the sync line came otherwise; NotTried: none was reported."""

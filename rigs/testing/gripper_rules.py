@@ -100,6 +100,7 @@ def _state_moving(bench: GripperBench) -> None:
         raise Seen(f"its range was {bench.device.range}, the driver declares {bench.range}")
     for wanted in (bench.opening_mm - CLOSED_MM, bench.opening_mm):
         bench.move(wanted, bench.range.speed_mm_s[0])
+        bench.until(bench.moving, QUIET_S)
         took: list[float] = []
         while bench.moving():
             begun_ns = time.monotonic_ns()
@@ -117,9 +118,7 @@ def _state_moving(bench: GripperBench) -> None:
         bench.until(lambda: not bench.state().moving, bench.bounds.call_s)
 
 
-@RULES.add(
-    "fingers stay", "connect and close move no finger: what is held stays held"
-)
+@RULES.add("fingers stay", "connect and close move no finger: what is held stays held")
 def _stay(bench: GripperBench) -> None:
     (before,) = bench.true_mm(time.monotonic_ns())
     bench.connect()

@@ -286,9 +286,7 @@ def _close_moving(bench: ArmBench) -> None:
 def _turn_and_depth(bench: ArmBench) -> None:
     x, y, z = bench.home.xyz_mm
     # z into the plate is z of the base frame
-    plate = PlaneSettings(
-        centre_mm=(x, y, z), right_mm=(x + 10.0, y, z), above_mm=(x, y + 10.0, z)
-    )
+    plate = PlaneSettings(centre_mm=(x, y, z), right_mm=(x + 10.0, y, z), above_mm=(x, y + 10.0, z))
     bench.restart(limits=_with(bench.limits, plate=plate, depth_mm=DEPTH_MM, tilt_deg=TILT_DEG))
     bench.connect()
     near, speed = bench.to(ARRIVED_MM), bench.speed_mm_s

@@ -146,12 +146,27 @@ class StreamBench(Bench):
             self.feed()
 
         def complete() -> bool:
-            got.extend(self.read())
+            try:
+                got.extend(self.read())
+            except RigError as error:
+                if not self.fed:
+                    raise
+                raise Seen(f"{self.missing(got)}; then {error}") from None
             return self.complete(got)
 
         if not self.until(complete, self.bounds.call_s):
-            raise Seen(f"not all that was sent had been read after {self.bounds.call_s:g} s")
+            raise Seen(
+                f"not all that was sent had been read after {self.bounds.call_s:g} s: "
+                f"{self.missing(got)}"
+            )
         return got
+
+    def missing(self, times: Sequence[int]) -> str:
+        """Return in words what was sent last, and what came, in the unit of the chunk."""
+        if not self.fed:
+            return f"{len(times)} came"
+        last = getattr(self.fed[-1], self.clock_field)[-1]
+        return f"{self.clock_field} up to {last} was sent, up to {max(times, default=0)} came"
 
     def flow(self, from_ns: int) -> list[int]:
         """Feed and read some batches from a time on; wait for as many data as were fed.
@@ -164,7 +179,7 @@ class StreamBench(Bench):
 
         Raises:
             Seen: not all come.
-            RigError: the driver reports a fault.
+            RigError: the driver reports a fault before.
         """
         got: list[int] = []
 
@@ -183,10 +198,13 @@ class StreamBench(Bench):
         self.seek(from_ns)
         for _ in range(BATCHES):
             self.feed()
-        count = sum(map(len, self.fed))
-        if not self.until(lambda: read(count), self.bounds.call_s):
-            raise Seen(f"{count} were sent and {len(got)} came")
-        return got
+        count, then = sum(map(len, self.fed)), ""
+        try:
+            if self.until(lambda: read(count), self.bounds.call_s):
+                return got
+        except RigError as error:
+            then = f"; then {error}"
+        raise Seen(f"{count} were sent and {len(got)} came{then}")
 
     def forget(self) -> None:
         """Forget what was fed and what came."""
@@ -266,4 +284,6 @@ def _signed(values: Any) -> Any:
 
 def _short(value: Any) -> str:
     """Return a row in few words: an image by its shape."""
-    return f"{value}" if np.size(value) <= 6 else f"{np.shape(value)} values of {np.mean(value):.1f}"
+    return (
+        f"{value}" if np.size(value) <= 6 else f"{np.shape(value)} values of {np.mean(value):.1f}"
+    )

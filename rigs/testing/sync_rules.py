@@ -97,7 +97,8 @@ def _clock_at_start(bench: SyncBench) -> None:
 
 
 @RULES.add(
-    "counter wraps", "clock and pulses go on where a counter of the box wraps, as one of 32 bits does"
+    "counter wraps",
+    "clock and pulses go on where a counter of the box wraps, as one of 32 bits does",
 )
 def _wraps(bench: SyncBench) -> None:
     bench.RATE_HZ = SLOW_HZ
