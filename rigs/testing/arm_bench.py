@@ -65,10 +65,16 @@ class ArmBench(Bench):
             address.
 
     Attributes:
+        axis: unit vector of turns, none of the base frame's axes.
+        twists: True if the driver declares that the arm turns its tool on the spot.
         load: force (N) and torque (N m) on the tool, base axes, by the controller's time in s.
         wraps_s: times of the fake's clock at which counters wrap, s.
+        sync_read: True once the fake has read the level of its sync input.
     """
 
+    axis = 0.48, 0.6, 0.64
+    twists = True
+    sync_read = False
     load: Callable[[float], Sequence[float]] = staticmethod(no_load)
     clock: ControllerClock | None = None
     wraps_s: tuple[float, ...] = ()
@@ -77,7 +83,7 @@ class ArmBench(Bench):
         super().__init__(bounds)
         if driver.fake is None:
             raise NotTried(f"{driver.name} declares no fake")
-        self.driver, self._fake = driver, driver.fake
+        self.driver, self._fake, self.twists = driver, driver.fake, driver.twists
         if settings.limits.frame != "base":
             raise ValueError("limits.frame: must be base for a conformance test, not plate")
         self.home = Pose(_centre(settings.limits), HOME.rotvec_deg)
@@ -88,7 +94,8 @@ class ArmBench(Bench):
         self._lines: list[tuple[float, Line]] = []
         motion = StraightMotion(self.home, lambda line, t_s: self._lines.append((t_s, line)))
         self.clock = running_clock(offset_s=clock_s)
-        scene = ArmScene(motion, self.clock, sync_level, REACH_MM, lambda t_s: self.load(t_s))
+        self.sync_read = False
+        scene = ArmScene(motion, self.clock, self._sync, REACH_MM, lambda t_s: self.load(t_s))
         self.fake: FakeController = self._fake(settings, scene)
         self.wraps_s = wraps_s(self.fake)
         self.fake.start()
@@ -125,10 +132,16 @@ class ArmBench(Bench):
             raise NotTried("this bench does not know the controller's clock")
         return self.clock.now_s()
 
+    def _sync(self, t_s: float) -> bool:
+        self.sync_read = True
+        return sync_level(t_s)
+
     def true_pose(self, t_s: float) -> Pose:
         """Return the true pose at a time of the controller's clock, s. Raises NotTried."""
         if self.clock is None:
             raise NotTried("this bench does not know the true motion")
+        if not self._lines and distance_mm(self.place(), self.home) > BEGUN_MM:
+            raise NotTried("the fake moves by another motion than that of its scene")
         for since_s, line in reversed(self._lines):
             if since_s <= t_s:
                 return line.pose(t_s)
@@ -170,11 +183,6 @@ class ArmBench(Bench):
         return self.fake.moving()
 
     # -- paths -----------------------------------------------------------------------------
-
-    @property
-    def twists(self) -> bool:
-        """Return whether the driver declares that the arm turns its tool on the spot."""
-        return self.driver.twists
 
     @property
     def speed_mm_s(self) -> float:

@@ -1,97 +1,142 @@
 """Drivers with wrong magnitudes: units, signs, orders, times and speeds that the rules catch.
 
-Each is an example driver with one defect. Unlike those of `broken`, a defect of this kind may break
-several rules; the one that is about it is named here. None can be named in a rig file.
+Each is an example driver with one defect. Unlike one of `broken`, such a defect may break several
+rules; those that are about it are named here. None can be named in a rig file.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sliplab.protocols.timing import Code
-from sliplab.rigs.core.capabilities import (
-    ArmState,
-    GripperState,
-    Pose,
-    Progress,
-    Segment,
-)
+from sliplab.rigs.core.capabilities import ArmState, Pose, Progress
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.pose import distance_mm
-from sliplab.rigs.testing.broken import Broken, arm_driver, event_driver, force_driver
-from sliplab.rigs.testing.examples import frames, gripper, sync
+from sliplab.rigs.testing.broken import Broken
+from sliplab.rigs.testing.examples import arm, events, force, frames, gripper, sync
 from sliplab.rigs.testing.examples.arm.driver import ExampleArm
 from sliplab.rigs.testing.examples.events.driver import ExampleEvents
 from sliplab.rigs.testing.examples.force.driver import ExampleForce
 from sliplab.rigs.testing.examples.frames.fake import FakedExampleFrames
 from sliplab.rigs.testing.examples.gripper.driver import ExampleGripper
 from sliplab.rigs.testing.examples.sync.driver import ExampleSync
-from sliplab.storage.streams import (
-    I64,
-    ClockReads,
-    EventChunk,
-    FrameChunk,
-    PoseChunk,
-    PulseChunk,
-    WrenchChunk,
-)
+from sliplab.storage.streams import EventChunk, PoseChunk
 
-_UNSIGNED = 1 << 32
+Change = Callable[[Any], Any]
+COUNTER = 1 << 32
+WAIT_S = 0.3
+
+
+def reports(base: type[Any], change: Change, *methods: str) -> type[Any]:
+    """Derive a driver whose methods return what `change` makes of a result that is not empty."""
+
+    def changed(name: str) -> Callable[..., Any]:
+        def method(self: Any, *arguments: Any) -> Any:
+            found = getattr(base, name)(self, *arguments)
+            return found if hasattr(found, "__len__") and not len(found) else change(found)
+
+        return method
+
+    return type("Reports", (base,), {name: changed(name) for name in methods})
+
+
+def takes(base: type[Any], name: str, change: Callable[..., tuple[Any, ...]]) -> type[Any]:
+    """Derive a driver one of whose methods gets the arguments that `change` makes of its own."""
+
+    def method(self: Any, *arguments: Any) -> Any:
+        return getattr(base, name)(self, *change(self, *arguments))
+
+    return type("Takes", (base,), {name: method})
+
+
+def scaled(**factors: Any) -> Change:
+    """Return a change that multiplies fields, or swaps their columns by a list of these."""
+
+    def change(chunk: Any) -> Any:
+        new = {}
+        for name, factor in factors.items():
+            old = getattr(chunk, name)
+            new[name] = old[:, factor] if isinstance(factor, list) else old * factor
+        return replace(chunk, **new)
+
+    return change
+
+
+def wrapped(name: str, step: int) -> Change:
+    """Return a change that takes a time for a counter of 32 bits of so many units."""
+    return lambda chunk: replace(chunk, **{name: getattr(chunk, name) % (COUNTER * step)})
+
+
+def us(name: str) -> Change:
+    """Return a change that takes a time in ns for one in us."""
+    return lambda chunk: replace(chunk, **{name: getattr(chunk, name) // 1000})
+
+
+def at_host(time_ns: Callable[[], int]) -> Change:
+    """Return a change that sets the host's time."""
+    return lambda chunk: replace(chunk, host_ns=np.full_like(chunk.host_ns, time_ns()))
+
 
 # -- arms ----------------------------------------------------------------------------------------
 
 
-class _Commands(ExampleArm):
-    """An arm whose moves are changed on their way to the controller."""
+def moves(change: Callable[[ExampleArm, list[float]], list[float]]) -> type[Any]:
+    """Derive an arm that is sent other numbers: place, rotation vector, speed."""
 
-    def _ask(self, request: str) -> int:
-        word, *numbers = request.split()
-        if word == "MOVE":
-            values = self._changed([float(number) for number in numbers])
-            request = "MOVE " + " ".join(f"{value:.6f}" for value in values)
-        return super()._ask(request)
+    def request(self: ExampleArm, text: str) -> tuple[str]:
+        word, *numbers = text.split()
+        if word != "MOVE":
+            return (text,)
+        values = change(self, [float(number) for number in numbers])
+        return ("MOVE " + " ".join(f"{value:.6f}" for value in values),)
 
-    def _changed(self, values: list[float]) -> list[float]:
-        raise NotImplementedError
-
-    def _turns(self, values: list[float]) -> bool:
-        x, y, z = values[:3]
-        return distance_mm(self.pose(), Pose((x, y, z), (0.0, 0.0, 0.0))) < 1e-3
+    return takes(ExampleArm, "_ask", request)
 
 
-class TenTimesTooFast(_Commands):
-    """Speeds are sent in a unit ten times smaller."""
+def poses(change: Change) -> type[Any]:
+    """Derive an arm whose `pose` and samples are changed alike."""
 
-    def _changed(self, values: list[float]) -> list[float]:
-        return [*values[:6], 10.0 * values[6]]
+    def of_pose(pose: Pose) -> Pose:
+        none = np.zeros(1, np.int64)
+        chunk = PoseChunk(none, none, np.array([pose.xyz_mm]), np.array([pose.rotvec_deg]))
+        new = change(chunk)
+        return Pose((*new.xyz_mm[0].tolist(),), (*new.rotvec_deg[0].tolist(),))
 
-
-class SpeedIgnored(_Commands):
-    """Every move has the same speed."""
-
-    def _changed(self, values: list[float]) -> list[float]:
-        return [*values[:6], 50.0]
+    return reports(reports(ExampleArm, change, "read_poses"), of_pose, "pose")
 
 
-class TurnsTwiceTooFast(_Commands):
-    """Moves have their speed, turns on the spot twice theirs."""
+def turns_twice(self: ExampleArm, values: list[float]) -> list[float]:
+    """Double the speed of a turn on the spot."""
+    x, y, z, *turn, speed = values
+    spot = distance_mm(self.pose(), Pose((x, y, z), (0.0, 0.0, 0.0))) < 1e-3
+    return [x, y, z, *turn, (2.0 if spot else 1.0) * speed]
 
-    def _changed(self, values: list[float]) -> list[float]:
-        return [*values[:6], values[6] * (2.0 if self._turns(values) else 1.0)]
+
+def scalar_last(chunk: PoseChunk) -> PoseChunk:
+    """Take quaternions w x y z for x y z w."""
+    wxyz = Rotation.from_rotvec(chunk.rotvec_deg, degrees=True).as_quat(scalar_first=True)
+    turned = Rotation.from_quat(wxyz, scalar_first=False)
+    return replace(chunk, rotvec_deg=turned.as_rotvec(degrees=True))
 
 
-class CommandsRadians(_Commands):
-    """Rotation vectors are sent in radians to a controller that takes degrees."""
+def counted(line: str) -> str:
+    """Cut the time in a line of a pose to 32 bits."""
+    word, *words = line.split(" ")
+    if word == "POSE":
+        words[0] = str(int(words[0]) % COUNTER)
+    return " ".join([word, *words])
 
-    def _changed(self, values: list[float]) -> list[float]:
-        return [*values[:3], *np.radians(values[3:6]).tolist(), values[6]]
+
+def inverted(line: str) -> str:
+    """Invert the level of the sync input in a line of a pose."""
+    return line[:-1] + "10"[int(line[-1])] if line.startswith("POSE ") else line
 
 
 class CutsCorners(ExampleArm):
@@ -103,36 +148,16 @@ class CutsCorners(ExampleArm):
         run.finished[:] = run.finished * len(whole)
 
 
-class HostSegmentTimes(ExampleArm):
-    """Begin and end of segments are times of the host's clock."""
-
-    def progress(self) -> Progress:
-        """Return the progress."""
-        found = super().progress()
-        now_ns = time.monotonic_ns()
-        return replace(found, finished=tuple((now_ns, now_ns) for _ in found.finished))
-
-
 class DoneTooEarly(ExampleArm):
     """The path counts as done shortly before its end."""
 
     def progress(self) -> Progress:
         """Return the progress."""
-        found, path = super().progress(), self._run.path
-        near = bool(path) and distance_mm(self.pose(), path[-1].to) < 2.0
-        if not near:
-            return found
+        path = self._run.path
+        if not path or distance_mm(self.pose(), path[-1].to) > 2.0:
+            return super().progress()
         now_ns = self.now_ns()
         return Progress(ArmState.READY, ((now_ns, now_ns),) * len(path), done=True)
-
-
-class ReadyWhileMoving(ExampleArm):
-    """The state is ready as long as the link is good."""
-
-    def state(self) -> ArmState:
-        """Return the state."""
-        found = super().state()
-        return ArmState.READY if found is ArmState.MOVING else found
 
 
 class ProgressWaits(ExampleArm):
@@ -151,122 +176,22 @@ class StopDoesNotWait(ExampleArm):
         self._ask("STOP")
 
 
-class TiltNotChecked(ExampleArm):
-    """The limit of a turn is not held against the path."""
-
-    def start(self, path: Sequence[Segment]) -> None:
-        """Start a path."""
-        limits = self._guard._limits
-        self._guard._limits = limits.model_copy(update={"tilt_deg": 180.0})
-        super().start(path)
-
-
-class _Poses(ExampleArm):
-    """An arm whose poses are changed when they are reported."""
-
-    def pose(self) -> Pose:
-        """Return the last pose."""
-        found = super().pose()
-        chunk = PoseChunk(
-            np.zeros(1, np.int64), np.zeros(1, np.int64), np.array([found.xyz_mm]),
-            np.array([found.rotvec_deg]),
-        )  # fmt: skip
-        wrong = self._changed(chunk)
-        return Pose((*wrong.xyz_mm[0].tolist(),), (*wrong.rotvec_deg[0].tolist(),))
-
-    def read_poses(self) -> PoseChunk:
-        """Return the poses since the last call."""
-        found = super().read_poses()
-        return self._changed(found) if len(found) else found
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        raise NotImplementedError
-
-
-class PosesInMetres(_Poses):
-    """Positions are reported in metres."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, xyz_mm=poses.xyz_mm / 1000.0)
-
-
-class PosesInRadians(_Poses):
-    """Rotation vectors are reported in radians."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, rotvec_deg=np.radians(poses.rotvec_deg))
-
-
-class ScalarPartLast(_Poses):
-    """Quaternions w x y z are taken for x y z w."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        wxyz = Rotation.from_rotvec(poses.rotvec_deg, degrees=True).as_quat(scalar_first=True)
-        turned = Rotation.from_quat(wxyz, scalar_first=False)
-        return replace(poses, rotvec_deg=turned.as_rotvec(degrees=True))
-
-
-class _Samples(ExampleArm):
-    """An arm whose samples are changed when they are read."""
-
-    def read_poses(self) -> PoseChunk:
-        """Return the poses since the last call."""
-        found = super().read_poses()
-        return self._changed(found) if len(found) else found
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        raise NotImplementedError
-
-
-class AxesSwapped(_Samples):
-    """Samples have y before x."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, xyz_mm=poses.xyz_mm[:, [1, 0, 2]])
-
-
-class HeightFlipped(_Samples):
-    """Samples have z downwards."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, xyz_mm=poses.xyz_mm * [1.0, 1.0, -1.0])
-
-
-class SamplesTwice(_Samples):
+class SamplesTwice(ExampleArm):
     """Each read returns the last sample of the one before, too."""
 
-    before: PoseChunk | None = None
+    last: PoseChunk | None = None
 
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        last, self.before = self.before, poses
+    def read_poses(self) -> PoseChunk:
+        """Return the poses since the last call."""
+        found, last = super().read_poses(), self.last
+        if not len(found):
+            return found
+        self.last = PoseChunk(*(column[-1:] for column in vars(found).values()))
         if last is None:
-            return poses
-        names = vars(poses)
-        return PoseChunk(*(np.concatenate([getattr(last, n)[-1:], names[n]]) for n in names))
-
-
-class HostTimeIsZero(_Samples):
-    """The host's time is not set."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, host_ns=np.zeros_like(poses.host_ns))
-
-
-class HostWallClock(_Samples):
-    """The host's time is the time of day, not the monotonic clock."""
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, host_ns=poses.host_ns + time.time_ns() - time.monotonic_ns())
-
-
-class HostTimeStands(_Samples):
-    """The host's time is that of the first sample."""
-
-    first_ns: int | None = None
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        self.first_ns = self.first_ns or int(poses.host_ns[0])
-        return replace(poses, host_ns=np.full_like(poses.host_ns, self.first_ns))
+            return found
+        return PoseChunk(
+            *(np.concatenate([getattr(c, n) for c in (last, found)]) for n in vars(found))
+        )
 
 
 class CommandedPose(ExampleArm):
@@ -283,10 +208,9 @@ class PoseLate(ExampleArm):
 
     def pose(self) -> Pose:
         """Return a pose."""
-        kept = self.__dict__.setdefault("kept", [])
-        now = time.monotonic()
-        kept.append((now, super().pose()))
-        return next((pose for at, pose in reversed(kept) if at < now - 0.5), kept[0][1])
+        seen, now = self.__dict__.setdefault("seen", []), time.monotonic()
+        seen.append((now, super().pose()))
+        return next((pose for at, pose in reversed(seen) if at < now - 0.5), seen[0][1])
 
 
 class ClockStands(ExampleArm):
@@ -300,37 +224,114 @@ class ClockStands(ExampleArm):
         return self.first_ns
 
 
-class ClockInMicroseconds(_Samples):
-    """Times are microseconds, called ns."""
-
-    def now_ns(self) -> int:
-        """Return a time."""
-        return super().now_ns() // 1000
-
-    def _changed(self, poses: PoseChunk) -> PoseChunk:
-        return replace(poses, t_ns=poses.t_ns // 1000)
+def without_tilt(self: ExampleArm, path: Any) -> tuple[Any]:
+    """Lift the limit of a turn."""
+    self._guard._limits = self._guard._limits.model_copy(update={"tilt_deg": 180.0})
+    return (path,)
 
 
-class ArmCounterWraps(ExampleArm):
-    """The controller's microseconds are taken for a counter of 32 bits that never wraps."""
-
-    def _take(self, line: str) -> None:
-        word, *words = line.split(" ")
-        if word == "POSE":
-            words[0] = str(int(words[0]) % _UNSIGNED)
-        super()._take(" ".join([word, *words]))
+def host_spans(progress: Progress) -> Progress:
+    """Set the times of segments to the host's."""
+    now_ns = time.monotonic_ns()
+    return replace(progress, finished=tuple((now_ns, now_ns) for _ in progress.finished))
 
 
-class FallingEdges(ExampleArm):
-    """Falling edges of the sync input are reported."""
-
-    def _take(self, line: str) -> None:
-        if line.startswith("POSE "):
-            line = line[:-1] + ("0" if line.endswith("1") else "1")
-        super()._take(line)
+def ready(state: ArmState) -> ArmState:
+    """Take an arm that moves for one that is ready."""
+    return ArmState.READY if state is ArmState.MOVING else state
 
 
-# -- event cameras -------------------------------------------------------------------------------
+SPEED, CALLS, POSES, HOST = "speed and length", "calls while moving", "poses", "host times"
+TURN, TILT, WRAPS = "orientation", "limits of turn and depth", "counter wraps"
+ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
+    "TenTimesTooFast": (
+        moves(lambda self, v: [*v[:6], 10 * v[6]]), (SPEED,), "followed at .* instead of 40 mm/s",
+    ),
+    "SpeedIgnored": (moves(lambda self, v: [*v[:6], 50.0]), (SPEED,), "followed at 50.0 mm/s"),
+    "TurnsTwiceTooFast": (moves(turns_twice), ("turn",), "followed at 40.0 deg/s instead of 20"),
+    "CommandsRadians": (
+        moves(lambda self, v: [*v[:3], *np.radians(v[3:6]), v[6]]), (TURN,), "orientation was",
+    ),
+    "CutsCorners": (CutsCorners, (SPEED,), "came no nearer to the end of segment 1"),
+    "HostSegmentTimes": (
+        reports(ExampleArm, host_spans, "progress"), (SPEED,), "segment 1 was reported to begin",
+    ),
+    "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
+    "ReadyWhileMoving": (
+        reports(ExampleArm, ready, "state"), (CALLS,), "its state was ArmState.READY",
+    ),
+    "ProgressWaits": (ProgressWaits, (CALLS,), "had not returned before the arm was at rest"),
+    "StopDoesNotWait": (StopDoesNotWait, ("stop while moving",), "still moving when the call"),
+    "TiltNotChecked": (
+        takes(ExampleArm, "start", without_tilt), (TILT,), "turns the tool too far",
+    ),
+    "PosesInMetres": (poses(scaled(xyz_mm=1e-3)), (POSES,), r"pose returned \(0\.4"),
+    "PosesInRadians": (
+        poses(scaled(rotvec_deg=np.pi / 180)), (TURN,), "returned the rotation vector",
+    ),
+    "ScalarPartLast": (poses(scalar_last), (TURN,), "returned the rotation vector"),
+    "AxesSwapped": (
+        reports(ExampleArm, scaled(xyz_mm=[1, 0, 2]), "read_poses"), (POSES,), "read_poses returned"
+    ),
+    "HeightFlipped": (
+        reports(ExampleArm, scaled(xyz_mm=np.array([1, 1, -1])), "read_poses"), (POSES,), ", -3",
+    ),
+    "SamplesTwice": (SamplesTwice, (POSES,), "was read twice"),
+    "HostTimeIsZero": (
+        reports(ExampleArm, at_host(lambda: 0), "read_poses"), (HOST,), "host_ns was 0, received",
+    ),
+    "HostWallClock": (
+        reports(ExampleArm, at_host(time.time_ns), "read_poses"), (HOST,), "host_ns was 1",
+    ),
+    "HostTimeStands": (
+        reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"), (HOST,),
+        "host_ns was",
+    ),
+    "CommandedPose": (CommandedPose, (POSES,), "and not there in the"),
+    "PoseLate": (PoseLate, (POSES,), "and not there in the"),
+    "ClockStands": (ClockStands, ("clock",), "now_ns went on by -?0.00|came when now_ns"),
+    "ClockInMicroseconds": (
+        reports(reports(ExampleArm, us("t_ns"), "read_poses"), lambda t_ns: t_ns // 1000, "now_ns"),
+        ("clock",), "now_ns went on by|came when now_ns",
+    ),
+    "ArmCounterWraps": (
+        takes(ExampleArm, "_take", lambda self, line: (counted(line),)), (WRAPS,), "fell back",
+    ),
+    "NoPulses": (
+        reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns[:0]), "read_pulses"), ("sync input",),
+        "0 of about 4 pulses",
+    ),
+    "FallingEdges": (
+        takes(ExampleArm, "_take", lambda self, line: (inverted(line),)), ("sync input",),
+        "from the nearest rising edge",
+    ),
+}  # fmt: skip
+
+
+# -- cameras and sensors -------------------------------------------------------------------------
+
+
+class ReadWaits(ExampleEvents):
+    """Read waits for events."""
+
+    def read(self) -> EventChunk:
+        """Events since the last call."""
+        found = super().read()
+        if not len(found):
+            threading.Event().wait(WAIT_S)
+        return found
+
+
+class EventsTwice(ExampleEvents):
+    """Each read returns the events of the one before, too."""
+
+    last: EventChunk | None = None
+
+    def read(self) -> EventChunk:
+        """Events since the last call."""
+        found, last = super().read(), self.last
+        self.last = found if len(found) else last
+        return EventChunk.joined([last, found]) if last is not None and len(found) else found
 
 
 class SizeSwapped(ExampleEvents):
@@ -341,155 +342,18 @@ class SizeSwapped(ExampleEvents):
         self.width, self.height = self.height, self.width
 
 
-class _Events(ExampleEvents):
-    """A camera whose events are changed when they are read."""
+class RegionStays(FakedExampleFrames):
+    """The first region stays."""
 
-    def read(self) -> EventChunk:
-        """Events since the last call."""
-        found = super().read()
-        return self._changed(found) if len(found) else found
+    first: tuple[int, int] | None = None
 
-    def _changed(self, events: EventChunk) -> EventChunk:
-        raise NotImplementedError
-
-
-class ColumnsSwapped(_Events):
-    """Columns and rows of events are swapped."""
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        return replace(events, x=events.y, y=events.x)
+    def set_region(self, width_px: int, height_px: int) -> None:
+        """Read out a region."""
+        self.first = self.first or (width_px, height_px)
+        super().set_region(*self.first)
 
 
-class PolarityInverted(_Events):
-    """Brighter is 0."""
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        return replace(events, p=1 - events.p)
-
-
-class PolaritySigned(_Events):
-    """Darker is -1."""
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        return replace(events, p=events.p.astype(np.int8) * 2 - 1)
-
-
-class EventsInNanoseconds(_Events):
-    """Times of events are ns."""
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        return replace(events, t_us=events.t_us * 1000)
-
-
-class EventCounterWraps(_Events):
-    """The camera's counter of 32 bits is not unwrapped."""
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        return replace(events, t_us=events.t_us % _UNSIGNED)
-
-
-class EventsTwice(_Events):
-    """Each read returns the events of the one before, too."""
-
-    before: EventChunk | None = None
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        last, self.before = self.before, events
-        return EventChunk.joined([last, events]) if last is not None else events
-
-
-class OneEventATime(_Events):
-    """Of events at the same time only the first is returned."""
-
-    def _changed(self, events: EventChunk) -> EventChunk:
-        _, first = np.unique(events.t_us, return_index=True)
-        return EventChunk(*(column[first] for column in vars(events).values()))
-
-
-class PulsesInMicroseconds(ExampleEvents):
-    """Times of pulses are us, called ns."""
-
-    def read_pulses(self) -> PulseChunk:
-        """Sync pulses since the last call."""
-        return PulseChunk(super().read_pulses().t_ns // 1000)
-
-
-class ReadWaits(ExampleEvents):
-    """Read waits for events."""
-
-    def read(self) -> EventChunk:
-        """Events since the last call."""
-        found = super().read()
-        if not len(found):
-            threading.Event().wait(0.3)
-        return found
-
-
-# -- frame cameras -------------------------------------------------------------------------------
-
-
-class _Frames(FakedExampleFrames):
-    """A camera whose frames are changed when they are read."""
-
-    def read(self) -> FrameChunk:
-        """Frames since the last call."""
-        found = super().read()
-        return self._changed(found) if len(found) else found
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        raise NotImplementedError
-
-
-class Transposed(_Frames):
-    """Images have columns before rows."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, images=frames.images.transpose(0, 2, 1))
-
-
-class UpsideDown(_Frames):
-    """Images begin with their last row."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, images=frames.images[:, ::-1])
-
-
-class StartOfExposure(_Frames):
-    """Times are those of the beginning of the exposure."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, t_ns=frames.t_ns - self.mid_exposure_ns)
-
-
-class LevelInverted(_Frames):
-    """The sync line is taken for active low."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, sync=1 - frames.sync)
-
-
-class HostTimeOfCamera(_Frames):
-    """The host's time is the camera's."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, host_ns=frames.t_ns)
-
-
-class HostTimeOfRead(_Frames):
-    """The host's time is that of the read."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, host_ns=np.full_like(frames.host_ns, time.monotonic_ns()))
-
-
-class FrameCounterWraps(_Frames):
-    """The camera's microseconds of 32 bits are not unwrapped."""
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return replace(frames, t_ns=frames.t_ns % (_UNSIGNED * 1000))
-
-
-class NumbersOfItsOwn(_Frames):
+class NumbersOfItsOwn(FakedExampleFrames):
     """Frames are numbered as they come."""
 
     count = 0
@@ -499,127 +363,34 @@ class NumbersOfItsOwn(_Frames):
         self.count = 0
         super().start()
 
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        first, self.count = self.count, self.count + len(frames)
-        return replace(frames, number=np.arange(first, self.count, dtype=np.int64))
-
-
-class RegionKept(_Frames):
-    """The first region stays."""
-
-    def set_region(self, width_px: int, height_px: int) -> None:
-        """Read out a region."""
-        if "region" not in self.__dict__:
-            self.region = width_px, height_px
-        super().set_region(*self.region)
-
-    def _changed(self, frames: FrameChunk) -> FrameChunk:
-        return frames
-
-
-# -- force sensors -------------------------------------------------------------------------------
-
-
-class _Loads(ExampleForce):
-    """A sensor whose samples are changed when they are read."""
-
-    def read(self) -> WrenchChunk:
-        """Forces and torques since the last call."""
+    def read(self) -> Any:
+        """Frames since the last call."""
         found = super().read()
-        return self._changed(found) if len(found) else found
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        raise NotImplementedError
+        first, self.count = self.count, self.count + len(found)
+        return replace(found, number=np.arange(first, self.count, dtype=np.int64))
 
 
-class MilliNewtons(_Loads):
-    """Forces are mN."""
+class StartOfExposure(FakedExampleFrames):
+    """Times are those of the beginning of the exposure."""
 
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, force_n=load.force_n * 1000.0)
-
-
-class NewtonMillimetres(_Loads):
-    """Torques are N mm."""
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, torque_nm=load.torque_nm * 1000.0)
+    def read(self) -> Any:
+        """Frames since the last call."""
+        found = super().read()
+        return replace(found, t_ns=found.t_ns - self.mid_exposure_ns)
 
 
-class Reaction(_Loads):
-    """Forces have the other sign."""
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, force_n=-load.force_n)
-
-
-class ForceAxesSwapped(_Loads):
-    """Forces have z first."""
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, force_n=load.force_n[:, ::-1])
-
-
-class OneLoad(_Loads):
-    """Every sample of a read has the load of the first one."""
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, force_n=np.repeat(load.force_n[:1], len(load), axis=0))
-
-
-class ForceHostTimeIsZero(_Loads):
-    """The host's time is not set."""
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, host_ns=np.zeros_like(load.host_ns))
-
-
-class ForceCounterWraps(_Loads):
-    """The sensor's ms of 32 bits are not unwrapped."""
-
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        return replace(load, t_ns=load.t_ns % (_UNSIGNED * 1_000_000))
-
-
-class ZeroHides(_Loads):
+class ZeroHides(ExampleForce):
     """After zero every load is zero."""
 
-    zeroed = False
+    share = 1.0
 
     def zero(self) -> None:
         """Take the present load for zero."""
-        self.zeroed = True
+        self.share = 0.0
 
-    def _changed(self, load: WrenchChunk) -> WrenchChunk:
-        share = 0.0 if self.zeroed else 1.0
-        return replace(load, force_n=share * load.force_n, torque_nm=share * load.torque_nm)
-
-
-# -- sync boxes ----------------------------------------------------------------------------------
-
-
-class SeedIgnored(ExampleSync):
-    """Every train has the same seed."""
-
-    def start(self, rate_hz: float, seed: int, code: Code) -> None:
-        """Start a train."""
-        super().start(rate_hz, seed and 77, code)
-
-
-class CodeIgnored(ExampleSync):
-    """Every train has the same code."""
-
-    def start(self, rate_hz: float, seed: int, code: Code) -> None:
-        """Start a train."""
-        super().start(rate_hz, seed, "lfsr")
-
-
-class HalfTheRate(ExampleSync):
-    """The rate is that of pulses and gaps together."""
-
-    def start(self, rate_hz: float, seed: int, code: Code) -> None:
-        """Start a train."""
-        super().start(rate_hz / 2, seed, code)
+    def read(self) -> Any:
+        """Forces and torques since the last call."""
+        return scaled(force_n=self.share, torque_nm=self.share)(super().read())
 
 
 class KeepsTicking(ExampleSync):
@@ -630,108 +401,138 @@ class KeepsTicking(ExampleSync):
         self._buffer.end()
 
 
-class _Clock(ExampleSync):
-    """A box whose clock is changed when it is read."""
-
-    def read_clock(self) -> ClockReads:
-        """Read the clock."""
-        return self._changed(super().read_clock())
-
-    def _changed(self, reads: ClockReads) -> ClockReads:
-        raise NotImplementedError
+def first_of_each_time(chunk: EventChunk) -> EventChunk:
+    """Keep the first one of events at the same time."""
+    _, rows = np.unique(chunk.t_us, return_index=True)
+    return EventChunk(*(column[rows] for column in vars(chunk).values()))
 
 
-class BoxClockInMicroseconds(_Clock):
-    """The clock is us, called ns."""
-
-    def _changed(self, reads: ClockReads) -> ClockReads:
-        return replace(reads, device_ns=reads.device_ns // 1000)
+def first_load(chunk: Any) -> Any:
+    """Repeat the force of the first sample."""
+    return replace(chunk, force_n=np.repeat(chunk.force_n[:1], len(chunk), axis=0))
 
 
-class BoxHostWallClock(_Clock):
-    """The host's times are the time of day."""
-
-    def _changed(self, reads: ClockReads) -> ClockReads:
-        ahead_ns = time.time_ns() - time.monotonic_ns()
-        return replace(
-            reads, before_ns=reads.before_ns + ahead_ns, after_ns=reads.after_ns + ahead_ns
-        )
+def wall_reads(reads: Any) -> Any:
+    """Set the host's times of a read to the time of day."""
+    ahead_ns = time.time_ns() - time.monotonic_ns()
+    return replace(reads, before_ns=reads.before_ns + ahead_ns, after_ns=reads.after_ns + ahead_ns)
 
 
-class ClockOfPowerOn(_Clock):
-    """The clock counts from an earlier time than tick 0."""
-
-    def _changed(self, reads: ClockReads) -> ClockReads:
-        return replace(reads, device_ns=reads.device_ns + 3_000_000_000)
+def _read(base: type[Any], change: Change) -> type[Any]:
+    return reports(base, change, "read")
 
 
-class BoxCounterWraps(_Clock):
-    """The box's counter of 32 bits is not unwrapped."""
-
-    def read_pulses(self) -> PulseChunk:
-        """Pulses since the last call."""
-        return PulseChunk(self._wrapped(super().read_pulses().t_ns))
-
-    def _changed(self, reads: ClockReads) -> ClockReads:
-        return replace(reads, device_ns=self._wrapped(reads.device_ns))
-
-    def _wrapped(self, t_ns: I64) -> I64:
-        return t_ns % (_UNSIGNED * 1000)
-
-
-class BitsInverted(ExampleSync):
-    """Pulses are reported half a tick late, as of a line that is active low."""
-
-    def read_pulses(self) -> PulseChunk:
-        """Pulses since the last call."""
-        return PulseChunk(super().read_pulses().t_ns + 2_500_000)
-
-
-class ExposuresInMilliseconds(ExampleSync):
-    """Times of exposures are a thousand times too small."""
-
-    def read_exposures(self) -> PulseChunk:
-        """Starts of exposures since the last call."""
-        return PulseChunk(super().read_exposures().t_ns // 1000)
+DATA = ("data",)
+EVENTS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
+    "SizeSwapped": (SizeSwapped, ("sensor size",), "width and height were 48 x 64"),
+    "ColumnsSwapped": (
+        _read(ExampleEvents, lambda c: replace(c, x=c.y, y=c.x)), DATA, "x came otherwise",
+    ),
+    "PolarityInverted": (
+        _read(ExampleEvents, lambda c: replace(c, p=1 - c.p)), DATA, "p came otherwise",
+    ),
+    "PolaritySigned": (
+        _read(ExampleEvents, lambda c: replace(c, p=c.p.astype(np.int8) * 2 - 1)), ("arrays",),
+        "p was an array of int8",
+    ),
+    "EventsInNanoseconds": (
+        _read(ExampleEvents, scaled(t_us=1000)), DATA, "t_us came otherwise|were sent and",
+    ),
+    "EventCounterWraps": (
+        _read(ExampleEvents, lambda c: replace(c, t_us=c.t_us % COUNTER)), (WRAPS,), "came after",
+    ),
+    "EventsTwice": (EventsTwice, DATA, "came after|were sent and"),
+    "OneEventATime": (_read(ExampleEvents, first_of_each_time), DATA, "were sent and"),
+    "PulsesInMicroseconds": (
+        reports(ExampleEvents, us("t_ns"), "read_pulses"), DATA, "pulses up to",
+    ),
+    "ReadWaits": (ReadWaits, ("read at once",), "read took"),
+}  # fmt: skip
+FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
+    "Transposed": (
+        _read(FakedExampleFrames, lambda c: replace(c, images=c.images.transpose(0, 2, 1))),
+        ("region",), "frames of",
+    ),
+    "UpsideDown": (
+        _read(FakedExampleFrames, lambda c: replace(c, images=c.images[:, ::-1])), DATA,
+        "images came otherwise",
+    ),
+    "StartOfExposure": (StartOfExposure, DATA, "t_ns up to 50.* was sent"),
+    "LevelInverted": (
+        _read(FakedExampleFrames, lambda c: replace(c, sync=1 - c.sync)),
+        ("level of the sync line",), "of the sync line, and came with",
+    ),
+    "HostTimeOfCamera": (
+        _read(FakedExampleFrames, lambda c: replace(c, host_ns=c.t_ns)), (HOST,), "host_ns was",
+    ),
+    "HostTimeOfRead": (
+        _read(FakedExampleFrames, at_host(time.monotonic_ns)), (HOST,), "after a sample was sent",
+    ),
+    "FrameCounterWraps": (
+        _read(FakedExampleFrames, wrapped("t_ns", 1000)), (WRAPS,), "came after",
+    ),
+    "NumbersOfItsOwn": (NumbersOfItsOwn, ("lost frames",), "number came otherwise"),
+    "RegionStays": (RegionStays, ("another region",), "frames of"),
+}  # fmt: skip
+FORCE: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
+    "MilliNewtons": (_read(ExampleForce, scaled(force_n=1e3)), DATA, "force_n came otherwise"),
+    "NewtonMillimetres": (
+        _read(ExampleForce, scaled(torque_nm=1e3)), DATA, "torque_nm came otherwise",
+    ),
+    "Reaction": (_read(ExampleForce, scaled(force_n=-1.0)), DATA, "force_n came otherwise"),
+    "ForceAxesSwapped": (
+        _read(ExampleForce, scaled(force_n=[2, 1, 0])), DATA, "force_n came otherwise",
+    ),
+    "OneLoad": (_read(ExampleForce, first_load), DATA, "force_n came otherwise"),
+    "ForceHostTimeIsZero": (_read(ExampleForce, at_host(lambda: 0)), (HOST,), "host_ns was 0"),
+    "ForceCounterWraps": (
+        _read(ExampleForce, wrapped("t_ns", 1_000_000)), (WRAPS,), "came after",
+    ),
+    "ZeroHides": (ZeroHides, ("zero",), "its change was not read"),
+}  # fmt: skip
+BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
+    "SeedIgnored": (
+        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed and 77, code)),
+        ("trains",), "the box sent 200 Hz, seed 77",
+    ),
+    "CodeIgnored": (
+        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed, "lfsr")), ("trains",),
+        "and code lfsr",
+    ),
+    "HalfTheRate": (
+        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz / 2, seed, code)),
+        ("trains",), "the box sent 100 Hz",
+    ),
+    "KeepsTicking": (KeepsTicking, ("ticks stop",), "the box still ticked"),
+    "BoxClockInMicroseconds": (
+        reports(ExampleSync, us("device_ns"), "read_clock"), ("clock",), "the clock went on by",
+    ),
+    "BoxHostWallClock": (
+        reports(ExampleSync, wall_reads, "read_clock"), ("clock",), "times before and after",
+    ),
+    "ClockOfPowerOn": (
+        reports(
+            ExampleSync, lambda c: replace(c, device_ns=c.device_ns + 3_000_000_000), "read_clock"
+        ),
+        ("clock at start",), "after start its clock was",
+    ),
+    "BoxCounterWraps": (
+        reports(ExampleSync, wrapped("device_ns", 1000), "read_clock"), (WRAPS,), "went on by",
+    ),
+    "PulseCounterWraps": (
+        reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"), (WRAPS,), "no pulse had",
+    ),
+    "EndOfPulses": (
+        reports(ExampleSync, lambda c: replace(c, t_ns=c.t_ns + 2_500_000), "read_pulses"), DATA,
+        "pulses came at",
+    ),
+    "ExposuresInMicroseconds": (
+        reports(ExampleSync, us("t_ns"), "read_exposures"), ("exposures",), "an exposure between",
+    ),
+}  # fmt: skip
 
 
 # -- grippers ------------------------------------------------------------------------------------
-
-
-class OpensToClose(ExampleGripper):
-    """Openings are sent as strokes from the open end."""
-
-    def move(self, opening_mm: float, speed_mm_s: float, force_n: float) -> None:
-        """Start a move."""
-        super().move(self.range.opening_mm[1] - opening_mm, speed_mm_s, force_n)
-
-
-class GripperSpeedIgnored(ExampleGripper):
-    """Every move has the largest speed."""
-
-    def move(self, opening_mm: float, speed_mm_s: float, force_n: float) -> None:
-        """Start a move."""
-        speed = speed_mm_s if speed_mm_s != speed_mm_s else self.range.speed_mm_s[1]
-        super().move(opening_mm, speed, force_n)
-
-
-class GripperForceInPercent(ExampleGripper):
-    """The force is sent in percent of the largest one."""
-
-    def _send(self, line: str) -> None:
-        word, *values = line.split()
-        if word == "MOVE":
-            values[2] = str(100.0 * float(values[2]) / self.range.force_n[1])
-        super()._send(" ".join([word, *values]))
-
-
-class OpeningInSteps(ExampleGripper):
-    """The opening is reported in the gripper's steps."""
-
-    def state(self) -> GripperState:
-        """Return opening and motion."""
-        found = super().state()
-        return replace(found, opening_mm=found.opening_mm / self.range.step_mm)
 
 
 class TargetReported(ExampleGripper):
@@ -744,13 +545,13 @@ class TargetReported(ExampleGripper):
         super().move(opening_mm, speed_mm_s, force_n)
         self.target = opening_mm
 
-    def state(self) -> GripperState:
+    def state(self) -> Any:
         """Return opening and motion."""
         found = super().state()
         return found if self.target is None else replace(found, opening_mm=self.target)
 
 
-class RestsAtOnce(ExampleGripper):
+class RestsTooEarly(ExampleGripper):
     """The fingers count as at rest once they are near the end of their move."""
 
     target = 0.0
@@ -760,13 +561,13 @@ class RestsAtOnce(ExampleGripper):
         super().move(opening_mm, speed_mm_s, force_n)
         self.target = opening_mm
 
-    def state(self) -> GripperState:
+    def state(self) -> Any:
         """Return opening and motion."""
         found = super().state()
         return replace(found, moving=found.moving and abs(found.opening_mm - self.target) > 3.0)
 
 
-class OpensWhenClosed(ExampleGripper):
+class OpensOnConnect(ExampleGripper):
     """Connecting opens the fingers, as an activation does."""
 
     def connect(self) -> None:
@@ -775,90 +576,52 @@ class OpensWhenClosed(ExampleGripper):
         self.move(self.range.opening_mm[1], self.range.speed_mm_s[1], self.range.force_n[0])
 
 
-def _frames(broken: Any) -> Driver[Any]:
-    return replace(frames.DRIVER, name=broken.__name__, fake=broken)
+def percent(self: ExampleGripper, line: str) -> tuple[str]:
+    """Send the force of a move in percent of the largest one."""
+    word, *values = line.split()
+    if word == "MOVE":
+        values[2] = str(100.0 * float(values[2]) / self.range.force_n[1])
+    return (" ".join([word, *values]),)
 
 
-def _sync(broken: type[ExampleSync]) -> Driver[Any]:
-    return replace(sync.DRIVER, name=broken.__name__, build=broken)
+MOVE, STATE = "values of a move", "state while moving"
+GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
+    "OpensToClose": (
+        takes(ExampleGripper, "move", lambda self, mm, *rest: (80.0 - mm, *rest)),
+        (MOVE, "move of the fingers"), "asked for",
+    ),
+    "GripperSpeedIgnored": (
+        takes(ExampleGripper, "move", lambda self, mm, speed, force: (mm, 90.0, force)), (MOVE,),
+        "the fingers went at",
+    ),
+    "GripperForceInPercent": (
+        takes(ExampleGripper, "_send", percent), (MOVE,), "the gripper was sent",
+    ),
+    "OpeningInSteps": (
+        reports(ExampleGripper, lambda s: replace(s, opening_mm=10 * s.opening_mm), "state"),
+        (STATE,), "the fingers were at",
+    ),
+    "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
+    "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it said"),
+    "OpensOnConnect": (OpensOnConnect, ("fingers stay",), "the fingers went from"),
+}  # fmt: skip
 
 
-def _gripper(broken: type[ExampleGripper]) -> Driver[Any]:
-    return replace(gripper.DRIVER, name=broken.__name__, build=broken)
+def _declared(declaration: Driver[Any], name: str, device: type[Any]) -> Driver[Any]:
+    if declaration is frames.DRIVER:
+        return replace(frames.DRIVER, name=name, fake=device)
+    if declaration is force.DRIVER:
+        return replace(force.DRIVER, name=name, build=lambda settings, arm: device(settings))
+    changes: dict[str, Any] = {"name": name, "build": device}
+    return replace(declaration, **changes)
 
 
-SPEED, CALLS, POSES, HOST = "speed and length", "calls while moving", "poses", "host times"
-WRAPS, MOVE, STATE = "counter wraps", "values of a move", "state while moving"
-WRONG_VALUES = (
-    Broken(arm_driver(TenTimesTooFast), (SPEED,), "followed at .* instead of 40 mm/s"),
-    Broken(arm_driver(SpeedIgnored), (SPEED,), "followed at 50.0 mm/s instead of 40 mm/s"),
-    Broken(arm_driver(TurnsTwiceTooFast), ("turn",), "followed at 40.0 deg/s instead of 20"),
-    Broken(arm_driver(CommandsRadians), ("orientation",), "orientation was|aborted|done"),
-    Broken(arm_driver(CutsCorners), (SPEED,), "came no nearer to the end of segment 1"),
-    Broken(arm_driver(HostSegmentTimes), (SPEED,), "segment 1 was reported to begin"),
-    Broken(arm_driver(DoneTooEarly), ("path", CALLS), "before the end of the path"),
-    Broken(arm_driver(ReadyWhileMoving), (CALLS,), "its state was ArmState.READY"),
-    Broken(arm_driver(ProgressWaits), (CALLS,), "had not returned before the arm was at rest"),
-    Broken(arm_driver(StopDoesNotWait), ("stop while moving",), "still moving when the call"),
-    Broken(arm_driver(TiltNotChecked), ("limits of turn and depth",), "turns the tool too far"),
-    Broken(arm_driver(PosesInMetres), (POSES,), r"pose returned \(0\.4"),
-    Broken(arm_driver(PosesInRadians), ("orientation",), "returned the rotation vector"),
-    Broken(arm_driver(ScalarPartLast), ("orientation",), "returned the rotation vector"),
-    Broken(arm_driver(AxesSwapped), (POSES,), "read_poses returned"),
-    Broken(arm_driver(HeightFlipped), (POSES,), r"read_poses returned .*, -3"),
-    Broken(arm_driver(SamplesTwice), (POSES,), "was read twice"),
-    Broken(arm_driver(HostTimeIsZero), (HOST,), "host_ns was 0, received between"),
-    Broken(arm_driver(HostWallClock), (HOST,), "host_ns was 1"),
-    Broken(arm_driver(HostTimeStands), (HOST,), "host_ns was"),
-    Broken(arm_driver(CommandedPose), (POSES,), "and not there in the"),
-    Broken(arm_driver(PoseLate), (POSES,), "and not there in the"),
-    Broken(arm_driver(ClockStands), ("clock",), "now_ns went on by -?0.00|came when now_ns"),
-    Broken(arm_driver(ClockInMicroseconds), ("clock",), "now_ns went on by|came when now_ns"),
-    Broken(arm_driver(ArmCounterWraps), (WRAPS,), "fell back|came after"),
-    Broken(arm_driver(FallingEdges), ("sync input",), "from the nearest rising edge"),
-    Broken(event_driver(SizeSwapped), ("sensor size",), "width and height were 48 x 64"),
-    Broken(event_driver(ColumnsSwapped), ("data",), "x came otherwise"),
-    Broken(event_driver(PolarityInverted), ("data",), "p came otherwise"),
-    Broken(event_driver(PolaritySigned), ("arrays",), "p was an array of int8"),
-    Broken(event_driver(EventsInNanoseconds), ("data",), "t_us came otherwise|were sent and"),
-    Broken(event_driver(EventCounterWraps), (WRAPS,), "came after|came as"),
-    Broken(event_driver(EventsTwice), ("data",), "came after|were sent and"),
-    Broken(event_driver(OneEventATime), ("data",), "were sent and"),
-    Broken(event_driver(PulsesInMicroseconds), ("data",), "pulses up to"),
-    Broken(event_driver(ReadWaits), ("read at once",), "read took"),
-    Broken(_frames(Transposed), ("region",), "frames of"),
-    Broken(_frames(UpsideDown), ("data",), "images came otherwise"),
-    Broken(_frames(StartOfExposure), ("data",), "t_ns up to 50.* was sent"),
-    Broken(_frames(LevelInverted), ("level of the sync line",), "of the sync line, and came with"),
-    Broken(_frames(HostTimeOfCamera), (HOST,), "host_ns was"),
-    Broken(_frames(HostTimeOfRead), (HOST,), "s or more after a sample was sent"),
-    Broken(_frames(FrameCounterWraps), (WRAPS,), "came after|came as"),
-    Broken(_frames(NumbersOfItsOwn), ("lost frames",), "number came otherwise"),
-    Broken(_frames(RegionKept), ("another region",), "frames of"),
-    Broken(force_driver(MilliNewtons), ("data",), "force_n came otherwise"),
-    Broken(force_driver(NewtonMillimetres), ("data",), "torque_nm came otherwise"),
-    Broken(force_driver(Reaction), ("data",), "force_n came otherwise"),
-    Broken(force_driver(ForceAxesSwapped), ("data",), "force_n came otherwise"),
-    Broken(force_driver(OneLoad), ("data",), "force_n came otherwise"),
-    Broken(force_driver(ForceHostTimeIsZero), (HOST,), "host_ns was 0"),
-    Broken(force_driver(ForceCounterWraps), (WRAPS,), "came after|came as"),
-    Broken(force_driver(ZeroHides), ("zero",), "its change was not read"),
-    Broken(_sync(SeedIgnored), ("trains",), "the box sent 200 Hz, seed 77"),
-    Broken(_sync(CodeIgnored), ("trains",), "and code lfsr"),
-    Broken(_sync(HalfTheRate), ("trains",), "the box sent 100 Hz"),
-    Broken(_sync(KeepsTicking), ("ticks stop",), "the box still ticked"),
-    Broken(_sync(BoxClockInMicroseconds), ("clock",), "between two reads the clock went on"),
-    Broken(_sync(BoxHostWallClock), ("clock",), "as the host's times before and after"),
-    Broken(_sync(ClockOfPowerOn), ("clock at start",), "after start its clock was"),
-    Broken(_sync(BoxCounterWraps), (WRAPS,), "went on by|no pulse had"),
-    Broken(_sync(BitsInverted), ("data",), "pulses came at"),
-    Broken(_sync(ExposuresInMilliseconds), ("exposures",), "an exposure between"),
-    Broken(_gripper(OpensToClose), (MOVE, "move of the fingers"), "asked for"),
-    Broken(_gripper(GripperSpeedIgnored), (MOVE,), "the fingers went at"),
-    Broken(_gripper(GripperForceInPercent), (MOVE,), "the gripper was sent"),
-    Broken(_gripper(OpeningInSteps), (STATE,), "the fingers were at"),
-    Broken(_gripper(TargetReported), (STATE,), "the fingers were at"),
-    Broken(_gripper(RestsAtOnce), (STATE, MOVE), "while the fingers moved it said"),
-    Broken(_gripper(OpensWhenClosed), ("fingers stay",), "the fingers went from"),
-)
-"""Each driver with wrong magnitudes, with the rules about its defect and what the first one sees."""
+WRONG_VALUES = tuple(
+    Broken(_declared(declaration, name, device), rules, seen)
+    for declaration, table in (
+        (arm.DRIVER, ARMS), (events.DRIVER, EVENTS), (frames.DRIVER, FRAMES),
+        (force.DRIVER, FORCE), (sync.DRIVER, BOXES), (gripper.DRIVER, GRIPPERS),
+    )
+    for name, (device, rules, seen) in table.items()
+)  # fmt: skip
+"""Each driver with wrong magnitudes, with the rules about them and what the first one sees."""

@@ -19,7 +19,6 @@ from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
 from sliplab.rigs.testing.stream_bench import BATCHES, StreamBench
 from sliplab.storage.streams import F64, PulseChunk, WrenchChunk
 
-
 LOAD = np.array([1.0, -2.0, 5.0, 0.1, 0.2, -0.3])
 """Force in N and torque in N m that a fake feels."""
 SWING, SWING_HZ = 0.2, 1.0
@@ -172,7 +171,8 @@ class SyncBench(StreamBench):
 
     capability = SyncBox
     RATE_HZ = 200.0
-    CODE: Code = "lfsr"
+    USUAL: Code = "lfsr"
+    CODE: Code = USUAL
 
     def __init__(self, driver: SyncBoxDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)

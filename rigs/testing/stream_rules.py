@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable
 from contextlib import suppress
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.testing.bench import QUIET_S, check_close, check_methods
 from sliplab.rigs.testing.camera_benches import PX_PER_MM, SIZE, EventBench, FrameBench
-from sliplab.rigs.testing.rule import Rules, Seen
+from sliplab.rigs.testing.rule import NotTried, Rules, Seen
 from sliplab.rigs.testing.sensor_benches import LOAD, ArmForceBench, ForceBench
 from sliplab.rigs.testing.stream_bench import StreamBench
 
@@ -38,7 +38,8 @@ HOST_WAIT_S, HOST_LATE_S = 0.3, 0.2
 COLUMNS: dict[str, tuple[str, int]] = {
     "x": ("uint16", 1), "y": ("uint16", 1), "p": ("uint8", 1), "t_us": ("int64", 1),
     "t_ns": ("int64", 1), "host_ns": ("int64", 1), "number": ("int64", 1), "sync": ("uint8", 1),
-    "images": ("uint8", 3), "force_n": ("float64", 2), "torque_nm": ("float64", 2),
+    "images": ("uint8", 3), "markers_px": ("float32", 3), "plate_px": ("float32", 2),
+    "force_n": ("float64", 2), "torque_nm": ("float64", 2),
 }  # fmt: skip
 """Type and number of axes of the arrays of a chunk, as `storage.streams` documents them."""
 
@@ -87,9 +88,9 @@ def _at_once(bench: StreamBench) -> None:
     took: list[float] = []
     with suppress(RigError):  # it has fallen silent meanwhile
         for _ in range(READS):
-            began = time.monotonic()
+            began = monotonic()
             bench.read()
-            took.append(time.monotonic() - began)
+            took.append(monotonic() - began)
     if not took or min(took) > AT_ONCE_S:
         raise Seen(f"read took {min(took, default=9):.2f} s or more where nothing had come")
 
@@ -324,7 +325,9 @@ def _another_region(bench: FrameBench) -> None:
     bench.start()
     bench.gather()
     bench.stop()
-    bench.call("set_region", lambda: bench.device.set_region(*OTHER_SIZE))
+    error = bench.refusal("set_region", lambda: bench.device.set_region(*OTHER_SIZE))
+    if error is not None:
+        raise NotTried(f"its sensor has no region of {OTHER_SIZE[0]} x {OTHER_SIZE[1]} px: {error}")
     bench.came.clear()
     bench.start()
     bench.gather()

@@ -57,7 +57,10 @@ def _trains(bench: SyncBench) -> None:
     bench.connect()
     for code, seed in zip(get_args(Code), (SEEDS - 9, 77, 123_456), strict=False):
         bench.CODE, bench.seed = code, seed
-        bench.start()
+        if code == bench.USUAL:
+            bench.start()
+        elif bench.refusal("start", bench.begin) is not None:
+            continue  # a box need not have every code
         train = bench.trains[-1] if bench.trains else None
         if train is None:
             raise Seen("start returned, and no train had begun")
@@ -104,7 +107,9 @@ def _wraps(bench: SyncBench) -> None:
     bench.RATE_HZ = SLOW_HZ
     wrap_s = COMMON_WRAPS_S[-1] / 1000.0  # of an unsigned counter of us
     bench.connect()
-    bench.start()
+    error = bench.refusal("start", bench.begin)
+    if error is not None:
+        raise NotTried(f"it sends no train of {SLOW_HZ:g} Hz: {error}")
     reads = [clock_row(bench, bench.device.read_clock)]
     for jump_s in (wrap_s - 2.5, 6.0):
         bench.pass_time(jump_s)
