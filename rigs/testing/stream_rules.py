@@ -240,14 +240,13 @@ def _close(bench: StreamBench) -> None:
     "counter wraps", "times go on where a counter of the device wraps, as one of 32 bits does"
 )
 def _wraps(bench: StreamBench) -> None:
-    wraps_s = sorted(bench.wraps_s)
-    bench.connect()
-    for wrap_s in wraps_s:
+    for wrap_s in sorted(bench.wraps_s):
         bench.seek(round((wrap_s - 1.0) * 1e9))
+        bench.connect()
         bench.start()
         _check_order(bench.flow(round((wrap_s - WRAP_S) * 1e9)))
         bench.check_steps()
-        bench.stop()
+        bench.call("close", bench.close_device)
 
 
 @HOST_RULES.add(
