@@ -69,11 +69,13 @@ class ArmBench(Bench):
         twists: True if the driver declares that the arm turns its tool on the spot.
         load: force (N) and torque (N m) on the tool, base axes, by the controller's time in s.
         wraps_s: times of the fake's clock at which counters wrap, s.
+        host_clock: True if the controller has no clock: it reports poses when it is asked.
         sync_read: True once the fake has read the level of its sync input.
     """
 
     axis = 0.48, 0.6, 0.64
     twists = True
+    host_clock = False
     sync_read = False
     load: Callable[[float], Sequence[float]] = staticmethod(no_load)
     clock: ControllerClock | None = None
@@ -91,6 +93,7 @@ class ArmBench(Bench):
 
     def _make(self, settings: BaseArmSettings, clock_s: float) -> None:
         self.settings, self.limits = settings, settings.limits
+        self.host_clock = settings.host_clock
         self._lines: list[tuple[float, Line]] = []
         motion = StraightMotion(self.home, lambda line, t_s: self._lines.append((t_s, line)))
         self.clock = running_clock(offset_s=clock_s)

@@ -277,6 +277,12 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleArm, scaled(xyz_mm=np.array([1, 1, -1])), "read_poses"), (POSES,), ", -3",
     ),
     "SamplesTwice": (SamplesTwice, (POSES,), "was read twice"),
+    "NewestSampleOnly": (
+        reports(
+            ExampleArm, lambda c: PoseChunk(*(v[-1:] for v in vars(c).values())), "read_poses"
+        ),
+        (POSES,), "returned 1 samples of 0.000 s",
+    ),
     "HostTimeIsZero": (
         reports(ExampleArm, at_host(lambda: 0), "read_poses"), (HOST,), "host_ns was 0, received",
     ),
@@ -320,6 +326,15 @@ class ReadWaits(ExampleEvents):
         if not len(found):
             threading.Event().wait(WAIT_S)
         return found
+
+
+class StopDrops(ExampleEvents):
+    """Stop drops what was not read."""
+
+    def stop(self) -> None:
+        """Stop streaming."""
+        super().stop()
+        self._buffer.take("events")
 
 
 class EventsTwice(ExampleEvents):
@@ -446,6 +461,7 @@ EVENTS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "PulsesInMicroseconds": (
         reports(ExampleEvents, us("t_ns"), "read_pulses"), DATA, "pulses up to",
     ),
+    "StopDrops": (StopDrops, ("read after stop",), "could not be read after it"),
     "ReadWaits": (ReadWaits, ("read at once",), "read took"),
 }  # fmt: skip
 FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {

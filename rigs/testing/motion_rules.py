@@ -48,7 +48,7 @@ STAMP_S = 0.05
 """Largest error of a pose's time, s."""
 AT_ONCE_S = 0.25
 """Longest duration of a call that does not wait for a motion, s."""
-WATCH_S = 1.0
+WATCH_S, PAUSE_S = 1.0, 0.4
 PULSES = 4
 TILT_DEG, DEPTH_MM = 20.0, 1.0
 
@@ -114,7 +114,7 @@ def _orientation(bench: ArmBench) -> None:
 @RULES.add(
     "poses",
     "pose and read_poses report where the arm truly is, in mm of the base frame: x, y and z in "
-    "their order and sign, each sample once and at its own time",
+    "their order and sign, each sample once and at its own time; all since the last read",
 )
 def _poses(bench: ArmBench) -> None:
     bench.connect()
@@ -130,6 +130,8 @@ def _poses(bench: ArmBench) -> None:
                 f"there in the {lag_s:g} s before"
             )
     _check_samples(bench, report)
+    if not bench.host_clock:
+        _check_kept(bench)
     at_rest = ask(bench, "pose", bench.arm.pose).value
     if not distance_mm(at_rest, bench.place()) <= ARRIVED_MM:
         raise Seen(f"at rest at {_xyz(bench.place())} mm, pose returned {_xyz(at_rest)} mm")
@@ -475,17 +477,28 @@ def _check_oriented(bench: ArmBench, to: Pose) -> None:
             raise Seen(f"{name} returned the rotation vector {_deg(pose)} deg, not {_deg(to)}")
 
 
+def _check_kept(bench: ArmBench) -> None:
+    """Check that samples of a time without a read are read after it."""
+    bench.read_times()
+    bench.wait(PAUSE_S)
+    times = bench.read_times()[0]
+    went_s = (times[-1] - times[0]) / 1e9 if times else 0.0
+    if went_s < 0.5 * PAUSE_S:
+        raise Seen(
+            f"{PAUSE_S:g} s after the last read, read_poses returned {len(times)} samples of "
+            f"{went_s:.3f} s"
+        )
+
+
 def _check_samples(bench: ArmBench, report: Report) -> None:
     """Check times, places and arrival of each sample that was read."""
-    before: tuple[int, int] | None = None
-    count = 0
+    last_ns, count = -1, 0
     for chunk in report.chunks:
-        rows = zip(chunk.t_ns.tolist(), chunk.host_ns.tolist(), chunk.xyz_mm.tolist(), strict=True)
-        first = True
-        for t_ns, host_ns, xyz in rows:
-            if first and before == (t_ns, host_ns):
-                raise Seen(f"the pose of {t_ns} ns was read twice")
-            first, before, count = False, (t_ns, host_ns), count + 1
+        if int(chunk.t_ns[0]) == last_ns:
+            raise Seen(f"the pose of {last_ns} ns was read twice")
+        last_ns = int(chunk.t_ns[-1])
+        for t_ns, xyz in zip(chunk.t_ns.tolist(), chunk.xyz_mm.tolist(), strict=True):
+            count += 1
             at_s, pose = report.true_s(t_ns), Pose((*xyz,), (0.0, 0.0, 0.0))
             if at_s < report.begin_s:
                 continue

@@ -184,6 +184,20 @@ def _stop(bench: StreamBench) -> None:
     _check_order(bench.gather())
 
 
+@RULES.add("read after stop", "what came before stop can still be read after it")
+def _read_after_stop(bench: StreamBench) -> None:
+    bench.connect()
+    bench.start()
+    last = bench.gather()[-1]
+    bench.came.clear()
+    bench.feed()
+    bench.wait(QUIET_S)
+    bench.stop()
+    late = bench.quiet()
+    if not late or late[-1] <= last:
+        raise Seen("what came before stop could not be read after it")
+
+
 @RULES.add("silent", "a device that falls silent is reported in time; stop and close return")
 def _silent(bench: StreamBench) -> None:
     bench.connect()
