@@ -16,7 +16,8 @@ from sliplab.storage.streams import PoseChunk
 
 STEP_S = 0.002
 """Step at which the true motion is evaluated, s."""
-OFFSET_READS = 10
+OFFSET_READS, OFFSET_EVERY_S = 10, 0.01
+"""Reads of the driver's clock, of which a busy computer may delay some, and time between them."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,10 @@ def ask(bench: ArmBench, name: str, work: Callable[[], Any]) -> Answer:
 
 def clock_offset_ns(bench: ArmBench) -> int:
     """Return the driver's clock minus the true one, ns; a stale answer of `now_ns` is too low."""
-    reads = [ask(bench, "now_ns", bench.arm.now_ns) for _ in range(OFFSET_READS)]
+    reads: list[Answer] = []
+    for _ in range(OFFSET_READS):
+        reads.append(ask(bench, "now_ns", bench.arm.now_ns))
+        bench.wait(OFFSET_EVERY_S)
     return max(read.value - round(read.end_s * 1e9) for read in reads)
 
 

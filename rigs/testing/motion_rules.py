@@ -44,12 +44,18 @@ TURN_DEG, TURN_DEG_S = 30.0, 20.0
 OFF_LINE_MM, OFF_SPOT_MM, ORIENTED_DEG = 0.2, 0.1, 0.2
 LAG_S = 0.25
 """Longest delay of a reported pose, s, besides twice the time that a stop takes."""
+STALL_S = 1.0
+"""Longest delay on a busy computer, s."""
+STALE_SHARE = 0.2
+"""Share of answers that a busy computer may delay for longer than `LAG_S`."""
+SPAN_S = 0.25
+"""Largest error of begin and end of a segment, s; a busy network loses samples."""
 STAMP_S = 0.05
 """Largest error of a pose's time, s."""
 AT_ONCE_S = 0.25
 """Longest duration of a call that does not wait for a motion, s."""
 WATCH_S, PAUSE_S = 1.0, 0.4
-PULSES = 4
+PULSES, ROUNDS = 4, 5
 TILT_DEG, DEPTH_MM = 20.0, 1.0
 
 
@@ -121,14 +127,17 @@ def _poses(bench: ArmBench) -> None:
     segment = _corner(bench)[0]
     report = follow(bench, segment)
     lag_s = _lag_s(bench)
-    for answer in report.of("pose"):
-        near = _nearest_mm(bench, answer.value, answer.begin_s - lag_s, answer.end_s)
-        if not near <= OFF_LINE_MM:
-            true = bench.true_pose(answer.end_s)
-            raise Seen(
-                f"pose returned {_xyz(answer.value)} mm, the arm was at {_xyz(true)} mm and not "
-                f"there in the {lag_s:g} s before"
-            )
+    answers = report.of("pose")
+    wrong = [
+        answer
+        for answer in answers
+        if not _nearest_mm(bench, answer.value, answer.begin_s - lag_s, answer.end_s) <= OFF_LINE_MM
+    ]
+    if len(wrong) > STALE_SHARE * len(answers):
+        raise Seen(
+            f"pose returned {_xyz(wrong[0].value)} mm, the arm was at "
+            f"{_xyz(bench.true_pose(wrong[0].end_s))} mm and not there in the {lag_s:g} s before"
+        )
     _check_samples(bench, report)
     if not bench.host_clock:
         _check_kept(bench)
@@ -176,7 +185,7 @@ def _clock(bench: ArmBench) -> None:
     bench.read_times()
     offset_ns = clock_offset_ns(bench)
     begin_s = read_s = bench.clock_s()
-    newest: list[float] = []
+    delays_s: list[float] = []
 
     def read() -> bool:
         nonlocal read_s
@@ -184,12 +193,12 @@ def _clock(bench: ArmBench) -> None:
         read_s = bench.clock_s()
         for t_ns in times:
             at_s = (t_ns - offset_ns) / 1e9
-            if not since_s - LAG_S <= at_s <= read_s + CLOCK_S:
+            if not since_s - STALL_S <= at_s <= read_s + CLOCK_S:
                 raise Seen(
                     f"a pose of {t_ns} ns came when now_ns was about "
                     f"{round(read_s * 1e9) + offset_ns} ns"
                 )
-            newest.append(at_s)
+            delays_s.append(read_s - at_s)
         return False
 
     bench.until(read, WATCH_S)
@@ -197,8 +206,8 @@ def _clock(bench: ArmBench) -> None:
     went_s = (clock_offset_ns(bench) - offset_ns) / 1e9 + passed_s
     if not abs(went_s - passed_s) <= SHARE * passed_s:
         raise Seen(f"now_ns went on by {went_s:.3f} s in {passed_s:.3f} s of the controller")
-    if not newest or not max(newest) >= read_s - CLOCK_S - LAG_S:
-        raise Seen(f"no pose of the last {LAG_S + CLOCK_S:.2f} s had come")
+    if not delays_s or not min(delays_s) <= LAG_S + CLOCK_S:
+        raise Seen(f"no pose came within {LAG_S + CLOCK_S:.2f} s of its time")
 
 
 @RULES.add(
@@ -207,15 +216,23 @@ def _clock(bench: ArmBench) -> None:
 def _host_times(bench: ArmBench) -> None:
     bench.connect()
     bench.read_times()
-    for _ in range(3):
+    stall_ns = round(STALL_S * 1e9)
+    ages_s: list[float] = []
+    for _ in range(ROUNDS):
         since_ns = bench.host_ns()
         bench.wait(QUIET_S)
         arrivals = bench.read_times()[1]
         now_ns = bench.host_ns()
-        check_arrivals(arrivals, since_ns - round(LAG_S * 1e9), now_ns)
+        check_arrivals(arrivals, since_ns - stall_ns, now_ns)
+        if arrivals:
+            ages_s.append((now_ns - arrivals[-1]) / 1e9)
+    if not ages_s:
+        raise Seen("read_poses returned no poses")
+    if np.median(ages_s) > LAG_S:
+        raise Seen(f"host_ns of the newest pose was {np.median(ages_s):.2f} s old when it was read")
     bench.start(bench.to(0.25 * _long_mm(bench)))
     bench.end(bench.bounds.news_s + 1.0)
-    check_arrivals(bench.read_times()[1], now_ns - round(LAG_S * 1e9), bench.host_ns())
+    check_arrivals(bench.read_times()[1], now_ns - stall_ns, bench.host_ns())
 
 
 @RULES.add(
@@ -443,10 +460,9 @@ def _check_span(report: Report, number: int, begin_s: float, end_s: float) -> No
     if len(report.progress.finished) < number:
         raise Seen(f"segment {number} was not reported finished")
     spans = report.progress.finished[number - 1]
-    slack_s = CLOCK_S + STAMP_S
     for what, t_ns, true_s in zip(("begin", "end"), spans, (begin_s, end_s), strict=True):
         off_s = report.true_s(t_ns) - true_s
-        if not abs(off_s) <= slack_s:
+        if not abs(off_s) <= SPAN_S:
             raise Seen(
                 f"segment {number} was reported to {what} {off_s:+.3f} s from when it did, on the "
                 "controller's clock"
