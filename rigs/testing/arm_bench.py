@@ -36,7 +36,7 @@ BEGUN_MM = 0.5
 """A motion has begun after this way."""
 CLOCK_S = 1000.0
 """Time of the fake controller's clock when it is made, s."""
-PULSE_S, PULSE_EVERY_S = 0.1, 0.3
+PULSE_S, PULSE_EVERY_S = 0.14, 0.4
 """Length of a pulse on the fake's sync input, and mean time from one to the next, s."""
 _JITTER_S = (0.0, 0.08, 0.03, 0.11, 0.05)
 
