@@ -49,6 +49,17 @@ def held() -> tuple[int, int, int]:
     return threading.active_count(), len(multiprocessing.active_children()), files
 
 
+def settle() -> None:
+    """Wait until what this process has open no longer changes, `SETTLE_S` at most."""
+    end, before = time.monotonic() + SETTLE_S, held()
+    while time.monotonic() < end:
+        threading.Event().wait(QUIET_S)
+        now = held()
+        if now == before:
+            return
+        before = now
+
+
 class Bench(ABC):
     """A device on its fake; a context manager that closes both.
 

@@ -28,6 +28,7 @@ from sliplab.rigs.core.driver import (
 )
 from sliplab.rigs.testing import arm_rules, gripper_rules, motion_rules, stream_rules, sync_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
+from sliplab.rigs.testing.bench import settle
 from sliplab.rigs.testing.camera_benches import EventBench, FrameBench
 from sliplab.rigs.testing.gripper_bench import GripperBench
 from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules, Seen
@@ -57,11 +58,12 @@ class Case:
             self.rule.hold(self.driver, bench)
 
     def _warm(self) -> None:
-        """Open and close a device, and forget it."""
+        """Open and close a device, forget it, and wait for threads that are ending."""
         with self.make() as bench, suppress(Seen):  # the rule itself will see it, too
             bench.refusal("connect", bench.open, bench.bounds.connect_s)
         del bench
         gc.collect()
+        settle()
 
 
 def cases(
