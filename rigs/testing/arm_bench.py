@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings, Limits
-from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, Progress, Segment
+from sliplab.rigs.core.capabilities import (
+    Arm,
+    ArmFault,
+    ArmState,
+    Pose,
+    Progress,
+    RigError,
+    Segment,
+)
 from sliplab.rigs.core.driver import ArmDriver, ArmScene
-from sliplab.rigs.core.fake_motion import StraightMotion, running_clock
+from sliplab.rigs.core.fake_motion import ControllerClock, Line, StraightMotion, running_clock
 from sliplab.rigs.core.fakes import HOME, FakeController, Kind
 from sliplab.rigs.core.pose import distance_mm
-from sliplab.rigs.testing.bench import Bench
+from sliplab.rigs.testing.bench import Bench, wraps_s
 from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
 
 REACH_MM = 5_000.0
@@ -24,6 +34,27 @@ LONG_SHARE = 0.8
 """Length of a long move, as a share of the way from the centre of the workspace to its side."""
 BEGUN_MM = 0.5
 """A motion has begun after this way."""
+CLOCK_S = 1000.0
+"""Time of the fake controller's clock when it is made, s."""
+PULSE_S, PULSE_EVERY_S = 0.14, 0.4
+"""Length of a pulse on the fake's sync input, and mean time from one to the next, s."""
+_JITTER_S = (0.0, 0.08, 0.03, 0.11, 0.05)
+
+
+def pulse_s(number: int) -> float:
+    """Return the time of a rising edge on the fake's sync input, s; intervals are irregular."""
+    return number * PULSE_EVERY_S + _JITTER_S[number % len(_JITTER_S)]
+
+
+def sync_level(t_s: float) -> bool:
+    """Return the level of the fake's sync input at a time of the controller's clock, s."""
+    number = int(t_s / PULSE_EVERY_S)
+    return any(0.0 <= t_s - pulse_s(near) < PULSE_S for near in (number - 1, number))
+
+
+def no_load(t_s: float) -> Sequence[float]:
+    """Return force and torque on a tool that touches nothing."""
+    return (0.0,) * 6
 
 
 class ArmBench(Bench):
@@ -32,20 +63,92 @@ class ArmBench(Bench):
     Args:
         settings: settings of a rig file, with limits in the base frame; the fake listens at its
             address.
+
+    Attributes:
+        axis: unit vector of turns, none of the base frame's axes.
+        twists: True if the driver declares that the arm turns its tool on the spot.
+        load: force (N) and torque (N m) on the tool, base axes, by the controller's time in s.
+        wraps_s: times of the fake's clock at which counters wrap, s.
+        host_clock: True if the controller has no clock: it reports poses when it is asked.
+        sync_read: True once the fake has read the level of its sync input.
     """
+
+    axis = 0.48, 0.6, 0.64
+    twists = True
+    host_clock = False
+    sync_read = False
+    load: Callable[[float], Sequence[float]] = staticmethod(no_load)
+    clock: ControllerClock | None = None
+    wraps_s: tuple[float, ...] = ()
 
     def __init__(self, driver: ArmDriver[Any], settings: BaseArmSettings, bounds: Bounds) -> None:
         super().__init__(bounds)
         if driver.fake is None:
             raise NotTried(f"{driver.name} declares no fake")
-        self.driver, self.settings, self.limits = driver, settings, settings.limits
-        if self.limits.frame != "base":
+        self.driver, self._fake, self.twists = driver, driver.fake, driver.twists
+        if settings.limits.frame != "base":
             raise ValueError("limits.frame: must be base for a conformance test, not plate")
-        self.home = Pose(_centre(self.limits), HOME.rotvec_deg)
-        scene = ArmScene(StraightMotion(self.home), running_clock(), lambda t_s: False, REACH_MM)
-        self.fake: FakeController = driver.fake(settings, scene)
+        self.home = Pose(_centre(settings.limits), HOME.rotvec_deg)
+        self._make(settings, CLOCK_S)
+
+    def _make(self, settings: BaseArmSettings, clock_s: float) -> None:
+        self.settings, self.limits = settings, settings.limits
+        self.host_clock = settings.host_clock
+        self._lines: list[tuple[float, Line]] = []
+        motion = StraightMotion(self.home, lambda line, t_s: self._lines.append((t_s, line)))
+        self.clock = running_clock(offset_s=clock_s)
+        self.sync_read = False
+        scene = ArmScene(motion, self.clock, self._sync, REACH_MM, lambda t_s: self.load(t_s))
+        self.fake: FakeController = self._fake(settings, scene)
+        self.wraps_s = wraps_s(self.fake)
         self.fake.start()
-        self.arm: Arm = driver.build(settings)
+        self.arm: Arm = self.driver.build(settings)
+
+    def restart(self, clock_s: float = CLOCK_S, limits: Limits | None = None) -> None:
+        """Close device and fake, and make others, whose clock shows another time.
+
+        Args:
+            limits: for both; those of the rig file's settings if left out.
+
+        Raises:
+            NotTried: this bench cannot.
+        """
+        if self.clock is None:
+            raise NotTried("the clock of this bench cannot be set")
+        with suppress(RigError):
+            self.call("close", self.close_device)
+        self.close_fake()
+        settings = self.settings
+        if limits is not None:
+            settings = settings.model_copy(update={"limits": limits})
+        self._make(settings, clock_s)
+
+    # -- the truth -------------------------------------------------------------------------
+
+    def host_ns(self) -> int:
+        """Return the host's monotonic clock, ns."""
+        return time.monotonic_ns()
+
+    def clock_s(self) -> float:
+        """Return the true time of the controller's clock, s. Raises NotTried: it is unknown."""
+        if self.clock is None:
+            raise NotTried("this bench does not know the controller's clock")
+        return self.clock.now_s()
+
+    def _sync(self, t_s: float) -> bool:
+        self.sync_read = True
+        return sync_level(t_s)
+
+    def true_pose(self, t_s: float) -> Pose:
+        """Return the true pose at a time of the controller's clock, s. Raises NotTried."""
+        if self.clock is None:
+            raise NotTried("this bench does not know the true motion")
+        if not self._lines and distance_mm(self.place(), self.home) > BEGUN_MM:
+            raise NotTried("the fake moves by another motion than that of its scene")
+        for since_s, line in reversed(self._lines):
+            if since_s <= t_s:
+                return line.pose(t_s)
+        return self.home
 
     def open(self) -> None:
         """Connect the arm. Raises ArmFault."""
@@ -184,5 +287,7 @@ class ArmBench(Bench):
 
 
 def _centre(limits: Limits) -> tuple[float, float, float]:
-    x, y, z = ((np.array(limits.low_mm) + np.array(limits.high_mm)) / 2).tolist()
+    """Return the centre of the box, in steps of 1/4 mm, which every number format has."""
+    middle = (np.array(limits.low_mm) + np.array(limits.high_mm)) / 2
+    x, y, z = (np.round(4.0 * middle) / 4.0).tolist()
     return float(x), float(y), float(z)

@@ -23,7 +23,8 @@ TIMES_S = 0.5
 
 @RULES.add(
     "declaration",
-    "the driver has every method of an Arm, its ping finds the fake, and connect makes it ready",
+    "the driver has every method of an Arm, its ping finds the fake, and connect makes it ready "
+    "and moves nothing",
 )
 def _declaration(bench: ArmBench) -> None:
     check_methods(bench.arm, Arm)
@@ -36,6 +37,8 @@ def _declaration(bench: ArmBench) -> None:
     bench.connect()  # a second one changes nothing
     if bench.state() is not ArmState.READY:
         raise Seen(f"after connect its state was {bench.state()}")
+    if bench.moving() or distance_mm(bench.home, bench.place()) > ARRIVED_MM:
+        raise Seen("the arm moved when it was connected")
 
 
 @RULES.add("path", "a path is followed to its end, and each segment has its start and its end")

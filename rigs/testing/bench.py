@@ -23,6 +23,20 @@ SETTLE_S = 2.0
 _FILES = "/proc/self/fd"
 
 
+COMMON_WRAPS_S = (2**31 / 1e6, 2**31 / 1e3, 2**32 / 1e3)
+"""Times at which counters of 32 bits wrap, s: signed ones of us and of ms, and unsigned ones of
+either, whose us wrap there for the thousandth time."""
+
+
+def wraps_s(fake: object) -> tuple[float, ...]:
+    """Return when a counter on a fake's wire wraps, s of its clock.
+
+    A fake whose counter does not count us or ms says so by an attribute `wraps_ns`.
+    """
+    own = [wrap_ns / 1e9 for wrap_ns in getattr(fake, "wraps_ns", ())]
+    return (*own, *COMMON_WRAPS_S)
+
+
 def held() -> tuple[int, int, int]:
     """Return the numbers of threads, child processes, and open files and sockets of this process.
 
@@ -33,6 +47,17 @@ def held() -> tuple[int, int, int]:
         with suppress(OSError):  # closed meanwhile
             files += os.readlink(f"{_FILES}/{handle}").startswith(("socket:", "/"))
     return threading.active_count(), len(multiprocessing.active_children()), files
+
+
+def settle() -> None:
+    """Wait until what this process has open no longer changes, `SETTLE_S` at most."""
+    end, before = time.monotonic() + SETTLE_S, held()
+    while time.monotonic() < end:
+        threading.Event().wait(QUIET_S)
+        now = held()
+        if now == before:
+            return
+        before = now
 
 
 class Bench(ABC):

@@ -189,37 +189,51 @@ class OldClock(ExampleSync):
             return super().read_clock()
 
 
-def _arm(broken: type[ExampleArm]) -> Driver[Any]:
+def arm_driver(broken: type[ExampleArm]) -> Driver[Any]:
+    """Declare a broken arm."""
     return replace(arm.DRIVER, name=broken.__name__, build=broken)
 
 
-def _events(broken: type[ExampleEvents]) -> Driver[Any]:
+def event_driver(broken: type[ExampleEvents]) -> Driver[Any]:
+    """Declare a broken event camera."""
     return replace(events.DRIVER, name=broken.__name__, build=broken)
 
 
-def _force(broken: type[ExampleForce]) -> Driver[Any]:
+def force_driver(broken: type[ExampleForce]) -> Driver[Any]:
+    """Declare a broken force sensor."""
     return replace(force.DRIVER, name=broken.__name__, build=lambda settings, arm: broken(settings))
 
 
 STOP = "stop while moving"
+LIMITS = "limits", "limits of turn and depth"
 BROKEN = (
-    Broken(_arm(NewestFirst), ("times in order",), "poses: "),
-    Broken(_arm(ClockNotWatched), ("clock falls back",), "came after"),
-    Broken(_arm(StopWaits), (STOP,), "stop had not returned"),
-    Broken(_arm(StopSendsNothing), (STOP,), "still moving when the call returned"),
-    Broken(_arm(StartWaits), ("silent when a path starts",), "start had not returned"),
-    Broken(_arm(NoLimits), ("limits",), "the arm moved"),
-    Broken(_arm(FirstSegmentOnly), ("limits",), "whose second segment lies outside the box"),
-    Broken(_arm(AnswersShift), ("late answer",), "was reported to begin|before the end"),
+    Broken(arm_driver(NewestFirst), ("times in order", "host times", "counter wraps"), "poses: "),
+    Broken(arm_driver(ClockNotWatched), ("clock falls back",), "came after"),
+    Broken(arm_driver(StopWaits), (STOP, "close while moving"), "stop had not returned"),
+    Broken(arm_driver(StopSendsNothing), (STOP,), "still moving when the call returned"),
+    Broken(arm_driver(StartWaits), ("silent when a path starts",), "start had not returned"),
+    Broken(arm_driver(NoLimits), LIMITS, "the arm moved"),
+    Broken(arm_driver(FirstSegmentOnly), LIMITS, "whose second segment lies outside the box"),
+    Broken(arm_driver(AnswersShift), ("late answer",), "was reported to begin|before the end"),
     Broken(
-        _events(FaultsSwallowed), ("unplugged", "silent", "times fall back"), "did not report it"
+        event_driver(FaultsSwallowed),
+        ("unplugged", "silent", "times fall back"),
+        "did not report it",
     ),
-    Broken(_events(NewestPacketOnly), ("data",), "were sent and"),
+    Broken(
+        event_driver(NewestPacketOnly),
+        ("data", "start while it streams", "counter wraps"),
+        "were sent and",
+    ),
     Broken(
         replace(frames.DRIVER, name="OldData", fake=OldData), ("fresh start",), "began with data"
     ),
-    Broken(_force(LeftOpen), ("close",), "stayed open"),
-    Broken(_force(OverloadIsANumber), ("overload",), "did not report it"),
-    Broken(replace(sync.DRIVER, name="OldClock", build=OldClock), ("late answer",), "the clock"),
+    Broken(force_driver(LeftOpen), ("close",), "stayed open"),
+    Broken(force_driver(OverloadIsANumber), ("overload",), "did not report it"),
+    Broken(
+        replace(sync.DRIVER, name="OldClock", build=OldClock),
+        ("late answer",),
+        "the (clock|host's times)",
+    ),
 )
 """Each broken driver, with what the rules see of it."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from sliplab.rigs.core.capabilities import EventCamera, FrameCamera
 from sliplab.rigs.core.driver import EventCameraDriver, FrameCameraDriver
+from sliplab.rigs.testing.bench import wraps_s
 from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
 from sliplab.rigs.testing.stream_bench import StreamBench
 from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk
@@ -45,9 +46,10 @@ class EventBench(StreamBench):
         self.fake.close()
 
     def feed(self) -> None:
-        """Send a hundred events within 10 ms, and a pulse."""
+        """Send a hundred events within 10 ms, some at the same time, and a pulse."""
         t_us = self.times(100, 100_000) // 1000
         at = t_us // 100
+        t_us[9::10] = t_us[8::10]
         chunk = EventChunk(
             (at % SIZE[0]).astype(np.uint16), (at % SIZE[1]).astype(np.uint16),
             (at % 2).astype(np.uint8), t_us,
@@ -72,12 +74,31 @@ class EventBench(StreamBench):
         pulses = bool(self.pulses) and self.pulses[-1] >= self.fed_pulses[-1]
         return pulses and super().complete(times)
 
+    def missing(self, times: Sequence[int]) -> str:
+        """Return in words what was sent last, and what came."""
+        pulses = f"pulses up to {self.fed_pulses[-1]} ns, up to {max(self.pulses, default=0)} ns"
+        return f"{super().missing(times)}; {pulses} came"
+
     def check_content(self) -> None:
         """Raise Seen if events or pulses came otherwise than they were sent."""
         super().check_content()
         found = [pulse for pulse in self.pulses if pulse >= (self._mark or 0) * 1000]
         if found != self.fed_pulses:
             raise Seen(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
+
+    def forget(self) -> None:
+        """Forget what was fed and what came."""
+        super().forget()
+        self.fed_pulses.clear()
+        self.pulses.clear()
+
+    def check_steps(self) -> None:
+        """Raise Seen if the times of events or pulses came with other differences."""
+        super().check_steps()
+        self.quiet()
+        sent, found = np.diff(self.fed_pulses), np.diff(self.pulses)
+        if sent.tolist() != found.tolist():
+            raise Seen(f"pulses {sent.tolist()} ns apart came {found.tolist()} ns apart")
 
     def silence(self) -> None:
         """Stall the fake."""
@@ -101,6 +122,8 @@ class FrameBench(StreamBench):
         self._fake, self._unplug = driver.fake, driver.unplug
         self.on_frames: Callable[[FrameChunk], None] = lambda frames: None
         self.shape = SIZE
+        self.mid_exposure_ns = round(settings.exposure_us * 500)
+        self.region = SIZE
         self._grabbing, self._number, self._begun_ns = False, 0, 0
         self._by_arrival = driver.grade == "host arrival"
         if self._by_arrival:
@@ -108,9 +131,46 @@ class FrameBench(StreamBench):
 
     def turn_back(self) -> None:
         """Let the camera's clock fall back. Raises NotTried: it has none."""
+        self._check_clock()
+        super().turn_back()
+
+    @property
+    def wraps_s(self) -> tuple[float, ...]:
+        """Times of the camera's clock at which counters wrap, s. Raises NotTried: it has none."""
+        self._check_clock()
+        return wraps_s(self.device)
+
+    def _check_clock(self) -> None:
         if self._by_arrival:
             raise NotTried("its frames are timed by their arrival")
-        super().turn_back()
+
+    def lose(self, count: int) -> None:
+        """Lose the next frames: their numbers are missing. Raises NotTried: it has no numbers."""
+        if self._by_arrival:
+            raise NotTried("a camera whose frames are timed by their arrival does not number them")
+        self._number += count
+
+    def check_sync(self) -> None:
+        """Raise Seen if levels of the sync line came otherwise; NotTried: none was reported."""
+        sent = {
+            int(number): int(level)
+            for chunk in self.fed
+            for number, level in zip(chunk.number, chunk.sync, strict=True)
+        }
+        found = {
+            int(number): int(level)
+            for chunk in self._of_run()
+            for number, level in zip(chunk.number, chunk.sync, strict=True)
+            if int(number) in sent
+        }
+        if not any(found.values()):
+            raise NotTried("it reports no level of the sync line: none is wired to it")
+        wrong = [number for number, level in found.items() if level != sent[number]]
+        if wrong:
+            raise Seen(
+                f"frame {wrong[0]} was exposed at level {sent[wrong[0]]} of the sync line, and "
+                f"came with {found[wrong[0]]}"
+            )
 
     def mark(self) -> int | None:
         """Return the time from which batches will be compared, ns."""
@@ -134,14 +194,15 @@ class FrameBench(StreamBench):
         super().check_content()
 
     def _of_run(self) -> list[FrameChunk]:
-        """Return what came since the last start; numbers begin anew with each."""
+        """Return what came since the last start, as far as that is known from times of arrival."""
+        if not self._by_arrival:
+            return list(self.came)
         return [chunk for chunk in self.came if chunk.t_ns[0] >= self._begun_ns]
 
     def open(self) -> None:
         """Open the camera on the scene's frames. Raises RigError."""
-        mid_ns = round(self.settings.exposure_us * 500)
-        self.device = self._fake(self.settings, PX_PER_MM, self, mid_ns)
-        self.device.set_region(*SIZE)
+        self.device = self._fake(self.settings, PX_PER_MM, self, self.mid_exposure_ns)
+        self.device.set_region(*self.region)
 
     def close_fake(self) -> None:
         """Nothing to close: the fake is the camera's."""
@@ -169,7 +230,8 @@ class FrameBench(StreamBench):
         self._number += count
         noise = np.random.default_rng(self._number)
         images = noise.integers(0, 256, (count, height, width)).astype(np.uint8)
-        return FrameChunk(images, number, t_ns, t_ns, np.zeros(count, np.uint8))
+        sync = (number % 3 == 0).astype(np.uint8)
+        return FrameChunk(images, number, t_ns, t_ns, sync)
 
     def silence(self) -> None:
         """A scene that shows nothing is silent."""

@@ -26,8 +26,9 @@ from sliplab.rigs.core.driver import (
     GripperDriver,
     SyncBoxDriver,
 )
-from sliplab.rigs.testing import arm_rules, gripper_rules, stream_rules
+from sliplab.rigs.testing import arm_rules, gripper_rules, motion_rules, stream_rules, sync_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
+from sliplab.rigs.testing.bench import settle
 from sliplab.rigs.testing.camera_benches import EventBench, FrameBench
 from sliplab.rigs.testing.gripper_bench import GripperBench
 from sliplab.rigs.testing.rule import Bounds, NotTried, Rule, RuleBroken, Rules, Seen
@@ -57,11 +58,12 @@ class Case:
             self.rule.hold(self.driver, bench)
 
     def _warm(self) -> None:
-        """Open and close a device, and forget it."""
+        """Open and close a device, forget it, and wait for threads that are ending."""
         with self.make() as bench, suppress(Seen):  # the rule itself will see it, too
             bench.refusal("connect", bench.open, bench.bounds.connect_s)
         del bench
         gc.collect()
+        settle()
 
 
 def cases(
@@ -85,18 +87,20 @@ def cases(
 
     if isinstance(driver, ArmDriver):
         own = cast(BaseArmSettings, settings)
-        return of(lambda: ArmBench(driver, own, limits), arm_rules.RULES)
+        return of(lambda: ArmBench(driver, own, limits), arm_rules.RULES, motion_rules.RULES)
     if isinstance(driver, EventCameraDriver):
-        return of(lambda: EventBench(driver, settings, limits), common)
+        own_rules = stream_rules.CLOCK_RULES, stream_rules.EVENT_RULES
+        return of(lambda: EventBench(driver, settings, limits), common, *own_rules)
     if isinstance(driver, FrameCameraDriver):
-        return of(lambda: FrameBench(driver, settings, limits), common, stream_rules.FRAME_RULES)
+        timed = stream_rules.CLOCK_RULES, stream_rules.HOST_RULES, stream_rules.FRAME_RULES
+        return of(lambda: FrameBench(driver, settings, limits), common, *timed)
     if isinstance(driver, SyncBoxDriver):
-        return of(lambda: SyncBench(driver, settings, limits), common, stream_rules.SYNC_RULES)
+        return of(lambda: SyncBench(driver, settings, limits), common, sync_rules.RULES)
     if isinstance(driver, GripperDriver):
         return of(lambda: GripperBench(driver, settings, limits), gripper_rules.RULES)
     if not isinstance(driver, ForceSensorDriver):
         raise TypeError(f"{driver.name}: there are no rules for a {driver.kind}")
-    rules = common, stream_rules.FORCE_RULES
+    rules = common, stream_rules.CLOCK_RULES, stream_rules.HOST_RULES, stream_rules.FORCE_RULES
     if arm is None:
         return of(lambda: ForceBench(driver, settings, limits), *rules)
     return of(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import numpy as np
+
 from sliplab.rigs.core.capabilities import Gripper, GripperState
 from sliplab.rigs.core.driver import GripperDriver, GripperScene
 from sliplab.rigs.core.finger_motion import FingerMotion
@@ -50,10 +52,21 @@ class GripperBench(Bench):
         """Return what the driver reports."""
         return self.call("state", self.device.state)
 
-    def move(self, opening_mm: float, speed_mm_s: float | None = None) -> None:
-        """Start a move, at the largest speed if none is given, with the least force."""
+    def true_mm(self, *t_ns: int) -> list[float]:
+        """Return the true openings at increasing times of the host's clock, ns."""
+        found: list[float] = self.fingers.opening_mm(np.array(t_ns, np.int64)).tolist()
+        return found
+
+    def moving(self) -> bool:
+        """Return whether the fingers truly move, or are about to."""
+        return self.fingers.moving(time.monotonic_ns())
+
+    def move(
+        self, opening_mm: float, speed_mm_s: float | None = None, force_n: float | None = None
+    ) -> None:
+        """Start a move, at the largest speed and with the least force if none is given."""
         speed = self.range.speed_mm_s[1] if speed_mm_s is None else speed_mm_s
-        force = self.range.force_n[0]
+        force = self.range.force_n[0] if force_n is None else force_n
         self.call("move", lambda: self.device.move(opening_mm, speed, force))
 
     def stall(self) -> None:

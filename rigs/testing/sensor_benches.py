@@ -10,13 +10,29 @@ import numpy as np
 
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import ForceSensor, SyncBox
-from sliplab.rigs.core.driver import ForceSensorDriver, SyncBoxDriver
+from sliplab.rigs.core.driver import ForceSensorDriver, PulseTrain, SyncBoxDriver
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
 from sliplab.rigs.testing.arm_bench import ArmBench
+from sliplab.rigs.testing.arm_report import clock_offset_ns
 from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
 from sliplab.rigs.testing.stream_bench import BATCHES, StreamBench
-from sliplab.storage.streams import PulseChunk, WrenchChunk
+from sliplab.storage.streams import F64, PulseChunk, WrenchChunk
+
+LOAD = np.array([1.0, -2.0, 5.0, 0.1, 0.2, -0.3])
+"""Force in N and torque in N m that a fake feels."""
+SWING, SWING_HZ = 0.2, 1.0
+"""Share by which the load swings, and how often in a second."""
+US_NS = 1000
+"""Step of a sync box's clock, ns."""
+TIMED_S = 0.05
+"""Largest error of the time of a load that the arm's controller measures, s."""
+
+
+def swinging(load: F64, t_s: F64, steady: bool) -> F64:
+    """Return the load at times of the device's clock, s, shape (n, 6)."""
+    swing = 0.0 if steady else SWING
+    return np.outer(1.0 + swing * np.sin(2 * np.pi * SWING_HZ * t_s), load)
 
 
 class ForceBench(StreamBench):
@@ -24,8 +40,11 @@ class ForceBench(StreamBench):
 
     capability = ForceSensor
     fields = ("t_ns", "force_n", "torque_nm")
-    load = np.array([1.0, -2.0, 5.0, 0.1, 0.2, -0.3])
-    """Force in N and torque in N m that the fake feels."""
+    slack_ns = 200_000
+    """A sample counter's step."""
+    load = LOAD
+    steady = False
+    """True for a constant load; else it swings by `SWING`."""
 
     def __init__(self, driver: ForceSensorDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
@@ -45,10 +64,10 @@ class ForceBench(StreamBench):
         self.fake.close()
 
     def feed(self) -> None:
-        """Send ten samples of a constant load within 10 ms."""
+        """Send ten samples of the load within 10 ms."""
         t_ns = self.times(10, 1_000_000)
-        force, torque = np.tile(self.load[:3], (10, 1)), np.tile(self.load[3:], (10, 1))
-        chunk = WrenchChunk(t_ns, t_ns, force, torque)
+        load = swinging(self.load, t_ns / 1e9, self.steady)
+        chunk = WrenchChunk(t_ns, t_ns, load[:, :3], load[:, 3:])
         self.fed.append(chunk)
         self.fake.send(chunk)
 
@@ -75,7 +94,15 @@ class ArmForceBench(StreamBench):
     ) -> None:
         super().__init__(driver, settings, bounds)
         self._arm = arm
+        arm.load = self._load_at
         self.device = driver.build(settings, arm.arm)
+
+    load = LOAD
+    steady = False
+
+    def _load_at(self, t_s: float) -> Sequence[float]:
+        found: list[float] = swinging(self.load, np.array([t_s]), self.steady)[0].tolist()
+        return found
 
     def open(self) -> None:
         """Connect the arm and the sensor. Raises RigError."""
@@ -103,7 +130,24 @@ class ArmForceBench(StreamBench):
         return len(times) > BATCHES
 
     def check_content(self) -> None:
-        """The load is the controller's own."""
+        """Raise Seen if forces or torques are not those on the tool at their times."""
+        offset_ns = clock_offset_ns(self._arm)
+        for chunk in self.came:
+            t_s = (chunk.t_ns - offset_ns) / 1e9
+            found = np.hstack([chunk.force_n, chunk.torque_nm])
+            true = swinging(self.load, t_s, self.steady)
+            slope = 2 * np.pi * SWING_HZ * SWING * np.abs(self.load)
+            wrong = np.flatnonzero(~(np.abs(found - true) <= TIMED_S * slope + 1e-3).all(axis=1))
+            if len(wrong):
+                raise Seen(
+                    f"force and torque came as {np.round(found[wrong[0]], 4).tolist()} N and N m, "
+                    f"on the tool were {np.round(true[wrong[0]], 4).tolist()}"
+                )
+
+    @property
+    def wraps_s(self) -> tuple[float, ...]:
+        """Not tried here. Raises NotTried."""
+        raise NotTried("the clock is the arm's, which the rules of arms try")
 
     def silence(self) -> None:
         """Silence the controller."""
@@ -127,16 +171,23 @@ class SyncBench(StreamBench):
 
     capability = SyncBox
     RATE_HZ = 200.0
-    CODE: Code = "lfsr"
+    USUAL: Code = "lfsr"
+    CODE: Code = USUAL
 
     def __init__(self, driver: SyncBoxDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
         if driver.fake is None or driver.reach is None:
             raise NotTried(f"{driver.name} declares no fake")
         self._build = driver.build
-        self.fake = driver.fake(time.monotonic_ns, lambda train, sent: None)
+        self.trains: list[PulseTrain | None] = []
+        """Trains that the box has begun, and None at each end."""
+        self._ahead_ns = 0
+        self.fake = driver.fake(
+            lambda: time.monotonic_ns() + self._ahead_ns,
+            lambda train, sent: self.trains.append(train),
+        )
         self.settings = driver.reach(settings, self.fake.address)
-        self.seed = 0
+        self.seed = 76
 
     def open(self) -> None:
         """Connect the box. Raises RigError."""
@@ -149,9 +200,13 @@ class SyncBench(StreamBench):
 
     def begin(self) -> None:
         """Start a train with another seed than the last one. Raises RigError."""
+        self.device.start(self.RATE_HZ, self.seed + 1, self.CODE)
         self.seed += 1
         self.came.clear()
-        self.device.start(self.RATE_HZ, self.seed, self.CODE)
+
+    def pass_time(self, seconds: float) -> None:
+        """Let the clock that drives the box jump ahead, as if time had passed."""
+        self._ahead_ns += round(seconds * 1e9)
 
     def take(self) -> PulseChunk:
         """Return the box's next pulses. Raises RigError."""
@@ -175,7 +230,7 @@ class SyncBench(StreamBench):
         ticks = int(found[-1] * self.RATE_HZ / 1e9) + 2
         bits = np.flatnonzero(CodeBits(self.seed, self.CODE).upto(ticks))
         due = (bits * (1e9 / self.RATE_HZ)).astype(np.int64)[: len(found)]
-        if len(due) < len(found) or np.abs(due - found).max() > 1000:
+        if len(due) < len(found) or np.abs(due - found).max() > US_NS:
             raise Seen(f"pulses came at {found.tolist()} ns, those of the code are {due.tolist()}")
 
     def silence(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -10,15 +11,18 @@ import numpy as np
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import Driver
-from sliplab.rigs.testing.bench import POLL_S, QUIET_S, Bench
-from sliplab.rigs.testing.rule import Bounds, Seen
+from sliplab.rigs.testing.bench import POLL_S, QUIET_S, Bench, wraps_s
+from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
 from sliplab.storage.streams import I64
 
 FIRST_NS = 5_000_000_000
 """First time of the fakes' clocks, ns."""
 BACK_NS = 2_000_000_000
 """Step by which a clock falls back, ns."""
+MS_NS = 1_000_000
 BATCHES = 3
+NUMBER_SLACK = 1e-3
+"""Largest error of a force in N, or of a torque in N m."""
 
 
 class StreamBench(Bench):
@@ -28,7 +32,10 @@ class StreamBench(Bench):
     clock_field: ClassVar[str] = "t_ns"
     fields: tuple[str, ...] = ()
     """Fields of a chunk that must come as they were sent."""
+    slack_ns: int = 0
+    """Largest error of a time that the driver may make by its rounding, ns."""
     device: Any = None
+    fake: Any = None
 
     def __init__(self, driver: Driver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(bounds)
@@ -55,6 +62,21 @@ class StreamBench(Bench):
     def turn_back(self) -> None:
         """Let the device's clock fall back."""
         self._next_ns -= BACK_NS
+
+    def seek(self, t_ns: int) -> None:
+        """Let the device's clock show a later time, a whole ms, from the next batch on."""
+        self._next_ns = t_ns // MS_NS * MS_NS
+
+    @property
+    def wraps_s(self) -> tuple[float, ...]:
+        """Times of the device's clock at which counters wrap, s."""
+        if self.fake is None:
+            raise NotTried("the clock of this bench cannot be set")
+        return wraps_s(self.fake)
+
+    def host_ns(self) -> int:
+        """Return the host's monotonic clock, ns."""
+        return time.monotonic_ns()
 
     # -- the device ------------------------------------------------------------------------
 
@@ -124,12 +146,70 @@ class StreamBench(Bench):
             self.feed()
 
         def complete() -> bool:
-            got.extend(self.read())
+            try:
+                got.extend(self.read())
+            except RigError as error:
+                if not self.fed:
+                    raise
+                raise Seen(f"{self.missing(got)}; then {error}") from None
             return self.complete(got)
 
         if not self.until(complete, self.bounds.call_s):
-            raise Seen(f"not all that was sent had been read after {self.bounds.call_s:g} s")
+            raise Seen(
+                f"not all that was sent had been read after {self.bounds.call_s:g} s: "
+                f"{self.missing(got)}"
+            )
         return got
+
+    def missing(self, times: Sequence[int]) -> str:
+        """Return in words what was sent last, and what came, in the unit of the chunk."""
+        if not self.fed:
+            return f"{len(times)} came"
+        last = getattr(self.fed[-1], self.clock_field)[-1]
+        return f"{self.clock_field} up to {last} was sent, up to {max(times, default=0)} came"
+
+    def flow(self, from_ns: int) -> list[int]:
+        """Feed and read some batches from a time on; wait for as many data as were fed.
+
+        Unlike `gather` it takes no time for known, since a counter does not say how often it
+        wrapped before.
+
+        Returns:
+            their times.
+
+        Raises:
+            Seen: not all come.
+            RigError: the driver reports a fault before.
+        """
+        got: list[int] = []
+
+        def read(count: int) -> bool:
+            if not count:
+                self.feed()
+                self.wait(POLL_S)
+            got.extend(self.read())
+            return len(got) >= max(count, 1)
+
+        if not self.until(lambda: read(0), self.bounds.call_s):
+            raise Seen(f"read returned nothing within {self.bounds.call_s:g} s of start")
+        self.quiet()
+        self.forget()
+        got.clear()
+        self.seek(from_ns)
+        for _ in range(BATCHES):
+            self.feed()
+        count, then = sum(map(len, self.fed)), ""
+        try:
+            if self.until(lambda: read(count), self.bounds.call_s):
+                return got
+        except RigError as error:
+            then = f"; then {error}"
+        raise Seen(f"{count} were sent and {len(got)} came{then}")
+
+    def forget(self) -> None:
+        """Forget what was fed and what came."""
+        self.fed.clear()
+        self.came.clear()
 
     def mark(self) -> int | None:
         """Return a time that all data from now on have reached, in the unit of the chunk.
@@ -141,22 +221,44 @@ class StreamBench(Bench):
     def complete(self, times: Sequence[int]) -> bool:
         """Return whether all that was fed has come."""
         last: int = getattr(self.fed[-1], self.clock_field)[-1]
-        return bool(times) and times[-1] >= last
+        return bool(times) and times[-1] >= last - self.slack_ns
 
     def check_content(self) -> None:
         """Raise Seen if what came differs from what `gather` fed last."""
         for name in self.fields:
-            sent = np.concatenate([getattr(chunk, name) for chunk in self.fed])
-            found = np.concatenate(
-                [
-                    getattr(chunk, name)[getattr(chunk, self.clock_field) >= (self._mark or 0)]
-                    for chunk in self.came
-                ]
-            )
+            sent, found = self._sent_and_found(name)
             if len(sent) != len(found):
                 raise Seen(f"{len(sent)} were sent and {len(found)} came ({name})")
-            if not np.allclose(sent, found, atol=1e-3):
-                raise Seen(f"{name} came otherwise than it was sent")
+            if sent.shape != found.shape:
+                raise Seen(f"{name} of shape {found.shape} came, {sent.shape} was sent")
+            slack = self.slack_ns if name == "t_ns" else NUMBER_SLACK if _floats(sent) else 0
+            off = np.abs(_signed(sent) - _signed(found))
+            if not (off <= slack).all():
+                wrong = int(np.flatnonzero(~(off <= slack).reshape(len(off), -1).all(axis=1))[0])
+                raise Seen(
+                    f"{name} came otherwise than it was sent, first in row {wrong}: "
+                    f"{_short(found[wrong])} instead of {_short(sent[wrong])}"
+                )
+
+    def _sent_and_found(self, name: str) -> tuple[Any, Any]:
+        """Return a field of what `gather` fed last, and of what came of it."""
+        sent = [getattr(chunk, name) for chunk in self.fed]
+        found = [
+            getattr(chunk, name)[getattr(chunk, self.clock_field) >= (self._mark or 0)]
+            for chunk in self.came
+        ]
+        return np.concatenate(sent), np.concatenate(found)
+
+    def check_steps(self) -> None:
+        """Raise Seen if the times of what `gather` fed last came with other differences."""
+        field = self.clock_field
+        sent = np.concatenate([getattr(chunk, field) for chunk in self.fed])
+        found = np.concatenate([getattr(chunk, field) for chunk in self.came])[-len(sent) :]
+        off = np.abs(np.diff(found) - np.diff(sent)).max() if len(found) == len(sent) else None
+        if off is None or off > 2 * self.slack_ns:
+            raise Seen(
+                f"times from {sent[0]} to {sent[-1]} came as {found[0]} to {found[-1]} ({field})"
+            )
 
     def times(self, count: int, step_ns: int) -> I64:
         """Return the next times of the fake's clock, ns, shape (count,)."""
@@ -169,3 +271,19 @@ class StreamBench(Bench):
         got = self.read()
         self.wait(QUIET_S)
         return [*got, *self.read()]
+
+
+def _floats(values: Any) -> bool:
+    return bool(values.dtype.kind == "f")
+
+
+def _signed(values: Any) -> Any:
+    """Return numbers whose differences do not wrap."""
+    return values if _floats(values) else values.astype(np.int64)
+
+
+def _short(value: Any) -> str:
+    """Return a row in few words: an image by its shape."""
+    return (
+        f"{value}" if np.size(value) <= 6 else f"{np.shape(value)} values of {np.mean(value):.1f}"
+    )

@@ -51,5 +51,6 @@ DRIVER = ArmDriver(
     address=lambda settings: f"{settings.host}:{settings.port}",
     locks=arm_lock,
     build=build,
+    twists=False,  # it has three linear axes
     fake=fake,
 )

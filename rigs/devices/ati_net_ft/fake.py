@@ -126,6 +126,11 @@ class FakeNetFt:
         """Its ports: of RDT and of the page."""
         return self.port, self.web_port
 
+    @property
+    def wraps_ns(self) -> tuple[int, ...]:
+        """Times of a scene's clock at which the 32-bit sample counter wraps, ns."""
+        return (2**32 * 1_000_000_000 // self._tick_hz,)
+
     def send(self, chunk: WrenchChunk) -> None:
         """Send samples of a scene, stamped by the scene's clock of this sensor."""
         with self._lock:

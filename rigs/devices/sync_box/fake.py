@@ -130,6 +130,11 @@ class FakeSyncBox:
         with self._lock:
             self._drop = reports
 
+    def expose(self) -> None:
+        """Simulate an exposure of the camera now, whose output is wired to the box."""
+        with self._lock:
+            self._stamps.append(self._us())
+
     # -- the box ---------------------------------------------------------------------------
 
     def _announce(self, plan: _Plan) -> None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sliplab.rigs.core.arm_settings import Limits
 from sliplab.rigs.core.capabilities import (
@@ -25,7 +27,7 @@ from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import ForceSensor as ForceSettings
 from sliplab.rigs.mock.settings import FrameCamera as FrameSettings
 from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.testing import arm_rules, stream_rules
+from sliplab.rigs.testing import arm_rules, motion_rules, stream_rules
 from sliplab.rigs.testing.arm_bench import ArmBench
 from sliplab.rigs.testing.bench import POLL_S, Bench, check_methods
 from sliplab.rigs.testing.rule import Bounds, NotTried
@@ -38,9 +40,13 @@ SETTINGS = MockSettings(
 )
 ARM_RULES = {
     "path", "times in order", "one path at a time", "stop at rest", "stop while moving",
-    "protective stop",
+    "protective stop", "speed and length", "turn", "orientation", "poses", "calls while moving",
+    "clock", "host times",
 }  # fmt: skip
-STREAM_RULES = {"data", "stop"}
+STREAM_RULES = {"data", "stop", "arrays", "read at once"}
+ALL_ARM_RULES = [*arm_rules.RULES.all, *motion_rules.RULES.all]
+TIMED = {"frames", "force"}
+"""Devices whose chunks have the host's time of reception."""
 
 
 class OnVirtualClock(Bench):
@@ -64,18 +70,33 @@ class OnVirtualClock(Bench):
 
 
 class MockArmBench(OnVirtualClock, ArmBench):
-    """The simulated arm, clear of the plate."""
+    """The simulated arm, clear of the plate; it turns about the plate's normal alone."""
 
     def __init__(self) -> None:
         Bench.__init__(self, Bounds())
         self.devices = build_mock(SETTINGS)
         self.arm = self.devices.arm
         self.home = self.devices.arm.pose()
+        tool = Rotation.from_rotvec(self.home.rotvec_deg, degrees=True)
+        self.axis = tuple(tool.apply([0.0, 0.0, 1.0]))
         low, high = ([value + step for value in self.home.xyz_mm] for step in (-20.0, 20.0))
         self.limits = Limits.model_validate({"low_mm": low, "high_mm": high})
 
     def place(self) -> Pose:
         return self.devices.arm.pose()
+
+    def host_ns(self) -> int:
+        return self.devices.clock.now_ns()
+
+    def clock_s(self) -> float:
+        world = self.devices.world
+        return world.clocks.arm.to_reference(world.now_ns) / 1e9
+
+    def true_pose(self, t_s: float) -> Pose:
+        world = self.devices.world
+        true_ns = world.clocks.arm.to_device(np.array([round(t_s * 1e9)], np.int64))
+        state = world.path.states(true_ns)[0].tolist()
+        return Pose((state[0], state[1], state[2]), (state[3], state[4], state[5]))
 
     def moving(self) -> bool:
         return self.devices.world.path.moving(self.devices.world.now_ns)
@@ -97,6 +118,9 @@ class MockStreamBench(OnVirtualClock, StreamBench):
         self.fed, self.came, self._next_ns = [], [], 0
         self.box = name == "sync"
         self.seed = 0
+
+    def host_ns(self) -> int:
+        return self.devices.clock.now_ns()
 
     def open(self) -> None:
         if not self.box:
@@ -134,7 +158,7 @@ class MockStreamBench(OnVirtualClock, StreamBench):
 
 
 @pytest.mark.parametrize(
-    "rule", [rule for rule in arm_rules.RULES.all if rule.name in ARM_RULES], ids=lambda r: r.name
+    "rule", [rule for rule in ALL_ARM_RULES if rule.name in ARM_RULES], ids=lambda r: r.name
 )
 def test_the_simulated_arm_keeps_a_rule(rule: Any) -> None:
     with MockArmBench() as bench:
@@ -159,6 +183,13 @@ def test_a_simulated_device_keeps_a_rule(rule: Any, name: str, capability: type)
         rule.hold(name, bench)
 
 
+@pytest.mark.parametrize("name", sorted(TIMED))
+def test_a_simulated_device_keeps_the_rule_of_host_times(name: str) -> None:
+    (rule,) = stream_rules.HOST_RULES.all
+    with MockStreamBench(name) as bench:
+        rule.hold(name, bench)
+
+
 def test_every_rule_that_is_named_here_is_one() -> None:
-    assert {rule.name for rule in arm_rules.RULES.all} >= ARM_RULES
+    assert {rule.name for rule in ALL_ARM_RULES} >= ARM_RULES
     assert {rule.name for rule in stream_rules.RULES.all} >= STREAM_RULES

@@ -92,19 +92,20 @@ def gripper_cases() -> list[Case]:
     return cases(robotiq_2f.DRIVER, settings)
 
 
-LATE = "late answer"
+LATE, SYNC, WRAPS = "late answer", "sync input", "counter wraps"
 DEVICES = {
     # not simulated: requests of their own connection, registers, and HTTP
-    "abb": (abb_cases, {LATE}),
-    "abb_socket": (socket_cases, {"clock falls back"}),  # it reports no time
+    "abb": (abb_cases, {LATE, SYNC}),
+    "abb_socket": (socket_cases, {"clock falls back", SYNC}),  # it reports no time
     "ur": (ur_cases, {LATE}),
-    "ur_wrench": (wrench_cases, {"overload"}),  # the controller's own stop
+    "ur_wrench": (wrench_cases, {"overload", WRAPS}),  # the controller's own stop, and its clock
     "ati_net_ft": (ati_cases, set()),
     "robotiq_2f": (gripper_cases, set()),
     "dvxplorer": (dvxplorer_cases, set()),
     "sync_box": (sync_cases, set()),
     "basler": (basler_cases, set()),
-    "uvc": (uvc_cases, {"times fall back"}),  # it has no clock
+    # it has neither clock nor frame numbers nor a line
+    "uvc": (uvc_cases, {"times fall back", WRAPS, "lost frames", "level of the sync line"}),
 }
 ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
 

@@ -10,6 +10,7 @@ import pytest
 
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.testing.broken import BROKEN, Broken
+from sliplab.rigs.testing.broken_values import WRONG_VALUES
 from sliplab.rigs.testing.conformance import Case, cases
 from sliplab.rigs.testing.examples import arm, events, force, frames, gripper, sync
 from sliplab.rigs.testing.rule import Bounds
@@ -49,7 +50,25 @@ def test_an_example_keeps_every_rule(driver: Driver[Any]) -> None:
 def test_a_broken_driver_is_caught_by_the_rules_about_its_defect(broken: Broken) -> None:
     found, _ = try_all(cases_of(broken.driver))
     assert set(found) == set(broken.rules), "\n".join(found.values())
+    check_message(broken, found)
+    gc.collect()  # what a broken driver leaves open is closed here, where nobody minds
+
+
+@pytest.mark.parametrize("broken", WRONG_VALUES, ids=lambda broken: broken.driver.name)
+def test_a_driver_with_wrong_values_is_caught_by_the_rules_about_them(broken: Broken) -> None:
+    own = [case for case in cases_of(broken.driver) if case.rule.name in broken.rules]
+    found, _ = try_all(own)
+    assert set(found) == set(broken.rules), "\n".join(found.values())
+    check_message(broken, found)
+
+
+def test_each_broken_driver_has_a_name_of_its_own() -> None:
+    names = [broken.driver.name for broken in (*BROKEN, *WRONG_VALUES)]
+    assert len(names) == len(set(names))
+
+
+def check_message(broken: Broken, found: dict[str, str]) -> None:
+    """Assert that the first rule names the driver, itself, and what is wrong."""
     message = found[broken.rules[0]]
     assert message.startswith(f"{broken.driver.name} breaks the rule '{broken.rules[0]}'")
     assert re.search(broken.seen, message.split("right:")[0])
-    gc.collect()  # what a broken driver leaves open is closed here, where nobody minds

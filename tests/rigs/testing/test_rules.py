@@ -8,7 +8,13 @@ import pytest
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import FrameCameraDriver
-from sliplab.rigs.testing import arm_rules, gripper_rules, stream_rules
+from sliplab.rigs.testing import (
+    arm_rules,
+    gripper_rules,
+    motion_rules,
+    stream_rules,
+    sync_rules,
+)
 from sliplab.rigs.testing.arm_bench import ArmBench
 from sliplab.rigs.testing.conformance import cases, conformance
 from sliplab.rigs.testing.examples import arm, events, frames
@@ -18,8 +24,9 @@ from tests.rigs.testing.trying import LIMITS
 from tests.rigs.waiting import own_address
 
 KINDS = (
-    arm_rules.RULES, stream_rules.RULES, stream_rules.FRAME_RULES, stream_rules.FORCE_RULES,
-    stream_rules.SYNC_RULES, gripper_rules.RULES,
+    arm_rules.RULES, motion_rules.RULES, stream_rules.RULES, stream_rules.CLOCK_RULES,
+    stream_rules.HOST_RULES, stream_rules.EVENT_RULES, stream_rules.FRAME_RULES,
+    stream_rules.FORCE_RULES, sync_rules.RULES, gripper_rules.RULES,
 )  # fmt: skip
 
 
@@ -98,6 +105,7 @@ def test_limits_in_the_plates_frame_are_refused_with_what_to_write() -> None:
 def test_a_failure_in_pytest_is_the_message_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     silly = Rule("poise", "the arm keeps its poise", _dances)
     monkeypatch.setattr(arm_rules.RULES, "all", [silly])
+    monkeypatch.setattr(motion_rules.RULES, "all", [])
     test = conformance(arm.DRIVER, arm_settings())
     (case,) = cases(arm.DRIVER, arm_settings())
     with pytest.raises(pytest.fail.Exception, match="breaks the rule 'poise'") as error:

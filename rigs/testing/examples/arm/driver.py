@@ -3,7 +3,8 @@
 The controller takes one client. It answers each line with `OK` and its time in microseconds, or
 with `ERROR` and a reason:
 
-    MOVE 400.0 5.0 300.0 180.0 0.0 0.0 1.6      (x y z in mm, rotation vector in deg, mm/s)
+    MOVE 400.0 5.0 300.0 180.0 0.0 0.0 1.6      (x y z in mm, rotation vector in deg, mm/s;
+                                                 deg/s where the tool turns on the spot)
     STOP
 
 Unasked it sends 500 times a second its time, its pose, its state and the level of its sync input:
@@ -139,8 +140,9 @@ class ExampleArm(ThreadedArm):
                 return
             here = self.pose()
             seconds = distance_mm(here, segment.to) / segment.speed_mm_s
-            seconds += angle_deg(here, segment.to) / TURN_DEG_S
-            numbers = (*segment.to.xyz_mm, *segment.to.rotvec_deg, segment.speed_mm_s)
+            seconds += angle_deg(here, segment.to) / (segment.turn_deg_s or TURN_DEG_S)
+            speed = segment.turn_deg_s or segment.speed_mm_s
+            numbers = (*segment.to.xyz_mm, *segment.to.rotvec_deg, speed)
             begin_ns = self._ask("MOVE " + " ".join(f"{number:.6f}" for number in numbers))
             if not self._rest(2 * seconds + OVERTIME_S, run):
                 raise ArmFault("arm", f"did not end a move of {seconds:.1f} s; it was stopped")

@@ -40,6 +40,10 @@ class FakeExampleSync(FakeStream):
         """Hold the answer to the next request back until the one after it."""
         self._late = True
 
+    def expose(self) -> None:
+        """Simulate an exposure of the frame camera, whose output is wired to the box."""
+        self.write(f"EXPOSURE {(self._now_ns() - self._zero_ns) // 1000}\n".encode())
+
     async def _serve(self, reader: asyncio.StreamReader) -> None:
         self._held = ""
         self._tick()
