@@ -202,9 +202,15 @@ class AbbArm(ThreadedArm):
                 self._began_s, self._may_move = math.inf, True  # no status covers this path yet
                 self._web.start(program)
             except WebError as error:
+                self._may_move |= self._began_s == math.inf
                 self._abort()
                 raise ArmFault("arm", f"did not accept the path: {error}") from None
             self._began_s = time.monotonic()
+            if run.cancelled:  # by a stop that may have come before the program had begun
+                with self._stopping:
+                    self._may_move = True
+                    self._halt(run)
+                return
             self._begin(run)
 
     def progress(self) -> Progress:
