@@ -86,9 +86,9 @@ class PoseCheck:
         if before is None:
             return None
         passed_ns, waited_ns = new[0] - before[0], new[1] - before[1]
-        if passed_ns - waited_ns > AHEAD_NS:
+        if passed_ns < 0 or passed_ns - waited_ns > AHEAD_NS:
             return f"its clock jumped by {passed_ns / 1e9:.3f} s"
-        seconds = max(min(passed_ns, waited_ns + BURST_NS), 0) / 1e9
+        seconds = min(passed_ns, max(waited_ns, 0) + BURST_NS) / 1e9
         for one, other in zip(before[2], new[2], strict=True):
             gone_mm = math.dist(one.xyz_mm, other.xyz_mm)
             if not gone_mm <= STEP_MM + self._fastest_mm_s * seconds:
