@@ -35,7 +35,7 @@ NO_ID = (1 << 64) - 1
 """Block id of pylon that means none."""
 GIGE_IDS = 65_535
 """Block ids of a GigE camera: 1 to 65,535, then 1 again; more than that, where it extends them."""
-FASTER, SPARE = 1.5, 10
+FASTER, SPARE = 1.5, 100
 """Largest gap in the ids: so many times the frames that fit into the time, and so many more."""
 MOST_EXPOSURES = 1000
 """Exposure ends that wait for their frame."""
