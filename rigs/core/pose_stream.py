@@ -55,7 +55,7 @@ class PoseCheck:
     def __init__(self, limit_mm_s: float = 0.0) -> None:
         self._fastest_mm_s = max(2 * limit_mm_s, FASTEST_MM_S)
         self._last: Stamped | None = None
-        self._held = self._last
+        self._held: Stamped | None = None
         self.active = True
         self.dropped = 0
 

@@ -170,7 +170,7 @@ class Prophesee:
         if len(t_us):
             if t_us[0] < self._last_us or np.any(np.diff(t_us) < 0):
                 raise FormatFault(f"its clock fell back after {self._last_us} us")
-            self._parts += int(t_us[-1]) > self._last_us  # times that stand still are no life
+            self._parts += int(t_us[-1]) > self._last_us  # times that stay the same are none
             self._last_us = int(t_us[-1])
         if pulses:
             if pulses[0] < self._last_pulse_us or pulses != sorted(pulses):

@@ -27,7 +27,6 @@ from sliplab.rigs.core.capabilities import (
     RigError,
     Segment,
 )
-from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.core.pose import MM_PER_M, TURN_PER_M, distance_mm, segment_seconds, to_ur
 from sliplab.rigs.core.pose_stream import PoseCheck, PoseJumpError, Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
@@ -92,7 +91,8 @@ class UrArm(ThreadedArm):
         self._listener: threading.Thread | None = None
         self._status: UrStatus | None = None
         self._check_pose = PoseCheck()
-        self._stall = StallTimer()
+        self._advanced_ns: int | None = None
+        """Host time of the last packet with a new time."""
         self._remote = True
         self._closing = False
         self._moved_ns: int | None = None
@@ -279,7 +279,7 @@ class UrArm(ThreadedArm):
                 "arm", f"{error}; check its power, its network and its address"
             ) from None
         self._reader, self._status, self._lost, self._closing = reader, None, None, False
-        self._missing, self._stall = 0, StallTimer()
+        self._missing, self._advanced_ns = 0, None
         self._check_pose = PoseCheck(self._settings.limits.speed_mm_s)
         self._check_pose.active = False  # until the tool is set, which moves its centre point
         self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
@@ -360,10 +360,11 @@ class UrArm(ThreadedArm):
                 f"jumped back by {-seconds:.3f} s" if seconds < 0 else f"jumped by {seconds:.3f} s"
             )
             raise RtdeError(f"its clock {how}: the controller restarted, or packets are invalid")
-        if self._stall.waited_s(status.t_ns) > SILENCE_S:
-            raise RtdeError(f"its clock has stopped for {SILENCE_S:g} s")
-        if before is not None and status.t_ns == before.t_ns:
+        if before is not None and status.t_ns == before.t_ns and self._advanced_ns is not None:
+            if packet.host_ns - self._advanced_ns > SILENCE_S * 1e9:
+                raise RtdeError(f"its clock has stopped for {SILENCE_S:g} s")
             return
+        self._advanced_ns = packet.host_ns
         x, y, z, a, b, c = packet.values[1:7]
         xyz_mm = (x * MM_PER_M, y * MM_PER_M, z * MM_PER_M)
         rotvec_deg = (math.degrees(a), math.degrees(b), math.degrees(c))
