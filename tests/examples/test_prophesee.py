@@ -149,7 +149,7 @@ def test_parts_whose_times_stop_are_silence(events: int, edges_us: np.ndarray) -
     camera = Prophesee(PropheseeSettings(source="stream", stall_s=0.3), Stopped(part))
     try:
         camera.start()
-        with pytest.raises(RigError, match="its clock has stopped"):
+        with pytest.raises(RigError, match=r"its clock has stopped|silent for 0\.\d s"):
             until(lambda: camera.read() is None, 5.0)
     finally:
         camera.close()
