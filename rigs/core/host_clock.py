@@ -26,7 +26,7 @@ class HostClock:
 
 
 STEP_S = 0.1
-"""Longest time between two calls that is counted, s."""
+"""Longest time between two calls that is counted, if no other is given, s."""
 
 
 class StallTimer:
@@ -34,10 +34,11 @@ class StallTimer:
 
     Args:
         now_ns: the host's monotonic clock; `time.monotonic_ns` if left out.
+        step_s: longest time between two calls that is counted, s.
     """
 
-    def __init__(self, now_ns: Callable[[], int] | None = None) -> None:
-        self._now_ns = now_ns
+    def __init__(self, now_ns: Callable[[], int] | None = None, step_s: float = STEP_S) -> None:
+        self._now_ns, self._step_ns = now_ns, round(step_s * 1e9)
         self._mark: int | None = None
         self._last_ns = self._waited_ns = 0
 
@@ -47,6 +48,6 @@ class StallTimer:
         if mark != self._mark:
             self._mark, self._waited_ns = mark, 0
         else:
-            self._waited_ns += min(now_ns - self._last_ns, round(STEP_S * 1e9))
+            self._waited_ns += min(now_ns - self._last_ns, self._step_ns)
         self._last_ns = now_ns
         return self._waited_ns / 1e9

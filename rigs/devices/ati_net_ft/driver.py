@@ -98,7 +98,7 @@ class AtiNetFt:
         self._passed = self._rejected = 0
         self._least_ns: int | None = None
         """Shortest delay of a record against the first one's."""
-        self._silence = StallTimer(self._now_ns)
+        self._silence = StallTimer(self._now_ns, LOOK_S)
 
     def connect(self) -> None:
         """Read and write the sensor's settings, and see that a record comes.
