@@ -148,7 +148,7 @@ class PipeCalls:
 
 
 def _end_late(calls: weakref.ref[PipeCalls], closed: threading.Event) -> None:
-    """Watch a child until its pipe is closed, or nobody uses it any more; runs in a thread."""
+    """Watch a child until its pipe is closed or it is no longer referenced; runs in a thread."""
     stall = StallTimer()
     while not closed.wait(STEP_S):
         watched = calls()

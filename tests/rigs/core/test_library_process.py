@@ -87,7 +87,7 @@ def test_answer_that_does_not_end_has_one_deadline(name: str, ignore_suspend: bo
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_process_that_nobody_uses_any_more_ends() -> None:
+def test_unreferenced_process_ends() -> None:
     process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0)
     child = process._child
     del process
