@@ -14,7 +14,10 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
+import weakref
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
@@ -46,6 +49,123 @@ def of_device(device: str, work: Callable[[], T]) -> T:
         raise RigError(device, reason.removeprefix(f"{device}: ")) from None
 
 
+class PipeCalls:
+    """Calls of a child process over a pipe: thread-safe, one at a time, each with one time limit.
+
+    The child is ended where an answer is late, since it would be taken for the next call's, and
+    where an answer has begun and does not end.
+
+    Args:
+        kill: ends the child at once, in any thread.
+        pending: answers that the child sends without a call, to be read by `answer`.
+        ignore_suspend: time for which this computer was suspended is not counted.
+    """
+
+    def __init__(
+        self,
+        pipe: Connection,
+        kill: Callable[[], object],
+        *,
+        pending: int = 0,
+        ignore_suspend: bool = False,
+    ) -> None:
+        self.pipe = pipe
+        self._kill, self._pending, self._ignore_suspend = kill, pending, ignore_suspend
+        self._lock = threading.Lock()
+        self._count = 0
+        self._reading: tuple[int, float] | None = None
+        """Number and time limit, s, of an answer that has begun."""
+        self._late = False
+        self._closed = threading.Event()
+        arguments = weakref.ref(self), self._closed
+        threading.Thread(target=_end_late, args=arguments, daemon=True).start()
+
+    def call(self, message: Any, within_s: float) -> tuple[bool, Any]:
+        """Send a message, and return its answer.
+
+        Raises:
+            TimeoutError: no answer within `within_s`, or none yet to an earlier call.
+            Exception: the child has ended, or sent something else.
+        """
+        if not self._lock.acquire(timeout=within_s):
+            raise TimeoutError("the previous call has not ended")
+        try:
+            self._pending += 1  # before sending: a surplus answer would be taken for the next one
+            with contextlib.suppress(OSError):  # a dead child's last message may be in the pipe
+                self.pipe.send(message)
+            return self._answer(within_s)
+        finally:
+            self._lock.release()
+
+    def answer(self, within_s: float) -> tuple[bool, Any]:
+        """Return an answer that the child sends without a call. Raises as `call`."""
+        with self._lock:
+            return self._answer(within_s)
+
+    def close(self) -> None:
+        """Close the pipe; safe to call more than once."""
+        self._closed.set()
+        self.pipe.close()
+
+    def end_late(self, stall: StallTimer) -> None:
+        """End the child if its answer has begun and does not end in time; call it regularly."""
+        reading = self._reading
+        if reading is not None and stall.waited_s(reading[0]) > reading[1]:
+            self._late = True
+            self._kill()
+
+    def _answer(self, within_s: float) -> tuple[bool, Any]:
+        found: tuple[bool, Any] = False, None
+        while self._pending:  # the answer to a call that Ctrl-C interrupted comes first
+            left_s = self._wait(within_s)
+            if left_s <= 0:
+                self._kill()
+                raise TimeoutError(f"no answer within {within_s:g} s")
+            self._count += 1
+            self._reading = self._count, left_s
+            try:
+                found = self.pipe.recv()
+            except BaseException:  # Ctrl-C too: the rest of the message would begin the next one
+                self._kill()
+                if self._late:
+                    raise TimeoutError(f"no whole answer within {within_s:g} s") from None
+                raise
+            finally:
+                self._reading = None
+            self._pending -= 1
+        return found
+
+    def _wait(self, within_s: float) -> float:
+        """Wait until an answer begins; return the time that is left for it, s."""
+        if not self._ignore_suspend:
+            end_s = time.monotonic() + within_s
+            return max(end_s - time.monotonic(), STEP_S) if self.pipe.poll(within_s) else 0.0
+        stall = StallTimer()
+        while (waited_s := stall.waited_s(0)) < within_s:
+            if self.pipe.poll(STEP_S):
+                return within_s - waited_s
+        return 0.0
+
+
+def _end_late(calls: weakref.ref[PipeCalls], closed: threading.Event) -> None:
+    """Watch a child until its pipe is closed or it is no longer referenced; runs in a thread."""
+    stall = StallTimer()
+    while not closed.wait(STEP_S):
+        watched = calls()
+        if watched is None:
+            return
+        watched.end_late(stall)
+        del watched
+
+
+def _kill(child: subprocess.Popen[bytes]) -> None:
+    """End a child now, whatever it is doing; safe to call more than once."""
+    if child.poll() is None:
+        child.kill()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        child.wait(KILL_S)
+
+
 class LibraryProcess:
     """The parent's side: remote calls by name, each with a timeout.
 
@@ -74,11 +194,9 @@ class LibraryProcess:
         *,
         ignore_suspend: bool = False,
     ) -> None:
-        self._what, self._error, self._ignore_suspend = what, error, ignore_suspend
-        self._pending = 1
+        self._what, self._error = what, error
         ours, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
-        self._lock = threading.Lock()
         module, function = serve.split(":")
         given = ", ".join(map(repr, (theirs.fileno(), *arguments)))
         code = (
@@ -94,9 +212,14 @@ class LibraryProcess:
                 stderr=self._log,
                 start_new_session=True,  # Ctrl-C is the parent's to handle
             )
-        self._pipe = Connection(ours.detach())
+        self._calls = PipeCalls(
+            Connection(ours.detach()),
+            partial(_kill, self._child),
+            pending=1,
+            ignore_suspend=ignore_suspend,
+        )
         try:
-            self.begun: Any = self._answer("connect", start_s)
+            self.begun: Any = self._result("connect", lambda: self._calls.answer(start_s))
         except BaseException:  # Ctrl-C too
             self.close()
             raise
@@ -108,19 +231,10 @@ class LibraryProcess:
             LibraryError: the library raised, died, or did not answer within `within_s`. In the
                 last two cases the child has ended and every later call fails at once.
         """
-        if not self._lock.acquire(timeout=within_s):
-            raise self._error(f"{name}: the previous call has not ended")
-        try:
-            if self._pipe.closed or self._child.poll() is not None:
-                raise self._error(f"{name}: the {self._what} has exited")
-            self._pending += 1  # before sending: a surplus answer would be taken for the next one
-            try:
-                self._pipe.send((name, arguments, within_s))
-            except OSError:
-                raise self._error(f"{name}: the {self._what} has exited{self._output()}") from None
-            return self._answer(name, within_s)
-        finally:
-            self._lock.release()
+        if self._calls.pipe.closed or self._child.poll() is not None:
+            raise self._error(f"{name}: the {self._what} has exited")
+        message = name, arguments, within_s
+        return self._result(name, lambda: self._calls.call(message, within_s))
 
     @property
     def pid(self) -> int:
@@ -129,15 +243,12 @@ class LibraryProcess:
 
     def kill(self) -> None:
         """End the child now, whatever it is doing; safe to call more than once."""
-        if self._child.poll() is None:
-            self._child.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._child.wait(KILL_S)
+        _kill(self._child)
 
     def end(self) -> None:
         """Ask the child to end, kill it if it does not within `KILL_S`, and close."""
         with contextlib.suppress(OSError, ValueError):
-            self._pipe.close()
+            self._calls.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._child.wait(KILL_S)
         self.close()
@@ -145,34 +256,19 @@ class LibraryProcess:
     def close(self) -> None:
         """Kill the child and release its pipe and log."""
         self.kill()
-        self._pipe.close()
+        self._calls.close()
         self._log.close()
 
-    def _answer(self, name: str, within_s: float) -> Any:
-        fine, result = False, None
+    def _result(self, name: str, answer: Callable[[], tuple[bool, Any]]) -> Any:
         try:
-            while self._pending:  # the answer to a call that Ctrl-C interrupted comes first
-                if not self._poll(within_s):
-                    self.kill()
-                    raise self._error(f"{name}: no answer within {within_s:g} s{self._output()}")
-                fine, result = self._pipe.recv()
-                self._pending -= 1
-        except (OSError, EOFError):
-            self.kill()
+            fine, result = answer()
+        except TimeoutError as error:
+            raise self._error(f"{name}: {error}{self._output()}") from None
+        except Exception:
             raise self._error(f"{name}: the {self._what} died{self._output()}") from None
         if not fine:
             raise self._error(f"{name}: {result}")
         return result
-
-    def _poll(self, within_s: float) -> bool:
-        """Wait for an answer; return whether one came."""
-        if not self._ignore_suspend:
-            return self._pipe.poll(within_s)
-        stall = StallTimer()
-        while stall.waited_s(0) < within_s:
-            if self._pipe.poll(STEP_S):
-                return True
-        return False
 
     def _output(self) -> str:
         """Return the child's last line of output, as text for a message."""

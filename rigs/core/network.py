@@ -1,13 +1,76 @@
-"""Devices on the network: a check that a port answers, and the lock of an arm."""
+"""Devices on the network: connections with bounded answers, and the lock of an arm."""
 
 from __future__ import annotations
 
+import math
 import socket
+import time
+from typing import Any
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 
 ANSWER_S = 1.0
 """Timeout of a connection, s."""
+
+MOST_BYTES = 1 << 20
+"""Largest answer of a device, bytes."""
+
+
+class BoundedSocket(socket.socket):
+    """A TCP connection whose answers have a limit each of time and size, in any number of pieces.
+
+    A timeout of a socket is that of one `recv`: a device that sends a byte now and then never
+    exceeds it. `expect` begins an answer; reading beyond its limits raises OSError.
+    """
+
+    _deadline = math.inf
+    _left = 0
+
+    @classmethod
+    def open(cls, host: str, port: int, within_s: float) -> BoundedSocket:
+        """Connect, and expect a first answer within the same time. Raises OSError."""
+        began = time.monotonic()
+        link = cls(fileno=socket.create_connection((host, port), within_s).detach())
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        link.expect(within_s - (time.monotonic() - began))
+        return link
+
+    def expect(self, within_s: float, most_bytes: int = MOST_BYTES) -> None:
+        """Begin an answer that ends within `within_s` and has at most `most_bytes`."""
+        self._deadline, self._left = time.monotonic() + within_s, most_bytes
+        self._wait()
+
+    def receive(self, most: int) -> bytes:
+        """Return what came, at least one byte and at most `most`. Raises OSError."""
+        data = self.recv(most)
+        if not data:
+            raise ConnectionError("it closed the connection")
+        return data
+
+    def recv(self, size: int, flags: int = 0) -> bytes:
+        """Return what came, at most `size` bytes; none at the end of the connection."""
+        self._wait()
+        data = super().recv(size, flags)
+        self._count(len(data))
+        return data
+
+    def recv_into(self, buffer: Any, size: int = 0, flags: int = 0) -> int:
+        """Read into a buffer, as `http.client` does; return the number of bytes."""
+        self._wait()
+        came = super().recv_into(buffer, size, flags)
+        self._count(came)
+        return came
+
+    def _wait(self) -> None:
+        left_s = self._deadline - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("timed out")
+        self.settimeout(left_s)
+
+    def _count(self, came: int) -> None:
+        self._left -= came
+        if self._left < 0:
+            raise ConnectionError("its answer does not end")
 
 
 def answers(host: str, port: int) -> str | None:

@@ -57,7 +57,7 @@ class StreamBuffer:
         """Add a part with its times, shape (n,), and its size; in the receiving thread.
 
         Raises:
-            ValueError: times fall back, or nobody reads.
+            ValueError: times fall back or stop, or nobody reads.
         """
         with self._lock:
             if not self._running or not len(times):
@@ -73,8 +73,12 @@ class StreamBuffer:
                 raise ValueError(f"nobody read it: {self._most_mb:g} MB are full")
             waiting.append(part)
             self._bytes[stream] = held
+            if stream in self._last and int(times[-1]) == last:
+                if self._stall.waited_s(self._count) > self._stall_s:
+                    raise ValueError(f"its clock has stopped at {last}")
+            else:  # data whose times stay the same are no life
+                self._count += 1
             self._last[stream] = int(times[-1])
-            self._count += 1
 
     def fail(self, why: str) -> None:
         """Note why nothing more comes; the first reason is kept, those after it follow from it."""

@@ -24,6 +24,7 @@ from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import PlateCourse, RigError, Truth
 from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.core.driver import EventCameraDriver
+from sliplab.rigs.core.library_process import PipeCalls
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.further_settings import FurtherEventCamera
@@ -76,9 +77,8 @@ class Loopback:
             if isinstance(stream, EventStream) and stream.device and stream.mock
         }
         context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
+        ours, theirs = context.Pipe()
         self._frames, their_frames = context.Pipe(duplex=False)
-        self._asking = threading.Lock()
         self.on_frames: Callable[[FrameChunk], None] = _forget
         self._process = context.Process(
             target=_serve,
@@ -88,8 +88,9 @@ class Loopback:
         self._process.start()
         theirs.close()
         their_frames.close()
+        self._calls = PipeCalls(ours, self._process.kill, pending=1)
         try:
-            self._take(self._answer(READY_S))
+            self._take(self._result(lambda: self._calls.answer(READY_S)))
         except BaseException:
             self.close()
             raise
@@ -98,7 +99,7 @@ class Loopback:
 
     def close(self) -> None:
         """End the fakes; safe to call more than once."""
-        self._pipe.close()
+        self._calls.close()
         self._process.join(END_S)
         if self._process.is_alive():
             self._process.kill()
@@ -216,16 +217,13 @@ class Loopback:
     # --------------------------------------------------------------------------------------
 
     def _ask(self, what: str, *arguments: Any) -> Any:
-        with self._asking:
-            with suppress(OSError, ValueError):  # their last message may still be in the pipe
-                self._pipe.send((what, arguments))
-            return self._answer(ANSWER_S)
+        return self._result(lambda: self._calls.call((what, arguments), ANSWER_S))
 
-    def _answer(self, within_s: float) -> Any:
+    def _result(self, answer: Callable[[], tuple[bool, Any]]) -> Any:
         try:
-            if not self._pipe.poll(within_s):
-                raise RigError("fakes", f"no answer within {within_s:g} s")
-            good, value = self._pipe.recv()
+            good, value = answer()
+        except TimeoutError as error:
+            raise RigError("fakes", str(error)) from None
         except (EOFError, OSError):
             raise RigError("fakes", "their process has ended") from None
         if not good:

@@ -16,7 +16,7 @@ import pytest
 from pydantic import ValidationError
 from sliplab_prophesee import DRIVER, PropheseeSettings, build, ping
 from sliplab_prophesee.driver import Prophesee
-from sliplab_prophesee.evt import Evt3Encoder, Header
+from sliplab_prophesee.evt import Decoded, Evt3Encoder, Header
 
 from sliplab.rigs.core.capabilities import EventCamera, RigError
 from sliplab.storage.streams import EventChunk, PulseChunk
@@ -111,6 +111,48 @@ def test_edges_wait_for_events_of_their_time(opened: Callable[..., Prophesee]) -
         assert gathered(camera, 200)[1] == [1_150_000_000]
     finally:
         fake.close()
+
+
+class Stopped:
+    """A source that reads the same part again and again, as fast as it is asked."""
+
+    name, serial, width, height = "none", "0", *SIZE
+
+    def __init__(self, found: Decoded) -> None:
+        self.found = found
+
+    def start(self) -> None:
+        pass
+
+    def stop(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def read(self) -> Decoded:
+        threading.Event().wait(0.01)
+        return self.found
+
+
+NONE = np.empty(0, np.int64)
+
+
+@realtime
+@pytest.mark.parametrize(
+    ("events", "edges_us"),
+    [(0, NONE), (1, NONE), (0, np.array([1_000_000], np.int64))],
+    ids=["nothing", "one event", "one pulse"],
+)
+def test_parts_whose_times_stop_are_silence(events: int, edges_us: np.ndarray) -> None:
+    part = Decoded(some_events(count=events), edges_us, 0 * edges_us, edges_us > 0)
+    camera = Prophesee(PropheseeSettings(source="stream", stall_s=0.3), Stopped(part))
+    try:
+        camera.start()
+        with pytest.raises(RigError, match=r"its clock has stopped|silent for 0\.\d s"):
+            until(lambda: camera.read() is None, 5.0)
+    finally:
+        camera.close()
 
 
 # -- recordings ----------------------------------------------------------------------------

@@ -17,6 +17,7 @@ It stops by itself when its client leaves.
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
 import time
@@ -40,6 +41,7 @@ ANSWER_S = 1.0
 """Time limit of connecting, and of every answer, s."""
 SILENCE_S = 1.0
 """A controller that has said nothing for this long is lost, s."""
+LONGEST_LINE = 1000
 STILL_S = 2.0
 """Time limit from a stop to the stage standing still, s."""
 OVERTIME_S = 3.0
@@ -73,6 +75,8 @@ class LabStage(ThreadedArm):
         self._count = 0
         """Poses since the connection."""
         self._t_ns = 0
+        self._advanced_ns = time.monotonic_ns()
+        """Arrival of the newest pose."""
         self._says = ArmState.DISCONNECTED
         self._may_move = False
         """A path was begun, and nobody has seen the stage at rest since."""
@@ -284,9 +288,14 @@ class LabStage(ThreadedArm):
                 *lines, waiting = (waiting + part).split(b"\n")
                 for line in lines:
                     self._take(line.decode("ascii"))
+                # other lines, half ones and a clock that has stopped are silence, too
+                if time.monotonic_ns() - self._advanced_ns > SILENCE_S * 1e9:
+                    raise TimeoutError
+                if len(waiting) > LONGEST_LINE:
+                    raise ValueError("it sent a line without an end")
             self._lose("the controller closed the connection")
         except TimeoutError:
-            self._lose(f"no line came for {SILENCE_S:g} s")
+            self._lose(f"no new pose came for {SILENCE_S:g} s")
         except (OSError, ValueError) as error:
             self._lose(str(error))
 
@@ -308,11 +317,13 @@ class LabStage(ThreadedArm):
             says = STATES[state]
         except (ValueError, KeyError):
             raise ValueError(f"it sent '{line}', which is no pose") from None
-        if word != "POSE":
+        if word != "POSE" or not all(map(math.isfinite, sample.xyz_mm)):
             raise ValueError(f"it sent '{line}', which is no pose")
         if sample.t_ns < self._t_ns:
             raise ValueError(f"its clock fell back by {(self._t_ns - sample.t_ns) / 1e9:.3f} s")
-        self._says, self._t_ns = says, sample.t_ns
+        if sample.t_ns == self._t_ns:
+            return
+        self._says, self._t_ns, self._advanced_ns = says, sample.t_ns, sample.host_ns
         self._count += 1
         self._stream.add(sample)
 

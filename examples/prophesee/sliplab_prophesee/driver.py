@@ -164,21 +164,24 @@ class Prophesee:
 
     def _take(self, found: Decoded) -> None:
         """Take a part of the stream. Raises FormatFault: a clock fell back, or nobody reads."""
-        self._parts += 1
         kept = found.trigger_up & (found.trigger_id == self._settings.trigger)
         pulses = found.trigger_us[kept].tolist()
         t_us = found.events.t_us
         if len(t_us):
             if t_us[0] < self._last_us or np.any(np.diff(t_us) < 0):
                 raise FormatFault(f"its clock fell back after {self._last_us} us")
+            self._parts += int(t_us[-1]) > self._last_us  # times that stay the same are none
             self._last_us = int(t_us[-1])
         if pulses:
             if pulses[0] < self._last_pulse_us or pulses != sorted(pulses):
                 text = f"its clock fell back after the pulse at {self._last_pulse_us} us"
                 raise FormatFault(text)
+            self._parts += pulses[-1] > self._last_pulse_us
             self._last_pulse_us = pulses[-1]
         if not self._running:
             return
+        if self._stall.waited_s(self._parts) > self._settings.stall_s:
+            raise FormatFault(f"its clock has stopped at {self._last_us} us")
         if len(t_us):
             self._events.append(found.events)
         self._pulses += pulses

@@ -202,9 +202,15 @@ class AbbArm(ThreadedArm):
                 self._began_s, self._may_move = math.inf, True  # no status covers this path yet
                 self._web.start(program)
             except WebError as error:
+                self._may_move |= self._began_s == math.inf
                 self._abort()
                 raise ArmFault("arm", f"did not accept the path: {error}") from None
             self._began_s = time.monotonic()
+            if run.cancelled:  # by a stop that may have come before the program had begun
+                with self._stopping:
+                    self._may_move = True
+                    self._halt(run)
+                return
             self._begin(run)
 
     def progress(self) -> Progress:
@@ -371,12 +377,15 @@ class AbbArm(ThreadedArm):
         self._closing = threading.Event()
         sender = settings.egm_host or settings.host
         try:
-            self._egm = EgmReceiver(settings.egm_bind, settings.egm_port, sender)
+            self._egm = EgmReceiver(
+                settings.egm_bind, settings.egm_port, sender, settings.limits.speed_mm_s
+            )
         except OSError as error:
             raise ArmFault(
                 "arm",
                 f"UDP port {settings.egm_port} cannot be opened for poses from {sender}: {error}",
             ) from None
+        self._egm.check.active = False  # until the tool is set, which moves its centre point
         self._web = WebServices(settings)
         self._update(self._web.status())
         self._lost = None
@@ -405,6 +414,7 @@ class AbbArm(ThreadedArm):
         asked = time.monotonic()
         if not self._stream.wait_for(lambda: self._has_stopped(asked), STOPPED_S + STATUS_S):
             raise ArmFault("arm", "its program does not end")
+        self._egm.check.active = True
         self._may_move, self._not_stopped = False, None
 
     def _begin_watch(self) -> None:
@@ -480,6 +490,7 @@ class AbbArm(ThreadedArm):
             "poses_missing": counts.lost,
             "poses_late": counts.late,
             "packets_malformed": counts.malformed,
+            "poses_implausible": counts.implausible,
             "packets_of_others": counts.foreign,
         }
 
@@ -501,21 +512,22 @@ class AbbArm(ThreadedArm):
         return compose(self._web.flange()[0], self._tool)
 
     def _receive(self) -> None:
-        """Receive poses until the arm is closed or the stream is unusable."""
+        """Receive poses until the arm is closed or the stream is unusable; runs in a thread."""
         flange = self._settings.egm_point == "flange"
         egm = self._egm
         while egm is not None and not self._closing.is_set():
             try:
                 came = egm.read(MONITOR_S)
-            except EgmFault as fault:
+                if came is not None:
+                    self._take(came, self._tool if flange else None)
+            except Exception as error:  # a thread that dies must not look like an arm at rest
+                fault = error if isinstance(error, EgmFault) else f"its poses: {error!r}"
                 if not self._run.done:
                     self._run.error = ArmFault("arm", f"{fault}; its path was aborted")
                 self._lost = str(fault)
                 self._stream.wake()
                 return
-            if came is not None:
-                self._take(came, self._tool if flange else None)
-            else:
+            if came is None:
                 self._stream.wake()  # waiting threads check the age of the last pose
 
     def _take(self, came: EgmPose, tool: Pose | None) -> None:

@@ -3,7 +3,7 @@
 abb-motion-program-exec's RAPID module starts the stream with every motion program. The time of a
 pose is the controller's (`feedBack.time`, s and us). The planned pose is the commanded one and has
 no noise, so segment starts and ends are detected from it where it is sent. UDP guarantees neither
-sender, order nor delivery: address, sequence number and time of every packet are checked.
+sender, order nor delivery: address, sequence number, time and pose of every packet are checked.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from google.protobuf.message import DecodeError
 
 from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.core.pose import from_quaternion
+from sliplab.rigs.core.pose_stream import PoseCheck, PoseJumpError
 
 _BUFFER_BYTES = 1 << 20
 _SO_TIMESTAMPNS = 35
@@ -31,13 +32,19 @@ _OLDEST_NS = 10_000_000_000
 """Largest age; a packet that seems older was stamped before the wall clock was set."""
 LATE_NS = 1_000_000_000
 """A packet this much older than the last was not delayed: the controller's clock jumped back."""
+_LATEST_NS = 1 << 62
+"""Largest time that fits into a recording."""
+_SHORTEST_NS = 2_000_000
+"""Shortest period of packets; a controller has 4 ms."""
+_NUMBERS = 1 << 32
+"""Sequence numbers before they begin at 0 again."""
 _FURTHEST_MM = 1e5
 _UNIT_TOLERANCE = 0.01
 """Largest deviation of a quaternion from length 1; the controller sends doubles."""
 
 
 class EgmFault(RuntimeError):
-    """The stream is unusable: no times, or times that decrease; the text says which."""
+    """The stream is unusable: no times, or times or poses that jump; the text says which."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +69,8 @@ class EgmCounts:
     """Packets out of order, or duplicates."""
     malformed: int = 0
     """Packets from the controller without a complete, finite pose."""
+    implausible: int = 0
+    """Poses that the arm cannot have reached, or times that cannot have passed."""
     foreign: int = 0
     """Packets from any other address."""
 
@@ -96,16 +105,19 @@ class EgmReceiver:
         bind: address of the network card that the controller sends to.
         port: UDP port that the controller sends to.
         sender: address or name of the controller; other packets are counted and dropped.
+        limit_mm_s: limit of the speed of a path.
 
     Attributes:
         counts: lost and rejected packets.
+        check: holds poses against the last ones.
 
     Raises:
         OSError: the port is taken, or the sender's name cannot be resolved.
     """
 
-    def __init__(self, bind: str, port: int, sender: str) -> None:
+    def __init__(self, bind: str, port: int, sender: str, limit_mm_s: float = 0.0) -> None:
         self.counts = EgmCounts()
+        self.check = PoseCheck(limit_mm_s)
         self._sender = socket.gethostbyname(sender)
         self._last: tuple[int, int] | None = None  # sequence number, time in ns
         self._egm = EGM(port=0)
@@ -124,7 +136,7 @@ class EgmReceiver:
         """Return the next packet's pose; None after `within_s`, or for a rejected packet.
 
         Raises:
-            EgmFault: packets carry no time, or the clock jumped back.
+            EgmFault: packets carry no time, or the clock or the poses jumped.
         """
         self._egm.egm_addr = None
         try:
@@ -149,28 +161,48 @@ class EgmReceiver:
             raise EgmFault("its EGM packets carry no time stamp: RobotWare 6.07 or newer is needed")
         clock = message.feedBack.time
         t_ns = clock.sec * 1_000_000_000 + clock.usec * 1_000
-        if not self._is_next(message.header.seqno, t_ns):
+        if t_ns > _LATEST_NS:
+            self.counts.malformed += 1
             return None
-        return EgmPose(t_ns, self._link.arrived_ns, measured, planned)
+        number, host_ns = message.header.seqno, self._link.arrived_ns
+        if not self._is_next(number, t_ns):
+            return None
+        try:
+            believed = self.check.believes(t_ns, host_ns, measured, planned)
+        except PoseJumpError as error:
+            raise EgmFault(str(error)) from None
+        finally:
+            self.counts.implausible = self.check.dropped
+        if not believed:
+            return None
+        self._count_lost(number, t_ns)
+        return EgmPose(t_ns, host_ns, measured, planned)
 
     def close(self) -> None:
         """Release the port."""
         self._egm.close()
 
     def _is_next(self, number: int, t_ns: int) -> bool:
-        """Return whether a packet is newer than the last one; count the missing ones between."""
-        if self._last is not None:
-            last, last_ns = self._last
-            back_ns = last_ns - t_ns
-            if back_ns > LATE_NS or (back_ns > 0 and number > last):
-                raise EgmFault(f"the controller's clock jumped back by {back_ns / 1e9:.3f} s")
-            if back_ns >= 0:
-                self.counts.late += 1
-                return False
-            if number > last:  # else the controller restarted its count, as with each program
-                self.counts.lost += number - last - 1
-        self._last = number, t_ns
+        """Return whether a packet is newer than the last one."""
+        if self._last is None:
+            return True
+        last, last_ns = self._last
+        back_ns = last_ns - t_ns
+        if back_ns > LATE_NS or (back_ns > 0 and 0 < (number - last) % _NUMBERS < _NUMBERS // 2):
+            raise EgmFault(f"the controller's clock jumped back by {back_ns / 1e9:.3f} s")
+        if back_ns >= 0:
+            self.counts.late += 1
+            return False
         return True
+
+    def _count_lost(self, number: int, t_ns: int) -> None:
+        """Count the packets that are missing before this one, the newest."""
+        if self._last is not None:
+            missing = (number - self._last[0]) % _NUMBERS - 1
+            # more than fit into the time: the controller restarted its count, as with each program
+            if 0 < missing <= (t_ns - self._last[1]) // _SHORTEST_NS:
+                self.counts.lost += missing
+        self._last = number, t_ns
 
 
 def _pose(cartesian: tuple[Any, Any]) -> Pose | None:

@@ -245,6 +245,10 @@ class FakeAbb(FakeController):
         if self._http is not None:
             self._http.cut()
 
+    def slow(self, answer_s: float) -> None:
+        """Take this time for every answer from now on."""
+        self._answer_s = answer_s
+
     def restore(self) -> None:
         """Clear every fault of connection, motors and mode, as an operator would."""
         self._unplug()

@@ -8,13 +8,12 @@ move is answered when the RAPID instruction returns. There is no stop command an
 from __future__ import annotations
 
 import math
-import socket
 import struct
-import time
 from collections.abc import Sequence
 from enum import IntEnum
 
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
+from sliplab.rigs.core.network import BoundedSocket
 
 _WORD = struct.Struct(">H")
 _UNIT_TOLERANCE = 0.01
@@ -74,10 +73,9 @@ class RapidSocket:
 
     def __init__(self, host: str, port: int, within_s: float) -> None:
         try:
-            self._socket = socket.create_connection((host, port), within_s)
+            self._socket = BoundedSocket.open(host, port, within_s)
         except OSError as error:
             raise RapidError(f"no connection to {host}:{port}: {error}") from None
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def ask(
         self, command: Command, *arguments: float | Sequence[float], within_s: float
@@ -92,10 +90,10 @@ class RapidSocket:
             for argument in arguments
             for value in (argument if isinstance(argument, Sequence) else [argument])
         ]
-        deadline = time.monotonic() + within_s
         try:
+            self._socket.expect(within_s)
             self._socket.sendall(_WORD.pack(command) + pack(command, flat))
-            (fine,) = _WORD.unpack(self._receive(_WORD.size, deadline))
+            (fine,) = _WORD.unpack(self._receive(_WORD.size))
             if fine not in {0, 1}:
                 raise RapidError(f"the answer to {command.name} begins with {fine}, not 0 or 1")
             if fine == 0:
@@ -103,7 +101,7 @@ class RapidSocket:
             if command is Command.INFO:
                 return ()
             numbers = struct.Struct(f">{RESULTS.get(command, 0)}f")
-            values = numbers.unpack(self._receive(numbers.size, deadline))
+            values = numbers.unpack(self._receive(numbers.size))
         except OSError as error:
             raise RapidError(f"no answer to {command.name}: {error}") from None
         if not all(map(math.isfinite, values)):
@@ -120,8 +118,8 @@ class RapidSocket:
         """
         self.ask(Command.INFO, within_s=within_s)
         try:
-            self._socket.settimeout(within_s)
-            return self._socket.recv(4096).decode("ascii", errors="replace").strip()
+            self._socket.expect(within_s)
+            return self._socket.receive(4096).decode("ascii", errors="replace").strip()
         except OSError as error:
             raise RapidError(f"no answer to INFO: {error}") from None
 
@@ -134,17 +132,10 @@ class RapidSocket:
         finally:
             self._socket.close()
 
-    def _receive(self, size: int, deadline: float) -> bytes:
+    def _receive(self, size: int) -> bytes:
         data = b""
         while len(data) < size:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise TimeoutError("timed out")
-            self._socket.settimeout(left)
-            more = self._socket.recv(size - len(data))
-            if not more:
-                raise ConnectionError("the connection was closed")
-            data += more
+            data += self._socket.receive(size - len(data))
         return data
 
 

@@ -1,7 +1,7 @@
 """ABB Robot Web Services with a timeout on every request, for motion programs on an IRC5.
 
-abb-robot-client 0.4.0 sets no timeout, so its session gets one here. The timeout applies to each
-wait for the next bytes of an answer; answers are a few hundred bytes.
+abb-robot-client 0.4.0 sets no timeout, so its session gets one here: to connect, and from a request
+to the end of its answer, in however many pieces that comes.
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ from abb_motion_program_exec.abb_motion_program_exec_client import (
 )
 from abb_robot_client.rws import RWS, ABBException
 from requests.adapters import HTTPAdapter
+from urllib3 import HTTPConnectionPool
+from urllib3.connection import HTTPConnection
 
 from sliplab.rigs.core.capabilities import UNKNOWN, ArmState, DeviceHealth, Pose
+from sliplab.rigs.core.network import BoundedSocket
 from sliplab.rigs.core.pose import from_quaternion
 from sliplab.rigs.devices.abb.settings import AbbSettings
 
 REQUEST_S = 1.0
-"""Timeout to connect, and of each wait for bytes of an answer, s."""
+"""Timeout to connect, and of an answer, s."""
 STATUS_REQUESTS = 4
 """Requests per status poll."""
 FULL_SPEED_PERCENT = 100.0
@@ -42,8 +45,40 @@ class WebRefused(WebError):
     """The web services refused a request, or answered with something else."""
 
 
+class _Connection(HTTPConnection):
+    """A connection whose answers end within `REQUEST_S`."""
+
+    def connect(self) -> None:
+        """Connect. Raises OSError."""
+        super().connect()
+        assert self.sock is not None
+        self.sock = BoundedSocket(fileno=self.sock.detach())
+        self.sock.settimeout(REQUEST_S)
+
+    def request(self, *what: Any, **how: Any) -> None:
+        """Send a request. Raises OSError."""
+        if self.sock is not None:
+            self.sock.settimeout(REQUEST_S)  # what is left of the last answer's time is no measure
+        super().request(*what, **how)
+
+    def getresponse(self) -> Any:
+        """Return the answer, which is read later, within `REQUEST_S` from now. Raises OSError."""
+        assert isinstance(self.sock, BoundedSocket)
+        self.sock.expect(REQUEST_S)
+        return super().getresponse()
+
+
+class _Pool(HTTPConnectionPool):
+    ConnectionCls = _Connection
+
+
 class _Bounded(HTTPAdapter):  # type: ignore[misc, unused-ignore]
-    """An HTTP adapter with a timeout."""
+    """An HTTP adapter with a timeout of connections and of whole answers."""
+
+    def init_poolmanager(self, *what: Any, **how: Any) -> None:
+        """Make the connections' pool."""
+        super().init_poolmanager(*what, **how)
+        self.poolmanager.pool_classes_by_scheme = {"http": _Pool}
 
     def send(self, request: Any, **how: Any) -> Any:
         """Send a request. Raises requests.RequestException after `REQUEST_S`."""
@@ -130,8 +165,12 @@ class WebServices:
         self._ask(lambda: self._client.execute_motion_program(program, self._task, wait=False))
 
     def stop(self) -> None:
-        """Stop the running program, and the arm with it. Raises WebError."""
-        self._ask(self._client.stop_motion_program)
+        """Stop the running program, and the arm with it.
+
+        Raises:
+            WebError: no answer, or another request of this session is still waiting for its own.
+        """
+        self._ask(self._client.stop_motion_program, REQUEST_S)
 
     def read_signal(self, name: str) -> float:
         """Read an analog signal. Raises WebError; WebRefused if there is none."""
@@ -152,11 +191,13 @@ class WebServices:
             else:
                 self._rws._session.close()
 
-    def _ask(self, request: Callable[[], T]) -> T:
+    def _ask(self, request: Callable[[], T], within_s: float = -1) -> T:
+        """Return the result of requests, which wait for earlier ones: for `within_s`, if given."""
+        if not self._lock.acquire(timeout=within_s):
+            raise WebError("the controller's web services have not answered an earlier request")
         try:
-            with self._lock:
-                self._answers = True
-                return request()
+            self._answers = True
+            return request()
         except requests.RequestException as error:
             self._answers = False
             raise WebError(f"the controller's web services do not answer: {error}") from None
@@ -164,6 +205,8 @@ class WebServices:
             raise WebRefused(f"the controller refused: {error}") from None
         except Exception as error:  # the client raises bare exceptions too
             raise WebRefused(str(error)) from None
+        finally:
+            self._lock.release()
 
 
 def abb_health(web: WebServices, notes: tuple[str, ...]) -> DeviceHealth:

@@ -25,7 +25,7 @@ from sliplab.rigs.core.capabilities import (
     Segment,
 )
 from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
-from sliplab.rigs.core.pose_stream import Sample
+from sliplab.rigs.core.pose_stream import PoseCheck, PoseJumpError, Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket, socket_health
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
@@ -56,6 +56,7 @@ class AbbSocketArm(ThreadedArm):
         self._settings = settings
         self._link: RapidSocket | None = None
         self._info = ""
+        self._check_pose = PoseCheck(settings.limits.speed_mm_s)
         self._start_pose = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self._one = threading.Lock()
         self._may_move = False
@@ -74,6 +75,7 @@ class AbbSocketArm(ThreadedArm):
         try:
             self._link = RapidSocket(settings.host, settings.port, ANSWER_S)
             self._info = self._link.info(ANSWER_S)
+            self._check_pose = PoseCheck(settings.limits.speed_mm_s)
             self._ask(Command.SET_TCP, frame.xyz_mm, quaternion(frame))
             self._ask(Command.SET_WORK_OBJECT, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
             self._settle(self._link)
@@ -273,6 +275,12 @@ class AbbSocketArm(ThreadedArm):
         values = link.ask(Command.POSE, within_s=ANSWER_S)
         answered = time.monotonic_ns()
         pose = from_quaternion(values[:3], values[3:])
+        try:
+            believed = self._check_pose.believes(asked, answered, pose)
+        except PoseJumpError as error:
+            raise RapidError(str(error)) from None
+        if not believed:
+            raise RapidError("the answer to POSE is one that the arm cannot have reached")
         self._stream.add(Sample((asked + answered) // 2, answered, pose.xyz_mm, pose.rotvec_deg))
 
     def _ask(

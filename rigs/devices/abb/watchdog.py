@@ -59,7 +59,7 @@ class Watchdog:
             self._thread.start()
         web.write_signal(LIMIT, self._limit_s)
         deadline = time.monotonic() + ECHO_S
-        while (web.read_signal(ECHO) - first) % _WRAP >= _WRAP / 2:
+        while not (web.read_signal(ECHO) - first) % _WRAP < _WRAP / 2:  # NaN, too
             if time.monotonic() > deadline:
                 raise WebRefused(f"{ECHO} does not follow {BEAT}: the task is not running")
 
@@ -73,7 +73,7 @@ class Watchdog:
 
     def stopped_it(self, web: WebServices) -> bool:
         """Return whether the watchdog task has stopped the arm. Raises WebError."""
-        return web.read_signal(LIMIT) == 0
+        return not web.read_signal(LIMIT) > 0
 
     def close(self, watch: bool) -> None:
         """End the heartbeat and log out; takes at most 5 requests.

@@ -1,9 +1,11 @@
 """Driver of ATI Net F/T sensors.
 
 A thread takes every record with the host's time of its arrival. The sensor's clock is its sample
-counter, `ft_sequence`, in nanoseconds at its nominal rate: it goes on whether or not records are
-lost. A record that comes after a later one is counted and dropped, so that times never fall back.
-Every wait is bounded by the settings; what goes wrong is a `RigError` in the next call.
+counter, `ft_sequence`, in nanoseconds at its nominal rate: it continues whether or not records are
+lost. A record that comes after a later one is counted and dropped, so that times never fall back,
+and so is one whose counter is ahead of the time that has passed. Silence is the time without an
+accepted record, whatever else arrives. Every wait is bounded by the settings; what goes wrong is a
+`RigError` in the next call.
 """
 
 from __future__ import annotations
@@ -14,12 +16,15 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import DeviceHealth, Mounting, RigError
+from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.network import BoundedSocket
 from sliplab.rigs.devices.ati_net_ft import rdt
 from sliplab.rigs.devices.ati_net_ft.settings import FILTER_NUMBERS, AtiNetFtSettings
 from sliplab.storage.streams import Json, WrenchChunk
@@ -32,6 +37,8 @@ LOOK_S = 0.05
 JOIN_S = 1.0
 BACKLOG = 1 << 20
 """Records kept for a reader, two minutes at most; older ones are dropped, and counted."""
+MISSING = 1 << 12
+"""Numbers of missing records that are remembered, for those that come late."""
 RECEIVE_BYTES = 1 << 20
 """Kernel's buffer: a host that is busy for some seconds loses nothing."""
 _WRAP, _HALF = 1 << 32, 1 << 31
@@ -46,18 +53,26 @@ class Counts:
     """Missing by their numbers, and not come late either."""
     late: int = 0
     """Came after a later one, or twice; dropped."""
+    ahead: int = 0
+    """Sample counter farther ahead than the time that has passed allows; dropped."""
     malformed: int = 0
     dropped: int = 0
     """Nobody read them in time."""
 
 
 class AtiNetFt:
-    """An ATI Net F/T sensor; a `ForceSensor` of `rigs.core.capabilities`."""
+    """An ATI Net F/T sensor; a `ForceSensor` of `rigs.core.capabilities`.
+
+    Args:
+        now_ns: the host's monotonic clock.
+    """
 
     grade: ForceGrade = "host time"
 
-    def __init__(self, settings: AtiNetFtSettings) -> None:
-        self._settings = settings
+    def __init__(
+        self, settings: AtiNetFtSettings, now_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._settings, self._now_ns = settings, now_ns
         self.mounting = Mounting(
             "plate", settings.mounting_rotvec_deg, "plate" if settings.mounted == "plate" else "arm"
         )
@@ -73,7 +88,17 @@ class AtiNetFt:
         self._ticks: int | None = None
         """Sample counter of the last record, unwrapped."""
         self._number: int | None = None
-        self.counts = Counts()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin a stream: nothing is known of its records."""
+        self.counts, self._fault = Counts(), None
+        self._number = self._ticks = None
+        self._missing: deque[int] = deque(maxlen=MISSING)
+        self._passed = self._rejected = 0
+        self._least_ns: int | None = None
+        """Shortest delay of a record against the first one's."""
+        self._silence = StallTimer(self._now_ns, LOOK_S)
 
     def connect(self) -> None:
         """Read and write the sensor's settings, and see that a record comes.
@@ -117,8 +142,7 @@ class AtiNetFt:
         self._halt()
         with self._lock:
             self._waiting.clear()
-            self.counts, self._fault = Counts(), None
-            self._number = self._ticks = None
+            self._forget()
         self._drain()
         self._send(rdt.STREAM)
         self._ending.clear()
@@ -229,10 +253,9 @@ class AtiNetFt:
 
     def _get(self, path: str) -> bytes:
         settings = self._settings
-        link = http.client.HTTPConnection(
-            settings.host, settings.web_port, timeout=settings.answer_s
-        )
+        link = http.client.HTTPConnection(settings.host, settings.web_port)
         try:
+            link.sock = BoundedSocket.open(settings.host, settings.web_port, settings.answer_s)
             link.request("GET", f"/{path}")
             answer = link.getresponse()
             body = answer.read(1 << 20)
@@ -285,12 +308,12 @@ class AtiNetFt:
         raise self._absent(f"none within {TRIES * self._settings.answer_s:g} s")
 
     def _drain(self) -> None:
-        """Forget what came before the stream."""
+        """Forget what came before the stream; no more than the kernel's buffer can hold."""
         if self._socket is None:
             return
         self._socket.setblocking(False)
         with contextlib.suppress(OSError):
-            while True:
+            for _ in range(RECEIVE_BYTES):
                 self._socket.recv(2048)
         self._socket.settimeout(LOOK_S)
 
@@ -307,32 +330,46 @@ class AtiNetFt:
 
     def _listen(self) -> None:
         """The thread: every record, until the stream ends or cannot be believed."""
-        link, silent_s = self._socket, 0.0
+        link = self._socket
         assert link is not None
         last: int | None = None
         try:
             while not self._ending.is_set():
                 try:
-                    data = link.recv(2048)
+                    data: bytes | None = link.recv(2048)
                 except TimeoutError:
-                    silent_s += LOOK_S  # a host that stood still itself is no silence
-                    if silent_s >= self._settings.silence_s:
-                        self._fail(
-                            f"nothing came for {self._settings.silence_s:g} s; check its power "
-                            "and its cable, and that no other program reads it"
-                        )
-                        return
-                    continue
-                host_ns, silent_s = time.monotonic_ns(), 0.0
+                    data = None
                 with self._lock:
-                    last = self._take(data, host_ns, last)
+                    if data is not None:
+                        last = self._take(data, self._now_ns(), last)
+                    self._check_silence()
+                    if self._fault is not None:
+                        return
         except Exception as error:  # a thread that dies must not look like a silent sensor
             self._fail(f"its stream ended: {error}")
 
+    def _check_silence(self) -> None:
+        """Note a fault if no record was accepted for too long; a host that was suspended waits."""
+        silence_s = self._settings.silence_s
+        if self._fault is not None or self._silence.waited_s(self.counts.received) < silence_s:
+            return
+        counts = self.counts
+        self._fault = (
+            f"none of {self._rejected} datagrams of the last {silence_s:g} s could be used (since "
+            f"the start {counts.late} late, {counts.ahead} ahead of their time, "
+            f"{counts.malformed} malformed): it restarted, or another program reads it; start the "
+            "trial again"
+            if self._rejected
+            else f"nothing came for {silence_s:g} s; check its power and its cable, and that no "
+            "other program reads it"
+        )
+
     def _take(self, data: bytes, host_ns: int, last: int | None) -> int | None:
-        """Take one datagram; returns the sample counter of the newest record."""
+        """Take one datagram; returns the sample counter of the newest record that was accepted."""
+        counts = self.counts
+        self._rejected += 1
         if len(data) != rdt.RECORD.itemsize:
-            self.counts.malformed += 1
+            counts.malformed += 1
             return last
         number, ticks, status = rdt.SEQUENCES.unpack_from(data)
         problem = rdt.status_problem(status)
@@ -342,27 +379,53 @@ class AtiNetFt:
         step = 1 if self._number is None else _signed(number - self._number)
         gone = 1 if last is None else _signed(ticks - last)
         if step <= 0 and gone <= 0:
-            self.counts.late += 1
-            self.counts.lost = max(self.counts.lost - (step < 0), 0)
+            counts.late += 1
+            if number in self._missing:
+                self._missing.remove(number)
+                counts.lost -= 1
             return last
         if gone <= 0:
             self._fault = self._fault or (
                 "its sample counter stopped or fell back: it restarted; start the trial again"
             )
             return last
-        self.counts.lost += max(step - 1, 0)
-        self.counts.received += 1
-        self.counts.dropped += len(self._waiting) == BACKLOG
-        self._number = number
+        if last is None:
+            self._passed, self._least_ns = 0, None
+        elif self._is_ahead(self._passed + gone, host_ns):
+            counts.ahead += 1
+            return last
+        else:
+            self._passed += gone
+        delay_ns = self._delay_ns(self._passed, host_ns)
+        self._least_ns = delay_ns if self._least_ns is None else min(self._least_ns, delay_ns)
+        if 1 < step <= gone:  # else the numbers of another request began
+            counts.lost += step - 1
+            first = number - min(step - 1, MISSING)
+            self._missing.extend(one % _WRAP for one in range(first, number))
+        counts.received += 1
+        counts.dropped += len(self._waiting) == BACKLOG
+        self._number, self._rejected = number, 0
         self._waiting.append((data, host_ns))
-        return ticks
+        return int(ticks)
+
+    def _delay_ns(self, passed: int, host_ns: int) -> int:
+        """Delay of a record, against an unknown constant, ns."""
+        return host_ns - passed * 1_000_000_000 // self._settings.tick_hz
+
+    def _is_ahead(self, passed: int, host_ns: int) -> bool:
+        """Return whether a record came before the time that its sample counter says.
+
+        The one that came fastest is the measure: what waited in a buffer may come in a burst.
+        """
+        least_ns, slack_ns = self._least_ns, self._settings.silence_s * 1e9
+        return least_ns is not None and self._delay_ns(passed, host_ns) < least_ns - slack_ns
 
     def _fail(self, fault: str) -> None:
         with self._lock:
             self._fault = self._fault or fault
 
     def _unwrap(self, ticks: np.ndarray) -> np.ndarray:
-        """Return counter readings (n,) as numbers that go on where 32 bits begin anew."""
+        """Unwrap readings (n,) of the 32-bit counter."""
         first = int(ticks[0]) if self._ticks is None else self._ticks
         steps = np.diff(ticks, prepend=first % _WRAP)
         steps = (steps + _HALF) % _WRAP - _HALF

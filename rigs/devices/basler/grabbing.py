@@ -3,7 +3,8 @@
 Pylon fills a fixed number of buffers and drops frames that find none free, so a dedicated thread
 empties them into a bounded queue. If the queue is not read, it fills up, then pylon's buffers do,
 and only then are frames lost, which shows as a gap in the camera's frame ids. Where the time of a
-frame comes separately, as an event, the thread waits for it.
+frame comes separately, as an event, the thread waits for it. Silence is the time without a frame
+that is delivered: incomplete frames, repeated ones and those without a time are none.
 """
 
 from __future__ import annotations
@@ -32,6 +33,12 @@ _DRAIN_ROUNDS = 2
 """Consecutive empty polls after which a stopped camera has no more frames."""
 NO_ID = (1 << 64) - 1
 """Block id of pylon that means none."""
+GIGE_IDS = 65_535
+"""Block ids of a GigE camera: 1 to 65,535, then 1 again; more than that, where it extends them."""
+FASTER, SPARE = 1.5, 100
+"""Largest gap in the ids: so many times the frames that fit into the time, and so many more."""
+MOST_EXPOSURES = 1000
+"""Exposure ends that wait for their frame."""
 
 
 @dataclass
@@ -43,7 +50,8 @@ class GrabCounts:
         failed: incomplete frames.
         skipped: frames missing in the camera's ids, or overwritten in pylon.
         late: frames with a longer delay than `late_s` allows; they are delivered.
-        out_of_order: frames after a later one, and duplicates; they are not delivered.
+        out_of_order: frames after a later one, duplicates, and ids that are too far ahead; they are
+            not delivered.
         unstamped: frames without a time stamp; they are not delivered.
     """
 
@@ -81,6 +89,8 @@ class _Waiting:
     number: int
     host_ns: int
     sync: int
+    block: int
+    """Id by which an exposure's end names it."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +133,9 @@ class Grab:
         self._counts = GrabCounts()
         self._fault: RigError | None = None
         self._last = -1
+        self._last_block: int | None = None
+        self._last_seen = (0, 0)
+        """Device's stamp and arrival of the last frame, ns."""
         self._shortest_ns: int | None = None
         self._latest_ns: int | None = None
         self._before: tuple[int, int] | None = None
@@ -153,9 +166,11 @@ class Grab:
                 return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")
             if limit and silent_ns > limit:
                 what = "no frame" if self._received else "no frame since the start,"
+                useless = self._counts.lost
+                but = f" ({useless} lost or unusable since the start)" if useless else ""
                 return RigError(
                     DEVICE,
-                    f"{what} for {silent_ns / 1e9:.1f} s; check its cable, its power and its "
+                    f"{what} for {silent_ns / 1e9:.1f} s{but}; check its cable, its power and its "
                     "trigger",
                 )
             return None
@@ -199,15 +214,13 @@ class Grab:
                 now_ns = time.monotonic_ns()
                 if result is None or not result.IsValid():
                     empty += 1
-                    # time for which this computer was suspended is not silence of the camera
-                    self._silent_ns += min(now_ns - asked_ns, POLL_MS * 1_000_000)
                 else:
                     empty = 0
                     try:
                         self._add(result, now_ns)
                     finally:
                         result.Release()
-                self._deliver(now_ns)
+                self._deliver(now_ns, asked_ns)
                 # not at every frame: each call into pylon releases the interpreter lock, and a busy
                 # interpreter is slow to return it
                 if now_ns - looked_ns > POLL_MS * 1_000_000:
@@ -240,30 +253,56 @@ class Grab:
 
     def _add(self, result: Any, now_ns: int) -> None:
         """Count one grab result, and queue it if it is a frame."""
+        good = bool(result.GrabSucceeded())
+        stamp = self._stamp(result, now_ns) if good else None
         block = int(result.BlockID)
-        counted = block if block != NO_ID else int(result.ImageNumber) - 1
-        number = counted - (self._settings.first_id if block != NO_ID else 0)
+        if block == NO_ID:
+            block = int(result.ImageNumber) - 1 + self._settings.first_id
         counts = self._counts
         with self._changed:
-            self._received, self._silent_ns = True, 0
-            if number <= self._last:
+            if not self._received:
+                self._received, self._silent_ns = True, 0
+            step = self._step(block, stamp, now_ns)
+            if step <= 0:
                 counts.out_of_order += 1
                 return
-            missing = number - self._last - 1
             overwritten = int(result.NumberOfSkippedImages)
             # frames overwritten in pylon are missing in the ids too, where there are ids
-            counts.skipped += max(missing, overwritten)
-            self._last = number
-            if not result.GrabSucceeded():
+            counts.skipped += max(step - 1, overwritten)
+            self._last += step
+            self._last_block, self._last_seen = block, (stamp or self._last_seen[0], now_ns)
+            if not good:
                 counts.failed += 1
                 return
         sync = 0
         if self._settings.sync_bit is not None:
             sync = int(result.ChunkLineStatusAll.Value) >> self._settings.sync_bit & 1
-        stamp = self._stamp(result, now_ns)
         if stamp is not None:
-            self._exposures[counted] = stamp
-        self._waiting.append(_Waiting(result.Array, number, now_ns, sync))
+            self._exposures[block] = stamp
+        self._waiting.append(_Waiting(result.Array, self._last, now_ns, sync, block))
+
+    def _step(self, block: int, stamp: int | None, now_ns: int) -> int:
+        """Return by how many frames a block is after the last one; 0 or less if it is not.
+
+        A gap for which the time since the last frame is too short is none: the camera began again,
+        or the id is invalid.
+        """
+        last, settings = self._last_block, self._settings
+        if last is None:
+            return block - settings.first_id + 1
+        step = block - last
+        if settings.first_id == 1 and max(block, last) <= GIGE_IDS:  # USB counts in 64 bits
+            half = GIGE_IDS // 2
+            step = (step + half) % GIGE_IDS - half
+        # frames that waited in pylon's buffers come in a burst: the camera's stamps are better
+        stamp_ns, arrival_ns = self._last_seen
+        passed_ns = settings.queue * settings.period_ns
+        if stamp and stamp_ns and settings.stamping.means != "host arrival":
+            passed_ns = stamp - stamp_ns
+        passed_ns = max(passed_ns, now_ns - arrival_ns)
+        if settings.period_ns and step - 1 > FASTER * passed_ns / settings.period_ns + SPARE:
+            return 0
+        return step
 
     def _stamp(self, result: Any, now_ns: int) -> int | None:
         """Return the frame's own stamp, ns; None where it comes as an event."""
@@ -277,14 +316,18 @@ class Grab:
             raise RigError(DEVICE, f"its {means} has no time stamp, though the camera offers one")
         return stamp
 
-    def _deliver(self, now_ns: int) -> None:
-        """Move the frames whose times are known to the queue, in order."""
-        settings = self._settings
+    def _deliver(self, now_ns: int, asked_ns: int) -> None:
+        """Move the frames whose times are known to the queue, in order.
+
+        Args:
+            asked_ns: since when frames were waited for.
+        """
+        settings, before = self._settings, self._counts.grabbed
         while self._waiting:
             frame = self._waiting[0]
-            stamp = self._exposures.pop(frame.number + settings.first_id, None)
+            stamp = self._exposures.pop(frame.block, None)
             if stamp is None and now_ns - frame.host_ns < EVENT_WAIT_S * 1e9:
-                return
+                break
             self._waiting.popleft()
             with self._changed:
                 if stamp is None:
@@ -302,6 +345,15 @@ class Grab:
                 self._ready.append(
                     Frame(frame.image, frame.number, middle, frame.host_ns, frame.sync)
                 )
+        for block in list(self._exposures)[:-MOST_EXPOSURES]:  # of frames that never came
+            self._exposures.pop(block, None)
+        with self._changed:
+            if self._counts.grabbed > before:
+                self._silent_ns = 0
+            else:
+                # time for which this computer was suspended is not silence of the camera
+                passed_ns = time.monotonic_ns() - asked_ns
+                self._silent_ns += min(passed_ns, POLL_MS * 1_000_000)
 
     def _is_late(self, frame: _Waiting, stamp_ns: int) -> bool:
         """Return whether a frame's delay exceeds the shortest one of this run by too much."""

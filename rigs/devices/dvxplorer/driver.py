@@ -49,7 +49,7 @@ class EventCounts:
         longest_gap_us: longest interval between two events.
         filtered: events dropped by the noise filter, if it is on.
         overflowed: events dropped because the buffer was full; the run then ends with an error.
-        other_triggers: triggers other than rising edges.
+        other_triggers: triggers other than rising edges, and repeated ones.
         before: events discarded before the run.
     """
 
@@ -231,16 +231,22 @@ class DvxplorerCamera:
             try:
                 wanted = self._wanted
                 batch = source.poll()
+                news = False
                 if batch.events is not None:
-                    self._take_events(batch.events, batch.filtered)
+                    news = self._take_events(batch.events, batch.filtered)
                 if len(batch.trigger_us):
-                    self._take_triggers(batch)
+                    news |= self._take_triggers(batch)
                 now_ns = time.monotonic_ns()
+                with self._lock:
+                    # time for which this computer was suspended is not the camera's silence
+                    passed_ns = min(now_ns - self._asked_ns, _POLL_NS)
+                    self._silent_ns = 0 if news else self._silent_ns + passed_ns
+                    stuck = self._keep and self._silent_ns > self.settings.stall_s * 1e9
+                if stuck and not batch.empty:
+                    self._fail(f"its clock has stopped for {self.settings.stall_s:g} s")
                 if batch.empty:
                     with self._lock:
                         self._keep = wanted
-                        # time for which this computer was suspended is not the camera's silence
-                        self._silent_ns += min(now_ns - self._asked_ns, _POLL_NS)
                     if wanted == self._wanted:
                         self._settled.set()
                     if not batch.running:
@@ -259,32 +265,40 @@ class DvxplorerCamera:
             if self._fault is None:
                 self._fault = RigError(DEVICE, what)
 
-    def _take_events(self, chunk: EventChunk, filtered: int) -> None:
+    def _take_events(self, chunk: EventChunk, filtered: int) -> bool:
+        """Keep events; return whether they show that the camera and its clock run."""
         if not self._keep:
             with self._lock:
                 self._counts.before += len(chunk) + filtered
-            return
+            return True
         with self._lock:
-            counts, self._silent_ns = self._counts, 0
+            counts = self._counts
             counts.filtered += filtered
             if not len(chunk) or self._fault is not None:
                 counts.overflowed += len(chunk) if counts.overflowed else 0
-                return
+                return filtered > 0
             if (self._held + len(chunk)) * _EVENT_BYTES > self.settings.buffer_mb * 1e6:
                 counts.overflowed += len(chunk)
                 self._fault = RigError(
                     DEVICE, f"was not read in time: {self.settings.buffer_mb:g} MB are full"
                 )
-                return
+                return False
+            before_us = self._last_us
             if not self._in_order(chunk.t_us):
                 self._fault = RigError(
                     DEVICE, f"its clock jumped back after {self._last_us} us; begin a new trial"
                 )
-                return
+                return False
+            if int(chunk.x.max()) >= self.width or int(chunk.y.max()) >= self.height:
+                self._fault = RigError(
+                    DEVICE, f"sent an event outside of its {self.width} x {self.height} px"
+                )
+                return False
             self._last_us = int(chunk.t_us[-1])
             counts.events += len(chunk)
             self._held += len(chunk)
             self._events.append(chunk)
+            return before_us is None or self._last_us > before_us or filtered > 0
 
     def _in_order(self, t_us: I64) -> bool:
         """Return whether times do not decrease; count gaps."""
@@ -297,11 +311,12 @@ class DvxplorerCamera:
         counts.longest_gap_us = max(counts.longest_gap_us, int(steps.max()))
         return True
 
-    def _take_triggers(self, batch: Batch) -> None:
+    def _take_triggers(self, batch: Batch) -> bool:
+        """Keep pulses; return whether there is a new one."""
         if not self._keep:
-            return
+            return True
         with self._lock:
-            self._silent_ns = 0
+            before = self._counts.pulses
             kinds = batch.trigger_kind.tolist()
             for at, kind in zip(batch.trigger_us.tolist(), kinds, strict=True):
                 if kind == TIMESTAMP_RESET:
@@ -312,7 +327,10 @@ class DvxplorerCamera:
                     self._fault = RigError(
                         DEVICE, f"its clock jumped back after the pulse at {self._last_pulse_us} us"
                     )
+                elif at == self._last_pulse_us:  # the same pulse again
+                    self._counts.other_triggers += 1
                 elif self._fault is None:
                     self._last_pulse_us = at
                     self._counts.pulses += 1
                     self._pulses.append(at)
+            return self._counts.pulses > before

@@ -8,9 +8,7 @@ process: `rigs.devices.dvxplorer.process` runs all of this in a child process.
 
 from __future__ import annotations
 
-import socket
 import struct
-import time
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Protocol
@@ -18,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sliplab.rigs.core.capabilities import DeviceHealth, RigError
+from sliplab.rigs.core.network import BoundedSocket
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream, UsbCamera
 from sliplab.storage.streams import I64, U8, EventChunk, Json
 
@@ -362,12 +361,11 @@ def check_header(host: str, port: int) -> None:
     at = f"{host}:{port}"
     expected = "a stream of dv-processing sends its header on connecting"
     came = bytearray()
-    end = time.monotonic() + HEADER_S
     try:
-        with socket.create_connection((host, port), HEADER_S) as link:
+        with BoundedSocket.open(host, port, HEADER_S) as link:
+            link.expect(HEADER_S, _MOST_HEADER)
             need = 12
             while len(came) < need:
-                link.settimeout(max(end - time.monotonic(), 0.001))
                 part = link.recv(need - len(came))
                 if not part:
                     break

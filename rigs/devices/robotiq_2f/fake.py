@@ -102,6 +102,15 @@ class FakeRobotiq:
             self.registers["FLT"] = OVERCURRENT
             self._fingers.stop(self._now_ns())
 
+    def cut(self) -> None:
+        """Break the open connections; new ones are accepted."""
+        self._server.cut()
+
+    def send(self, data: bytes) -> None:
+        """Send bytes to every client, which none has asked for."""
+        for handler in list(self._server.open):
+            handler.wfile.write(data)
+
     def close(self) -> None:
         """Break the connections; safe to call more than once."""
         self._server.shutdown()
@@ -174,6 +183,10 @@ class _Server(socketserver.ThreadingTCPServer):
     def end(self) -> None:
         """Close the port and every connection."""
         self.server_close()
+        self.cut()
+
+    def cut(self) -> None:
+        """Break every connection."""
         for handler in list(self.open):
             with contextlib.suppress(OSError):
                 handler.connection.shutdown(2)

@@ -11,6 +11,7 @@ Source: Robotiq, instruction manual of 2F-85 and 2F-140, register mapping and sp
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 
 from sliplab.rigs.core.gripper_range import GripperRange
@@ -37,7 +38,22 @@ FAULTS: Mapping[int, str] = {
     14: "draws too much current",
     15: "has released automatically",
 }
+LARGEST: Mapping[str, int] = {"STA": 3, "OBJ": 3}
+"""Largest value of a register that has not all of `COUNTS`."""
 _EPS = 1e-6
+
+
+def register(name: str, line: bytes) -> int:
+    """Return a register's value from the answer to its question.
+
+    Raises:
+        ValueError: it answers another question, or has no such value.
+    """
+    found, _, value = line.decode("ascii", "replace").strip().partition(" ")
+    most = LARGEST.get(name, COUNTS)
+    if found != name or not re.fullmatch("[0-9]{1,3}", value) or int(value) > most:
+        raise ValueError(f"answered {line.strip()!r} to GET {name}, not {name} 0 to {most}")
+    return int(value)
 
 
 def range_of(model: Model) -> GripperRange:

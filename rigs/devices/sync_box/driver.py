@@ -7,6 +7,7 @@ raises a `SyncBoxFault`, and the next `start` reconnects.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -68,8 +69,11 @@ class Train:
         """Longest time between two pulses, s."""
         return LONGEST_GAP_TICKS * 1000 / self._millihertz
 
-    def tick(self, number: int, bit: int, us: int) -> int | None:
+    def tick(self, number: int, bit: int, us: int, latest_us: float = math.inf) -> int | None:
         """Check a tick's report; return its time since tick 0, us, if it has a pulse, else None.
+
+        Args:
+            latest_us: latest plausible time since tick 0.
 
         Raises:
             ValueError: it is not a tick of this train.
@@ -78,6 +82,8 @@ class Train:
             raise ValueError(f"tick {number} after {self._next_tick - 1}")
         since_us = us - self.first_us
         due_us = number * 1_000_000_000 // self._millihertz
+        if since_us > latest_us:  # otherwise every later one would seem too early
+            raise ValueError(f"tick {number} at {us} us lies in the future")
         if since_us != due_us or bit != self._bits.upto(number + 1)[number]:
             raise ValueError(f"tick {number}: bit {bit}, {since_us} us")
         self._miss_to(number)
@@ -117,6 +123,8 @@ MOST_WAITING = 100_000
 """Buffered pulses or exposures: 17 minutes at 100 Hz. Further ones are counted, not kept."""
 AHEAD_US = 1_000_000
 """Largest lead of an exposure over the host's clock, besides 2 %; a larger one is garbled."""
+TICK_AHEAD_US = 5_000_000
+"""The same of a tick, which was checked against the train; a scene may jump ahead."""
 MOST_EARLY = 1000
 """Buffered reports before the answer to `GO`, in case the request must be repeated."""
 
@@ -328,19 +336,22 @@ class SerialSyncBox:
         numbers = [whole(word) for word in rest.split(" ")]
         if kind == "D":
             (train.losses.told_by_box,) = numbers
-        elif train.first_us is None:
+            return True
+        if train.first_us is None:
             if len(self._early) < MOST_EARLY:
                 self._early.append(body)
-        elif kind == "P":
+            return True
+        passed_us = (self._now_ns() - self._asked_ns) // 1000
+        latest_us = passed_us + passed_us // 50
+        if kind == "P":
             number, bit, us = numbers
-            since_us = train.tick(number, bit, us)
+            since_us = train.tick(number, bit, us, latest_us + TICK_AHEAD_US)
             self._heard_ns = self._now_ns()
             if since_us is not None:
                 self._keep(self._pulses, since_us, train)
         else:
             number, us = numbers
-            passed_us = (self._now_ns() - self._asked_ns) // 1000
-            since_us = train.exposure(number, us, passed_us + passed_us // 50 + AHEAD_US)
+            since_us = train.exposure(number, us, latest_us + AHEAD_US)
             if since_us >= 0:
                 self._keep(self._exposures, since_us, train)
         return True

@@ -28,7 +28,7 @@ from sliplab.rigs.core.capabilities import (
     Segment,
 )
 from sliplab.rigs.core.pose import MM_PER_M, TURN_PER_M, distance_mm, segment_seconds, to_ur
-from sliplab.rigs.core.pose_stream import Sample
+from sliplab.rigs.core.pose_stream import PoseCheck, PoseJumpError, Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.ur import ports
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
@@ -90,6 +90,9 @@ class UrArm(ThreadedArm):
         self._control: ControlProcess | None = None
         self._listener: threading.Thread | None = None
         self._status: UrStatus | None = None
+        self._check_pose = PoseCheck()
+        self._advanced_ns: int | None = None
+        """Host time of the last packet with a new time."""
         self._remote = True
         self._closing = False
         self._moved_ns: int | None = None
@@ -120,6 +123,7 @@ class UrArm(ThreadedArm):
             self._check_remote()
             self._check_free()
             self._take_control()
+            self._check_pose.active = True
         except BaseException:
             self.close()
             raise
@@ -157,8 +161,8 @@ class UrArm(ThreadedArm):
             raise ArmFault("arm", f"{error}; check its power and network") from None
 
     def describe(self) -> Json:
-        """Return the number of missing poses since connecting, from gaps in the clock."""
-        return {"poses_missing": self._missing}
+        """Return the counts of missing poses, by gaps in the clock, and of those not believed."""
+        return {"poses_missing": self._missing, "poses_implausible": self._check_pose.dropped}
 
     def start(self, path: Sequence[Segment]) -> None:
         """Check `path` against all limits, and start its first move on the controller.
@@ -275,7 +279,9 @@ class UrArm(ThreadedArm):
                 "arm", f"{error}; check its power, its network and its address"
             ) from None
         self._reader, self._status, self._lost, self._closing = reader, None, None, False
-        self._missing = 0
+        self._missing, self._advanced_ns = 0, None
+        self._check_pose = PoseCheck(self._settings.limits.speed_mm_s)
+        self._check_pose.active = False  # until the tool is set, which moves its centre point
         self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
         self._listener.start()
         first = self._stream.wait_for(lambda: bool(self._status or self._lost), SILENCE_S + 0.5)
@@ -339,7 +345,8 @@ class UrArm(ThreadedArm):
         except Exception as error:  # a thread that dies must not look like an arm at rest
             if self._closing:
                 return
-            self._lost = str(error) if isinstance(error, RtdeError) else f"its stream: {error!r}"
+            named = isinstance(error, RtdeError | PoseJumpError)
+            self._lost = str(error) if named else f"its stream: {error!r}"
             if self._control is not None:
                 self._control.kill()  # or it would reconnect and repeat the move
             self._stream.wake()
@@ -353,6 +360,17 @@ class UrArm(ThreadedArm):
                 f"jumped back by {-seconds:.3f} s" if seconds < 0 else f"jumped by {seconds:.3f} s"
             )
             raise RtdeError(f"its clock {how}: the controller restarted, or packets are invalid")
+        if before is not None and status.t_ns == before.t_ns and self._advanced_ns is not None:
+            if packet.host_ns - self._advanced_ns > SILENCE_S * 1e9:
+                raise RtdeError(f"its clock has stopped for {SILENCE_S:g} s")
+            return
+        self._advanced_ns = packet.host_ns
+        x, y, z, a, b, c = packet.values[1:7]
+        xyz_mm = (x * MM_PER_M, y * MM_PER_M, z * MM_PER_M)
+        rotvec_deg = (math.degrees(a), math.degrees(b), math.degrees(c))
+        pose = Pose(xyz_mm, rotvec_deg)
+        if not self._check_pose.believes(status.t_ns, packet.host_ns, pose):
+            return
         if before is not None:
             cycles = (status.t_ns - before.t_ns) * self._settings.frequency_hz / 1e9
             self._missing += max(round(cycles) - 1, 0)
@@ -365,9 +383,6 @@ class UrArm(ThreadedArm):
         moved_ns = self._moved_ns
         if moved_ns is not None and packet.host_ns > moved_ns + _NEWS_S * 1e9 and _rests(status):
             self._rested(moved_ns)
-        x, y, z, a, b, c = packet.values[1:7]
-        xyz_mm = (x * MM_PER_M, y * MM_PER_M, z * MM_PER_M)
-        rotvec_deg = (math.degrees(a), math.degrees(b), math.degrees(c))
         self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
         if self.on_wrench is not None:
             self.on_wrench(status.t_ns, packet.host_ns, packet.values[-6:])

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import time
 
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
+from sliplab.rigs.core.network import BoundedSocket
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 HEALTH_S = 1.0
@@ -30,12 +30,11 @@ def dashboard(host: str, request: str, within_s: float) -> str:
     Raises:
         PortError: no connection or no answer within `within_s` seconds.
     """
-    deadline = time.monotonic() + within_s
     try:
-        with socket.create_connection((host, DASHBOARD_PORT), within_s) as link:
-            _line(link, deadline)  # the greeting
+        with BoundedSocket.open(host, DASHBOARD_PORT, within_s) as link:
+            _line(link)  # the greeting
             link.sendall(request.encode() + b"\n")
-            return _line(link, deadline)
+            return _line(link)
     except OSError as error:
         raise PortError(f"dashboard of {host}: '{request}': {error}") from None
 
@@ -73,17 +72,10 @@ def end_program(host: str, deceleration_m_s2: float, within_s: float) -> bool:
     return False
 
 
-def _line(link: socket.socket, deadline: float) -> str:
+def _line(link: BoundedSocket) -> str:
     data = b""
     while not data.endswith(b"\n"):
-        left = deadline - time.monotonic()
-        if left <= 0:
-            raise TimeoutError("no answer in time")
-        link.settimeout(left)
-        more = link.recv(4096)
-        if not more:
-            raise ConnectionError("the connection was closed")
-        data += more
+        data += link.receive(4096)
         if len(data) > _LONGEST_LINE:
             raise ConnectionError("the answer is not a line of text")
     return data.decode(errors="replace").strip()

@@ -132,18 +132,28 @@ class Capture:
 
     def _grab(self) -> None:
         """Grab for as long as frames come; runs in a thread."""
+        height, width = self._settings.height_px, self._settings.width_px
+        fault = (
+            "it gives no more frames: unplugged, or its driver gave up; check its cable"
+            if self._settings.is_camera
+            else "its stream has ended"
+        )
         while self._device.grab():
             now_ns = time.monotonic_ns()
             with self._lock:
-                self._seen += 1
                 region, run = self._region, self._run
+                self._seen += region is None
             if region is None:
                 continue
             good, picture = self._device.retrieve()
             if not good:
                 break
+            if picture.shape[:2] != (height, width):
+                fault = f"it changed to {picture.shape[1]} x {picture.shape[0]} px; open it again"
+                break
             image = np.ascontiguousarray(_grey(picture)[region])
             with self._lock:
+                self._seen += 1
                 if self._run != run or self._region is None:
                     continue
                 if len(self._ready) < self._most:
@@ -152,11 +162,7 @@ class Capture:
                     self._overflowed += 1
                 self._grabbed += 1
         with self._lock:
-            self._fault = (
-                "it gives no more frames: unplugged, or its driver gave up; check its cable"
-                if self._settings.is_camera
-                else "its stream has ended"
-            )
+            self._fault = fault
 
 
 def configure(device: Any, settings: UvcSettings) -> Json:

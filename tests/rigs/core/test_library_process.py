@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
@@ -25,6 +26,12 @@ def serve(fd: int, word: str) -> None:
             if name == "die":
                 os.write(2, b"terminate called\n  what(): no \xff packet\n")
                 os._exit(6)
+            if name in {"half", "drip"}:
+                os.write(fd, (100_000).to_bytes(4, "big"))
+                while name == "drip":
+                    os.write(fd, b"x")
+                    threading.Event().wait(0.05)
+                threading.Event().wait(60.0)
             if name == "late":
                 threading.Event().wait(arguments[0])
             pipe.send((name != "fail", name))
@@ -63,11 +70,36 @@ def test_a_call_that_is_too_late_ends_the_child(process: LibraryProcess) -> None
     process.close()
 
 
+@pytest.mark.parametrize("ignore_suspend", [False, True])
+@pytest.mark.parametrize("name", ["half", "drip"])
+def test_answer_that_does_not_end_has_one_deadline(name: str, ignore_suspend: bool) -> None:
+    process = LibraryProcess(
+        "echo", f"{HERE}:serve", ("hello",), 60.0, ignore_suspend=ignore_suspend
+    )
+    began = time.monotonic()
+    with pytest.raises(LibraryError, match=rf"{name}: no whole answer within 0\.4 s"):
+        process.call(name, within_s=0.4)
+    assert time.monotonic() - began < 10.0
+    with pytest.raises(LibraryError, match="has exited"):
+        process.call("any", within_s=20.0)
+    process.close()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_unreferenced_process_ends() -> None:
+    process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0)
+    child = process._child
+    del process
+    gc.collect()
+    child.wait(20.0)
+
+
 def test_a_computer_that_stood_still_is_no_fault_of_the_child(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0, ignore_suspend=True)
-    pipe, now_ns = process._pipe, time.monotonic_ns
+    pipe, now_ns = process._calls.pipe, time.monotonic_ns
     late_ns = [0]
 
     class StoodStill:
@@ -84,7 +116,7 @@ def test_a_computer_that_stood_still_is_no_fault_of_the_child(
 
     with monkeypatch.context() as patch:
         patch.setattr(time, "monotonic_ns", lambda: now_ns() + late_ns[0])
-        patch.setattr(process, "_pipe", StoodStill())
+        patch.setattr(process._calls, "pipe", StoodStill())
         assert process.call("any", within_s=20.0) == "any"
         assert late_ns[0]
     with pytest.raises(LibraryError, match=r"late: no answer within 0\.3 s"):
@@ -95,7 +127,7 @@ def test_a_computer_that_stood_still_is_no_fault_of_the_child(
 def test_after_ctrl_c_an_answer_is_still_its_own_calls(
     process: LibraryProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pipe = process._pipe
+    pipe = process._calls.pipe
 
     class Interrupted:
         """A pipe during whose first wait a person presses Ctrl-C."""
@@ -106,9 +138,9 @@ def test_after_ctrl_c_an_answer_is_still_its_own_calls(
         def poll(self, within_s: float) -> bool:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(process, "_pipe", Interrupted())
+    monkeypatch.setattr(process._calls, "pipe", Interrupted())
     with pytest.raises(KeyboardInterrupt):
         process.call("late", 0.1, within_s=20.0)
-    monkeypatch.setattr(process, "_pipe", pipe)
+    monkeypatch.setattr(process._calls, "pipe", pipe)
     assert process.call("other", within_s=20.0) == "other"
     process.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
+import threading
 import time
 from collections.abc import Callable
 
@@ -160,6 +161,23 @@ def test_poses_alone_can_show_that_the_controller_has_stopped_it(abb_pair: MakeA
     arm.stop()
     assert robot.watchdog_stops == 1
     assert not robot.moving()
+
+
+def test_stop_does_not_wait_for_a_path_that_is_being_sent(abb_pair: MakeAbb) -> None:
+    """And the arm does not move after it."""
+    arm, robot = abb_pair()
+    robot.slow(0.5)
+    starting = threading.Thread(target=arm.start, args=(SLIDE,))
+    starting.start()
+    until(lambda: arm._may_move, 10 * REQUEST_S)
+    began = time.monotonic()
+    arm.stop()
+    assert time.monotonic() - began < 6 * REQUEST_S + driver.STOPPED_S + BUSY_S
+    starting.join(25 * REQUEST_S)
+    assert not starting.is_alive()
+    assert arm.state() is ArmState.READY
+    assert not robot.running
+    assert robot.pose().xyz_mm[1] < 2.0
 
 
 KILLED = """

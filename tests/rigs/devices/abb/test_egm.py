@@ -109,3 +109,76 @@ def test_a_clock_that_goes_back_is_a_fault(take: Take, number: int, t_s: float) 
 def test_packets_without_time_are_a_fault(take: Take) -> None:
     with pytest.raises(EgmFault, match=r"carry no time.*RobotWare 6\.07"):
         take(packet(1, None))
+
+
+AHEAD = Pose((1399.0, 1.0, 300.0), HERE.rotvec_deg)
+TURNED = Pose(HERE.xyz_mm, (90.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("pose", [AHEAD, TURNED])
+def test_pose_that_the_arm_cannot_have_reached_is_dropped(
+    take: Take, receiver: EgmReceiver, pose: Pose
+) -> None:
+    assert take(packet(1, 1.000)) is not None
+    for number in range(1, 10):
+        assert take(packet(2 * number, 1 + 0.008 * number, pose)) is None
+        came = take(packet(2 * number + 1, 1.004 + 0.008 * number))
+        assert came is not None
+        assert came.measured.xyz_mm == HERE.xyz_mm
+    assert receiver.counts == EgmCounts(implausible=9, lost=9)
+
+
+def test_planned_pose_is_checked_too(take: Take, receiver: EgmReceiver) -> None:
+    assert take(packet(1, 1.000)) is not None
+    jumped = packet(2, 1.004)
+    jumped.planned.cartesian.CopyFrom(packet(2, 1.004, AHEAD).feedBack.cartesian)
+    assert take(jumped) is None
+    assert receiver.counts == EgmCounts(implausible=1)
+
+
+def test_arm_that_stays_where_it_jumped_is_a_fault(take: Take) -> None:
+    assert take(packet(1, 1.000)) is not None
+    assert take(packet(2, 1.004, AHEAD)) is None
+    with pytest.raises(EgmFault, match=r"its pose jumped by 999\.0 mm"):
+        take(packet(3, 1.008, AHEAD))
+
+
+def test_pose_is_not_believed_for_a_time_that_has_not_passed(
+    take: Take, receiver: EgmReceiver
+) -> None:
+    assert take(packet(1, 1.000)) is not None
+    assert take(packet(2, 1.990, AHEAD)) is None  # at 1 m/s, it says
+    assert take(packet(3, 3600.0)) is None
+    assert take(packet(4, 2.0**62)) is None
+    assert take(packet(5, 1.016)) is not None
+    assert receiver.counts == EgmCounts(implausible=2, malformed=1, lost=3)
+
+
+def test_clock_that_stays_ahead_is_a_fault(take: Take) -> None:
+    assert take(packet(1, 1.000)) is not None
+    assert take(packet(2, 11.004)) is None
+    with pytest.raises(EgmFault, match=r"its clock jumped by 10\.0"):
+        take(packet(3, 11.008))
+
+
+def test_slow_motion_after_lost_packets_is_believed(take: Take) -> None:
+    assert take(packet(1, 1.0)) is not None
+    assert take(packet(26, 1.1, Pose((404.0, 1.0, 300.0), HERE.rotvec_deg))) is not None
+
+
+@pytest.mark.parametrize(
+    ("numbers", "lost"),
+    [
+        ([2**32 - 2, 2**32 - 1, 0, 1], 0),
+        ([2**32 - 2, 1, 2], 2),
+        ([7, 2**31, 2**31 + 1], 0),
+        ([7, 2**32 - 1, 0], 0),
+        ([3_000_000_000, 0, 1], 0),
+    ],
+)
+def test_sequence_numbers_wrap_and_restart(
+    take: Take, receiver: EgmReceiver, numbers: list[int], lost: int
+) -> None:
+    for at, number in enumerate(numbers):
+        assert take(packet(number, 1.0 + 0.012 * at)) is not None
+    assert receiver.counts == EgmCounts(lost=lost)

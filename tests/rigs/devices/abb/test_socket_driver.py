@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
@@ -260,3 +261,10 @@ def test_what_the_server_refuses_is_an_error(pair: MakePair) -> None:
         link.close()
     with pytest.raises(ValueError, match="clock back is not simulated"):
         robot.inject(Kind.CLOCK_BACK)
+
+
+def test_pose_that_the_arm_cannot_have_reached_is_a_fault(pair: MakePair) -> None:
+    arm, robot = pair()
+    robot.motion = StraightMotion(at(50_000.0))
+    fails(arm.read_poses, driver.ANSWER_S, "one that the arm cannot have reached")
+    assert arm.state() is ArmState.DISCONNECTED

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
@@ -326,6 +327,138 @@ def test_a_page_that_is_none_is_named(page: bytes, said: str) -> None:
 )
 def test_status_words(status: int, said: str | None) -> None:
     assert rdt.status_problem(status) == said
+
+
+# -- records that cannot be used: fed by hand, on a clock of the test ------------------------------
+
+
+class Wire:
+    """A driver that is given datagrams, a record a millisecond of seven ticks."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**12
+        settings = AtiNetFtSettings(host="127.0.0.1", counts_per_n=1e6, counts_per_nm=1e6)
+        self.sensor = AtiNetFt(settings, lambda: self.now_ns)
+        self.sensor._scale = 1e6, 1e6
+        self._last: int | None = None
+
+    def hear(self, data: bytes) -> None:
+        self.now_ns += 1_000_000
+        with self.sensor._lock:
+            self._last = self.sensor._take(data, self.now_ns, self._last)
+            self.sensor._check_silence()
+
+    def hear_all(self, numbers: Iterable[int], ahead: int = 0, newtons: float = 0.0) -> None:
+        for number in numbers:
+            self.hear(record(number + ahead, 7 * number + ahead, newtons))
+
+
+def record(number: int, ticks: int, newtons: float = 0.0) -> bytes:
+    found = np.zeros(1, rdt.RECORD)
+    found["rdt"], found["ft"] = number % 2**32, ticks % 2**32
+    found["force"][0, 2] = round(newtons * 1e6)
+    return found.tobytes()
+
+
+def test_one_record_far_ahead_is_dropped_and_the_next_ones_are_read() -> None:
+    wire = Wire()
+    wire.hear_all(range(600))
+    wire.hear(record(600 + 2**30, 7 * 600 + 2**30))
+    wire.hear_all(range(601, 2156), newtons=50.0)
+    found = wire.sensor.read()
+    assert found.force_n[:, 2].max() == 50.0
+    assert len(found) == 600 + 1555
+    counts = wire.sensor.counts
+    assert (counts.ahead, counts.late, counts.lost) == (1, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("useless", "said"),
+    [
+        (lambda n: record(n, 7 * n)[:35], "0 late, 0 ahead of their time, 500 malformed"),
+        (lambda n: record(n, 7 * n) + b"x", "0 late, 0 ahead of their time, 500 malformed"),
+        (lambda n: record(50, 350), "500 late, 0 ahead of their time, 0 malformed"),
+        (lambda n: record(n % 90, 7 * (n % 90)), "500 late, 0 ahead of their time, 0 malformed"),
+        (lambda n: record(n, 7 * n + 10**6), "0 late, 500 ahead of their time, 0 malformed"),
+    ],
+    ids=["short", "long", "the same", "older ones", "far ahead"],
+)
+def test_records_that_cannot_be_used_are_silence(
+    useless: Callable[[int], bytes], said: str
+) -> None:
+    wire = Wire()
+    wire.hear_all(range(90))
+    for number in range(90, 589):
+        wire.hear(useless(number))
+    wire.sensor.read()
+    wire.hear(useless(589))
+    with pytest.raises(RigError, match=f"none of 500 datagrams of the last 0.5 s .*{said}"):
+        wire.sensor.read()
+
+
+def test_first_record_far_ahead_ends_in_a_fault() -> None:
+    wire = Wire()
+    wire.hear(record(2**30, 2**30))
+    wire.hear_all(range(500))
+    with pytest.raises(RigError, match="none of 500 datagrams"):
+        wire.sensor.read()
+
+
+def test_records_that_waited_in_a_buffer_are_not_ahead() -> None:
+    wire = Wire()
+    wire.hear_all(range(100))
+    wire.now_ns += 3_000_000_000  # of these 3 s the first records fitted into the buffer
+    for number in range(100, 600):
+        wire.now_ns -= 999_000
+        wire.hear(record(number, 7 * number))
+    wire.hear_all(range(3100, 3200))
+    assert len(wire.sensor.read()) == 700
+    assert (wire.sensor.counts.ahead, wire.sensor.counts.lost) == (0, 2500)
+
+
+def test_doubles_do_not_make_lost_records_good() -> None:
+    wire = Wire()
+    wire.hear_all([1, 2, 6, 3, 3, 2, 2, 1, 1, 7])
+    counts = wire.sensor.counts
+    assert (counts.lost, counts.late) == (2, 6)
+
+
+@pytest.mark.parametrize(("first", "lost"), [(2**32 - 3, 0), (2**32 - 2, 3)])
+def test_counters_wrap_at_32_bits(first: int, lost: int) -> None:
+    wire = Wire()
+    wire.hear_all([first + n + (lost if n > 2 else 0) for n in range(6)])
+    assert (wire.sensor.counts.received, wire.sensor.counts.lost) == (6, lost)
+    assert len(wire.sensor.read()) == 6
+
+
+def test_numbers_of_another_request_are_neither_lost_nor_late() -> None:
+    wire = Wire()
+    for ticks, number in enumerate([500, 501, 1, 2, 2**31, 4], 1):
+        wire.hear(record(number, 7 * ticks))
+    counts = wire.sensor.counts
+    assert (counts.received, counts.lost, counts.late) == (6, 0, 0)
+
+
+def test_page_that_drips_has_one_deadline() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        page = b"HTTP/1.1 200 OK\r\n" * 9
+        threading.Thread(target=drip, args=(server, page), daemon=True).start()
+        settings = AtiNetFtSettings(
+            host="127.0.0.1", web_port=server.getsockname()[1], answer_s=ANSWER_S
+        )
+        begin = time.monotonic()
+        with pytest.raises(RigError, match="no answer from its page"):
+            AtiNetFt(settings).connect()
+        assert time.monotonic() - begin < ANSWER_S + SLACK_S
+
+
+def drip(server: socket.socket, data: bytes) -> None:
+    """Send a byte every 50 ms to the one who connects."""
+    link, _ = server.accept()
+    with link, suppress(OSError):
+        for byte in data:
+            link.sendall(bytes([byte]))
+            threading.Event().wait(0.05)
 
 
 def test_one_count_needs_the_other() -> None:

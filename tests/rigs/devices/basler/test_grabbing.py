@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -125,6 +126,120 @@ def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on(until: Unti
         device.results.append(Result(1, ChunkTimestamp=exposed))
         until(lambda: grab.counts.grabbed == 2)
         assert grab.counts.late == 1
+
+
+GIGE = changed(
+    stamping=Stamping("grab result", "device time stamps"),
+    first_id=1,
+    late_ns=10**12,
+    sync_bit=None,
+    queue=10**6,
+)
+
+
+class Gige(Device):
+    """A GigE camera that numbers its blocks 1 to 65,535 again and again, 10 ms apart.
+
+    Args:
+        frames: numbers of the exposures that arrive, from 0.
+        ids: largest block id.
+    """
+
+    def __init__(self, frames: Iterable[int], ids: int = 65_535) -> None:
+        super().__init__()
+        self.frames, self.ids = iter(frames), ids
+
+    def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
+        frame = next(self.frames, None)
+        if frame is None:
+            return super().RetrieveResult(timeout_ms, handling)
+        return Result(frame % self.ids + 1, TimeStamp=10_000_000 * frame + 1)
+
+
+def test_block_ids_of_gige_wrap_at_16_bits(until: Until) -> None:
+    frames = [*range(65_000, 66_000), *range(97_000, 97_100), *range(129_000, 131_500)]
+    with grabbing(Gige(frames), GIGE) as grab:
+        until(lambda: grab.counts.grabbed == len(frames))
+        assert grab.counts.lost == 131_500 - len(frames)
+        assert [frame.number for frame in grab.take()] == frames
+
+
+def test_extended_block_ids_do_not_wrap(until: Until) -> None:
+    with grabbing(Gige(range(65_000, 66_000), 2**40), GIGE) as grab:
+        until(lambda: grab.counts.grabbed == 1000)
+        assert (grab.counts.skipped, grab.counts.out_of_order) == (65_000, 0)
+        assert [frame.number for frame in grab.take()] == list(range(65_000, 66_000))
+
+
+@pytest.mark.parametrize(("last", "first"), [(65_530, 65_540), (65_534, 65_536), (60_000, 80_000)])
+def test_frames_lost_across_the_wrap_are_counted(until: Until, last: int, first: int) -> None:
+    numbers = [*range(59_000, last + 1), *range(first, first + 10)]
+    with grabbing(Gige(numbers), GIGE) as grab:
+        until(lambda: grab.counts.grabbed == len(numbers))
+        assert grab.counts.skipped == 59_000 + first - last - 1
+        assert [frame.number for frame in grab.take()] == numbers
+
+
+def test_incomplete_and_repeated_frames_across_the_wrap_are_counted(until: Until) -> None:
+    device = Gige(())
+    device.results = [
+        Result(block, TimeStamp=10_000_000 * at, good=block != 65_535)
+        for at, block in enumerate((65_533, 65_534, 65_535, 1, 65_534, 1, 3), 1)
+    ]
+    with grabbing(device, GIGE) as grab:
+        until(lambda: not device.results and grab.counts.grabbed == 4)
+        counts = grab.counts
+        assert (counts.failed, counts.out_of_order, counts.skipped) == (1, 2, 65_532 + 1)
+        numbers = [frame.number for frame in grab.take()]
+        assert numbers == [65_532, 65_533, 65_535, 65_537]
+
+
+@pytest.mark.parametrize("before", [300, 30_000, 50_000, 65_000])
+def test_camera_that_begins_again_is_noticed(until: Until, before: int) -> None:
+    device = Gige(())
+    ids = [*range(before - 99, before + 1), *range(1, 200)]
+    device.results = [Result(block, TimeStamp=10_000_000 * at) for at, block in enumerate(ids, 1)]
+    with grabbing(device, changed(**vars(GIGE) | {"stall_ns": 300_000_000})) as grab:
+        until(lambda: grab.fault is not None)
+        assert (grab.counts.grabbed, grab.counts.out_of_order) == (100, 199)
+        assert re.search(r"no frame for 0.3 s \(\d+ lost or unusable", str(grab.fault))
+
+
+def test_block_id_far_ahead_is_dropped(until: Until) -> None:
+    with grabbing(Device(*map(Result, (0, 1, 2**40, 2, 3)))) as grab:
+        until(lambda: grab.counts.grabbed == 4)
+        assert (grab.counts.skipped, grab.counts.out_of_order) == (0, 1)
+
+
+def test_exposure_ends_are_found_by_block_ids_that_wrap(until: Until) -> None:
+    settings = changed(**vars(GIGE) | {"stamping": Stamping("exposure end event", "exposure line")})
+    ends = {block: 10_000_000 * at for at, block in enumerate((65_534, 65_535, 1, 2), 1)}
+    device = Gige(())
+    device.results = [Result(block) for block in ends]
+    with grabbing(device, settings, dict(ends)) as grab:
+        until(lambda: grab.counts.grabbed == 4)
+        assert [frame.t_ns for frame in grab.take()] == [end - 1000 for end in ends.values()]
+
+
+@pytest.mark.parametrize("useless", [{"good": False}, {"BlockID": 1}, {"BlockID": 2**50}])
+def test_frames_that_cannot_be_used_are_silence(until: Until, useless: dict[str, Any]) -> None:
+    """However many of them come."""
+
+    class Useless(Device):
+        count, on = 1, True
+
+        def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
+            threading.Event().wait(0.001)
+            self.count += 1
+            found = super().RetrieveResult(timeout_ms, handling)
+            return found or (Result(self.count, **useless) if self.on else None)
+
+    device = Useless(Result(0), Result(1))
+    with grabbing(device, changed(stall_ns=300_000_000)) as grab:
+        until(lambda: grab.fault is not None)
+        assert "no frame for 0.3 s" in str(grab.fault)
+        assert grab.counts.grabbed == 2
+        device.on = False
 
 
 def test_a_promised_stamp_that_is_missing_ends_the_run(until: Until) -> None:

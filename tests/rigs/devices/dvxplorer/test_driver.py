@@ -173,6 +173,17 @@ class Batches:
         return True
 
 
+class Endless(Batches):
+    """An input that always has the same to give."""
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        super().__init__()
+        self._make = make
+
+    def getNextEventBatch(self) -> Any:
+        return super().getNextEventBatch() if self.events else self._make()
+
+
 def store(*times_us: int) -> Any:
     events = dv.EventStore()
     for at in times_us:
@@ -181,8 +192,8 @@ def store(*times_us: int) -> Any:
 
 
 @contextmanager
-def fed(**settings: Any) -> Iterator[tuple[DvxplorerCamera, Batches]]:
-    batches = Batches()
+def fed(given: Batches | None = None, **settings: Any) -> Iterator[tuple[DvxplorerCamera, Batches]]:
+    batches = given or Batches()
     source = EventSource(batches, batches, None, (640, 480), "batches")
     camera = DvxplorerCamera(DvxplorerSettings(**settings), source)
     try:
@@ -336,3 +347,35 @@ def test_a_threshold_that_the_camera_does_not_take_is_refused() -> None:
     configure(camera, usb)
     with pytest.raises(RigError, match=r"source.contrast_on = 40: the camera set 17"):
         check_taken(in_force(camera), usb)
+
+
+@pytest.mark.parametrize("times_us", [(), (100, 100)], ids=["no event", "a clock that stopped"])
+def test_batches_that_show_no_life_are_silence(until: Until, times_us: tuple[int, ...]) -> None:
+    with fed(Endless(lambda: store(*times_us)), stall_s=0.3) as (camera, _):
+        camera.start()
+        with pytest.raises(RigError, match="its clock has stopped for"):
+            until(lambda: camera.read() is None)
+
+
+def test_repeated_and_other_triggers_are_silence(until: Until) -> None:
+    rising, other = dv.Trigger(7, dv.TriggerType(1)), dv.Trigger(9, dv.TriggerType(2))
+    with fed(stall_s=0.3) as (camera, batches):
+        camera.start()
+        batches.triggers = [[rising], *[[rising, other]] * 100_000]
+        with pytest.raises(RigError, match="its clock has stopped for"):
+            until(lambda: camera.read() is None)
+        batches.triggers = []
+        assert camera.counts.pulses == 1
+        assert camera.counts.other_triggers > 2
+
+
+def test_event_outside_of_the_sensor_is_a_fault(until: Until) -> None:
+    outside = dv.EventStore()
+    outside.push_back(10, 640, 6, True)
+    with fed() as (camera, batches):
+        camera.start()
+        batches.events = [store(5), outside]
+        until(lambda: not batches.events)
+        assert len(camera.read()) == 1
+        with pytest.raises(RigError, match="an event outside of its 640 x 480 px"):
+            until(lambda: camera.read() is None)

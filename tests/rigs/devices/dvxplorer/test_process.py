@@ -20,6 +20,7 @@ import pytest
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.devices.dvxplorer import process as event_process
+from sliplab.rigs.devices.dvxplorer import source
 from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
 from sliplab.rigs.devices.dvxplorer.fake_stream import events_header, events_packet, triggers_header
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream, UsbCamera
@@ -99,6 +100,24 @@ def test_a_port_that_is_no_camera_is_named(greeting: bytes | None, message: str)
     with ports((greeting,)) as (_, settings), pytest.raises(RigError, match=message):
         DvxplorerCamera(settings)
     assert time.monotonic() - began < WITHIN_S
+
+
+def test_header_that_drips_has_one_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(source, "HEADER_S", 0.5)
+    port = Port(b"")
+
+    def drip() -> None:
+        with suppress(OSError, IndexError):
+            for byte in struct.pack("<II", 1 << 19, 24) + b"IOHE" + bytes(1 << 19):
+                port.send(bytes([byte]))
+                threading.Event().wait(0.02)
+
+    threading.Timer(0.1, drip).start()
+    began = time.monotonic()
+    with pytest.raises(RigError, match=r"sent only \d+ bytes of its header"):
+        source.check_header("127.0.0.1", port.number)
+    assert time.monotonic() - began < 5.0
+    port.close()
 
 
 def test_a_library_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import socket
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import pytest
@@ -14,6 +18,7 @@ from sliplab.rigs.devices.robotiq_2f import DRIVER, protocol
 from sliplab.rigs.devices.robotiq_2f.driver import Robotiq2f
 from sliplab.rigs.devices.robotiq_2f.fake import ElasticObject, FakeRobotiq
 from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
+from tests.rigs.waiting import until
 
 MS = 1_000_000
 
@@ -164,3 +169,130 @@ def test_it_is_a_gripper_and_says_how_it_is(bench: Bench) -> None:
     reached = Robotiq2fSettings(host=host, port=port, opening_mm=40.0)
     assert DRIVER.ping(reached) is None
     assert DRIVER.range(reached) == bench.gripper.range
+
+
+# -- answers that are none ----------------------------------------------------------------------
+
+
+def answer_with(bench: Bench, name: str, wrong: bytes) -> list[str]:
+    """Let the gripper answer a question wrongly; the lines that it is sent from now on."""
+    sent: list[str] = []
+    right = bench.fake.answer
+
+    def answer(line: str) -> bytes:
+        sent.append(line.strip())
+        return wrong if line.strip() == f"GET {name}" else right(line)
+
+    bench.fake.answer = answer  # type: ignore[method-assign]
+    return sent
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("FLT", b"FLT 256\n"),
+        ("FLT", b"FLT -1\n"),
+        ("FLT", b"FLT\n"),
+        ("FLT", b"FLT 0 0\n"),
+        ("FLT", b"FLT 0.0\n"),
+        ("FLT", "FLT \N{SUPERSCRIPT TWO}\n".encode()),
+        ("POS", b"POS 300\n"),
+        ("POS", b"POS " + b"9" * 5000 + b"\n"),
+        ("POS", b"POS 0" * 20),
+        ("OBJ", b"OBJ 4\n"),
+        ("OBJ", b"\xff\x1b[31m" * 50 + b"\n"),
+        ("OBJ", b"POS 3\n"),
+    ],
+)
+def test_wrong_answer_is_refused_and_nothing_more_asked(
+    bench: Bench, name: str, wrong: bytes
+) -> None:
+    sent = answer_with(bench, name, wrong)
+    for _ in range(2):
+        with pytest.raises(RigError, match=r"gripper: answered .*; connect it again") as fault:
+            bench.gripper.state()
+        assert len(str(fault.value)) < 400
+    assert sent.count(f"GET {name}") == 1
+    with pytest.raises(RigError, match="connect it again"):
+        bench.gripper.move(30.0, 50.0, 60.0)
+    bench.gripper.stop()
+    assert sent[-1] == "SET GTO 0"
+
+
+def test_acks_without_end_are_refused(bench: Bench) -> None:
+    answer_with(bench, "FLT", b"ack" * 100_000)
+    with pytest.raises(RigError, match="its answer does not end"):
+        bench.gripper.state()
+
+
+def test_answer_to_a_lost_question_is_not_taken_for_the_next(bench: Bench) -> None:
+    answer_with(bench, "FLT", b"")
+    with pytest.raises(RigError, match="timed out"):
+        bench.gripper.state()
+    bench.fake.send(b"FLT 0\nPOS 200\nOBJ 3\n")
+    with pytest.raises(RigError, match="timed out"):
+        bench.gripper.state()
+
+
+def test_stop_after_a_broken_connection_takes_a_new_one(bench: Bench) -> None:
+    bench.gripper.move(0.0, 20.0, 20.0)
+    bench.wait(100)
+    bench.fake.cut()
+    with pytest.raises(RigError, match="it closed the connection"):
+        bench.gripper.state()
+    bench.gripper.stop()
+    assert bench.fake.sets[-1] == "SET GTO 0"
+    bench.fake.close()
+    with pytest.raises(RigError, match="no answer"):
+        bench.gripper.stop()
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("byte", [b"F", b"\r", b"a"])
+def test_stop_is_sent_while_an_answer_drips(byte: bytes) -> None:
+    lines: list[bytes] = []
+
+    def serve(server: socket.socket) -> None:
+        """Answer as a gripper at rest, but to POS with a byte every 50 ms."""
+        link, _ = server.accept()
+        answers = {b"FLT": b"FLT 0\n", b"STA": b"STA 3\n"}
+        with link, link.makefile("rb") as requests, suppress(OSError):
+            for line in requests:
+                lines.append(line)
+                if line == b"GET POS\n":
+                    threading.Thread(target=drip, args=(link,), daemon=True).start()
+                else:
+                    link.sendall(answers.get(line.split()[1], b"ack"))
+
+    def drip(link: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                link.sendall(byte)
+                threading.Event().wait(0.05)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve, args=(server,), daemon=True).start()
+        settings = Robotiq2fSettings(
+            host="127.0.0.1", port=server.getsockname()[1], opening_mm=40.0, answer_s=0.5
+        )
+        gripper = Robotiq2f(settings)
+        gripper.connect()
+        faults: list[RigError] = []
+
+        def ask() -> None:
+            try:
+                gripper.state()
+            except RigError as fault:
+                faults.append(fault)
+
+        asking = threading.Thread(target=ask)
+        began = time.monotonic()
+        asking.start()
+        until(lambda: b"GET POS\n" in lines, 5.0)
+        gripper.stop()
+        until(lambda: b"SET GTO 0\n" in lines, 5.0)
+        assert asking.is_alive()
+        asking.join(5.0)
+        assert time.monotonic() - began < 3.0
+        assert "timed out" in str(faults[0])
+        gripper.close()

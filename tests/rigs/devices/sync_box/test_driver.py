@@ -511,6 +511,18 @@ def test_a_garbled_report_that_passes_the_checksum_is_no_tick(
     assert train.losses.pulses == 1
 
 
+def test_tick_in_the_future_is_refused() -> None:
+    """All of it fits, but the ticks that follow would come too late."""
+    train = Train(100_000, 0b1111_1101_1111_1011, "lfsr")
+    train.first_us = 1000
+    assert train.tick(0, 1, 1000, 5000) == 0
+    bit = int(code_bits(0b1111_1101_1111_1011, 50_001, "lfsr")[50_000])
+    with pytest.raises(ValueError, match="tick 50000 at 500001000 us lies in the future"):
+        train.tick(50_000, bit, 500_001_000, 25_000)
+    assert train.tick(2, 0, 21_000, 25_000) is None
+    assert train.losses.pulses == 1
+
+
 def test_exposures_out_of_order_are_refused() -> None:
     train = Train(100_000, 1, "lfsr")
     train.first_us = 1000

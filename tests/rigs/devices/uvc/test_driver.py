@@ -5,6 +5,7 @@ What a rig needs of it is tried by the rules of conformance (tests/rigs/testing/
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +20,7 @@ from pydantic import ValidationError
 from sliplab.rigs.core.capabilities import FrameCamera, RigError
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.devices.uvc import DRIVER, driver
-from sliplab.rigs.devices.uvc.capture import configure
+from sliplab.rigs.devices.uvc.capture import Capture, configure
 from sliplab.rigs.devices.uvc.driver import UvcCamera
 from sliplab.rigs.devices.uvc.fake import VideoPipe
 from sliplab.rigs.devices.uvc.settings import UvcSettings
@@ -170,6 +171,39 @@ def test_pictures_come_unchanged_cut_to_the_region_and_in_order(
         assert camera.describe()["counts"]["overflowed"] == 14
     finally:
         camera.close()
+
+
+class Changing:
+    """A `VideoCapture` whose pictures change their size after the first ones."""
+
+    def __init__(self, pictures: list[np.ndarray]) -> None:
+        self.pictures, self.begun = pictures, threading.Event()
+
+    def isOpened(self) -> bool:
+        return True
+
+    def grab(self) -> bool:
+        return self.begun.wait(10.0) and bool(self.pictures)
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, self.pictures.pop(0)
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        return self.retrieve()
+
+
+def test_pictures_of_another_size_are_a_fault(
+    until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, wrong = np.zeros((48, 64, 3), np.uint8), np.zeros((24, 64, 3), np.uint8)
+    device = Changing([right, right, right, wrong])
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
+    found = Capture(UvcSettings(device="http://127.0.0.1:1/stream", **SMALL))
+    found.start(64, 48)
+    device.begun.set()
+    until(lambda: found.fault() is not None)
+    assert found.fault() == "it changed to 64 x 24 px; open it again"
+    assert found.take().images.shape == (2, 48, 64)
 
 
 @pytest.mark.realtime
