@@ -27,7 +27,7 @@ from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fau
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _EXPECTED = {
     "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
-    "OutputLost", "WorkerKilled", "WorkNotBegun",
+    "OutputLost", "WorkerKilled", "WorkNotBegun", "MainModuleError",
 }  # fmt: skip
 """Errors that need no traceback, by name: their modules are slow to import."""
 _OPTION = re.compile(r"--[a-z-]+|DETECTOR|FOLDER|KIND|NAME|TRIAL|URL")
