@@ -163,13 +163,14 @@ def operator(store: Path) -> object:
 def test_command_works_on_paths_that_are_not_utf_8(tmp_path: Path) -> None:
     folder = tmp_path / BYTES
     folder.mkdir()
+    store = folder / "store"
     protocol = folder / f"{BYTES}.yaml"
     protocol.write_bytes((ROOT / "protocols" / "pilot.yaml").read_bytes())
-    words = ("--rig", "rehearsal", "--store", folder, "--operator", "Zo\udceb", "--trials", 1)
+    words = ("--rig", "rehearsal", "--store", store, "--operator", "Zo\udceb", "--trials", 1)
     assert answer("collect", protocol, *words)["committed"] == 1
-    assert answer("label", folder)["done"] == 1
-    assert answer("verify", folder)["ok"]
-    assert operator(folder) == "Zo\udceb"
+    assert answer("label", store)["done"] == 1
+    assert answer("verify", store)["ok"]
+    assert operator(store) == "Zo\udceb"
 
 
 def test_text_that_is_not_utf_8_is_one_line_where_it_cannot_be_kept(tmp_path: Path) -> None:
