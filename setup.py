@@ -1,20 +1,11 @@
-"""Mapping of folders to packages; everything else is in pyproject.toml.
+"""Packages of the project; everything else is in pyproject.toml.
 
-The five packages stand at the root of the repository and are installed below ``sliplab``, so that
-no other name can be taken from, or by, anybody else's code.
+The five packages are at the root of the repository and are installed below ``sliplab``, so that no
+other name can be taken from, or by, other code. ``src/sliplab`` links to them as installed. An
+editable install adds ``src`` to Python's path, where a clone named ``sliplab`` in the working
+folder cannot hide it: a package with ``__init__.py`` goes before a folder without one.
 """
 
 from setuptools import find_packages, setup
 
-BELOW = ("protocols", "rigs", "storage", "analysis", "flows")
-
-setup(
-    packages=[
-        "sliplab",
-        *(
-            f"sliplab.{name}"
-            for name in find_packages(include=[*BELOW, *(f"{n}.*" for n in BELOW)])
-        ),
-    ],
-    package_dir={"sliplab": "sliplab", **{f"sliplab.{name}": name for name in BELOW}},
-)
+setup(packages=find_packages("src", include=["sliplab", "sliplab.*"]), package_dir={"": "src"})

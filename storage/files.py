@@ -19,6 +19,7 @@ import re
 import stat
 import threading
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -177,7 +178,7 @@ def _runs(pid: int) -> bool:
 
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
-    write_bytes(path, text.encode())
+    write_bytes(path, _utf_8(text))
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -198,9 +199,24 @@ def write_json_aside(path: Path, data: Any) -> None:
         ValueError: as `write_json`.
     """
     with path.open("wb") as handle:
-        handle.write(json_text(data).encode())
+        handle.write(_utf_8(json_text(data)))
         handle.flush()
         os.fsync(handle.fileno())
+
+
+def _utf_8(text: str) -> bytes:
+    r"""Encode text as UTF-8.
+
+    In a file name, and in an argument of the command line, Python keeps a byte that it cannot
+    decode as a lone surrogate. These bytes are restored where the text is UTF-8 with them, because
+    the locale was none of UTF-8; else each is written as its JSON escape, such as ``\udcff``, from
+    which JSON makes the same surrogate.
+    """
+    with suppress(UnicodeError):
+        data = text.encode(errors="surrogateescape")
+        data.decode()
+        return data
+    return text.encode(errors="backslashreplace")
 
 
 def json_text(data: Any) -> str:

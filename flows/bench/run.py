@@ -13,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children
 from pathlib import Path
 
 from sliplab.analysis.bench.alarms import Judged, hours_without_slip
@@ -37,6 +37,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.bench import BenchDetector, BenchResult, KeptDetector
 from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.workers import WORKERS
 
 ENTRIES_VERSION = 1
 """Incremented when a shipped detector gives other figures on the same scenes."""
@@ -240,9 +241,7 @@ def _judge_each(jobs: Sequence[Job], workers: int, done: Callable[[KeptDetector]
         return
     with (
         console.bar("bench (detectors, simulated)", len(jobs)) as bar,
-        ProcessPoolExecutor(
-            min(workers, len(jobs)), get_context("spawn"), stopping.leave_to_parent
-        ) as pool,
+        ProcessPoolExecutor(min(workers, len(jobs)), WORKERS, stopping.leave_to_parent) as pool,
     ):
         try:
             for judged_one in as_completed([pool.submit(_judge, job) for job in jobs]):

@@ -6,7 +6,9 @@ when and why. `serve` offers one rig's deployments on Prefect's page, with sched
 
 from __future__ import annotations
 
+from operator import itemgetter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
     from sliplab.storage.trials.control import Kind
 
 app = typer.Typer()
+
+RUNS = 3
+"""Upcoming runs of each schedule that `serve --check` shows."""
+_SHOWN = "%a %Y-%m-%d %H:%M %Z"
 
 TrialsArgument = Annotated[
     list[str], typer.Argument(help="Trial ids, as listed by `sliplab plan --json`.")
@@ -184,21 +190,41 @@ def serve(
     as_json: JsonOption = False,
 ) -> None:
     """Serve the flows of one rig as Prefect deployments. Ctrl-C stops the arm, then all runs."""
-    from sliplab.flows.server.schedules import load_schedules
+    from sliplab.flows.running.orchestration import configure_prefect
+    from sliplab.flows.server.schedules import load_schedules, upcoming_runs
     from sliplab.rigs.rig_file import load_rig_file
     from sliplab.rigs.rig_inheritance import rig_path
 
     found = [] if schedules is None else load_schedules(schedules)
     file, _ = load_rig_file(rig)
+    named = schedules or Path()
     if check:
-        rows = [[i.name, i.flow, i.cron, i.timezone, i.active, i.parameters] for i in found]
+        with TemporaryDirectory() as home:
+            configure_prefect(Path(home))  # before anything imports Prefect
+            runs = [
+                times if item.active else []
+                for item, times in zip(found, upcoming_runs(named, found, RUNS), strict=True)
+            ]
         if as_json:
-            console.print_json({"schedules": [item.model_dump() for item in found]})
+            listed = [
+                {**item.model_dump(), "runs": [f"{time:%Y-%m-%dT%H:%M:%S%z}" for time in times]}
+                for item, times in zip(found, runs, strict=True)
+            ]
+            console.print_json({"schedules": listed})
         else:
+            rows = [[i.name, i.flow, i.cron, i.timezone, i.active, i.parameters] for i in found]
             columns = ["name", "flow", "cron", "time zone", "active", "parameters"]
             console.print_table(f"schedules of {schedules}", columns, rows)
+            due = [(time, item) for item, times in zip(found, runs, strict=True) for time in times]
+            rows = [
+                [f"{time:{_SHOWN}}", end and f"{end:{_SHOWN}}", item.name, item.flow]
+                for time, item in sorted(due, key=itemgetter(0))
+                for end in [item.end(time)]
+            ]
+            console.print_table("upcoming runs", ["begins", "until", "name", "flow"], rows)
         return
     prepare_store(store)
+    upcoming_runs(named, found, RUNS)
     from sliplab.flows.server.serve import serve as run
     from sliplab.storage.trials.store import Store
 

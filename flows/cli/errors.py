@@ -23,12 +23,12 @@ from typer.exceptions import TyperException
 from sliplab.flows.running import console, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
-from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault
+from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _EXPECTED = {
     "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
-    "OutputLost", "WorkerKilled",
+    "OutputLost", "WorkerKilled", "WorkNotBegun", "MainModuleError",
 }  # fmt: skip
 """Errors that need no traceback, by name: their modules are slow to import."""
 _OPTION = re.compile(r"--[a-z-]+|DETECTOR|FOLDER|KIND|NAME|TRIAL|URL")
@@ -109,10 +109,38 @@ def failure(error: Exception) -> Failure:
         return Failure(f"a file cannot be written: its disk {fault}", console.FAILED)
     if isinstance(error, StoreError):
         return Failure(str(error), console.FAILED, _place(str(error)))
+    if isinstance(error, UnicodeEncodeError):  # a lone surrogate: a byte that is not UTF-8
+        return Failure(
+            f"{error.object[:200]!r}: is not UTF-8; rename the file or folder, or correct the text",
+            console.WRONG_INPUT,
+        )
+    if _in_prefects_settings(error):
+        return Failure(
+            f"Prefect's settings cannot be read: {_brief(error)}; check the variables PREFECT_* of "
+            "the environment, and .env, prefect.toml and pyproject.toml in this folder",
+            console.WRONG_INPUT,
+        )
     trace = ""
     if type(error).__name__ not in _EXPECTED:
         trace = "".join(traceback.format_exception(error, limit=-8))
     return Failure(str(error) or type(error).__name__, console.FAILED, trace=trace)
+
+
+def _in_prefects_settings(error: Exception) -> bool:
+    """Return whether Prefect raised an error while it read its settings."""
+    frames = traceback.walk_tb(error.__traceback__)
+    modules = (str(frame.f_globals.get("__name__")) for frame, _ in frames)
+    return any(name.startswith("prefect.settings") for name in modules)
+
+
+def _brief(error: Exception) -> str:
+    """Return an error as one line; of a pydantic one the first fault with its key and value."""
+    if isinstance(error, ValidationError):
+        found = error.errors()[0]
+        where = ".".join([error.title, *map(str, found["loc"])])
+        value = f" = {masked(found['input'])}" if isinstance(found["input"], str) else ""
+        return f"{where}{value}: {found['msg']}"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _command() -> str:

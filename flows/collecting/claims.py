@@ -14,7 +14,6 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from multiprocessing import get_context
 
 import numpy as np
 
@@ -43,6 +42,7 @@ from sliplab.storage.schema.claims import (
 )
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.workers import WORKERS
 
 WAIT_S = 600.0
 """Longest wait for the figures of a trial."""
@@ -73,8 +73,7 @@ class ClaimWatch:
     @contextmanager
     def opened(self) -> Iterator[ClaimWatch]:
         """Run the process that makes figures while the block runs."""
-        context = get_context("spawn")
-        pool = ProcessPoolExecutor(1, context, initializer=stopping.leave_to_parent)
+        pool = ProcessPoolExecutor(1, WORKERS, initializer=stopping.leave_to_parent)
         self._pool = pool
         try:
             yield self

@@ -79,7 +79,11 @@ class EmbeddedServer:
         self._log = home / "server.log"
         kind = {"PREFECT_UI_ENABLED": "1"} if page else {**LEAN, **_HEADLESS}
         kept = {name: value for name, value in os.environ.items() if name not in _HEADLESS}
-        with socket.socket() as listener, self._log.open("w") as log:
+        try:
+            written = self._log.open("w")
+        except OSError as error:
+            raise ServerError(f"{self._log}: cannot be written: {error.strerror}") from None
+        with socket.socket() as listener, written as log:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 listener.bind(("127.0.0.1", port))
@@ -218,6 +222,11 @@ def _serve(handle: int, parent: int, home: Path) -> None:
     if not die_with(parent):
         return  # it died before it could be watched
     collect_garbage_seldom()
+    if not _names_database():
+        # so that no part of the folder's name is read as part of the database's address
+        os.chdir(home)
+        home = Path()
+        os.environ["PREFECT_HOME"] = str(home)
     import uvicorn
     from prefect.server.api.server import create_app
 
@@ -228,9 +237,14 @@ def _serve(handle: int, parent: int, home: Path) -> None:
 
 
 NAME = "prefect.db"
-_CONNECTION = ("PREFECT_SERVER_DATABASE_CONNECTION_URL", "PREFECT_API_DATABASE_CONNECTION_URL")
+_DATABASE = re.compile("PREFECT_(SERVER|API)_DATABASE_(CONNECTION_URL|DRIVER)")
 _MADE = "alembic_version"
 """The one table with a row in a file that has just been made."""
+
+
+def _names_database() -> bool:
+    """Return True where the user has set another database."""
+    return any(_DATABASE.fullmatch(name) for name in os.environ)
 
 
 def prepare_database(home: Path) -> None:
@@ -241,7 +255,7 @@ def prepare_database(home: Path) -> None:
     empty as it is then, into the user's cache folder, and every later store begins with that copy.
     It may be deleted at any time; one that is damaged is not used.
     """
-    if any(name in os.environ for name in _CONNECTION) or (home / NAME).exists():
+    if _names_database() or (home / NAME).exists():
         return
     template = _template()
     if template is not None and _sound(template):

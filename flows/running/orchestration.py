@@ -14,14 +14,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import re
+import ssl
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from sliplab.flows.running import console, run_records, stopping
 from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import masked
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -47,7 +52,10 @@ _DEFAULTS = {
 NO_RESULTS: Any = Path(os.devnull)
 """A flow's `result_storage`. Without one, Prefect asks the server for it, by a client of its own
 that has no limit and stays open."""
+_CERTIFICATES = ("SSL_CERT_FILE", "PREFECT_API_SSL_CERT_FILE")
+_PROXY = re.compile("(all|https?|no)_proxy", re.IGNORECASE)
 _LOOPBACK = ("127.0.0.1", "localhost")
+_NO_PROXY = ",".join(_LOOPBACK)
 _servers: dict[str, EmbeddedServer] = {}
 _store: Path | None = None
 _link: ServerLink | None = None
@@ -79,7 +87,11 @@ class Pickled(Opaque[T]):
 
 
 def configure_prefect(store: Path) -> None:
-    """Point Prefect at the store's own home, unless the user has set one; the store must exist."""
+    """Point Prefect at the store's own home, unless the user has set one; the store must exist.
+
+    Raises:
+        InputError: Prefect cannot work with the proxies or certificates of the environment.
+    """
     global _store
     _store = store.resolve()
     home = _store / ".prefect"
@@ -88,8 +100,47 @@ def configure_prefect(store: Path) -> None:
         os.environ["PREFECT_HOME"] = str(home)
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)
+    try:
+        Path.home()
+    except RuntimeError:  # a user without one, as in a container: Prefect names it and needs none
+        os.environ["HOME"] = os.environ["PREFECT_HOME"]
+    check_connections()
     _ask_loopback_directly()
     hide_what_a_lost_server_leaves()
+
+
+def check_connections() -> None:
+    """Check that HTTP clients can be made with the proxies and certificates of the environment.
+
+    Prefect makes one for whatever it does, and the first one while it is imported.
+
+    Raises:
+        InputError: one of the variables cannot be used.
+    """
+    proxies = [
+        name
+        for name, value in sorted(os.environ.items())
+        if _PROXY.fullmatch(name) and value not in ("", _NO_PROXY)
+    ]
+    if proxies and find_spec("httpx") is not None:  # else the command says which packages it lacks
+        import httpx
+
+        with _checked(", ".join(proxies)):
+            httpx.Client(verify=False).close()
+    for name in _CERTIFICATES:
+        if path := os.environ.get(name):
+            with _checked(name):
+                ssl.create_default_context(cafile=path)
+
+
+@contextmanager
+def _checked(names: str) -> Iterator[None]:
+    """Report any error of the block as that of some variables of the environment."""
+    try:
+        yield
+    except Exception as error:
+        text = f"cannot be used ({masked(reason_of(error))}); correct or unset it"
+        raise InputError("environment", names, None, text) from None
 
 
 def hide_what_a_lost_server_leaves() -> None:
@@ -120,9 +171,13 @@ def _ask_loopback_directly() -> None:
 
 
 def start_server() -> None:
-    """Start the embedded server, if a flow will need it, and continue without waiting for it."""
+    """Start the embedded server, if a flow will need it, and continue without waiting for it.
+
+    The flow reports one that cannot be started.
+    """
     if "PREFECT_API_URL" not in os.environ:
-        embedded()
+        with suppress(ServerError):
+            embedded()
 
 
 def embedded() -> EmbeddedServer:
@@ -270,22 +325,36 @@ class _Work:
     def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
         self._do, self._link = do, link
         self.on_start: Callable[[], None] = lambda: None
-        self.started = False
-        self.result: Any = None
+        self.started = self._done = False
+        self._result: Any = None
         self.error: BaseException | None = None
 
     def do(self, argument: Any) -> Any:
         """Do it, and keep its result or its error."""
         self.started = True
-        self.on_start()
         try:
-            self.result = self._do(argument)
+            self.on_start()
+            self._result = self._do(argument)
+            self._done = True
         except BaseException as error:
             self.error = error
             raise
         finally:
             self._link.ending = True
-        return self.result
+        return self._result
+
+    def outcome(self) -> Any:
+        """Return its result.
+
+        Raises:
+            WorkNotBegun: there is none, because the work did not begin.
+            BaseException: that of the work.
+        """
+        if self.error is not None:
+            raise self.error
+        if not self._done:
+            raise WorkNotBegun("Prefect ended the run before its work began; nothing was done")
+        return self._result
 
     @property
     def end(self) -> tuple[str, str]:
@@ -294,6 +363,10 @@ class _Work:
             return "COMPLETED", ""
         said = f"{type(self.error).__name__}: {self.error}"
         return ("FAILED" if isinstance(self.error, Exception) else "CRASHED"), said
+
+
+class WorkNotBegun(RuntimeError):
+    """A flow run ended before its work began."""
 
 
 def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any:
@@ -307,6 +380,7 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
 
     Raises:
         ServerError: there is no server, and a cluster, whose workers report there.
+        WorkNotBegun: the run was cancelled on the server before its work began.
     """
     from prefect.context import FlowRunContext
     from prefect.settings import PREFECT_API_URL, temporary_settings
@@ -339,6 +413,7 @@ def _reported(
 ) -> Any:
     """Do the work as a flow run that the server knows, and keep in the store how it ended."""
     from prefect import Flow
+    from prefect.exceptions import CancelledRun, PausedRun, PrefectSignal
     from prefect.flow_engine import run_flow
 
     def do(argument: Opaque[Any]) -> Any:
@@ -361,11 +436,16 @@ def _reported(
     try:
         run_flow(reported_flow, flow_run=flow_run, parameters={"argument": argument})
         delivered = True
+    except (PrefectSignal, CancelledRun, PausedRun) as error:  # so the server, or the work, decided
+        delivered = not work.started or error is work.error
     except Exception as error:
         if not work.started:
             link.mark_lost(error)
-            with suppress(BaseException):  # it is kept, and raised below
+            try:
                 _without_server(work, argument)
+            except BaseException:
+                if not work.started:  # an error of the work is kept, and raised below
+                    raise
         elif not (delivered := error is work.error):
             link.mark_lost(error)
     except BaseException as error:  # Ctrl-C, during the work or while its end was reported
@@ -375,11 +455,9 @@ def _reported(
         if not delivered:
             run_records.record_undelivered_end(store, run_id, *work.end)
         run_records.end(store, run_id, *work.end, "flow")
-    if work.error is not None:
-        raise work.error
-    if interrupted is not None:
+    if work.error is None and interrupted is not None:
         raise interrupted
-    return work.result
+    return work.outcome()
 
 
 def _without_server(work: _Work, argument: Any) -> Any:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children
 from typing import TYPE_CHECKING, Any
 
 from prefect import flow, task
@@ -32,6 +32,7 @@ from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.workers import WORKERS, check_work
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -61,16 +62,18 @@ def parallel_map(
     Raises:
         KeyboardInterrupt: a stop was requested; what nobody had begun is not begun.
         WorkerKilled: a process of this machine that did the work was killed.
+        MainModuleError: the work needs the script that runs.
     """
     if not jobs:
         return
     if cluster is not None:
         _on_cluster(name, piece, jobs, done, cluster)
         return
+    check_work(piece, jobs[0])
     local = _local_chunk.with_options(name=f"{name} trials")
     workers = max(1, min(len(jobs), os.cpu_count() or 1))
     with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=stopping.leave_to_parent
+        workers, mp_context=WORKERS, initializer=stopping.leave_to_parent
     ) as pool:
         try:
             for start in range(0, len(jobs), CHUNK):

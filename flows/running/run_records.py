@@ -41,8 +41,11 @@ def server_name(url: str | None) -> str:
     """Return a Prefect server's address without the secrets that it may contain."""
     if not url:
         return EMBEDDED
-    parts = urlsplit(url)
-    port = f":{parts.port}" if parts.port else ""
+    try:
+        parts = urlsplit(url)
+        port = f":{parts.port}" if parts.port else ""
+    except ValueError:
+        return "at an invalid address"
     return f"{parts.scheme}://{parts.hostname or ''}{port}"
 
 

@@ -14,11 +14,13 @@ its night out of the next day.
 
 from __future__ import annotations
 
+import asyncio
 import re
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+from zoneinfo import ZoneInfo, available_timezones
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
@@ -38,10 +40,8 @@ _FROM = re.compile(_CLOCK, re.ASCII)
 
 
 def _zone(name: str) -> str:
-    try:
-        ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise ValueError("is not a time zone; write one like Europe/Rome or UTC") from None
+    if name not in available_timezones():  # not: links of this computer such as posixrules
+        raise ValueError("is not a time zone; write one like Europe/Rome or UTC")
     return name
 
 
@@ -244,6 +244,11 @@ class Scheduled(StrictModel):
     active: bool
     parameters: dict[str, Any]
 
+    def end(self, begin: datetime) -> datetime | None:
+        """The end of the window of a run that is due at `begin`; None without one."""
+        until = self.parameters.get("until")
+        return None if until is None else window_end(begin, until, self.timezone)
+
 
 class _File(StrictModel):
     """The file before each schedule is checked by its flow."""
@@ -289,7 +294,7 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
         )
     model: Any = validate(_MODELS[flow], data, path)
     try:
-        cron = _cron(model, timezone)
+        cron = _cron(model)
     except KeyedError as error:
         raise InputError(path, error.key, error.value, str(error)) from None
     if not _NAME.fullmatch(model.name):
@@ -306,11 +311,17 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     )  # fmt: skip
 
 
-def _cron(model: Any, timezone: str) -> str:
+_FIELDS = (
+    "five fields, minute, hour, day of the month, month and day of the week, such as "
+    '"0 22 * * mon-thu"'
+)
+
+
+def _cron(model: Any) -> str:
     """The cron line.
 
     Raises:
-        KeyedError: it does not exist, or two ways of saying it, or it is not one.
+        KeyedError: it does not exist, or two ways of saying it, or it has not five fields.
     """
     if model.cron is None:
         if model.days is None or model.from_ is None:
@@ -320,15 +331,58 @@ def _cron(model: Any, timezone: str) -> str:
     for key, value in (("days", model.days), ("from", model.from_)):
         if value is not None:
             raise KeyedError(key, value, "cannot be combined with cron")
-    from prefect.client.schemas.schedules import CronSchedule
+    fields = model.cron.split()
+    if len(fields) != 5 or not model.cron.isascii():
+        raise KeyedError("cron", model.cron, f"must have {_FIELDS}")
+    return " ".join(fields)
 
-    try:
-        CronSchedule(cron=model.cron, timezone=timezone)
-    except ValueError:
-        raise KeyedError(
-            "cron", model.cron, 'is not a cron line; write one like "0 22 * * mon-thu"'
-        ) from None
-    return str(model.cron)
+
+def upcoming_runs(
+    path: Path, schedules: Sequence[Scheduled], count: int, after: datetime | None = None
+) -> list[list[datetime]]:
+    """The next runs of each schedule, as Prefect's server plans them, whether it is active or not.
+
+    It loads Prefect, which must have been pointed at its home.
+
+    Args:
+        path: the schedules' file, for messages.
+        count: so many runs of each. after: now by default.
+
+    Returns:
+        In each schedule's time zone.
+
+    Raises:
+        InputError: a cron line is wrong or has no run, or a window ends at the time it begins.
+    """
+    from prefect.server.schemas.schedules import CronSchedule
+
+    found = []
+    for number, item in enumerate(schedules):
+        key = f"schedules[{number}]"
+        try:
+            schedule = CronSchedule(cron=item.cron, timezone=item.timezone)
+        except ValueError:
+            raise InputError(path, f"{key}.cron", item.cron, f"must have {_FIELDS}") from None
+        try:
+            runs = asyncio.run(schedule.get_dates(count, after))
+        except ValueError:  # it looks 50 years ahead
+            raise InputError(
+                path, f"{key}.cron", item.cron, "never runs: no month has such a day"
+            ) from None
+        until = item.parameters.get("until")
+        if until is not None and any(_ends_as_it_begins(run, until) for run in runs):
+            raise InputError(
+                path, f"{key}.until", until,
+                "is when the window begins, which would last a whole day or week; give another "
+                "time",
+            )  # fmt: skip
+        zone = ZoneInfo(item.timezone)
+        found.append([datetime.fromtimestamp(run.timestamp(), zone) for run in runs])
+    return found
+
+
+def _ends_as_it_begins(begin: datetime, until: str) -> bool:
+    return until in (f"{begin:%H:%M}", f"{DAYS[begin.weekday()]} {begin:%H:%M}")
 
 
 def _protocol(path: Path, name: Path, enable: list[str]) -> str:

@@ -6,7 +6,7 @@ import asyncio
 import os
 import signal
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -42,7 +42,7 @@ def serve(
 
     Args:
         rig: a rig file's absolute path, or the name of one that ships.
-        name: of the deployments.
+        name: of the service; those of its deployments end in it.
         folders: below which a run may name its protocol; a relative name is of the first. Those
             that ship, and those that a schedule names, it may name as well.
         port: of the embedded server's page.
@@ -86,11 +86,13 @@ async def _serve(
         await _refuse_another(flow.name, here.name, here.folder)
         when = _prefects([item for item in schedules if item.flow == flow.name])
         made = await flow.ato_deployment(
-            here.name, schedules=when, tags=_tags(here.folder, here.rig),
-            description=flow.description,
+            deployment_name(flow.name, here.name), schedules=when,
+            tags=_tags(here.folder, here.rig), description=flow.description,
         )  # fmt: skip
         (on_rig if flow in ON_RIG else control)[await made.aapply()] = flow
-    await _close_stranded(here.name, [flow.name for flow in (*ON_RIG, *CONTROL)], here.folder)
+    names = [flow.name for flow in (*ON_RIG, *CONTROL)]
+    await _close_stranded(here.name, names, here.folder)
+    await _delete_older(here.name, names, here.folder)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
@@ -101,7 +103,8 @@ async def _serve(
         carrying_out = asyncio.create_task(served.carry_out(min(poll_s, POLL_S), stopped))
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
     ending = asyncio.create_task(stopped.wait())
-    console.say(f"serving {here.folder} on the rig {here.rig}: deployments */{here.name}")
+    shown = ", ".join(deployment_name(flow.name, here.name) for flow in (ON_RIG[0], *CONTROL))
+    console.say(f"serving {here.folder} on the rig {here.rig}: deployments {shown} and others")
     console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
     await asyncio.wait([ending, carrying_out], return_when=asyncio.FIRST_COMPLETED)
     console.say("stopping: the arm first, then all runs")
@@ -140,6 +143,11 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
     ]
 
 
+def deployment_name(flow: str, name: str) -> str:
+    """Return the name of a flow's deployment, which begins with what it does: ``stop NAME``."""
+    return f"{flow} {name}"
+
+
 async def _refuse_another(flow: str, name: str, store: Path) -> None:
     """Check that no other program serves this name; two would take each other's runs.
 
@@ -151,7 +159,7 @@ async def _refuse_another(flow: str, name: str, store: Path) -> None:
 
     async with get_client() as client:
         try:
-            there = await client.read_deployment_by_name(f"{flow}/{name}")
+            there = await client.read_deployment_by_name(f"{flow}/{deployment_name(flow, name)}")
         except ObjectNotFound:
             return
     mine = f"store:{store.resolve()}"
@@ -160,6 +168,19 @@ async def _refuse_another(flow: str, name: str, store: Path) -> None:
         raise InputError(
             "--name", "", name, f"is served for {others[0].removeprefix('store:')}; give another"
         )
+
+
+async def _delete_older(name: str, flows: list[str], store: Path) -> None:
+    """Delete the deployments that an older version made for this store, all called `name`."""
+    from prefect.client.orchestration import get_client
+    from prefect.exceptions import ObjectNotFound
+
+    async with get_client() as client:
+        for flow in flows:
+            with suppress(ObjectNotFound):
+                there = await client.read_deployment_by_name(f"{flow}/{name}")
+                if f"store:{store.resolve()}" in there.tags:
+                    await client.delete_deployment(there.id)
 
 
 async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
@@ -183,11 +204,12 @@ async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
     from prefect.states import Crashed
 
     taken = [StateType.PENDING, StateType.RUNNING, StateType.CANCELLING]
+    names = [name, *(deployment_name(flow, name) for flow in flows)]
     alive = {item["run"] for item in run_records.open_runs(store)}
     async with get_client() as client:
         runs = await client.read_flow_runs(
             flow_filter=FlowFilter(name=FlowFilterName(any_=flows)),
-            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[name])),
+            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=names)),
             flow_run_filter=FlowRunFilter(
                 state=FlowRunFilterState(type=FlowRunFilterStateType(any_=taken))
             ),

@@ -24,7 +24,7 @@ class Service:
 
     Attributes:
         store: its absolute folder; rig: a rig file, or the name of one that ships.
-        name: of the deployments: ``collect/NAME``.
+        name: of the service, in those of its deployments: ``collect/collect NAME``.
         server: Prefect's, as `run_records.server_name` calls it.
         pid: of the program that serves.
         protocols: folders below which a run may name its protocol, and files that a schedule names;

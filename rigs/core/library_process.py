@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
+from sliplab.storage.workers import refuse_main
 
 T = TypeVar("T")
 KILL_S = 2.0
@@ -182,6 +183,7 @@ class LibraryProcess:
 
     Raises:
         LibraryError: it was not ready within `start_s`; the child has been killed.
+        MainModuleError: `serve` is of the script that runs.
     """
 
     def __init__(
@@ -194,10 +196,11 @@ class LibraryProcess:
         *,
         ignore_suspend: bool = False,
     ) -> None:
+        module, function = serve.split(":")
+        refuse_main(module, function)
         self._what, self._error = what, error
         ours, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
-        module, function = serve.split(":")
         given = ", ".join(map(repr, (theirs.fileno(), *arguments)))
         code = (
             f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function}; "

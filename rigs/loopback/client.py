@@ -14,7 +14,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -31,6 +30,7 @@ from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.stream_settings import EventStream, Stream
 from sliplab.storage.streams import FrameChunk, Sink
+from sliplab.storage.workers import WORKERS
 
 READY_S = 180.0
 """Timeout for the fakes to start: kernels may have to be compiled, s."""
@@ -76,11 +76,10 @@ class Loopback:
             for name, stream in (streams or {}).items()
             if isinstance(stream, EventStream) and stream.device and stream.mock
         }
-        context = get_context("spawn")
-        ours, theirs = context.Pipe()
-        self._frames, their_frames = context.Pipe(duplex=False)
+        ours, theirs = WORKERS.Pipe()
+        self._frames, their_frames = WORKERS.Pipe(duplex=False)
         self.on_frames: Callable[[FrameChunk], None] = _forget
-        self._process = context.Process(
+        self._process = WORKERS.Process(
             target=_serve,
             args=(theirs, their_frames, settings, timing, devices, further),
             name="stand-ins",

@@ -13,6 +13,7 @@ import numpy as np
 
 from sliplab.storage.formats.foreign import MOST_PX, Damage, FormatError, grey
 from sliplab.storage.streams import U8
+from sliplab.storage.trials.video import video_url
 
 _CONTAINERS = "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2"
 """Kinds of video that hold their own frames; others may name files and addresses to be read."""
@@ -45,7 +46,7 @@ def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
     """
     options = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
     try:
-        with av.open(str(path), options=options) as container:
+        with av.open(video_url(path), options=options) as container:
             if not container.streams.video or container.streams.video[0].codec_context is None:
                 raise Damage("holds no video, or one of an unknown codec")
             stream = container.streams.video[0]

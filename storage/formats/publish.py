@@ -75,7 +75,7 @@ def publish(
         InputError: `output` exists, or a trial is damaged or does not fit the format.
     """
     how = FORMS[form]
-    with staged(output) as folder:
+    with staged(output.absolute()) as folder:
         for campaign in publication.campaigns:
             _copy_campaign(campaign, folder)
         for campaign, recording in publication.recordings:

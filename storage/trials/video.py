@@ -27,6 +27,11 @@ _QUEUE_FRAMES = 32
 _PUT_TIMEOUT_S = 60.0
 
 
+def video_url(path: Path) -> str:
+    """Return a file as FFmpeg opens it: what precedes a colon in its name is no protocol."""
+    return f"file:{path}"
+
+
 class VideoWriter:
     """Writes grey frames of one size; `close` returns when every frame is in the file.
 
@@ -38,7 +43,7 @@ class VideoWriter:
         self.frames = 0
         self._time_base = Fraction(1, rate_hz)
         self._container = av.open(
-            str(path), "w", format="matroska", options={"fflags": "+bitexact"}
+            video_url(path), "w", format="matroska", options={"fflags": "+bitexact"}
         )
         self._stream = self._container.add_stream("ffv1", rate=rate_hz, options=CODEC_OPTIONS)
         encoders = [self._stream.codec_context]
@@ -128,7 +133,7 @@ class VideoWriter:
 
 def read_frames(path: Path, threads: int = 1) -> Iterator[U8]:
     """Decode a video frame by frame: uint8 arrays of shape (height, width)."""
-    with av.open(str(path)) as container:
+    with av.open(video_url(path)) as container:
         stream = container.streams.video[0]
         stream.codec_context.thread_count = threads
         stream.codec_context.thread_type = "FRAME" if threads > 1 else "SLICE"
@@ -142,7 +147,7 @@ def read_frame(path: Path, index: int) -> U8:
     Raises:
         IndexError: the video has fewer frames.
     """
-    with av.open(str(path)) as container:
+    with av.open(video_url(path)) as container:
         stream = container.streams.video[0]
         for number, packet in enumerate(container.demux(stream)):
             if number == index and packet.size:
@@ -158,7 +163,7 @@ class FrameReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._container = av.open(str(path))
+        self._container = av.open(video_url(path))
         self._stream = self._container.streams.video[0]
         self._stream.codec_context.thread_type = "SLICE"
 
@@ -192,12 +197,12 @@ class FrameReader:
 
 def count_frames(path: Path) -> int:
     """Number of frames, counted by packets without decoding."""
-    with av.open(str(path)) as container:
+    with av.open(video_url(path)) as container:
         return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
 
 
 def frame_rate(path: Path) -> int:
     """Frames a second of a video's time base; the frames have times of their own."""
-    with av.open(str(path)) as container:
+    with av.open(video_url(path)) as container:
         rate: int = round(container.streams.video[0].average_rate)
     return rate

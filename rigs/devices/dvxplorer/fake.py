@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -29,6 +28,7 @@ from sliplab.rigs.devices.dvxplorer.fake_stream import (
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
 from sliplab.storage.streams import I64, EventChunk
+from sliplab.storage.workers import WORKERS, check_work
 
 Packet = tuple[EventChunk, I64]
 """Events, and the rising edges that belong to them, us of the camera's clock."""
@@ -74,9 +74,9 @@ class DvxplorerServer:
         stall_after: int | None = None,
         size: tuple[int, int] = (640, 480),
     ) -> None:
-        context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(
+        check_work(source)
+        self._pipe, theirs = WORKERS.Pipe()
+        self._process = WORKERS.Process(
             target=_serve, args=(theirs, source, realtime, stall_after, size), daemon=True
         )
         self._process.start()

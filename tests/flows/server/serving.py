@@ -76,7 +76,7 @@ class Page:
 
     def deployment(self, flow: str) -> Any:
         """One of the service's."""
-        return self.call(f"/deployments/name/{flow}/{self._name}")
+        return self.call(f"/deployments/name/{flow}/{flow}%20{self._name}")
 
     def run(self, flow: str, **wanted: Any) -> Any:
         """Press Run; returns the flow run, or the refusal."""

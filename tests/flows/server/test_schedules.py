@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.flows.server.schedules import DAYS, load_schedules, window_end
+from sliplab.flows.server.schedules import DAYS, load_schedules, upcoming_runs, window_end
 from sliplab.protocols import InputError
+from tests.command_line import answer, here
 from tests.conftest import ROOT
 
 ROME = "Europe/Rome"
+RIG = ROOT / "rigs" / "rehearsal.yaml"
 NIGHT: dict[str, Any] = {
     "name": "nights", "flow": "collect", "protocol": str(ROOT / "protocols" / "pilot.yaml"),
     "days": ["mon", "thu"], "from": "22:00", "until": "06:00",
@@ -53,7 +56,17 @@ def test_the_shipped_example_is_right() -> None:
         ({"from": "24:00"}, 'schedules[0].from = 24:00: must be a time like "22:00"'),
         ({"until": "monday 6:00"}, "schedules[0].until = monday 6:00: must be a time like"),
         ({"cron": "0 22 * * *"}, "schedules[0].days"),
-        ({"cron": "0 25 * * *", "days": None, "from": None}, "is not a cron line"),
+        *(
+            ({"cron": cron, "days": None, "from": None}, f".cron = {cron}: must have five fields")
+            for cron in (
+                "0 0 22 * * *",
+                "*/10 * * * * *",
+                "0 22 * *",
+                "@daily",
+                "RRULE:FREQ=DAILY",
+                "\u0663 22 * * *",
+            )
+        ),
         ({"timezone": "UTC"}, "schedules[0].timezone = UTC: applies to the whole file"),
         ({"trials": 0}, "schedules[0].trials = 0"),
         ({"name": "Nights!"}, "schedules[0].name = Nights!"),
@@ -107,6 +120,71 @@ def test_names_and_zones_are_checked(tmp_path: Path) -> None:
         load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
     with pytest.raises(InputError, match=r"timezone = Europe/Rom: is not a time zone"):
         load_schedules(write(tmp_path, NIGHT, timezone="Europe/Rom"))
+
+
+def weekly(cron: str) -> dict[str, Any]:
+    return {"name": "weekly", "flow": "report", "cron": cron}
+
+
+@pytest.mark.parametrize(
+    ("schedule", "key", "said"),
+    [
+        (weekly("0 25 * * *"), "cron", "must have five fields"),
+        (weekly("*/0 * * * *"), "cron", "must have five fields"),
+        (weekly("R R * * *"), "cron", "must have five fields"),
+        (weekly("0 3 30 2 *"), "cron", "never runs"),
+        (weekly("0 3 31 4,6,9,11 *"), "cron", "never runs"),
+        ({**NIGHT, "until": "22:00"}, "until", "is when the window begins"),
+        ({**NIGHT, "until": "thu 22:00"}, "until", "is when the window begins"),
+    ],
+)
+def test_schedule_without_a_run_is_refused(
+    schedule: dict[str, Any], key: str, said: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path, weekly("0 8 * * *") | {"name": "daily"}, schedule)
+    with pytest.raises(InputError, match=said) as error:
+        upcoming_runs(path, load_schedules(path), 3)
+    assert (error.value.file, error.value.key) == (str(path), f"schedules[1].{key}")
+
+
+@pytest.mark.parametrize(
+    ("schedule", "runs"),
+    [
+        (weekly("0 3 29 2 *"), ["2028-02-29 03:00:00+01:00", "2032-02-29 03:00:00+01:00"]),
+        (weekly("0  3 * *  7"), ["2026-03-29 03:00:00+02:00", "2026-04-05 03:00:00+02:00"]),
+        (weekly("30 8 * * fri-mon"), ["2026-03-28 08:30:00+01:00", "2026-03-29 08:30:00+02:00"]),
+        (NIGHT, ["2026-03-30 22:00:00+02:00", "2026-04-02 22:00:00+02:00"]),
+    ],
+)
+def test_upcoming_runs_are_local_times(
+    schedule: dict[str, Any], runs: list[str], tmp_path: Path
+) -> None:
+    path = write(tmp_path, schedule)
+    after = datetime(2026, 3, 27, 12, tzinfo=UTC)
+    (found,) = upcoming_runs(path, load_schedules(path), 2, after)
+    assert [str(time) for time in found] == runs
+
+
+def test_zone_of_this_computer_only_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, weekly("0 3 * * *"), timezone="posixrules")
+    with pytest.raises(InputError, match="timezone = posixrules: is not a time zone"):
+        load_schedules(path)
+
+
+def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
+    off = {**weekly("0 3 * * *"), "active": False}
+    words = ("serve", write(tmp_path, NIGHT, off), "--store", tmp_path / "store", "--rig", RIG)
+    shown = here(*words, "--check").stdout.partition("upcoming runs")[2]
+    rows = re.findall(
+        r"(Mon|Thu) \d{4}-\d\d-\d\d 22:00 CES?T +(Tue|Fri) \S+ 06:00 CES?T +nights", shown
+    )
+    assert len(rows) == 3
+    assert {("Mon", "Tue"), ("Thu", "Fri")} == set(rows)
+    assert "weekly" not in shown
+    nights, report = answer(*words, "--check")["schedules"]
+    assert [time[10:19] for time in nights["runs"]] == ["T22:00:00"] * 3
+    assert report["runs"] == []
+    assert not (tmp_path / "store").exists()
 
 
 @pytest.mark.parametrize(

@@ -278,7 +278,7 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
 
     async def register() -> None:
         made = await collect.ato_deployment(
-            "here", schedules=when, tags=serve._tags(store.folder, "r")
+            "collect here", schedules=when, tags=serve._tags(store.folder, "r")
         )
         await made.aapply()
 
@@ -323,7 +323,7 @@ def test_what_a_killed_service_had_taken_is_closed(
     from sliplab.flows.server.deployments import label
 
     async def register() -> None:
-        await (await label.ato_deployment("stranded")).aapply()
+        await (await label.ato_deployment("label stranded")).aapply()
 
     asyncio.run(register())
     page, store = Page(server.url, server.password, "stranded"), Store.open(service.folder)
@@ -336,3 +336,25 @@ def test_what_a_killed_service_had_taken_is_closed(
     assert page.state(taken)["type"] == "CRASHED"
     assert "was killed" in page.state(taken)["message"]
     assert [page.state(run)["type"] for run in (ours, waiting)] == ["PENDING", "SCHEDULED"]
+
+
+def test_deployments_of_an_older_version_are_deleted(
+    service: Service, server: EmbeddedServer, tmp_path: Path
+) -> None:
+    from sliplab.flows.server.deployments import label, stop
+
+    store = service.folder
+
+    async def register() -> None:
+        for flow, folder in ((label, store), (stop, tmp_path / "another")):
+            tags = serve._tags(folder, "r")
+            await (await flow.ato_deployment("older", tags=tags)).aapply()
+            named = serve.deployment_name(flow.name, "older")
+            await (await flow.ato_deployment(named, tags=tags)).aapply()
+
+    asyncio.run(register())
+    asyncio.run(serve._delete_older("older", ["label", "stop", "pause"], store))
+    page = Page(server.url, server.password, "older")
+    found = page.call("/deployments/filter", {"deployments": {"name": {"like_": "older"}}})
+    assert sorted(item["name"] for item in found) == ["label older", "older", "stop older"]
+    assert next(item for item in found if item["name"] == "older")["tags"][1].endswith("another")

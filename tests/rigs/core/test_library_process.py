@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection
 import pytest
 
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
+from sliplab.storage.workers import MainModuleError
 
 HERE = "tests.rigs.core.test_library_process"
 
@@ -144,3 +145,8 @@ def test_after_ctrl_c_an_answer_is_still_its_own_calls(
     monkeypatch.setattr(process._calls, "pipe", pipe)
     assert process.call("other", within_s=20.0) == "other"
     process.close()
+
+
+def test_function_of_the_main_script_is_refused() -> None:
+    with pytest.raises(MainModuleError, match="serve: is defined in the script that runs"):
+        LibraryProcess("echo", "__main__:serve", (), 60.0)

@@ -1,0 +1,1 @@
+../../sliplab/__init__.py

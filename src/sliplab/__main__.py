@@ -1,0 +1,1 @@
+../../sliplab/__main__.py

@@ -1,0 +1,1 @@
+../../sliplab/testing.py
