@@ -4,12 +4,11 @@ BIN := .venv/bin
 # several workers share the cores: threads of one would wait for those of the others
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 DONE := .venv/.installed
-LINKS := build/lint
 
 # what one worker or program has compiled, the others need not
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-programs test-realtime test-long lint types imports links docs bench clean
+.PHONY: setup demo test test-programs test-realtime test-long lint types imports docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -41,21 +40,14 @@ lint: types imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(DONE) links
+types: $(DONE)
 	$(BIN)/mypy
 
-imports: $(DONE) links
-	cd $(LINKS) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
-
-# the packages as they are installed: tools that only look at files do not find them otherwise
-links:
-	rm -rf $(LINKS)
-	mkdir -p $(LINKS)/sliplab
-	ln -s $(CURDIR)/sliplab/* $(LINKS)/sliplab
-	ln -s $(addprefix $(CURDIR)/,protocols rigs storage analysis flows) $(LINKS)/sliplab
+imports: $(DONE)
+	cd .links && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
 
 # every link, anchor and page is looked at; nothing is fetched
-docs: $(DONE) links
+docs: $(DONE)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 bench: $(DONE)

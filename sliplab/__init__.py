@@ -14,7 +14,13 @@ Importing this loads nothing and starts nothing; each name is loaded when it is 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+# Python that starts in the root of a checkout finds this folder before the installed links to it.
+__path__ += [
+    str(links) for links in [Path(__file__).parents[1] / ".links" / "sliplab"] if links.is_dir()
+]
 
 if TYPE_CHECKING:
     from sliplab.flows.api import (

@@ -1,4 +1,4 @@
-"""Links in `src` show the packages as they are installed."""
+"""Links in `.links` show the packages as they are installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.conftest import ROOT
 
 
 def test_links_show_every_package_and_file() -> None:
-    links = {path.name: path.resolve() for path in (ROOT / "src" / "sliplab").iterdir()}
+    links = {path.name: path.resolve() for path in (ROOT / ".links" / "sliplab").iterdir()}
     top = {path.name: path for path in (ROOT / "sliplab").iterdir() if path.is_file()}
     below = {name: ROOT / name for name in ("protocols", "storage", "rigs", "analysis", "flows")}
     links.pop("__pycache__", None)
@@ -20,10 +20,18 @@ def test_links_show_every_package_and_file() -> None:
 def test_clone_called_sliplab_in_the_working_folder_hides_nothing(tmp_path: Path) -> None:
     """Python's path of an editable install, without its packages."""
     (tmp_path / "sliplab").symlink_to(ROOT)
-    code = (
-        f"import sys; sys.path += [{str(ROOT / 'src')!r}]; import sliplab; print(sliplab.__file__)"
-    )
+    code = f"import sys; sys.path += [{str(ROOT / '.links')!r}]; import sliplab; print(sliplab.__file__)"
     done = subprocess.run(
         [sys.executable, "-S", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == str(ROOT / "src" / "sliplab" / "__init__.py")
+    assert done.stdout.strip() == str(ROOT / ".links" / "sliplab" / "__init__.py")
+
+
+def test_packages_are_found_from_the_root_of_a_checkout() -> None:
+    code = (
+        "import sys; sys.path.insert(0, ''); import sliplab.protocols.units as u; print(u.TABLE[0])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert "mm" in done.stdout
