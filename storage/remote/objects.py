@@ -163,6 +163,20 @@ class Remote:
         found = (entry for entry in self._list(folder) if entry["type"] == "directory")
         return sorted(str(entry["name"]).rstrip("/").rpartition("/")[2] for entry in found)
 
+    def campaigns(self) -> list[str]:
+        """Return the names of the pushed campaigns.
+
+        Raises:
+            RemoteMissing: there is none: an empty or missing list is no news of any campaign.
+        """
+        found = self.folders("campaigns")
+        if not found:
+            raise RemoteMissing(
+                f"{self.where('campaigns')}: is empty or missing: no campaign was pushed, or the "
+                "folder cannot be read at the moment; nothing was changed"
+            )
+        return found
+
     def size(self, key: str) -> int:
         """Return the bytes of an object.
 
