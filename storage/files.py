@@ -17,12 +17,15 @@ import os
 import re
 import threading
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from sliplab.storage.errors import StoreError
 
+COMMITTED = 0o444
+"""Mode of a committed trial's files: other programs open them to read only."""
 _BLOCK = 1 << 20
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
 _NAME_BYTES = 200
@@ -46,6 +49,15 @@ def sync_file(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def protect(path: Path) -> None:
+    """Take away the right to write a file, which its user can still move and delete.
+
+    Nothing happens on a file system without such rights.
+    """
+    with suppress(OSError):
+        path.chmod(COMMITTED)
 
 
 def make_folder(folder: Path) -> None:
@@ -250,8 +262,13 @@ def _finite(text: str) -> float:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, 64 hex digits."""
+    return sha256_of(read_blocks(path))
+
+
+def sha256_of(blocks: Iterable[bytes]) -> str:
+    """Return the SHA-256 of some blocks of bytes, 64 hex digits."""
     digest = hashlib.sha256()
-    for block in read_blocks(path):
+    for block in blocks:
         digest.update(block)
     return digest.hexdigest()
 

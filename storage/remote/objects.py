@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.storage.errors import NoStore, StoreError, masked
-from sliplab.storage.files import json_text, make_folder, read_blocks, write_blocks
+from sliplab.storage.files import COMMITTED, json_text, make_folder, read_blocks, write_blocks
 from sliplab.storage.trials.checksums import Checksum
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
@@ -236,12 +236,14 @@ class Remote:
     def get(self, key: str, path: Path, known: Checksum) -> None:
         """Fetch an object into `path`, which appears once all of it matches its checksum.
 
+        It is read-only, as a committed file is.
+
         Raises:
             RemoteMissing: it does not exist.
             RemoteError: it cannot be read, or does not match its checksum.
             OSError: `path` cannot be written.
         """
-        write_blocks(path, self._checked(key, known))
+        write_blocks(path, self._checked(key, known), COMMITTED)
 
     def put(self, key: str, source: bytes | Path) -> None:
         """Write an object from bytes or a file, in one step as far as the storage can."""

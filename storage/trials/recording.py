@@ -262,9 +262,11 @@ class Recording:
             StoreError: the trial has no such further camera.
         """
         if stream is None or stream in {EVENTS_KIND, FRAMES_KIND}:
-            return StreamReader(self._sound(DATA))
+            return StreamReader(self._sound(DATA), self.record.geometry.event_px)
         self._check_stream(stream, EVENTS_KIND, FRAMES_KIND)
-        return StreamReader(self._sound(stream_file(stream)))
+        about = self.record.streams[stream]
+        size = about.size_px if about.kind == EVENTS_KIND else None
+        return StreamReader(self._sound(stream_file(stream)), size)
 
     def streams(self, *kinds: str) -> list[str]:
         """Names of the streams of some kinds, the first cameras' ``events`` and ``frames`` first.
