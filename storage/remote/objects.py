@@ -21,7 +21,14 @@ from urllib.parse import urlsplit
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.storage.errors import NoStore, StoreError, masked
-from sliplab.storage.files import COMMITTED, json_text, make_folder, read_blocks, write_blocks
+from sliplab.storage.files import (
+    COMMITTED,
+    is_temporary,
+    json_text,
+    make_folder,
+    read_blocks,
+    write_blocks,
+)
 from sliplab.storage.trials.checksums import Checksum
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
@@ -119,7 +126,8 @@ class Remote:
         try:
             self.check()
         except RemoteMissing:
-            if self._list(""):
+            listed = [str(entry["name"]).rpartition("/")[2] for entry in self._list("")]
+            if not all(map(is_temporary, listed)):  # a first push that was killed
                 raise RemoteError(
                     f"{self.url}: contains other files; give an empty location or one "
                     "created by `sliplab push`"

@@ -18,6 +18,7 @@ from sliplab.storage.files import (
     make_folder,
     read_json,
     safe_name,
+    sweep_temporary,
     sync_folder,
     write_bytes,
     write_json,
@@ -51,6 +52,8 @@ take that came from the URL. What is not in it is the store's own."""
 BIG = frozenset({DATA, FRAMES})
 """Files of a trial that a mirror fetches when they are first read."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
+_ASIDE = ".aside"
+"""End of the name of a quarantined folder while it is downloaded."""
 
 
 @dataclass
@@ -218,10 +221,20 @@ class _Pull:
                 self.done.problems.append(str(error))
             if on_trial is not None:
                 on_trial(trial)
+        self._delete_partial({*pushed}, quarantine)
         if self.follows:
             self._withdraw(self.campaign.committed() - pushed.keys())
         if quarantine:
             self._pull_quarantine()
+
+    def _delete_partial(self, trials: Set[str], quarantine: bool) -> None:
+        """Delete what an interrupted pull left and this one does not continue."""
+        incoming = self.campaign.folder / "incoming"
+        sweep_temporary(incoming)
+        for path in sorted(incoming.iterdir()):
+            wanted = path.name in trials or (quarantine and path.suffix == _ASIDE)
+            if not wanted and not path.name.startswith(".") and (path / ELSEWHERE).is_file():
+                shutil.rmtree(path)
 
     def _withdraw(self, unlisted: Set[str]) -> None:
         """Quarantine trials that were pulled and are marked as withdrawn; keep all others."""
@@ -327,7 +340,7 @@ class _Pull:
             try:
                 if isinstance(known, RemoteError):
                     raise known
-                staging = self.campaign.folder / "incoming" / f"{name}.aside"
+                staging = self.campaign.folder / "incoming" / f"{name}{_ASIDE}"
                 download(self.remote, known, staging, target, on_file=self._count)
                 self.done.set_aside += 1
             except RemoteError as error:
