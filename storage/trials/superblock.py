@@ -110,7 +110,7 @@ def lookup3(data: bytes) -> int:
     c = ((c ^ b) - _turned(b, 16)) & _MASK
     a = ((a ^ c) - _turned(c, 4)) & _MASK
     b = ((b ^ a) - _turned(a, 14)) & _MASK
-    return ((c ^ b) - _turned(b, 24)) & _MASK
+    return int((c ^ b) - _turned(b, 24)) & _MASK
 
 
 def _turned(value: int, bits: int) -> int:
