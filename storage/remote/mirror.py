@@ -19,7 +19,7 @@ from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import make_folder, temporary_path, write_json
 from sliplab.storage.remote.manifest import objects_folder, read_manifests
 from sliplab.storage.remote.objects import Remote, RemoteError, RemoteMissing, check_url, is_url
-from sliplab.storage.remote.pull import ORIGIN, PullResult, download, note_pulled, origin_of, pull
+from sliplab.storage.remote.pull import ORIGIN, PullResult, download, origin_of, pull
 from sliplab.storage.trials.checksums import Checksum, incomplete
 from sliplab.storage.trials.store import FORMAT, STORE, Store
 
@@ -103,7 +103,6 @@ def _download_trial(remote: Remote, campaign: str, trial: str, target: Path) -> 
         for name in ("trials", "incoming"):
             make_folder(folder / name)
         staging = temporary_path(folder / "incoming" / trial)
-        note_pulled(target, found.take)
         download(remote, found, staging, target, small=True)
 
 

@@ -242,7 +242,7 @@ class _Pull:
         lost = []
         for trial in sorted(unlisted):
             path = self.campaign.folder / "trials" / trial
-            if not was_pulled(path):
+            if not _from_there(path):
                 continue
             if not isinstance(marked.get(take_of(path)), Manifest):
                 lost.append(trial)
@@ -298,7 +298,8 @@ class _Pull:
         if target.exists():
             cause = incomplete(target) if target.is_dir() else "is no folder"
             if cause is None and take_of(target) == manifest.take:
-                if self.follows and self.older:
+                known = self.older or (target / ELSEWHERE).is_file()
+                if self.follows and known and not was_pulled(target):
                     note_pulled(target, manifest.take)
                 self._complete(target, manifest)
                 self.done.there += 1

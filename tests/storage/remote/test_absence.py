@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from sliplab.storage.remote.manifest import manifest_key, read_manifests
+from sliplab.storage.remote.mirror import open_for_trial, open_mirror
 from sliplab.storage.remote.objects import Remote, RemoteError
 from sliplab.storage.remote.pull import PULLED, pull
 from sliplab.storage.remote.push import push
@@ -169,6 +170,34 @@ def test_store_pulled_by_older_version_follows(
     done = pull(remote, tmp_path / "back")
     assert (done.withdrawn, done.replaced, done.problems) == (1, 1, [])
     assert back.committed() == {*TRIALS[1:], "depth=9mm,r=1"}
+
+
+def test_mirror_of_older_version_follows(
+    lab: Campaign, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials that a mirror has without their big files came from there, whatever is noted."""
+    monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "cache"))
+    mirror, _ = open_mirror(remote.url)
+    shutil.rmtree(mirror.folder / PULLED)
+    again(lab, TRIALS[:2], BY)
+    commit(lab, TRIALS[1], attempt=1)
+    push(store_of(lab), remote)
+    open_for_trial(remote.url, "c", TRIALS[2])
+    _, done = open_mirror(remote.url)
+    assert (done.withdrawn, done.replaced, done.problems) == (1, 1, [])
+    assert mirror.campaign("c").committed() == set(TRIALS[1:])
+
+
+def test_interrupted_download_of_a_trial_that_went_is_deleted(
+    lab: Campaign, remote: Remote, back: Campaign
+) -> None:
+    for name in ("depth=9mm,r=1", f"{TRIALS[0]}.1.aside"):
+        (back.folder / "incoming" / name).mkdir()
+        (back.folder / "incoming" / name / "elsewhere.json").write_text("{}")
+    begun = back.begin("depth=8mm,r=1", (48, 32), 100)
+    assert pull(remote, back.folder.parents[1]).problems == []
+    assert [path.name for path in (back.folder / "incoming").iterdir()] == ["depth=8mm,r=1"]
+    begun.discard()
 
 
 def test_pull_overwrites_neither_own_campaign_nor_own_session(
