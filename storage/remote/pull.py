@@ -138,8 +138,9 @@ def pull(
     """
     remote.check()
     listed = remote.campaigns()
-    fresh = not folder.exists() or not any(folder.iterdir())
     store = Store.create(folder)
+    # or an earlier pull was killed before it said where from
+    fresh = origin_of(folder) is None and not any((folder / "campaigns").glob("*"))
     done = PullResult()
     with (
         translated_disk_errors(folder),

@@ -10,7 +10,7 @@ import pytest
 from sliplab.storage.remote.manifest import manifest_key, read_manifests
 from sliplab.storage.remote.mirror import open_for_trial, open_mirror
 from sliplab.storage.remote.objects import Remote, RemoteError
-from sliplab.storage.remote.pull import PULLED, pull
+from sliplab.storage.remote.pull import PULLED, origin_of, pull
 from sliplab.storage.remote.push import push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.control import again
@@ -186,6 +186,12 @@ def test_mirror_of_older_version_follows(
     _, done = open_mirror(remote.url)
     assert (done.withdrawn, done.replaced, done.problems) == (1, 1, [])
     assert mirror.campaign("c").committed() == set(TRIALS[1:])
+
+
+def test_pull_that_was_killed_at_once_follows_later(remote: Remote, tmp_path: Path) -> None:
+    Store.create(tmp_path / "killed")
+    assert pull(remote, tmp_path / "killed").pulled == 3
+    assert origin_of(tmp_path / "killed") == remote.url
 
 
 def test_interrupted_download_of_a_trial_that_went_is_deleted(
