@@ -398,7 +398,8 @@ class _opened:
         if isinstance(error, FormatError):
             return
         if isinstance(error, _FAULTS):
-            raise Damage(f"cannot be read: {error}") from None
+            what = str(error).removeprefix(f"{self._path}: ").removeprefix("cannot be read: ")
+            raise Damage(f"cannot be read: {what}") from None
 
     def _close(self) -> None:
         if self._padded is not None:
