@@ -37,7 +37,7 @@ _TEMPORARY = re.compile(r"\.(?P<name>.*?)(?:\.sliplab-(?P<place>[0-9a-f]{8}))?\.
 _STALE_S = 86_400.0
 """Age of what another machine left: a program that still writes changes it more often."""
 _SWEPT: set[Path] = set()
-"""Folders that this process has swept."""
+"""Folders that this process has swept before its first write there."""
 _NAME_BYTES = 200
 """Bytes of a target's name in that of its temporary file; a file's name has at most 255."""
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
@@ -151,6 +151,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     The block writes a file or makes a folder there; a folder does not replace anything.
     """
+    sweep_marked(path.parent)
     temporary = temporary_path(path)
     _delete(temporary)  # of an earlier process with this number
     try:
@@ -168,7 +169,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def scratch_folder() -> Iterator[Path]:
     """Yield a new folder among the system's temporary files, deleted when the block ends."""
     base = Path(tempfile.gettempdir())
-    _sweep_once(base)
+    sweep_marked(base)
     made = Path(tempfile.mkdtemp(_mark(), ".scratch.", base))
     try:
         yield made
@@ -184,7 +185,9 @@ def temporary_path(path: Path, more: str = "") -> Path:
     Args:
         more: added to the name, where several threads write one file.
     """
-    _sweep_once(path.parent)
+    if path.parent not in _SWEPT:
+        _SWEPT.add(path.parent)
+        sweep_marked(path.parent)
     name = os.fsencode(path.name)[:_NAME_BYTES].decode(errors="ignore")
     return path.with_name(f".{name}{more}{_mark()}")
 
@@ -226,11 +229,8 @@ def sweep_temporary(folder: Path) -> int:
     return len(left)
 
 
-def _sweep_once(folder: Path) -> None:
-    """Delete what killed programs left in any folder, once a process: only what is surely ours."""
-    if folder in _SWEPT:
-        return
-    _SWEPT.add(folder)
+def sweep_marked(folder: Path) -> None:
+    """Delete what killed programs left in any folder: only what is marked as this project's."""
     with suppress(OSError):
         for path, runs in temporary_files(folder):
             marked = _TEMPORARY.fullmatch(path.name)

@@ -27,6 +27,7 @@ from sliplab.storage.files import (
     json_text,
     make_folder,
     read_blocks,
+    sweep_marked,
     write_blocks,
 )
 from sliplab.storage.trials.checksums import Checksum
@@ -184,6 +185,15 @@ class Remote:
                 "folder cannot be read at the moment; nothing was changed"
             )
         return found
+
+    def sweep(self, *folders: str) -> None:
+        """Delete temporary objects that killed programs left in some folders.
+
+        Only a folder has them: other storages write an object in one step, or clean up themselves.
+        """
+        if self._local:
+            for folder in folders:
+                sweep_marked(Path(self._path(folder) if folder else self._root))
 
     def size(self, key: str) -> int:
         """Return the bytes of an object.

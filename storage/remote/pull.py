@@ -386,6 +386,7 @@ def download(
         RemoteError: a file does not match its manifest, or cannot be fetched.
     """
     make_folder(staging)
+    sweep_temporary(staging)
     marker = staging / ELSEWHERE
     write_json(marker, {"take": manifest.take})
     for name, known in sorted(manifest.files.items()):

@@ -17,6 +17,7 @@ from sliplab.storage.remote.manifest import (
     Kind,
     Manifest,
     campaign_manifest,
+    manifest_key,
     objects_folder,
     quarantine_manifest,
     read_manifests,
@@ -138,6 +139,9 @@ class _Push:
                 raise
             self._problem(f"{error}")
             return
+        kinds: tuple[Kind, ...] = ("trials", "quarantine", "withdrawn")
+        folders = [manifest_key(kind, name).removesuffix(".json") for kind in kinds]
+        self.remote.sweep("", f"campaigns/{name}", objects_folder(name), *folders)
         self.sizes = self.remote.sizes(objects_folder(name))
         theirs = self._manifests("trials")
         self._send(about, self.campaign.folder, self._manifests("about").get(""))

@@ -95,12 +95,13 @@ def test_scratch_folder_of_killed_program_is_deleted(
 
 def test_killed_push_leaves_nothing_after_the_next(tmp_path: Path) -> None:
     where = campaign(tmp_path / "store")
-    commit(where, "t")
     url = f"file://{tmp_path}/shared"
-    killed("push", tmp_path / "store", url)
-    assert list((tmp_path / "shared").rglob("*.tmp"))
-    assert push(Store.open(tmp_path / "store"), Remote(url)).problems == []
-    assert not list((tmp_path / "shared").rglob("*.tmp"))
+    for trial in ("t", "u"):  # in an empty place, and in one that this process has written to
+        commit(where, trial)
+        killed("push", tmp_path / "store", url)
+        assert list((tmp_path / "shared").rglob("*.tmp"))
+        assert push(Store.open(tmp_path / "store"), Remote(url)).problems == []
+        assert not list((tmp_path / "shared").rglob("*.tmp"))
 
 
 def test_killed_publication_is_deleted_by_the_next(tmp_path: Path) -> None:

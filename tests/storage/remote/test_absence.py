@@ -15,6 +15,7 @@ from sliplab.storage.remote.push import push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.control import again
 from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
 
@@ -192,6 +193,19 @@ def test_pull_that_was_killed_at_once_follows_later(remote: Remote, tmp_path: Pa
     Store.create(tmp_path / "killed")
     assert pull(remote, tmp_path / "killed").pulled == 3
     assert origin_of(tmp_path / "killed") == remote.url
+
+
+def test_pull_goes_on_from_a_killed_one_without_its_leftovers(
+    lab: Campaign, remote: Remote, back: Campaign
+) -> None:
+    commit(lab, "depth=9mm,r=1")
+    push(store_of(lab), remote)
+    staging = back.folder / "incoming" / "depth=9mm,r=1"
+    staging.mkdir()
+    (staging / "elsewhere.json").write_text("{}")
+    (staging / ".data.h5.4194305.tmp").write_bytes(b"x")  # a process number beyond the largest
+    assert pull(remote, back.folder.parents[1]).pulled == 1
+    assert verify(store_of(back)) == []
 
 
 def test_interrupted_download_of_a_trial_that_went_is_deleted(
