@@ -95,7 +95,7 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check every checksum, count and clock of a store; read-only unless --quarantine."""
+    """Check every checksum, count and clock of a store; close files that others left open."""
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
     from sliplab.storage.trials.verify import quarantine_damaged, salvaged, trial_folders
