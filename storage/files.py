@@ -4,8 +4,10 @@ Every write in the project goes through here: a temporary file in the target's f
 the disk and renamed over the target, then the folder is flushed as well. In a folder that becomes
 visible by its own rename, files are only flushed.
 
-A killed program may leave a temporary file. Its name contains the process (`.NAME.PID.tmp`), so
-that `sweep_temporary` can delete the files of dead processes.
+A killed program may leave a temporary file or folder. Its name contains the machine and the process
+(`.NAME.sliplab-PLACE.PID.tmp`); the next program that writes into the same folder deletes it. On a
+shared folder another machine's process cannot be seen: its files are left alone for a day. Older
+versions wrote `.NAME.PID.tmp`, which are deleted in a store only, as nothing else writes there.
 """
 
 from __future__ import annotations
@@ -16,10 +18,14 @@ import json
 import math
 import os
 import re
+import shutil
+import socket
 import stat
+import tempfile
 import threading
+import time
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,8 +34,14 @@ from sliplab.storage.errors import StoreError
 
 MOST_BYTES = 1 << 30
 """Of a file that `read_plain` reads: far more than any model has."""
+COMMITTED = 0o444
+"""Mode of a committed trial's files: other programs open them to read only."""
 _BLOCK = 1 << 20
-_TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
+_TEMPORARY = re.compile(r"\.(?P<name>.*?)(?:\.sliplab-(?P<place>[0-9a-f]{8}))?\.(?P<pid>\d+)\.tmp")
+_STALE_S = 86_400.0
+"""Age of what another machine left: a program that still writes changes it more often."""
+_SWEPT: set[Path] = set()
+"""Folders that this process has swept before its first write there."""
 _NAME_BYTES = 200
 """Bytes of a target's name in that of its temporary file; a file's name has at most 255."""
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
@@ -51,6 +63,15 @@ def sync_file(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def protect(path: Path) -> None:
+    """Take away the right to write a file, which its user can still move and delete.
+
+    Nothing happens on a file system without such rights.
+    """
+    with suppress(OSError):
+        path.chmod(COMMITTED)
 
 
 def make_folder(folder: Path) -> None:
@@ -80,8 +101,7 @@ def write_blocks(path: Path, blocks: Iterable[bytes], mode: int = 0o666) -> None
     Args:
         mode: as `write_bytes`.
     """
-    name = os.fsencode(path.name)[:_NAME_BYTES].decode(errors="ignore")
-    temporary = path.with_name(f".{name}.{os.getpid()}.tmp")
+    temporary = temporary_path(path)
     try:
         temporary.unlink(missing_ok=True)  # of another mode, or a link
         with open(temporary, "xb", opener=lambda name, how: os.open(name, how, mode)) as handle:
@@ -130,7 +150,7 @@ def write_new_json(path: Path, data: Any) -> bool:
     Raises:
         ValueError: as `write_json`.
     """
-    temporary = path.with_name(f".{path.name}.{threading.get_ident()}.{os.getpid()}.tmp")
+    temporary = temporary_path(path, f".{threading.get_ident()}")
     try:
         write_json_aside(temporary, data)
         try:
@@ -147,26 +167,115 @@ def write_new_json(path: Path, data: Any) -> bool:
     return True
 
 
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes `path`, flushed, when the block ends without an error.
+
+    The block writes a file or makes a folder there; a folder does not replace anything.
+    """
+    sweep_marked(path.parent)
+    temporary = temporary_path(path)
+    _delete(temporary)  # of an earlier process with this number
+    try:
+        yield temporary
+        inside = sorted(temporary.rglob("*")) if temporary.is_dir() else []
+        for made in (*inside, temporary):
+            (sync_folder if made.is_dir() else sync_file)(made)
+        os.replace(temporary, path)
+    finally:
+        _delete(temporary)
+    sync_folder(path.parent)
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Yield a new folder among the system's temporary files, deleted when the block ends."""
+    base = Path(tempfile.gettempdir())
+    sweep_marked(base)
+    made = Path(tempfile.mkdtemp(_mark(), ".scratch.", base))
+    try:
+        yield made
+    finally:
+        _delete(made)
+
+
+def temporary_path(path: Path, more: str = "") -> Path:
+    """Return the path under which `path` is written until it is complete.
+
+    What killed programs left in its folder is deleted when this process first writes there.
+
+    Args:
+        more: added to the name, where several threads write one file.
+    """
+    if path.parent not in _SWEPT:
+        _SWEPT.add(path.parent)
+        sweep_marked(path.parent)
+    name = os.fsencode(path.name)[:_NAME_BYTES].decode(errors="ignore")
+    return path.with_name(f".{name}{more}{_mark()}")
+
+
+def _mark() -> str:
+    return f".sliplab-{_place()}.{os.getpid()}.tmp"
+
+
+@cache
+def _place() -> str:
+    """Return a hash of what numbers this process: the machine since its start, and a container."""
+    found = []
+    for about in ("/proc/sys/kernel/random/boot_id", "/proc/self/ns/pid"):
+        with suppress(OSError):
+            found.append(os.readlink(about) if "ns" in about else Path(about).read_text())
+    return hashlib.sha256("".join(found or [socket.gethostname()]).encode()).hexdigest()[:8]
+
+
 def temporary_files(folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield temporary files in a folder, each with whether its program still runs."""
+    """Yield temporary files and folders, each with whether its program may still run."""
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
-        if (found := _TEMPORARY.fullmatch(path.name)) and path.is_file():
-            yield path, _runs(int(found[1]))
+        found = _TEMPORARY.fullmatch(path.name)
+        if found and not path.is_symlink() and (path.is_file() or found["place"]):
+            yield path, _may_run(path, int(found["pid"]), found["place"])
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a name is that of a temporary file or folder of this project."""
+    return _TEMPORARY.fullmatch(name) is not None
 
 
 def sweep_temporary(folder: Path) -> int:
-    """Delete temporary files that a killed program left in a folder; return their number."""
+    """Delete what killed programs left in a folder of a store; return the number of files."""
     left = [path for path, runs in temporary_files(folder) if not runs]
     for path in left:
-        path.unlink(missing_ok=True)
+        _delete(path)
     return len(left)
 
 
-def _runs(pid: int) -> bool:
+def sweep_marked(folder: Path) -> None:
+    """Delete what killed programs left in any folder: only what is marked as this project's."""
+    with suppress(OSError):
+        for path, runs in temporary_files(folder):
+            marked = _TEMPORARY.fullmatch(path.name)
+            if marked and marked["place"] and not runs and path.lstat().st_uid == os.getuid():
+                _delete(path)
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _may_run(path: Path, pid: int, place: str | None) -> bool:
+    if place not in {None, _place()}:  # another machine's, or of before this one's start
+        try:
+            return time.time() - path.lstat().st_mtime < _STALE_S
+        except OSError:
+            return True
     if pid == os.getpid():
-        return False  # asked between two writes of ours: it is of another with this number
+        # without a place it is of another process with this number: asked between two writes
+        return place is not None
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -288,8 +397,13 @@ def _finite(text: str) -> float:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, 64 hex digits."""
+    return sha256_of(read_blocks(path))
+
+
+def sha256_of(blocks: Iterable[bytes]) -> str:
+    """Return the SHA-256 of some blocks of bytes, 64 hex digits."""
     digest = hashlib.sha256()
-    for block in read_blocks(path):
+    for block in blocks:
         digest.update(block)
     return digest.hexdigest()
 

@@ -20,7 +20,8 @@ def test_links_show_every_package_and_file() -> None:
 def test_clone_called_sliplab_in_the_working_folder_hides_nothing(tmp_path: Path) -> None:
     """Python's path of an editable install, without its packages."""
     (tmp_path / "sliplab").symlink_to(ROOT)
-    code = f"import sys; sys.path += [{str(ROOT / '.links')!r}]; import sliplab; print(sliplab.__file__)"
+    links = str(ROOT / ".links")
+    code = f"import sys; sys.path += [{links!r}]; import sliplab; print(sliplab.__file__)"
     done = subprocess.run(
         [sys.executable, "-S", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )

@@ -96,7 +96,7 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check every checksum, count and clock of a store; read-only unless --quarantine."""
+    """Check every checksum, count and clock of a store; close files that others left open."""
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
     from sliplab.storage.trials.verify import quarantine_damaged, salvaged, trial_folders
@@ -108,7 +108,10 @@ def verify(
     opened = Store.open(Path(store))
     total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
     with console.bar("verify (trials)", total) as bar:
-        problems = look(opened, lambda name: bar.advance(1, name))
+        mended: list[Path] = []
+        problems = look(opened, lambda name: bar.advance(1, name), mended.append)
+    for path in mended:
+        console.say(f"{path}: another program had left it open for writing; as committed again")
     moved: list[str] = []
     if quarantine and any(item.trial for item in problems):
         from sliplab.flows.collecting.requests import store_lock
@@ -130,6 +133,7 @@ def verify(
             "problems": [vars(item) for item in problems],
             "quarantined": moved,
         }
+        result |= {"mended": [str(path) for path in mended]} if mended else {}
         console.print_json(result | ({"salvaged": torn} if torn else {}))
     elif problems:
         rows = [[item.path, item.what] for item in problems]

@@ -143,12 +143,11 @@ def clean_up(store: Store) -> None:
     """Delete the temporary files that killed programs left outside the campaigns."""
     sweep_temporary(store.folder)
     sweep_temporary(store.folder / control.FOLDER)
-    derived = store.folder / "derived"
-    folders = [store.folder / "models", store.folder / "report", derived]
-    if derived.is_dir():
-        folders += [path for path in derived.rglob("*") if path.is_dir()]
-    for folder in folders:
-        sweep_temporary(folder)
+    for name in ("models", "report", "derived", "review", "pulled"):
+        folder = store.folder / name
+        for path in (folder, *folder.rglob("*")):
+            if path.is_dir():
+                sweep_temporary(path)
 
 
 def _session_record(run_request: RunRequest) -> SessionRecord:

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypedDict
 
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -226,13 +225,14 @@ def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's clocks are fitted."""
     from sliplab.analysis.clocks.synchronise import further_clocks, streams_of, synchronise
     from sliplab.analysis.quality import sync_gate
+    from sliplab.storage.files import scratch_folder
     from sliplab.storage.trials.checksums import DATA
     from sliplab.storage.trials.hdf5_reader import StreamReader
     from sliplab.storage.trials.writer import TrialWriter
 
     rate = run_request.plan.protocol.collection.recording.sync_rate
-    with TemporaryDirectory() as folder:
-        check = Path(folder) / "check"
+    with scratch_folder() as folder:
+        check = folder / "check"
         writer = TrialWriter(check, check.with_name("none"), None, rate)
         rig.listen(LISTEN_S, writer, rate)
         sealed = writer.seal()

@@ -310,25 +310,21 @@ def _make() -> None:
 
 def _keep(made: Path, template: Path) -> None:
     template.parent.mkdir(parents=True, exist_ok=True)
-    temporary = template.with_name(f".{template.name}.{os.getpid()}.tmp")
-    try:
-        with (
-            closing(sqlite3.connect(made)) as source,
-            closing(sqlite3.connect(temporary)) as target,
-        ):
-            source.backup(target)
-        os.replace(temporary, template)
-    finally:
-        temporary.unlink(missing_ok=True)
+    from sliplab.storage.files import replacing
+
+    with (
+        replacing(template) as temporary,
+        closing(sqlite3.connect(made)) as source,
+        closing(sqlite3.connect(temporary)) as target,
+    ):
+        source.backup(target)
 
 
 def _copy(template: Path, target: Path) -> None:
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
+    from sliplab.storage.files import replacing
+
+    with replacing(target) as temporary:
         shutil.copyfile(template, temporary)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ import os
 import shutil
 import signal
 import subprocess
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -43,7 +42,7 @@ from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import event_rate
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import make_folder
+from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import (
     EVENTS_KIND,
@@ -109,8 +108,7 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
     library.set_strict_mode(True)  # what cannot be written is an error, not a warning
 
     make_folder(path.parent)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with replacing(path) as unfinished:
         stream = library.RecordingStream(
             APPLICATION, recording_id=f"{subject.item.name}/{subject.trial}"
         )
@@ -124,9 +122,6 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
             stream.flush()
         finally:
             stream.disconnect()
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
     return {**counts, "bytes": path.stat().st_size}
 
 
@@ -140,8 +135,8 @@ def show(subject: Subject) -> None:
     rerun()
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise StoreError("no display available; --save FILE.rrd writes a file to open elsewhere")
-    with tempfile.TemporaryDirectory(prefix="sliplab-view-") as folder:
-        path = Path(folder) / f"{subject.item.name}.rrd"
+    with scratch_folder() as folder:
+        path = folder / f"{subject.item.name}.rrd"
         save(subject, path)
         with silent() as environment, viewer(str(path), environment=environment) as window:
             while window.poll() is None:
@@ -202,8 +197,8 @@ def silent() -> Iterator[dict[str, str]]:
     Raises:
         StoreError: the switch could not be set.
     """
-    with tempfile.TemporaryDirectory(prefix="sliplab-rerun-") as folder:
-        environment = {**os.environ, "XDG_CONFIG_HOME": folder}
+    with scratch_folder() as folder:
+        environment = {**os.environ, "XDG_CONFIG_HOME": str(folder)}
         done = subprocess.run(
             [program(), "analytics", "disable"], env=environment, capture_output=True, timeout=60,
             check=False,

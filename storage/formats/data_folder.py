@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -19,6 +17,7 @@ from zipfile import BadZipFile, ZipFile, ZipInfo
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern
 from sliplab.protocols.recorded import natural
+from sliplab.storage.files import scratch_folder
 from sliplab.storage.formats.foreign import Skipped
 
 MOST_FILES = 2_000_000
@@ -163,15 +162,12 @@ class DataFolder:
         if self._zip is None:
             yield [self._folder / name for name in names]
             return
-        folder = Path(tempfile.mkdtemp(prefix="sliplab-"))
-        try:
+        with scratch_folder() as folder:
             paths = []
             for name in names:
                 paths.append(folder / Path(name).name)
                 paths[-1].write_bytes(self._unpack(self._items[name]))
             yield paths
-        finally:
-            shutil.rmtree(folder)
 
 
 def _no_link(path: str, flags: int) -> int:

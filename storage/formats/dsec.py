@@ -7,7 +7,6 @@ of the file.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import suppress
 from dataclasses import replace
@@ -31,10 +30,9 @@ from sliplab.storage.formats.foreign import (
 )
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, EventChunk
-from sliplab.storage.trials.hdf5_reader import RowFile, Rows
+from sliplab.storage.trials.hdf5_reader import FileContent, RowFile, Rows
+from sliplab.storage.trials.superblock import SIGNATURE
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-"""First bytes of an HDF5 file."""
 PIECE = 1 << 20
 _SUPERBLOCK = 52
 _FEW_ROWS = 1 << 12
@@ -374,14 +372,14 @@ class _opened:
 
     def __init__(self, path: Path, *, torn: bool = False) -> None:
         self._path, self._torn = path, torn
-        self._padded: _Padded | None = None
+        self._padded: FileContent | None = None
 
     def __enter__(self) -> tuple[RowFile, Callable[[str], Rows]]:
         size = self._path.stat().st_size
         try:
             end = _stated_end(self._path)
             if self._torn and end > size:
-                self._padded = _Padded(self._path, end)
+                self._padded = FileContent(self._path, end)
             self._file = RowFile(self._path, self._padded)
         except _FAULTS as error:
             self._close()
@@ -400,7 +398,8 @@ class _opened:
         if isinstance(error, FormatError):
             return
         if isinstance(error, _FAULTS):
-            raise Damage(f"cannot be read: {error}") from None
+            what = str(error).removeprefix(f"{self._path}: ").removeprefix("cannot be read: ")
+            raise Damage(f"cannot be read: {what}") from None
 
     def _close(self) -> None:
         if self._padded is not None:
@@ -425,38 +424,6 @@ def _stated_end(path: Path) -> int:
     if at is None or not head.startswith(SIGNATURE) or width != b"\x08":
         return 0
     return int.from_bytes(head[at : at + 8], "little")
-
-
-class _Padded(io.RawIOBase):
-    """A file as long as it says it is: zeros in place of what is missing at its end."""
-
-    def __init__(self, path: Path, size: int) -> None:
-        self._file, self._size, self._at = path.open("rb"), size, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at}.get(whence, self._size)
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        room = memoryview(buffer).cast("B")
-        self._file.seek(self._at)
-        filled = self._file.readinto(room)
-        room[filled:] = bytes(len(room) - filled)
-        self._at += len(room)
-        return len(room)
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
 
 
 def _integers(values: Any) -> I64:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
+from sliplab.storage.files import make_folder, replacing, sync_folder, write_json
 from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, Aedat4Writer, Stream
 from sliplab.storage.formats.dsec import write_dsec
 from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST, RISING, Triggers
@@ -51,15 +50,11 @@ def export_trials(
     for recording in recordings:
         on_trial(recording.trial_id)
         path = folder / f"{recording.trial_id}{SUFFIXES[kind]}"
-        temporary = path.with_name(f".{path.name[:200]}.{os.getpid()}.tmp")
         try:
-            counts = _WRITERS[kind](recording, temporary, stream)
-            sync_file(temporary)
-            os.replace(temporary, path)
+            with replacing(path) as temporary:
+                counts = _WRITERS[kind](recording, temporary, stream)
         except ValueError as error:
             raise InputError("--format", "", kind, f"trial {recording.trial_id} {error}") from None
-        finally:
-            temporary.unlink(missing_ok=True)
         listed.append(_listed(recording, path.name, counts))
     sync_folder(folder)
     simulated = any(recording.simulated for recording in recordings)

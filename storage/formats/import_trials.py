@@ -87,7 +87,7 @@ def import_trials(
             committed; of this one nothing is left.
     """
     campaign = store.campaign(name)
-    fresh = not campaign.begun
+    fresh = not campaign.folder.exists()
     existing = campaign.committed()
     joined: ForeignCampaign | None = None
     imported: list[str] = []

@@ -6,9 +6,7 @@ complete, or it is not there. The store is only read.
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +15,7 @@ from pathlib import Path
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import make_folder, sync_file, sync_folder
+from sliplab.storage.files import make_folder, replacing
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 
@@ -200,19 +198,6 @@ def staged(output: Path) -> Iterator[Path]:
             "--output", "", str(output), "exists; it is not overwritten: name a new folder"
         )
     make_folder(output.parent)
-    folder = output.with_name(f".{output.name[:200]}.{os.getpid()}.tmp")
-    shutil.rmtree(folder, ignore_errors=True)  # of an earlier process with this number
-    folder.mkdir()
-    try:
+    with replacing(output) as folder:
+        folder.mkdir()
         yield folder
-        for path in sorted(folder.rglob("*")):
-            if path.is_dir():
-                sync_folder(path)
-            else:
-                sync_file(path)
-        sync_folder(folder)
-        os.rename(folder, output)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    sync_folder(output.parent)

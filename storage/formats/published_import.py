@@ -19,6 +19,7 @@ from sliplab.storage.errors import DamagedFile, StoreError
 from sliplab.storage.files import (
     inside,
     make_folder,
+    protect,
     sync_file,
     sync_folder,
     write_bytes,
@@ -184,8 +185,10 @@ class PublishedTrial:
         write_json_aside(
             incoming / PROVENANCE, Provenance.model_validate({**found, **about}).to_json()
         )
-        for file in (*incoming.iterdir(), incoming):
-            (sync_folder if file.is_dir() else sync_file)(file)
+        for file in incoming.iterdir():
+            sync_file(file)
+            protect(file)
+        sync_folder(incoming)
 
     def _copy_derived(self, store: Store, campaign: Campaign) -> Iterator[Path]:
         for step, files in self.derived.items():

@@ -5,6 +5,8 @@
     URL/campaigns/NAME/about.json            manifest of campaign.json, protocol, rig file, bench
     URL/campaigns/NAME/trials/ID.json        manifest of a committed trial, written after its files
     URL/campaigns/NAME/quarantine/ID.N.json  manifest of a quarantined folder, where asked for
+    URL/campaigns/NAME/withdrawn/TAKE.json   mark: the recording TAKE of a trial is not wanted any
+                                             more; without one, a missing manifest is a fault
 
 A manifest comes from elsewhere and is not trusted: names are plain file names of the kinds that
 belong there, and objects are found by their checksums, so that no path in it leads anywhere.
@@ -39,17 +41,19 @@ from sliplab.storage.trials.checksums import (
 from sliplab.storage.trials.control import SKIPPED
 from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError
 
-Kind = Literal["about", "trials", "quarantine"]
+Kind = Literal["about", "trials", "quarantine", "withdrawn"]
 FORMAT = 1
 NEEDED: Mapping[Kind, frozenset[str]] = {
     "about": frozenset({INFO, PROTOCOL, RIG, CHECKSUMS}),
     "trials": frozenset({DATA, RECORD, CHECKSUMS, PROVENANCE}),
     "quarantine": frozenset({CAUSE}),
+    "withdrawn": frozenset(),
 }
 ALLOWED: Mapping[Kind, frozenset[str]] = {
     "about": NEEDED["about"] | {SKIPPED, CHOICES, STOPPING},
     "trials": NEEDED["trials"] | {FRAMES},
     "quarantine": NEEDED["trials"] | {FRAMES, CAUSE, SPOOL},
+    "withdrawn": frozenset(),
 }
 _BENCH = re.compile(r"bench/\d{4,8}\.json")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -61,7 +65,7 @@ class Manifest:
     """All files of a campaign's description, a trial, or a quarantined folder.
 
     Attributes:
-        name: the folder's; empty for a description.
+        name: the folder's; empty for a description; the take of a withdrawn trial.
         files: checksums by path below the folder.
         take: hash of the checksums of raw data and record; empty if there are none.
     """
@@ -138,8 +142,10 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
 
 def _allowed(path: str, kind: Kind) -> bool:
     """Return whether a file of this name may be in a manifest of a kind."""
-    further = _BENCH.fullmatch(path) is not None if kind == "about" else is_stream_file(path)
-    return path in ALLOWED[kind] or further
+    further = is_stream_file(path)
+    if kind == "about":
+        further = _BENCH.fullmatch(path) is not None
+    return path in ALLOWED[kind] or (further and kind != "withdrawn")
 
 
 def read_manifests(
@@ -177,6 +183,35 @@ def read_manifests(
         except RemoteError as error:
             found[name] = error
     return found
+
+
+def listing_problem(
+    remote: Remote,
+    campaign: str,
+    about: Manifest | RemoteError | None,
+    trials: Mapping[str, Manifest | RemoteError],
+) -> str | None:
+    """Return why the list of a campaign's trials cannot be complete; None if it can be.
+
+    Every file that was pushed belongs to a manifest; a campaign whose files are there without any
+    trial has lost its manifests, or its folder cannot be read completely at the moment.
+    """
+    if about is None and trials:
+        return f"{remote.where(manifest_key('about', campaign))}: is missing"
+    if trials or read_manifests(remote, campaign, "withdrawn"):
+        return None
+    listed = [about, *read_manifests(remote, campaign, "quarantine").values()]
+    known = {
+        item.sha256 for found in listed if isinstance(found, Manifest)
+        for item in found.files.values()
+    }  # fmt: skip
+    if remote.sizes(objects_folder(campaign)).keys() <= known:
+        return None
+    return (
+        f"{remote.url}/campaigns/{campaign}/trials: is empty or missing, although files of trials "
+        "are there: a push has not ended, or the folder cannot be read at the moment; try again, "
+        "and if it stays so, push the store again"
+    )
 
 
 def campaign_manifest(campaign: Campaign) -> Manifest:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from sliplab.protocols.hashing import hash_text
 from sliplab.storage.errors import StoreError, translated_disk_errors
-from sliplab.storage.files import make_folder, write_json
+from sliplab.storage.files import make_folder, temporary_path, write_json
 from sliplab.storage.remote.manifest import objects_folder, read_manifests
 from sliplab.storage.remote.objects import Remote, RemoteError, RemoteMissing, check_url, is_url
 from sliplab.storage.remote.pull import ORIGIN, PullResult, download, origin_of, pull
@@ -102,7 +102,7 @@ def _download_trial(remote: Remote, campaign: str, trial: str, target: Path) -> 
     with translated_disk_errors(target):
         for name in ("trials", "incoming"):
             make_folder(folder / name)
-        staging = folder / "incoming" / f"{trial}.{os.getpid()}"
+        staging = temporary_path(folder / "incoming" / trial)
         download(remote, found, staging, target, small=True)
 
 

@@ -21,7 +21,15 @@ from urllib.parse import urlsplit
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.storage.errors import NoStore, StoreError, masked
-from sliplab.storage.files import json_text, make_folder, read_blocks, write_blocks
+from sliplab.storage.files import (
+    COMMITTED,
+    is_temporary,
+    json_text,
+    make_folder,
+    read_blocks,
+    sweep_marked,
+    write_blocks,
+)
 from sliplab.storage.trials.checksums import Checksum
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
@@ -119,7 +127,8 @@ class Remote:
         try:
             self.check()
         except RemoteMissing:
-            if self._list(""):
+            listed = [str(entry["name"]).rpartition("/")[2] for entry in self._list("")]
+            if not all(map(is_temporary, listed)):  # a first push that was killed
                 raise RemoteError(
                     f"{self.url}: contains other files; give an empty location or one "
                     "created by `sliplab push`"
@@ -162,6 +171,29 @@ class Remote:
         """Return the names of the folders right below `folder`."""
         found = (entry for entry in self._list(folder) if entry["type"] == "directory")
         return sorted(str(entry["name"]).rstrip("/").rpartition("/")[2] for entry in found)
+
+    def campaigns(self) -> list[str]:
+        """Return the names of the pushed campaigns.
+
+        Raises:
+            RemoteMissing: there is none: an empty or missing list is no news of any campaign.
+        """
+        found = self.folders("campaigns")
+        if not found:
+            raise RemoteMissing(
+                f"{self.where('campaigns')}: is empty or missing: no campaign was pushed, or the "
+                "folder cannot be read at the moment; nothing was changed"
+            )
+        return found
+
+    def sweep(self, *folders: str) -> None:
+        """Delete temporary objects that killed programs left in some folders.
+
+        Only a folder has them: other storages write an object in one step, or clean up themselves.
+        """
+        if self._local:
+            for folder in folders:
+                sweep_marked(Path(self._path(folder) if folder else self._root))
 
     def size(self, key: str) -> int:
         """Return the bytes of an object.
@@ -222,12 +254,14 @@ class Remote:
     def get(self, key: str, path: Path, known: Checksum) -> None:
         """Fetch an object into `path`, which appears once all of it matches its checksum.
 
+        It is read-only, as a committed file is.
+
         Raises:
             RemoteMissing: it does not exist.
             RemoteError: it cannot be read, or does not match its checksum.
             OSError: `path` cannot be written.
         """
-        write_blocks(path, self._checked(key, known))
+        write_blocks(path, self._checked(key, known), COMMITTED)
 
     def put(self, key: str, source: bytes | Path) -> None:
         """Write an object from bytes or a file, in one step as far as the storage can."""

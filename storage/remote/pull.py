@@ -8,15 +8,17 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import (
+    inside,
     make_folder,
     read_json,
     safe_name,
+    sweep_temporary,
     sync_folder,
     write_bytes,
     write_json,
@@ -24,6 +26,7 @@ from sliplab.storage.files import (
 from sliplab.storage.remote.manifest import (
     Manifest,
     check_against_sums,
+    listing_problem,
     read_manifests,
     take_of,
 )
@@ -43,9 +46,14 @@ from sliplab.storage.trials.store import Campaign, Store
 
 ORIGIN = "origin.json"
 """In a store that was pulled: its URL."""
+PULLED = "pulled"
+"""Folder of a store that was pulled: for each of its campaigns a folder that has, by trial, the
+take that came from the URL. What is not in it is the store's own."""
 BIG = frozenset({DATA, FRAMES})
 """Files of a trial that a mirror fetches when they are first read."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
+_ASIDE = ".aside"
+"""End of the name of a quarantined folder while it is downloaded."""
 
 
 @dataclass
@@ -54,7 +62,8 @@ class PullResult:
 
     Attributes:
         trials: visible at the URL; pulled and replaced: of these, downloaded now; there: they had
-            been before; withdrawn: no longer visible at the URL, and quarantined here.
+            been before; withdrawn: pulled before, marked as withdrawn at the URL, and quarantined
+            here.
         set_aside: of quarantine; files and bytes: fetched.
         problems: what was not downloaded, and why.
     """
@@ -78,6 +87,27 @@ def origin_of(folder: Path) -> str | None:
         return None
 
 
+def _note(store: Path, campaign: str, trial: str) -> Path:
+    """Return the path of the note that a trial was pulled."""
+    return inside(store / PULLED / campaign / f"{trial}.json", store)
+
+
+def note_pulled(target: Path, take: str) -> None:
+    """Note that the trial at `target` comes from the URL of its store, before it does."""
+    path = _note(target.parents[3], target.parents[1].name, target.name)
+    make_folder(path.parent)
+    write_json(path, {"take": take})
+
+
+def was_pulled(target: Path) -> bool:
+    """Return whether the trial at `target` is as it was pulled from the URL of its store."""
+    path = _note(target.parents[3], target.parents[1].name, target.name)
+    try:
+        return bool(read_json(path)["take"] == take_of(target))
+    except (OSError, ValueError, KeyError):
+        return False
+
+
 def pull(
     remote: Remote,
     folder: Path,
@@ -90,9 +120,9 @@ def pull(
 ) -> PullResult:
     """Download what the store in `folder` lacks; it is made if there is none.
 
-    A store that was pulled from here before follows: its descriptions are updated, and
-    trials that were retaken, or withdrawn, go to quarantine. In any other store nothing that
-    exists is changed.
+    A store that was pulled from here before follows: descriptions of pulled campaigns are updated,
+    and pulled trials that were retaken, or are marked as withdrawn, go to quarantine. Its own
+    trials and any other store's are not changed, nor is a trial that is merely not listed.
 
     Args:
         campaigns: only these.
@@ -101,13 +131,16 @@ def pull(
         on_trial: called with each trial's id once it is done with.
 
     Raises:
-        RemoteError: nothing was pushed there, or the storage fails; what was downloaded stays.
+        RemoteError: nothing was pushed there, no campaign is listed, or the storage fails; what was
+            downloaded stays.
         StoreError: the folder holds something else, or cannot be written.
         Locked: another program writes into the store.
     """
     remote.check()
-    fresh = not folder.exists() or not any(folder.iterdir())
+    listed = remote.campaigns()
     store = Store.create(folder)
+    # or an earlier pull was killed before it said where from
+    fresh = origin_of(folder) is None and not any((folder / "campaigns").glob("*"))
     done = PullResult()
     with (
         translated_disk_errors(folder),
@@ -116,15 +149,27 @@ def pull(
         if fresh:
             write_json(folder / ORIGIN, {"url": remote.url})
         follows = origin_of(folder) == remote.url
-        for name in remote.folders("campaigns"):
-            if campaigns is not None and name not in campaigns:
+        notes = inside(folder / PULLED, folder)
+        older = follows and not fresh and not notes.is_dir()
+        pulled = {path.name for path in notes.iterdir()} if notes.is_dir() else set()
+        if follows:
+            make_folder(notes)
+        wanted = {*listed, *pulled} if campaigns is None else set(campaigns)
+        for name in sorted(wanted - {*listed}):
+            done.problems.append(
+                f"{remote.url}: campaign '{name}' is not listed; nothing of it was changed"
+            )
+        for name in listed:
+            if name not in wanted:
                 continue
             try:
                 campaign = store.campaign(safe_name(name))
             except StoreError as error:
                 done.problems.append(f"{remote.url}: {error}")
                 continue
-            _Pull(remote, campaign, follows, small, done, on_bytes).run(quarantine, on_trial)
+            ours = campaign.begun and name not in pulled and not older
+            one = _Pull(remote, campaign, follows and not ours, older, small, done, on_bytes)
+            one.run(quarantine, on_trial)
     return done
 
 
@@ -137,12 +182,14 @@ class _Pull:
     """Pull of one campaign.
 
     Attributes:
-        follows: the store was pulled from this remote before, and is changed as the remote is.
+        follows: the campaign was pulled from this remote, and is changed as the remote is.
+        older: by a version that did not note which trials; those that agree count as pulled.
     """
 
     remote: Remote
     campaign: Campaign
     follows: bool
+    older: bool
     small: bool
     done: PullResult
     on_bytes: OnBytes | None
@@ -150,6 +197,9 @@ class _Pull:
     def run(self, quarantine: bool, on_trial: Callable[[str], None] | None) -> None:
         name = self.campaign.name
         about = read_manifests(self.remote, name, "about").get("")
+        pushed = read_manifests(self.remote, name, "trials")
+        if (lost := listing_problem(self.remote, name, about, pushed)) is not None:
+            self.done.problems.append(lost)
         if about is None:  # its first push has not ended
             return
         if isinstance(about, RemoteError):
@@ -160,7 +210,8 @@ class _Pull:
         except (_Differs, RemoteError) as error:
             self.done.problems.append(str(error))
             return
-        pushed = read_manifests(self.remote, name, "trials")
+        if self.follows:
+            make_folder(_note(self.campaign.folder.parents[1], name, "").parent)
         for trial, known in pushed.items():
             self.done.trials += 1
             try:
@@ -171,13 +222,40 @@ class _Pull:
                 self.done.problems.append(str(error))
             if on_trial is not None:
                 on_trial(trial)
+        self._delete_partial({*pushed}, quarantine)
         if self.follows:
-            for trial in sorted(self.campaign.committed() - pushed.keys()):
-                path = self.campaign.folder / "trials" / trial
-                self.campaign.quarantine(path, f"withdrawn: is no longer at {self.remote.url}")
-                self.done.withdrawn += 1
+            self._withdraw(self.campaign.committed() - pushed.keys())
         if quarantine:
             self._pull_quarantine()
+
+    def _delete_partial(self, trials: Set[str], quarantine: bool) -> None:
+        """Delete what an interrupted pull left and this one does not continue."""
+        incoming = self.campaign.folder / "incoming"
+        sweep_temporary(incoming)
+        for path in sorted(incoming.iterdir()):
+            wanted = path.name in trials or (quarantine and path.suffix == _ASIDE)
+            if not wanted and not path.name.startswith(".") and (path / ELSEWHERE).is_file():
+                shutil.rmtree(path)
+
+    def _withdraw(self, unlisted: Set[str]) -> None:
+        """Quarantine trials that were pulled and are marked as withdrawn; keep all others."""
+        marked = read_manifests(self.remote, self.campaign.name, "withdrawn")
+        lost = []
+        for trial in sorted(unlisted):
+            path = self.campaign.folder / "trials" / trial
+            if not _from_there(path):
+                continue
+            if not isinstance(marked.get(take_of(path)), Manifest):
+                lost.append(trial)
+                continue
+            self.campaign.quarantine(path, f"withdrawn: is no longer at {self.remote.url}")
+            self.done.withdrawn += 1
+        if lost:
+            self.done.problems.append(
+                f"{self.remote.url}: campaign '{self.campaign.name}': {len(lost)} trials that were "
+                f"pulled are neither listed nor marked as withdrawn, and are left as they are: "
+                f"{', '.join(lost[:3])}{' ...' if len(lost) > 3 else ''}"
+            )
 
     def _describe(self, about: Manifest) -> None:
         """Download the campaign's own files: all of them, then their checksums."""
@@ -185,6 +263,12 @@ class _Pull:
         for name in _FOLDERS:
             make_folder(self.campaign.inside(folder / name))
         lacks = [name for name, known in about.files.items() if known.problem(folder / name)]
+        for name in [name for name in lacks if name.startswith("bench/") and self.follows]:
+            if (folder / name).exists():  # records of sessions are never changed: it is our own
+                self.done.problems.append(
+                    f"{folder / name}: differs from that at {self.remote.url}, and is left as it is"
+                )
+                lacks.remove(name)
         if not lacks:
             return
         if not self.follows:
@@ -215,10 +299,13 @@ class _Pull:
         if target.exists():
             cause = incomplete(target) if target.is_dir() else "is no folder"
             if cause is None and take_of(target) == manifest.take:
+                known = self.older or (target / ELSEWHERE).is_file()
+                if self.follows and known and not was_pulled(target):
+                    note_pulled(target, manifest.take)
                 self._complete(target, manifest)
                 self.done.there += 1
                 return
-            if cause is None and not self.follows:
+            if cause is None and not (self.follows and _from_there(target)):
                 raise _Differs(
                     f"{target}: is another attempt than that at {self.remote.url}; pull into "
                     "another store"
@@ -229,6 +316,8 @@ class _Pull:
         staging = self.campaign.inside(self.campaign.folder / "incoming" / manifest.name)
         if staging.exists() and not (staging / ELSEWHERE).exists():
             self.campaign.quarantine(staging, "interrupted")
+        if self.follows:
+            note_pulled(target, manifest.take)
         download(self.remote, manifest, staging, target, small=self.small, on_file=self._count)
         if replaced:
             self.done.replaced += 1
@@ -253,7 +342,7 @@ class _Pull:
             try:
                 if isinstance(known, RemoteError):
                     raise known
-                staging = self.campaign.folder / "incoming" / f"{name}.aside"
+                staging = self.campaign.folder / "incoming" / f"{name}{_ASIDE}"
                 download(self.remote, known, staging, target, on_file=self._count)
                 self.done.set_aside += 1
             except RemoteError as error:
@@ -264,6 +353,11 @@ class _Pull:
         self.done.bytes += size
         if self.on_bytes is not None:
             self.on_bytes(size)
+
+
+def _from_there(target: Path) -> bool:
+    """Return whether a trial was pulled; that of a mirror shows it itself, of any version."""
+    return was_pulled(target) or (target / ELSEWHERE).is_file()
 
 
 def _big(name: str) -> bool:
@@ -292,6 +386,7 @@ def download(
         RemoteError: a file does not match its manifest, or cannot be fetched.
     """
     make_folder(staging)
+    sweep_temporary(staging)
     marker = staging / ELSEWHERE
     write_json(marker, {"take": manifest.take})
     for name, known in sorted(manifest.files.items()):

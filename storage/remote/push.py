@@ -8,7 +8,7 @@ URL are not sent again.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from sliplab.storage.remote.manifest import (
     Kind,
     Manifest,
     campaign_manifest,
+    manifest_key,
     objects_folder,
     quarantine_manifest,
     read_manifests,
@@ -138,6 +139,9 @@ class _Push:
                 raise
             self._problem(f"{error}")
             return
+        kinds: tuple[Kind, ...] = ("trials", "quarantine", "withdrawn")
+        folders = [manifest_key(kind, name).removesuffix(".json") for kind in kinds]
+        self.remote.sweep("", f"campaigns/{name}", objects_folder(name), *folders)
         self.sizes = self.remote.sizes(objects_folder(name))
         theirs = self._manifests("trials")
         self._send(about, self.campaign.folder, self._manifests("about").get(""))
@@ -149,6 +153,7 @@ class _Push:
             self._push_trial(trial, theirs.get(trial))
             if on_trial is not None:
                 on_trial(trial)
+        self._mark_withdrawn(ours)
         for trial, pushed in theirs.items():
             if trial not in ours and pushed.take in self._takes(trial, AGAIN):
                 self.remote.remove(pushed.key)
@@ -177,6 +182,14 @@ class _Push:
                 self.done.pushed += 1
             else:
                 self.done.replaced += 1
+
+    def _mark_withdrawn(self, ours: Set[str]) -> None:
+        """Mark each take that a person wants again: other stores withdraw marked takes only."""
+        marked = self._manifests("withdrawn")
+        current = {take_of(self.campaign.folder / "trials" / trial) for trial in ours}
+        for take in sorted(self._takes(None, AGAIN) - current - marked.keys()):
+            mark = Manifest("withdrawn", self.campaign.name, take, {}, take)
+            self.remote.put(mark.key, mark.dump())
 
     def _push_quarantine(self) -> None:
         existing = self._manifests("quarantine")
@@ -268,12 +281,16 @@ class _Push:
                 "push to another location"
             )
 
-    def _takes(self, trial: str, cause: str) -> set[str]:
-        """Return earlier takes of a trial that were quarantined for a cause that begins so."""
+    def _takes(self, trial: str | None, cause: str) -> set[str]:
+        """Return earlier takes of a trial that were quarantined for a cause that begins so.
+
+        Args:
+            trial: None for any.
+        """
         return {
             take_of(self.campaign.folder / "quarantine" / item["folder"])
             for item in self.campaign.quarantined()
-            if item["trial"] == trial and str(item["cause"]).startswith(cause)
+            if trial in {None, item["trial"]} and str(item["cause"]).startswith(cause)
         } - {""}
 
     def _problem(self, text: str) -> None:

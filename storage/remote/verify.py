@@ -10,15 +10,16 @@ from sliplab.storage.remote.manifest import (
     Kind,
     Manifest,
     check_against_sums,
+    listing_problem,
     objects_folder,
     read_manifests,
 )
-from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError
+from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError, RemoteMissing
 from sliplab.storage.trials.checksums import CHECKSUMS
 from sliplab.storage.trials.store import StoreError
 from sliplab.storage.trials.verify import Problem
 
-KINDS: tuple[Kind, ...] = ("about", "trials", "quarantine")
+KINDS: tuple[Kind, ...] = ("about", "trials", "quarantine", "withdrawn")
 
 
 def verify_remote(
@@ -32,11 +33,12 @@ def verify_remote(
         The number of visible trials, and the problems; an empty list means all is well.
 
     Raises:
-        RemoteError: nothing was pushed there, or the storage cannot be reached.
+        RemoteError: nothing was pushed there, no campaign or trial is listed, or the storage cannot
+            be reached.
     """
     remote.check()
-    trials, problems = 0, []
-    for name in remote.folders("campaigns"):
+    trials, problems, unlisted = 0, [], ""
+    for name in remote.campaigns():
         try:
             safe_name(name)
         except StoreError as error:
@@ -44,8 +46,13 @@ def verify_remote(
             continue
         sizes = remote.sizes(objects_folder(name))
         known: dict[str, bool] = {}
+        listed = {kind: read_manifests(remote, name, kind) for kind in KINDS}
+        lost = listing_problem(remote, name, listed["about"].get(""), listed["trials"])
+        if lost is not None:
+            unlisted = lost
+            problems.append(Problem(f"{remote.url}/campaigns/{name}", lost, campaign=name))
         for kind in KINDS:
-            for item, found in read_manifests(remote, name, kind).items():
+            for item, found in listed[kind].items():
                 trial = item if kind == "trials" else ""
                 trials += bool(trial)
                 if isinstance(found, RemoteError):
@@ -57,6 +64,8 @@ def verify_remote(
                     ]
                 if trial and on_trial is not None:
                     on_trial(trial)
+    if unlisted and not trials:
+        raise RemoteMissing(unlisted)
     return trials, problems
 
 

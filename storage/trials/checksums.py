@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from sliplab.storage.errors import own_fault
 from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.superblock import mend
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
 SPOOL = "frames.raw"
@@ -80,13 +81,25 @@ class Checksum(NamedTuple):
     def problem(self, path: Path) -> str | None:
         """Read a file and say what is wrong with it; None when it is as it was written.
 
+        An HDF5 file that a program left open, and that is otherwise as it was written, is closed.
+
         Raises:
             OSError: as `size_problem`.
         """
         if (problem := self.size_problem(path)) is not None:
             return problem
         try:
-            return None if sha256(path) == self.sha256 else "does not match its checksum"
+            if sha256(path) == self.sha256:
+                return None
+            why = ""
+            try:
+                if mend(path, self.sha256):
+                    return None
+            except OSError as error:
+                if own_fault(error):
+                    raise
+                why = f": was left open by another program, and cannot be closed: {error.strerror}"
+            return f"does not match its checksum{why}"
         except OSError as error:
             if own_fault(error):
                 raise

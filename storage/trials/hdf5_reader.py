@@ -1,11 +1,13 @@
 """Reading of a trial's HDF5 file, column by column, through h5py's low-level interface.
 
 h5py's file and dataset objects would double the time to read a window of 30 ms. All data
-must be in the file itself: links, external and virtual data are rejected.
+must be in the file itself: links, external and virtual data are rejected. This interface writes
+where it is pointed to: shapes and types are checked before anything is read, and never assumed.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from bisect import bisect_left
@@ -18,7 +20,7 @@ import h5py
 import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 
-from sliplab.storage.errors import StoreError
+from sliplab.storage.errors import StoreError, disk_fault, own_fault
 from sliplab.storage.streams import (
     I64,
     ClockReads,
@@ -41,16 +43,43 @@ from sliplab.storage.trials.hdf5_writer import (
     TRACKS,
     UNIT_ATTRIBUTE,
     Array,
+    Kind,
 )
+from sliplab.storage.trials.superblock import HEAD_BYTES, closed
 
 MOST_STREAMS = 64
 """Named streams that are read of one trial; a file with more is none of ours."""
 _BLOCK = 1 << 15
 _FEW = 16
 _MOST_TEXT = 128
+_NUMBERS, _ATTRIBUTES = "biuf", "biufS"
+"""Kinds of type of a column and of an attribute, as numpy names them."""
+_HDF5_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
+_LARGE = 1 << 26
+"""Bytes that a column may claim without having them in the file."""
 _CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
 """Cache of unpacked chunks, a column. A chunk of events fits; with more than the processor's own
 cache holds, every chunk would go through main memory."""
+
+
+class _faults:
+    """Context manager that turns HDF5's errors into one line; those of the disk stay as they are.
+
+    A class, for a generator would cost as much as a small read.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, at: Any) -> None:
+        if not isinstance(error, _HDF5_ERRORS) or isinstance(error, NotOurs):
+            return
+        if own_fault(error) or disk_fault(error) is not None:
+            return
+        raise NotOurs(f"{self._name}: cannot be read: {error}") from error
 
 
 @cache
@@ -61,8 +90,58 @@ def _access() -> Any:
     return access
 
 
+class NotOurs(StoreError, ValueError):
+    """A file that claims to be a trial's has something else where its data should be."""
+
+
+class NoColumn(NotOurs):
+    """A file lacks a column."""
+
+
+class FileContent(io.RawIOBase):
+    """Bytes of a file, read by Python: HDF5's locks and flags do not matter.
+
+    Args:
+        size: bytes; zeros are in place of those that the file lacks. None for those that it has.
+        head: in place of its first bytes.
+    """
+
+    def __init__(self, path: Path, size: int | None = None, head: bytes = b"") -> None:
+        self._file, self._head, self._at = path.open("rb"), head, 0
+        self._size = os.fstat(self._file.fileno()).st_size if size is None else size
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at}.get(whence, self._size)
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        room = memoryview(buffer).cast("B")
+        self._file.seek(self._at)
+        filled = self._file.readinto(room)
+        room[filled:] = bytes(len(room) - filled)
+        head = self._head[self._at : self._at + len(room)]
+        room[: len(head)] = head
+        self._at += len(room)
+        return len(room)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
 class RowFile:
     """An HDF5 file that is open for reading.
+
+    A file that another program has open, or this one in another mode, is read all the same.
 
     Args:
         content: its bytes as an open binary file, read in place of what is at `path`.
@@ -73,65 +152,80 @@ class RowFile:
 
     def __init__(self, path: Path, content: Any = None) -> None:
         self.path = path
-        name, access = os.fsencode(path), _access()
-        if content is not None:
-            access = access.copy()
-            access.set_fileobj_driver(h5py.h5fd.fileobj_driver, content)
-            name = repr(content).encode()
-        self._file = h5py.h5f.open(name, h5py.h5f.ACC_RDONLY, fapl=access)
+        self._own: FileContent | None = None
         self._opened: dict[str, Rows] = {}
+        if content is not None:
+            self._file = _open_content(content)
+            return
+        try:
+            self._file = h5py.h5f.open(os.fsencode(path), h5py.h5f.ACC_RDONLY, fapl=_access())
+        except OSError as error:
+            # a lock, a flag that a dead program left, or another mode in this program
+            if own_fault(error) or not path.is_file():
+                raise
+            try:
+                with path.open("rb") as file:
+                    head = closed(file.read(HEAD_BYTES)) or b""
+                self._own = FileContent(path, head=head)
+                self._file = _open_content(self._own)
+            except OSError:
+                if self._own is not None:
+                    self._own.close()
+                raise error from None
 
     def close(self) -> None:
         """Close it, and every column of it."""
         self._opened.clear()
         self._file.close()
+        if self._own is not None:
+            self._own.close()
 
     def attribute(self, name: str, otherwise: int) -> int:
-        """An integer attribute of the file."""
-        if not h5py.h5a.exists(self._file, name.encode()):
+        """Return an integer attribute of the file.
+
+        Raises:
+            NotOurs: it is not one integer.
+        """
+        with _faults(str(self.path)):
+            found = _attribute(self._file, name)
+        if found is None:
             return otherwise
-        value = np.empty((), np.int64)
-        h5py.h5a.open(self._file, name.encode()).read(value)
-        return int(value)
+        if found.dtype.kind not in "biu" or found.size != 1:
+            raise NotOurs(f"{self.path}: attribute '{name}' is not one integer")
+        return int(found.reshape(-1)[0])
 
     def integers(self, name: str) -> list[int] | None:
         """A small attribute of the file with integers in a row; None if there is no such one."""
-        if not h5py.h5a.exists(self._file, name.encode()):
+        try:
+            found = _attribute(self._file, name)
+        except ValueError:
             return None
-        found = h5py.h5a.open(self._file, name.encode())
-        if found.dtype.kind not in "iu" or len(found.shape) != 1 or found.shape[0] > _FEW:
+        if found is None or found.dtype.kind not in "iu" or found.ndim != 1:
             return None
-        values = np.empty(found.shape, found.dtype)
-        found.read(values)
-        return [int(value) for value in values]
+        return [int(value) for value in found]
 
     def streams(self) -> dict[str, str]:
         """Return the kind of every named stream, by name; it is ``""`` where it is unknown.
 
         Raises:
-            ValueError: a stream points outside the file, has a wrong name, or there are too many.
+            NotOurs: a stream points outside the file, has a wrong name, or there are too many.
         """
         group = STREAM_GROUP.encode()
         if not self._file.links.exists(group):
             return {}
         found = self._group(STREAM_GROUP)
         if found.get_num_objs() > MOST_STREAMS:
-            raise ValueError(f"{self.path}: has more than {MOST_STREAMS} named streams")
+            raise NotOurs(f"{self.path}: has more than {MOST_STREAMS} named streams")
         names = sorted(name.decode("utf-8", "replace") for name in found)
         for name in names:
             if not STREAM_NAME.fullmatch(name):
-                raise ValueError(f"{self.path}: a stream has the name {name!r}")
+                raise NotOurs(f"{self.path}: a stream has the name {name!r}")
         return {name: self._kind(self._group(f"{STREAM_GROUP}/{name}")) for name in names}
 
     def _group(self, name: str) -> Any:
-        at = b""
-        for part in name.encode().split(b"/"):
-            at += b"/" + part
-            if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
-                raise ValueError(f"{self.path}: {name} points outside the file")
-        found = h5py.h5o.open(self._file, at)
+        found = h5py.h5o.open(self._file, self._place(name))
         if not isinstance(found, h5py.h5g.GroupID):
-            raise ValueError(f"{self.path}: {name} is no group")
+            raise NotOurs(f"{self.path}: {name} is no group")
         return found
 
     @staticmethod
@@ -145,47 +239,137 @@ class RowFile:
         return _text(self._group(f"{STREAM_GROUP}/{name}"), UNIT_ATTRIBUTE)
 
     def has(self, name: str) -> bool:
-        """Return whether there is a column of this name."""
+        """Return whether there is a column of this name, or something that cannot be read."""
         if name in self._opened:
             return True
-        parts = name.split("/")
-        paths = ("/".join(parts[: end + 1]).encode() for end in range(len(parts)))
-        return all(self._file.links.exists(path) for path in paths)
+        try:
+            self._place(name)
+        except NoColumn:
+            return False
+        except NotOurs:
+            pass
+        return True
 
     def rows(self, name: str) -> Rows:
         """Return a column, opened once.
 
         Raises:
-            KeyError: there is none of this name.
-            ValueError: its values are not in this file.
+            NoColumn: there is none of this name.
+            NotOurs: its values are not in this file, or not numbers.
         """
         if name not in self._opened:
-            self._opened[name] = self._open(name)
+            with _faults(f"{self.path}: {name}"):
+                self._opened[name] = self._open(name)
         return self._opened[name]
 
     def _open(self, name: str) -> Rows:
+        data = h5py.h5o.open(self._file, self._place(name))
+        if not isinstance(data, h5py.h5d.DatasetID):
+            raise NotOurs(f"{self.path}: {name} is no column")
+        kept = data.get_create_plist()
+        if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
+            raise NotOurs(f"{self.path}: {name} points outside the file")
+        if not _plain(data, _NUMBERS):
+            raise NotOurs(f"{self.path}: {name} does not contain numbers")
+        stated = data.dtype.itemsize * math.prod(data.shape)
+        if stated > _LARGE and (stored := _stored_bytes(data, kept)) < stated:
+            raise NotOurs(f"{self.path}: {name} has {stored} of its {stated} bytes")
+        chunk = kept.get_chunk() if kept.get_layout() == h5py.h5d.CHUNKED else ()
+        if max(_LARGE, 2 * stated) < data.dtype.itemsize * math.prod(chunk):
+            raise NotOurs(f"{self.path}: {name} is stored in pieces of {chunk} for {data.shape}")
+        return Rows(data, f"{self.path}: {name}")
+
+    def _place(self, name: str) -> bytes:
+        """Return the full path of something in the file itself.
+
+        Raises:
+            NoColumn: there is none of this name.
+            NotOurs: a part of the path is a link.
+        """
         at = b""
         for part in name.encode().split(b"/"):
             at += b"/" + part
+            with _faults(f"{self.path}: {name}"):  # its group may be something else
+                there = self._file.links.exists(at)
+            if not there:
+                raise NoColumn(f"{self.path}: has no {name}")
             if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
-                raise ValueError(f"{self.path}: {name} points outside the file")
-        data = h5py.h5d.open(self._file, at)
-        kept = data.get_create_plist()
-        if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
-            raise ValueError(f"{self.path}: {name} points outside the file")
-        return Rows(data)
+                raise NotOurs(f"{self.path}: {name} points outside the file")
+        return at
+
+
+def _open_content(content: Any) -> Any:
+    """Open an HDF5 file that is read through an open binary file."""
+    access = _access().copy()
+    access.set_fileobj_driver(h5py.h5fd.fileobj_driver, content)
+    return h5py.h5f.open(repr(content).encode(), h5py.h5f.ACC_RDONLY, fapl=access)
+
+
+def _plain(found: Any, kinds: str) -> bool:
+    """Return whether a dataset or an attribute consists of values of these kinds of type."""
+    try:
+        return found.get_space().get_simple_extent_type() != h5py.h5s.NULL and (
+            found.dtype.kind in kinds
+        )
+    except TypeError:  # one that numpy has no type for
+        return False
+
+
+def _stored_bytes(data: Any, kept: Any) -> int:
+    """Return how many bytes of a dataset are in the file, at most, once they are unpacked."""
+    if kept.get_layout() != h5py.h5d.CHUNKED:
+        return int(data.get_storage_size())
+    return int(data.get_num_chunks() * math.prod(kept.get_chunk()) * data.dtype.itemsize)
+
+
+def _attribute(of: Any, name: str) -> Array | None:
+    """Return a small attribute; None if there is none of this name.
+
+    Raises:
+        ValueError: it has many values, or none of a plain type.
+    """
+    if not h5py.h5a.exists(of, name.encode()):
+        return None
+    found = h5py.h5a.open(of, name.encode())
+    if not _plain(found, _ATTRIBUTES) or math.prod(found.shape) > _FEW:
+        raise ValueError(f"attribute '{name}' is not a few plain values")
+    if found.dtype.itemsize > _MOST_TEXT:
+        raise ValueError(f"attribute '{name}' is longer than {_MOST_TEXT} bytes")
+    values = np.empty(found.shape, found.dtype)
+    found.read(values)
+    return values
 
 
 def _text(group: Any, name: str) -> str:
     """Return a short text among a group's attributes; ``""`` where there is none."""
-    if not h5py.h5a.exists(group, name.encode()):
+    try:
+        found = _attribute(group, name)
+    except ValueError:
         return ""
-    found = h5py.h5a.open(group, name.encode())
-    if found.dtype.kind != "S" or found.shape != () or found.dtype.itemsize > _MOST_TEXT:
+    if found is None or found.dtype.kind != "S" or found.shape != ():
         return ""
-    value = np.empty((), found.dtype)
-    found.read(value)
-    return bytes(value.item()).decode("utf-8", "replace")
+    return bytes(found.item()).decode("utf-8", "replace")
+
+
+_ANY = "integer"
+_POSE = ("t", "host", "xyz", "rotvec")
+_OFFSET: Kind = (_ANY, (), "us")
+_KINDS: dict[str, Kind] = {
+    **COLUMNS,
+    **TRACKS,
+    **TIMING,
+    TIMES: (_ANY, (), "us"),
+    INDEX: (_ANY, (), "row"),
+    OFFSET: _OFFSET,
+}
+_STREAM_PARTS = {part: kind for columns in STREAMS.values() for part, (_, kind) in columns.items()}
+
+
+def _kind_of(name: str) -> Kind | None:
+    """Return the kind that a column of a trial must have; None where none is known."""
+    if name.startswith(STREAM_GROUP):
+        return _STREAM_PARTS.get(name.rpartition("/")[2])
+    return _KINDS.get(name)
 
 
 class Rows:
@@ -193,12 +377,23 @@ class Rows:
 
     Attributes:
         shape: all of it, rows first; () for a single value.
+        dtype: of its values.
     """
 
-    def __init__(self, data: Any) -> None:
-        self._data = data
+    def __init__(self, data: Any, name: str) -> None:
+        self._data, self._name = data, name
         self.shape: tuple[int, ...] = data.shape
-        self._dtype = data.dtype
+        self.dtype = data.dtype
+
+    def fits(self, kind: Kind) -> bool:
+        """Return whether type and shape are of a kind; of ``integer`` any integers are."""
+        dtype, shape, _ = kind
+        same = self.dtype.kind in "iu" if dtype == _ANY else self.dtype == dtype
+        rest = self.shape[1:] if kind is not _OFFSET else self.shape
+        fits = len(rest) == len(shape) and all(
+            wanted in {-1, found} for wanted, found in zip(shape, rest, strict=True)
+        )
+        return same and fits and (kind is _OFFSET or bool(self.shape))
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -210,7 +405,7 @@ class Rows:
         index of them may be damaged.
         """
         kept = self._data.get_create_plist()
-        row, others = self._dtype.itemsize * math.prod(self.shape[1:]), (0,) * len(self.shape[1:])
+        row, others = self.dtype.itemsize * math.prod(self.shape[1:]), (0,) * len(self.shape[1:])
         if kept.get_layout() == h5py.h5d.CHUNKED:
             for low in range(0, len(self), kept.get_chunk()[0]):
                 found = self._data.get_chunk_info_by_coord((low, *others))
@@ -229,31 +424,38 @@ class Rows:
     def read(self, low: int = 0, high: int | None = None) -> Array:
         """Read rows low to high, the last one not included; all by default."""
         if not self.shape or (low == 0 and high in {None, self.shape[0]}):
-            values = np.empty(self.shape, self._dtype)
+            values = np.empty(self.shape, self.dtype)
             if values.size:
-                self._data.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+                with _faults(self._name):
+                    self._data.read(_room(values), h5py.h5s.ALL, values)
             return values
         high = min(len(self) if high is None else high, len(self))
         low = min(low, high)
-        values = np.empty((high - low, *self.shape[1:]), self._dtype)
+        values = np.empty((high - low, *self.shape[1:]), self.dtype)
         self._read(low, values)
         return values
 
     def _read(self, low: int, values: Array) -> None:
         """Fill `values` from row `low` on."""
         if values.size:
-            place = self._data.get_space()
-            place.select_hyperslab((low, *(0 for _ in self.shape[1:])), values.shape)
-            self._data.read(h5py.h5s.create_simple(values.shape), place, values)
+            with _faults(self._name):
+                place = self._data.get_space()
+                place.select_hyperslab((low, *(0 for _ in self.shape[1:])), values.shape)
+                self._data.read(_room(values), place, values)
 
     def added(self, low: int, high: int, amount: int) -> I64:
         """Read rows low to high of a column of integers, as int64, with `amount` added to each.
 
         Narrower rows are read into the end of the result and widened from its beginning, block by
         block: fresh memory costs as much as unpacking what goes into it.
+
+        Raises:
+            NotOurs: it is no column of single integers.
         """
+        if len(self.shape) != 1 or self.dtype.kind not in "iu":
+            raise NotOurs(f"{self._name} has the type {self.dtype} and the shape {self.shape}")
         values = np.empty(high - low, np.int64)
-        narrow = values.view(self._dtype)[-len(values) :] if len(values) else values
+        narrow = values.view(self.dtype)[-len(values) :] if len(values) else values
         self._read(low, narrow)
         for start in range(0, len(values), _BLOCK):
             block = values[start : start + _BLOCK]
@@ -262,16 +464,29 @@ class Rows:
         return values
 
 
+def _room(values: Array) -> Any:
+    """Return the extent of an array: HDF5 then writes no further than that."""
+    return h5py.h5s.create_simple(values.shape) if values.shape else _SINGLE
+
+
+_SINGLE = h5py.h5s.create(h5py.h5s.SCALAR)
+
+
 class StreamReader:
     """A trial's HDF5 file opened for reading; a context manager.
 
+    Args:
+        size_px: columns and rows of the event camera; None where they are unknown.
+
     Raises:
         StoreError: it was written by a newer version.
-        ValueError: a column points outside the file.
+        NotOurs: its columns are not those of a trial.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = RowFile(path)
+    def __init__(self, path: Path, size_px: tuple[int, int] | None = None) -> None:
+        self._size_px = size_px
+        with _faults(str(path)):
+            self._file = RowFile(path)
         try:
             found = self._file.attribute("format", 1)
             if found > INDEX_CUT_FORMAT:
@@ -280,7 +495,7 @@ class StreamReader:
                     f"one reads formats up to {INDEX_CUT_FORMAT}: update it"
                 )
             self._index_cut = found == INDEX_CUT_FORMAT
-            self.t_offset_us = int(self._file.rows(OFFSET).read())
+            self.t_offset_us = int(self._rows(OFFSET).read())
         except BaseException:
             self._file.close()
             raise
@@ -291,35 +506,79 @@ class StreamReader:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
+    def _rows(self, name: str) -> Rows:
+        """Return a column, which is of the type and shape that belong to its name.
+
+        Raises:
+            NoColumn: there is none of this name.
+            NotOurs: its values are not in this file, or are of another type or shape.
+        """
+        found = self._file.rows(name)
+        if (kind := _kind_of(name)) is not None and not found.fits(kind):
+            raise NotOurs(
+                f"{self._file.path}: {name} has the type {found.dtype} and the shape {found.shape}"
+            )
+        return found
+
     def event_times(self) -> I64:
         """Return the times of all events on the camera's clock, us."""
-        return self._times(0, len(self._file.rows(TIMES)))
+        return self._times(0, len(self._rows(TIMES)))
 
     def _times(self, low: int, high: int) -> I64:
         """Return the times of some events on the camera's clock, us."""
-        return self._file.rows(TIMES).added(low, high, self.t_offset_us)
+        return self._rows(TIMES).added(low, high, self.t_offset_us)
 
     def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
         """Return the events with start <= t < end on the camera's clock; all by default.
 
         Only the part of the file that holds them is read.
         """
-        x, y, p = (self._file.rows(f"events/{name}") for name in "xyp")
-        low, high = 0, len(self._file.rows(TIMES))
-        marks = self._file.rows(INDEX)
+        x, y, p, t = self._group("events", "x", "y", "p", "t")
+        low, high = 0, len(t)
+        marks = self._rows(INDEX)
         if start_us is not None and len(marks):
             low = self._bracket(marks, start_us - self.t_offset_us, high)[0]
         if end_us is not None and len(marks):
             high = self._bracket(marks, end_us - self.t_offset_us, high)[1]
+        low, high = (min(max(row, 0), len(t)) for row in (low, high))  # of the index, as it is
         high = max(low, high)
         times = self._times(low, high)
         first = 0 if start_us is None else int(np.searchsorted(times, start_us, "left"))
         last = len(times) if end_us is None else int(np.searchsorted(times, end_us, "left"))
         last = max(first, last)
         low, high = low + first, low + last
-        return EventChunk(
+        found = EventChunk(
             x.read(low, high), y.read(low, high), p.read(low, high), times[first:last]
         )
+        self._check_pixels(found)
+        return found
+
+    def _check_pixels(self, found: EventChunk) -> None:
+        """Refuse events outside of the camera: what counts them by pixel relies on it.
+
+        Raises:
+            NotOurs: there is one.
+        """
+        if self._size_px is None or not len(found):
+            return
+        last = int(found.x.max()), int(found.y.max())
+        if last[0] >= self._size_px[0] or last[1] >= self._size_px[1]:
+            raise NotOurs(
+                f"{self._file.path}: has events up to column {last[0]} and row {last[1]}, outside "
+                f"of its camera of {self._size_px[0]} x {self._size_px[1]} px"
+            )
+
+    def _group(self, group: str, *parts: str) -> list[Rows]:
+        """Return columns that have the same number of rows.
+
+        Raises:
+            NotOurs: they have not.
+        """
+        found = [self._rows(f"{group}/{part}") for part in parts]
+        if len({len(rows) for rows in found}) > 1:
+            lengths = dict(zip(parts, map(len, found), strict=True))
+            raise NotOurs(f"{self._file.path}: {group} has columns of different lengths: {lengths}")
+        return found
 
     def _bracket(self, marks: Rows, t_us: int, count: int) -> tuple[int, int]:
         """Return rows that enclose `t_us` after the offset, from the index or behind its end."""
@@ -328,7 +587,7 @@ class StreamReader:
         if ms < 0:
             return 0, near[0] if ms == -1 and near else 0
         if self._index_cut and len(near) < 2:
-            times = self._file.rows(TIMES)
+            times = self._rows(TIMES)
             rows = range(near[0] if near else 0, count)
             found = bisect_left(rows, t_us, key=lambda row: int(times.read(row, row + 1)[0]))
             return rows.start + found, rows.start + found
@@ -344,7 +603,10 @@ class StreamReader:
 
     def clock_reads(self, group: str) -> ClockReads:
         """Return all of ``box_reads`` or ``frame_camera_reads``; empty without any."""
-        return ClockReads(*(self._late(f"{group}/{name}") for name in ("t", "before", "after")))
+        parts = ("t", "before", "after")
+        if all(self.has(f"{group}/{part}") for part in parts):
+            self._group(group, *parts)
+        return ClockReads(*(self._late(f"{group}/{part}") for part in parts))
 
     def _late(self, name: str) -> I64:
         """Return a column of times; empty if it is one of `TIMING` that was never made."""
@@ -354,13 +616,13 @@ class StreamReader:
 
     def poses(self) -> PoseChunk:
         """Return all arm poses."""
-        return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
+        return PoseChunk(*(rows.read() for rows in self._group("poses", *_POSE)))
 
     def streams(self) -> dict[str, str]:
         """Return the kind of every named stream, by name; ``""`` for one that is unknown.
 
         Raises:
-            ValueError: what is there is no stream of ours.
+            NotOurs: what is there is no stream of ours.
         """
         return self._file.streams()
 
@@ -368,38 +630,39 @@ class StreamReader:
         """Return all forces and torques of a named stream; empty where the trial has none.
 
         Raises:
-            ValueError: the stream is of another kind.
+            NotOurs: the stream is of another kind.
         """
         kind = self._file.streams().get(name)
         if kind is None:
             return WrenchChunk.empty()
         if kind != WrenchChunk.KIND:
-            raise ValueError(f"{self._file.path}: stream '{name}' is of kind '{kind}', no wrench")
+            raise NotOurs(f"{self._file.path}: stream '{name}' is of kind '{kind}', no wrench")
         return WrenchChunk(**self._fields(name, kind))
 
     def scalars(self, name: str) -> ScalarChunk:
         """Return all readings of a named stream; empty where the trial has none.
 
         Raises:
-            ValueError: the stream is of another kind.
+            NotOurs: the stream is of another kind.
         """
         kind = self._file.streams().get(name)
         if kind is None:
             return ScalarChunk.empty()
         if kind != ScalarChunk.KIND:
-            raise ValueError(f"{self._file.path}: stream '{name}' is of kind '{kind}', no scalar")
+            raise NotOurs(f"{self._file.path}: stream '{name}' is of kind '{kind}', no scalar")
         return ScalarChunk(**self._fields(name, kind), unit=self._file.unit(name))
 
     def _fields(self, name: str, kind: str) -> dict[str, Array]:
         """Return the columns of a named stream, by the field of its chunks."""
+        columns = self._group(f"{STREAM_GROUP}/{name}", *STREAMS[kind])
         return {
-            field: self.column(f"{STREAM_GROUP}/{name}/{part}")
-            for part, (field, _) in STREAMS[kind].items()
+            field: rows.read()
+            for rows, (field, _) in zip(columns, STREAMS[kind].values(), strict=True)
         }
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""
-        values = self._file.rows(name).read()
+        values = self._rows(name).read()
         return values.astype(np.int64) if name == TIMES else values
 
     def has(self, name: str) -> bool:
@@ -409,7 +672,7 @@ class StreamReader:
     def counts(self) -> dict[str, int]:
         """Count the rows of every column; 0 for one that is missing."""
         return {
-            name: len(self._file.rows(name)) if self.has(name) else 0
+            name: len(self._rows(name)) if self.has(name) else 0
             for name in (*COLUMNS, *TRACKS, *TIMING)
         }
 
@@ -417,11 +680,11 @@ class StreamReader:
         """Count the rows of every column of the named streams, by stream and column.
 
         Raises:
-            KeyError: a column is missing.
+            NoColumn: a column is missing.
         """
         return {
             name: {
-                part: len(self._file.rows(f"{STREAM_GROUP}/{name}/{part}"))
+                part: len(self._rows(f"{STREAM_GROUP}/{name}/{part}"))
                 for part in STREAMS.get(kind, {})
             }
             for name, kind in self._file.streams().items()

@@ -262,9 +262,11 @@ class Recording:
             StoreError: the trial has no such further camera.
         """
         if stream is None or stream in {EVENTS_KIND, FRAMES_KIND}:
-            return StreamReader(self._sound(DATA))
+            return StreamReader(self._sound(DATA), self.record.geometry.event_px)
         self._check_stream(stream, EVENTS_KIND, FRAMES_KIND)
-        return StreamReader(self._sound(stream_file(stream)))
+        about = self.record.streams[stream]
+        size = about.size_px if about.kind == EVENTS_KIND else None
+        return StreamReader(self._sound(stream_file(stream)), size)
 
     def streams(self, *kinds: str) -> list[str]:
         """Names of the streams of some kinds, the first cameras' ``events`` and ``frames`` first.
@@ -378,12 +380,27 @@ class Recording:
         return stream_file(stream, "mkv")
 
     def frames(self, threads: int = 1, stream: str = FRAMES_KIND) -> Iterator[U8]:
-        """Decoded frames, uint8 of shape (height, width); `stream` as in `frame_times`."""
-        return read_frames(self._sound(self._video(stream)), threads)
+        """Decoded frames, uint8 of shape (height, width); `stream` as in `frame_times`.
+
+        Raises:
+            StoreError: one is of another size than the record says.
+        """
+        found = read_frames(self._sound(self._video(stream)), threads)
+        return (self._fitting(image, stream) for image in found)
 
     def frame(self, index: int, stream: str = FRAMES_KIND) -> U8:
         """One decoded frame; `stream` as in `frame_times`."""
-        return read_frame(self._sound(self._video(stream)), index)
+        return self._fitting(read_frame(self._sound(self._video(stream)), index), stream)
+
+    def _fitting(self, image: U8, stream: str) -> U8:
+        """Return a frame of the size that the record says: positions are looked up in it."""
+        size = self.record.geometry.frame_px if stream == FRAMES_KIND else None
+        if size is not None and image.shape != (size[1], size[0]):
+            raise self._damaged(
+                f"{self.folder / self._video(stream)}: has a frame of {image.shape[1]} x "
+                f"{image.shape[0]} px, the record says {size[0]} x {size[1]}"
+            )
+        return image
 
     def frame_reader(self) -> FrameReader:
         """The video, opened for frames in any order; a context manager."""

@@ -1,4 +1,7 @@
-"""Verification that everything in a store is as committed; nothing is changed."""
+"""Verification that everything in a store is as committed.
+
+Nothing is changed but a file that another program left open for writing: it is closed.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from sliplab.storage.errors import StoreError, own_fault
 from sliplab.storage.files import read_json, temporary_files
 from sliplab.storage.schema.document import NewerFormat
 from sliplab.storage.schema.trial import Provenance, TrialRecord
+from sliplab.storage.streams import EVENTS_KIND
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
     DATA,
@@ -30,8 +34,9 @@ from sliplab.storage.trials.checksums import (
     to_fetch,
 )
 from sliplab.storage.trials.hdf5_reader import StreamReader
-from sliplab.storage.trials.hdf5_writer import STREAM_GROUP, TIMING, TRACKS
+from sliplab.storage.trials.hdf5_writer import COLUMNS, INDEX, STREAM_GROUP, TIMING, TRACKS
 from sliplab.storage.trials.store import CAUSE, IMPORTED, INFO, PROTOCOL, RIG, Campaign, Store
+from sliplab.storage.trials.superblock import left_open
 from sliplab.storage.trials.video import count_frames
 
 _KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
@@ -59,11 +64,17 @@ class Problem:
     trial: str = ""
 
 
-def verify(store: Store, on_trial: Callable[[str], None] | None = None) -> list[Problem]:
+def verify(
+    store: Store,
+    on_trial: Callable[[str], None] | None = None,
+    on_mended: Callable[[Path], None] | None = None,
+) -> list[Problem]:
     """Check every trial of every campaign; an empty list means all is well.
 
     Args:
         on_trial: called with each trial's id before it is checked.
+        on_mended: called with each data file that another program had left open for writing, and
+            that is as it was committed again.
     """
     problems = _temporary(store.folder, "")
     derived = store.folder / "derived"
@@ -74,18 +85,26 @@ def verify(store: Store, on_trial: Callable[[str], None] | None = None) -> list[
         if path.is_symlink() or not path.is_dir():
             problems.append(Problem(str(path), "is not a campaign folder"))
         else:
-            problems += _campaign(store, Campaign(path), on_trial)
+            problems += _campaign(store, Campaign(path), on_trial, on_mended)
     return problems
 
 
 def _campaign(
-    store: Store, campaign: Campaign, on_trial: Callable[[str], None] | None
+    store: Store,
+    campaign: Campaign,
+    on_trial: Callable[[str], None] | None,
+    on_mended: Callable[[Path], None] | None,
 ) -> list[Problem]:
     problems = _description(store, campaign)
     for trial in trial_folders(campaign):
         if on_trial is not None:
             on_trial(trial.name)
+        were_open = [path for path in trial.glob("*.h5") if left_open(path)]
         problems += verify_trial(trial)
+        if on_mended is not None:
+            for path in were_open:
+                if not left_open(path):
+                    on_mended(path)
     return problems + _leftovers(campaign)
 
 
@@ -235,6 +254,7 @@ def content_problems(folder: Path, record: TrialRecord) -> Found:
         for name in ("events/t", "event_pulses/t", "sync_pulses/t", "poses/t", "frames/t", *made):
             if np.any(np.diff(reader.column(name)) < 0):
                 problems.append((folder / DATA, f"{name} runs backwards"))
+        problems += _data_problems(folder / DATA, reader, counts, record.geometry.event_px)
         problems += _stream_problems(folder, reader, record)
     problems += _camera_problems(folder, record)
     found = {
@@ -250,6 +270,30 @@ def content_problems(folder: Path, record: TrialRecord) -> Found:
     problems += _frame_problems(folder / DATA, folder / FRAMES, tracks, counts)
     if not record.quality.passed:
         problems.append((folder / RECORD, "was committed although a gate failed"))
+    return problems
+
+
+def _data_problems(
+    path: Path, reader: StreamReader, counts: dict[str, int], size_px: tuple[int, int] | None
+) -> Found:
+    """Check that columns of a group have equal lengths, that events are in the camera, and that the
+    index leads to the first event at or after each millisecond."""
+    problems: Found = []
+    groups: dict[str, dict[str, int]] = {}
+    for name in {*COLUMNS, *TIMING}:
+        group, _, part = name.partition("/")
+        groups.setdefault(group, {})[part] = counts[name]
+    for group, lengths in sorted(groups.items()):
+        if len(set(lengths.values())) > 1:
+            problems.append((path, f"{group} has columns of different lengths: {lengths}"))
+    for name, most in zip("xy", size_px or (), strict=False):
+        last = int(reader.column(f"events/{name}").max(initial=0))
+        if counts["events/t"] and last >= most:
+            problems.append((path, f"events/{name} has {last}, the camera has {most} px"))
+    marks = reader.column(INDEX)
+    after = np.arange(len(marks)) * 1000 + reader.t_offset_us
+    if not np.array_equal(marks, np.searchsorted(reader.event_times(), after)):
+        problems.append((path, f"{INDEX} does not lead to the events"))
     return problems
 
 
@@ -303,6 +347,8 @@ def _camera_problems(folder: Path, record: TrialRecord) -> Found:
                 for column in ("events/t", "event_pulses/t", "frames/t")
                 if np.any(np.diff(reader.column(column)) < 0)
             ]
+            pixels = said.size_px if said.kind == EVENTS_KIND else None
+            problems += _data_problems(data, reader, counts, pixels)
         stated_rows = {f"{said.kind}/t": said.rows, "event_pulses/t": said.pulses or 0}
         problems += [
             (data, f"{counts[column]} rows of {column}, the record says {rows}")

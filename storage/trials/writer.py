@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from sliplab.storage.errors import masked
-from sliplab.storage.files import sync_file, sync_folder, write_json_aside
+from sliplab.storage.files import protect, sync_file, sync_folder, write_json_aside
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,
@@ -197,6 +197,8 @@ class TrialWriter:
             sync_file(self.folder / name)
         sums = {name: Checksum.of(self.folder / name) for name in (*data, RECORD)}
         write_json_aside(self.folder / CHECKSUMS, as_json(sums))
+        for name in (*sums, CHECKSUMS, PROVENANCE):
+            protect(self.folder / name)
         sync_folder(self.folder)
 
     def _stream_files(self) -> Iterator[str]:

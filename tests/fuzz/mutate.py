@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
+import math
 import random
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
+import h5py
+import hdf5plugin  # noqa: F401  (registers the filters)
+import numpy as np
 import yaml
 
 TOKENS = [
@@ -162,14 +168,76 @@ class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mis
         return True
 
 
+def change_hdf5(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
+    """An HDF5 file with some attributes or datasets of another shape, type, size or place."""
+    made = io.BytesIO(data)
+    with h5py.File(made, "r+") as file:
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            places: list[str] = []
+            file.visit(places.append)
+            with suppress(OSError, KeyError, ValueError, TypeError):  # not every change fits
+                _change_object(file, rng.choice(places or ["x"]), rng)
+    return made.getvalue()
+
+
+def _change_object(file: Any, name: str, rng: random.Random) -> None:
+    how = rng.randrange(9)
+    if how < 3:  # an attribute: one that is read, or another
+        of = file if rng.random() < 0.6 else file[name]
+        key = rng.choice((*of.attrs, "format", "kind", "simulated", "sensor_resolution", "unit"))
+        of.attrs.pop(key, None)
+        of.attrs[key] = _numbers(rng) if rng.random() < 0.7 else rng.choice(HDF5_VALUES)
+        return
+    old = file.get(name)
+    shape = getattr(old, "shape", None) or (3,)
+    del file[name]
+    if how == 3:
+        file[name] = h5py.SoftLink(rng.choice(("/", "/none", name, "/events/x", "/events")))
+    elif how == 4:
+        file[name] = h5py.ExternalLink(rng.choice(("/dev/stdin", "../canary", "")), "/events/x")
+    elif how == 5:
+        layout = h5py.VirtualLayout(shape, "u2")
+        layout[...] = h5py.VirtualSource("/dev/zero", "x", shape)
+        file.create_virtual_dataset(name, layout)
+    elif how == 6:  # claimed, and never written
+        shape = (rng.choice((0, 1, 1 << 20, 1 << 34, 1 << 60)), *shape[1:])
+        file.create_dataset(name, shape, rng.choice(HDF5_TYPES[:6]), chunks=True)
+    elif how == 7:
+        plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plan.set_chunk(shape)
+        plan.set_filter(40_000, h5py.h5z.FLAG_OPTIONAL, (1,))
+        space = h5py.h5s.create_simple(shape)
+        data = h5py.h5d.create(file.id, name.encode(), h5py.h5t.NATIVE_UINT16, space, plan)
+        data.write_direct_chunk((0,) * len(shape), bytes(2 * math.prod(shape)))
+    else:
+        file.create_dataset(name, data=_numbers(rng, shape))
+
+
+def _numbers(rng: random.Random, shape: tuple[int, ...] = ()) -> Any:
+    """Values of some type and shape."""
+    shape = rng.choice((shape, shape[:1], (*shape, 3), (), (8000,), (2, 2), (1,)))
+    return np.full(shape, rng.choice((0, 1, -1, 700, 1 << 62)), np.int64).astype(
+        rng.choice(HDF5_TYPES)
+    )
+
+
+HDF5_TYPES = ["i8", "u2", "u8", ">i4", "f4", "f8", "i1", "S1", "S300", "?", "g", "c16"]
+HDF5_VALUES: list[Any] = [
+    "text", b"x" * 5000, h5py.Empty("i8"), np.zeros((), np.dtype([("a", "i8"), ("b", "S500")])),
+    h5py.Reference(), np.zeros(3, h5py.string_dtype()), np.zeros(1, np.dtype("800i8,i8")),
+]  # fmt: skip
+
+
 def mutate(kind: str, data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
     """One damaged file, of at most some MB.
 
     Args:
-        kind: ``yaml``, ``json`` or ``bytes``: whether it has a structure that can be changed.
+        kind: ``yaml``, ``json``, ``hdf5`` or ``bytes``: the structure that can be changed.
         others: files to splice with.
     """
     found = data
+    if kind == "hdf5":
+        return change_hdf5(data, rng, others)
     structured = {"yaml": change_yaml, "json": change_json}.get(kind)
     if structured is not None and rng.random() < 0.6:
         try:

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from sliplab.storage.trials.superblock import SIGNATURE
 from tests.conftest import ROOT
 
 SCHEDULE = b"""\
@@ -90,13 +91,16 @@ def read_store(box: Path, name: str, data: bytes) -> None:
     store = box / "store"
     if not store.exists():
         shutil.copytree(box.parent / "small-store", store)
+        for path in store.rglob("*.*"):
+            path.chmod(path.stat().st_mode | 0o200)
     path = store / name
     kept = path.read_bytes()
     sums = path.parent / "checksums.json"
     kept_sums = sums.read_bytes() if sums.exists() else None
     path.write_bytes(data)
     try:
-        if kept_sums is not None and len(data) % 2 and path.name != "checksums.json":
+        fits = len(data) % 2 or path.suffix == ".h5"
+        if kept_sums is not None and fits and path.name != "checksums.json":
             said = json.loads(kept_sums)
             if path.name in said:
                 said[path.name] = {"sha256": sha256(path), "bytes": len(data)}
@@ -319,6 +323,7 @@ def targets(small_store: Path, foreign: dict[str, bytes]) -> list[Target]:
         for path in sorted(small_store.rglob("*"))
         if path.suffix in {".json", ".yaml"}
     }
+    data = next(small_store.glob("campaigns/c/trials/*/data.h5"))
     small = sorted((ROOT / "protocols").glob("pilot*.yaml"))
     rigs = sorted((ROOT / "rigs").glob("*.yaml"))
     return [
@@ -346,6 +351,20 @@ def targets(small_store: Path, foreign: dict[str, bytes]) -> list[Target]:
             {name: data for name, data in foreign.items() if name not in manifest},
             read_foreign,
             6,
+        ),
+        Target(
+            "trial hdf5",
+            "hdf5",
+            {data.relative_to(small_store).as_posix(): data.read_bytes()},
+            read_store,
+            3,
+        ),
+        Target(
+            "foreign hdf5",
+            "hdf5",
+            {name: item for name, item in foreign.items() if item.startswith(SIGNATURE)},
+            read_foreign,
+            3,
         ),
         Target("pickle", "bytes", pickle_seeds(), read_foreign_pickle, 8),
     ]

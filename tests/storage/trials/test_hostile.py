@@ -107,6 +107,19 @@ def test_a_trial_without_a_clock_says_which_it_has(made: Campaign) -> None:
     _with(folder, whole)
 
 
+def test_frames_of_another_size_than_the_record_says_are_damage(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "store")
+    commit(where, "t", geometry={"frame_px": [48, 32]})
+    commit(where, "u", geometry={"frame_px": [32, 48]})
+    assert len(list(where.recording("t").frames())) == 12
+    for read in (
+        lambda: list(where.recording("u").frames()),
+        lambda: where.recording("u").frame(3),
+    ):
+        with pytest.raises(StoreError, match=r"frame of 48 x 32 px, the record says 32 x 48"):
+            read()
+
+
 @pytest.mark.parametrize(
     "name", ["../x", "/etc/passwd", "a/b", "", ".", "..", "a\0b", "C:\\x", ".x", "x" * 200]
 )
