@@ -153,8 +153,7 @@ class ForeignTrial:
         campaign: the one that it is of; None for one of its own.
         clocks: those that are known, by device and stream. experiment: see the record.
         geometry: further keys of the record's geometry.
-        warnings: lines about what was left out or changed, each to continue after the file's name;
-            called once all was read.
+        notes: warnings about it, such as of what was left out; called once all was read.
         whole: what follows from all that was read; a trial with it may be without events. Raises
             InputError where that cannot be right.
     """
@@ -183,7 +182,7 @@ class ForeignTrial:
     clocks: Mapping[str, DeviceRecord] = field(default_factory=dict)
     experiment: str = "imported"
     geometry: Json = field(default_factory=dict)
-    warnings: Callable[[], list[str]] = list
+    notes: Callable[[], tuple[str, ...]] = tuple
     whole: Callable[[Seen], Whole] | None = None
 
 

@@ -174,7 +174,7 @@ def _take_whole(
         frame_px=whole.frame_px,
         lost=whole.lost,
         packets=whole.packets,
-        warnings=whole.warnings,
+        notes=whole.notes,
         salvage=None,
     )
     with as_damage():
@@ -194,7 +194,7 @@ def _take(
     try:
         seen, warnings = _fill(writer, trial)
         streams = _fill_further(writer, trial)
-        warnings = [*_loss_warnings(trial.lost), *trial.warnings(), *warnings]
+        warnings = [*_loss_warnings(trial.lost), *trial.notes(), *warnings]
         counts = writer.counts
         rows = Counts(
             events=counts["events/t"],

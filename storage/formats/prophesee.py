@@ -3,9 +3,10 @@
 A file is a header of lines that begin with `% `, and words. The header ends at `% end`, or where a
 line is none of text; the words are decoded in `evt`. Where this deviates from faery, which tests
 compare it with, it follows the maker's documentation and decoders: events before the first time
-are dropped; times that no event used change no later one; vectors stand at their own base, and one that reaches beyond the camera is damage; the
-clock begins again at 0 after a gap, too, and not where it only fell; what follows
-`% end` is no header. Times are microseconds, with the header's `T0` added, which faery writes.
+are dropped; times that no event used change no later one; vectors stand at their own base, and one
+that reaches beyond the camera is damage; the clock begins again at 0 after a gap, too, and not
+where it only fell; what follows `% end` is no header. Times are microseconds, with the header's
+`T0` added, which faery writes.
 """
 
 from __future__ import annotations
@@ -273,7 +274,7 @@ def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
         lambda: header.size, triggers,
         about={"encoding": header.encoding.name, "left_out": left_out},
         unknown=unknown if triggers is not None else (*unknown, "triggers"),
-        warnings=lambda: [line for state in states for line in raised_warning(state)],
+        notes=lambda: tuple(line for state in states for line in raised_warning(state)),
     )  # fmt: skip
 
 
@@ -285,8 +286,17 @@ def _triggers(path: Path, header: Header) -> tuple[Triggers | None, list[str]]:
     ):
         return None, []
     edges = np.concatenate([found for _, found in _decoded(path, header)])
+    return triggers_of(edges)
+
+
+def triggers_of(edges: I64) -> tuple[Triggers | None, list[str]]:
+    """Return the edges of the first trigger input, and the names of others.
+
+    Args:
+        edges: time (us), input, and 1 for a rising one, shape (n, 3).
+    """
     inputs = np.unique(edges[:, 1])
-    if not len(inputs):  # all of them stand before the first time
+    if not len(inputs):
         return None, []
     mine = edges[edges[:, 1] == inputs[0]]
     kind = np.where(mine[:, 2] == 1, RISING, _FALLING).astype(np.uint8)

@@ -51,6 +51,13 @@ from sliplab.storage.formats.prophesee import (
     salvage_prophesee,
 )
 from sliplab.storage.formats.published_import import publication_at, read_publication
+from sliplab.storage.formats.ros_bags import (
+    BAG,
+    SQLITE,
+    is_bag_folder,
+    read_bag,
+    salvage_bag,
+)
 from sliplab.storage.streams import Json
 
 Reader = Callable[[Path, str], ForeignTrial]
@@ -61,6 +68,7 @@ READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
     "raw": ((".raw", ".dat"), read_prophesee),
     "es": ((".es",), read_es),
     "mcap": ((".mcap",), read_mcap),
+    "rosbag": ((".bag", ".db3"), read_bag),
 }
 SALVAGE: dict[str, Reader] = {
     "aedat4": salvage_aedat4,
@@ -69,6 +77,7 @@ SALVAGE: dict[str, Reader] = {
     "raw": salvage_prophesee,
     "es": salvage_es,
     "mcap": salvage_mcap,
+    "rosbag": salvage_bag,
 }
 """Readers of what stands whole before the damage in a file, by format."""
 LAB_PICKLES = "lab-pickles"
@@ -234,8 +243,16 @@ def _check_names(path: Path, wanted: list[Wanted]) -> None:
             )  # fmt: skip
         if kind == "es" and isinstance(file, Path):
             check_faery(file)
-        if kind == "mcap" and util.find_spec("mcap") is None:
-            raise ModuleNotFoundError("No module named 'mcap'", name="mcap")
+        if isinstance(file, Path) and (needed := _needs(kind, file)) is not None:
+            raise ModuleNotFoundError(f"No module named {needed!r}", name=needed)
+
+
+def _needs(kind: str, file: Path) -> str | None:
+    """Return the module that a file needs and that is not installed."""
+    needed = "mcap" if kind == "mcap" else None
+    if kind == "rosbag" and file.is_file() and read_head(file).startswith(BAG):
+        needed = "rosbags"
+    return needed if needed is not None and util.find_spec(needed) is None else None
 
 
 def name_of(stem: str) -> str:
@@ -264,7 +281,7 @@ def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     try:
         return read_file(kind, file, name, salvage)
     except FormatError as error:
-        raise refusal(file, error) from None
+        raise refusal(error.file or file, error) from None
 
 
 def _stem(file: Path) -> str:
@@ -274,10 +291,17 @@ def _stem(file: Path) -> str:
 
 
 def _files(path: Path) -> list[Path]:
-    """List plain files; links are left out, for they may lead anywhere."""
-    if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
-    elif path.is_file():
+    """List plain files, and folders of one recording of ROS 2 each.
+
+    Links are left out, for they may lead anywhere.
+    """
+    if path.is_dir() and not is_bag_folder(path):
+        found = sorted(
+            file
+            for file in path.iterdir()
+            if (file.is_file() or is_bag_folder(file)) and not file.is_symlink()
+        )
+    elif path.exists():
         found = [path]
     else:
         raise InputError(path, "", None, "no such file or folder")
@@ -286,11 +310,15 @@ def _files(path: Path) -> list[Path]:
 
 def _possible(file: Path) -> tuple[str, ...]:
     """Return the formats that a file may have: by its first bytes, else by its name's ending."""
+    if file.is_dir():
+        return ("rosbag",)
     head = read_head(file)
     if head.startswith(LINE):
         return ("aedat4",)
     if head.startswith(MAGIC):
         return ("mcap",)
+    if head.startswith((SQLITE, BAG)):
+        return ("rosbag",)
     if head.startswith(SIGNATURE):
         return ("dsec", "lab-hdf5")
     if head.startswith(EVENT_STREAM):

@@ -251,7 +251,7 @@ def test_a_time_that_no_event_used_changes_no_later_one(tmp_path: Path, name: st
     form, data, times = UNUSED[name]
     found = read_prophesee(write(tmp_path, form, data), "a")
     assert [row[0] for row in listed(found)] == times
-    assert found.warnings() == []
+    assert found.notes() == ()
 
 
 STEPS_BACK: dict[str, tuple[str, bytes, list[int], str]] = {
@@ -294,7 +294,7 @@ def test_an_event_that_steps_back_a_little_is_raised_and_counted(tmp_path: Path,
     path = write(tmp_path, form, data)
     found = read_prophesee(path, "a")
     assert [row[0] for row in listed(found)] == times
-    (line,) = found.warnings()
+    (line,) = found.notes()
     assert line.startswith(says)
     store = Store.create(tmp_path / "store")
     result = import_trials(store, "theirs", trials_in(path, "raw"), path, "raw")
