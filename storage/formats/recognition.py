@@ -58,6 +58,7 @@ from sliplab.storage.formats.ros_bags import (
     read_bag,
     salvage_bag,
 )
+from sliplab.storage.formats.unread import unread
 from sliplab.storage.streams import Json
 
 Reader = Callable[[Path, str], ForeignTrial]
@@ -102,6 +103,9 @@ def kind_of(path: Path) -> str:
         return whole
     found = _sort(path)
     if not found:
+        said = [(file, what) for file in _files(path) if (what := unread(file)) is not None]
+        if said:
+            raise InputError(said[0][0], "", None, said[0][1])
         raise InputError(
             path, "", None, f"contains no known file format; name one of {', '.join(KINDS)}"
         )
@@ -187,7 +191,9 @@ def _reason(entry: Path, other: str) -> str:
         return "is a link"
     if entry.is_dir():
         return "is a folder; import it by itself"
-    return other if entry.is_file() else "is no regular file"
+    if not entry.is_file():
+        return "is no regular file"
+    return unread(entry) or other
 
 
 Wanted = tuple[str, str, "Path | Pair"]
@@ -267,6 +273,8 @@ def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     Raises:
         FormatError: it is damaged, or of another format.
     """
+    if (what := unread(file)) is not None:
+        raise FormatError(what)
     _, reader = READERS[kind]
     again = partial(SALVAGE[kind], file, name) if kind in SALVAGE else None
     try:
@@ -330,7 +338,7 @@ def _possible(file: Path) -> tuple[str, ...]:
 
 
 def _kind(file: Path) -> str | None:
-    kinds = _possible(file)
+    kinds = () if unread(file) is not None else _possible(file)
     if "dsec" in kinds:
         try:
             return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
