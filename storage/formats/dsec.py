@@ -27,6 +27,7 @@ from sliplab.storage.formats.foreign import (
     as_damage,
     event_chunk,
     read_head,
+    resolution_us,
     rounded_us,
 )
 from sliplab.storage.schema.trial import Lost
@@ -100,7 +101,10 @@ def salvage_dsec(path: Path, name: str) -> ForeignTrial:
 
 
 def _offset(file: RowFile) -> int:
-    offset = int(_integers(file.rows("t_offset").read())) if file.has("t_offset") else 0
+    stated = _integers(file.rows("t_offset").read()) if file.has("t_offset") else np.zeros(1)
+    if stated.size != 1:
+        raise FormatError(f"t_offset has the shape {stated.shape}; one number is right")
+    offset = int(stated.reshape(())[()])
     if not 0 <= offset < LATEST_US:
         raise FormatError(f"t_offset = {offset}: is not a time")
     return offset
@@ -111,7 +115,8 @@ def _triggers(file: RowFile, rows: Callable[[str], Rows]) -> Triggers | None:
         return None
     kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
     found = Triggers(_integers(rows("triggers/t").read()), kinds)
-    _rising(found)
+    if len(found.t_us) != len(kinds):
+        raise FormatError("holds triggers whose columns have different lengths")
     return found
 
 
@@ -167,7 +172,7 @@ def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         def check(low: int, high: int) -> EventChunk:
             return _sorted(*_lab_events(columns, low, high))
 
-        count, lost = _whole_rows(path, columns, check, ordered=False)
+        count, lost = _whole_rows(path, columns, check)
         if count > _MOST_UNSORTED:
             raise FormatError(f"holds {count} events, too many events to sort")
         size = _resolution(file.integers("sensor_resolution"), columns, count)
@@ -179,18 +184,18 @@ def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
     return replace(_lab_trial(path, name, all_events, size), lost=lost)
 
 
-def _lab_events(columns: Mapping[str, Rows], low: int, high: int) -> tuple[I64, I64, Any, I64]:
-    """Return columns, rows, polarities and times, us, as the file orders them."""
+def _lab_events(
+    columns: Mapping[str, Rows], low: int, high: int
+) -> tuple[I64, I64, Any, I64, float]:
+    """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
     xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
-    t_us = rounded_us(ts, 1e6)
-    if len(t_us) and int(t_us.min()) < 0:
-        raise FormatError("contains an event before its own clock started")
-    return _pixels(xs), _pixels(ys), np.asarray(ps) > 0, t_us  # 0 and 1, or -1 and 1
+    positive = np.asarray(ps) > 0  # 0 and 1, or -1 and 1
+    return _pixels(xs), _pixels(ys), positive, rounded_us(ts, 1e6), resolution_us(ts, 1e6)
 
 
-def _sorted(x: I64, y: I64, p: Any, t_us: I64) -> EventChunk:
+def _sorted(x: I64, y: I64, p: Any, t_us: I64, resolution: float) -> EventChunk:
     order = np.argsort(t_us, kind="stable")
-    return event_chunk(x[order], y[order], p[order], t_us[order])
+    return event_chunk(x[order], y[order], p[order], t_us[order], resolution)
 
 
 def _lab_trial(
@@ -219,15 +224,12 @@ def _piece(columns: Mapping[str, Rows]) -> int:
 def _whole_rows(
     path: Path,
     columns: Mapping[str, Rows],
-    check: Callable[[int, int], EventChunk],
-    *,
-    ordered: bool = True,
+    check: Callable[[int, int], object],
 ) -> tuple[int, Lost | None]:
     """Return the number of rows before the first that cannot be read in all columns.
 
     Args:
         check: reads rows low to high; raises where they cannot be right.
-        ordered: times must not decrease from one piece to the next.
     """
     size = path.stat().st_size
     lengths = {key: len(column) for key, column in columns.items()}
@@ -236,20 +238,17 @@ def _whole_rows(
     for key, column in columns.items():
         if (row := _rows_inside(column, count, size)) < count:
             count, reason = row, f"is cut short in the column events/{key}, at row {row}"
-    low, last, step = 0, 0, PIECE
+    low, step = 0, PIECE
     while low < count:
         high = min(low + step, count)
         try:
-            chunk = check(low, high)
-            if ordered and len(chunk) and int(chunk.t_us[0]) < last:
-                raise FormatError("contains events with decreasing times")
+            check(low, high)
         except (FormatError, *_FAULTS) as error:
             if step > (piece := _piece(columns)):
                 step = piece
                 continue
             count, reason = low, f"holds rows that cannot be read from row {low} on: {error}"
             break
-        last = int(chunk.t_us[-1]) if len(chunk) else last
         low = high
     if reason is None:
         return count, None
@@ -461,22 +460,14 @@ class _Padded(io.RawIOBase):
 
 def _integers(values: Any) -> I64:
     found = np.asarray(values)
-    if found.dtype.kind not in "iu" or (found.size and int(found.max()) >= 1 << 62):
+    if found.dtype.kind not in "iu":
         raise FormatError("contains times that are not integers")
-    return found.astype(np.int64)
-
-
-def _rising(found: Triggers) -> None:
-    t = found.t_us
-    wrong = np.any(t < 0) or np.any(t >= LATEST_US) or np.any(t[1:] < t[:-1])
-    if len(t) != len(found.kind) or wrong:
-        raise FormatError("contains triggers with decreasing or invalid times")
+    return np.where(found < LATEST_US, found, LATEST_US).astype(np.int64)
 
 
 def _pixels(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind == "f":
-        if not np.isfinite(found).all() or np.any(found != np.rint(found)):
-            raise FormatError("contains coordinates that are not pixels")
-        found = np.clip(found, -1, 1 << 20)
+        with np.errstate(invalid="ignore"):
+            found = np.where(found == np.rint(found), np.clip(found, -1, 1 << 20), -1)
     return found.astype(np.int64)

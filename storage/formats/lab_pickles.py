@@ -19,6 +19,7 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.foreign import (
+    LATEST_US,
     Damage,
     ForeignTrial,
     FormatError,
@@ -152,12 +153,8 @@ def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, 
         raise FormatError(f"contains times that are not numbers; {_RIGHT}")
     try:
         t_us = rounded_us(times, 1000.0)
-    except OverflowError:
-        raise FormatError("contains a time out of range") from None
-    if len(t_us) and int(t_us.min()) < 0:
-        raise FormatError(
-            f"holds an event at {t_us.min() / 1000:g} ms, before its own clock started"
-        )
+    except OverflowError:  # an integer beyond any float
+        t_us = rounded_us([time if abs(time) < LATEST_US else math.nan for time in times], 1000.0)
     place = np.repeat(np.arange(len(cells)), counts)
     shape = (int(found.shape[0]), int(found.shape[1]))
     return shape, place % shape[1], place // shape[1], np.full(len(t_us), polarity), t_us

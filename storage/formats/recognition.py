@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib import util
@@ -39,6 +40,7 @@ from sliplab.storage.formats.foreign import (
     FormatError,
     Skipped,
     before_damage,
+    broken,
     read_head,
     refusal,
 )
@@ -289,7 +291,7 @@ def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     try:
         return read_file(kind, file, name, salvage)
     except FormatError as error:
-        raise refusal(error.file or file, error) from None
+        return broken(name, file.name, refusal(error.file or file, error))
 
 
 def _stem(file: Path) -> str:
@@ -340,10 +342,8 @@ def _possible(file: Path) -> tuple[str, ...]:
 def _kind(file: Path) -> str | None:
     kinds = () if unread(file) is not None else _possible(file)
     if "dsec" in kinds:
-        try:
+        with suppress(FormatError):  # its reader finds the same fault
             return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
-        except FormatError as error:
-            raise refusal(file, error) from None
     return kinds[0] if kinds else None
 
 

@@ -16,19 +16,20 @@ from sliplab.storage.formats.evt import (
     EDGES,
     EVT3,
     FAULT,
+    FELL,
     GOT,
     HAD,
     HIGH,
+    HIGH_US,
+    LOW,
     NOW,
-    OUTSIDE,
-    RAISED,
-    RAISED_US,
     ROOM,
     ROW,
     new_state,
     raised_warning,
 )
-from sliplab.storage.formats.foreign import LATEST_US, MOST_PX, FormatError
+from sliplab.storage.formats.evt import OUTSIDE as PLACE
+from sliplab.storage.formats.foreign import MOST_PX, OUTSIDE, ForeignChunk, FormatError
 from sliplab.storage.formats.ros2_messages import EVENTS, MONO, EventPacket, Fields, unpack_mono
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
@@ -46,8 +47,6 @@ _EVT3_HIGH, _NO_ROW = 0x8, (1 << 11) - 1
 """Type of a word with the high part of a time, and a row that no camera has."""
 _ROOM = 12
 """Events that a word of 16 bits may hold."""
-_LATE_US = 1000
-"""Time by which an event may be earlier than the event before it."""
 _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 _ROS2_EVENT = np.dtype(
     {
@@ -68,8 +67,6 @@ class EventDecoder:
     Attributes:
         size: columns and rows of the camera, None until a message gave it.
         encoding: of the packets; empty for arrays.
-        state: counts events that were raised, for `evt.raised_warning`.
-        outside: words of events left out, which were outside of the camera's pixels.
         edges: of trigger inputs in the last packet: time (us), input, 1 for a rising edge.
 
     Args:
@@ -78,30 +75,27 @@ class EventDecoder:
 
     def __init__(self, kind: str) -> None:
         self._array = kind in ARRAYS
-        self.state = new_state(0)
-        self.state[NOW] = -LATEST_US
         self._evt3 = new_state(0)
         self._lost = False
         self._offset_us: int | None = None
         self.size: tuple[int, int] | None = None
         self.encoding = ""
-        self.outside = 0
         self.edges = np.empty((0, 3), np.int64)
 
     def read(self, fields: Fields) -> EventChunk:
         """Return the events of a message; times in us.
 
         Raises:
-            FormatError: it is damaged, of an unknown encoding, or earlier than the one before.
+            FormatError: it is damaged, or of an unknown encoding.
         """
         self.edges = self.edges[:0]
         try:
-            return self._ordered(self._inside(fields))
+            return self._events(fields)
         except FormatError:
             self._lost = True
             raise
 
-    def _inside(self, fields: Fields) -> EventChunk:
+    def _events(self, fields: Fields) -> EventChunk:
         if self._array:
             height, width = fields.number("I"), fields.number("I")
             found = _listed(fields)
@@ -111,40 +105,14 @@ class EventDecoder:
             found = self._unpacked(packet)
         if 0 < width <= MOST_PX and 0 < height <= MOST_PX:
             self.size = self.size or (width, height)
-            inside = (found.x < width) & (found.y < height)
-            if not inside.all():
-                self.outside += int(np.count_nonzero(~inside))
-                found = EventChunk(*(column[inside] for column in vars(found).values()))
         return found
 
     def warnings(self) -> list[str]:
-        """Return lines about events that were left out or changed."""
-        found = raised_warning(self.state)
-        if self.outside and self.size is not None:
-            found.append(
-                f"{self.outside:,} events outside of the {self.size[0]} x {self.size[1]} pixels of "
-                "the camera are left out"
-            )
+        """Return lines about events that were changed."""
+        found = raised_warning(self._evt3)
         if self.encoding == _MISLABELLED:
             found.append("its packets are called libcaer_cmp and hold words of evt3: read as such")
         return found
-
-    def _ordered(self, found: EventChunk) -> EventChunk:
-        """Raise times that step back a little."""
-        if not len(found):
-            return found
-        times, now = found.t_us, int(self.state[NOW])
-        if max(abs(int(times.min())), abs(int(times.max()))) >= LATEST_US:
-            raise FormatError("holds events at times that are none")
-        latest = np.maximum(np.maximum.accumulate(times), now)
-        late_us = int((latest - times).max())
-        if late_us > _LATE_US:
-            raise FormatError(f"holds events that run back by {late_us:,} us")
-        if late_us:
-            self.state[RAISED] += np.count_nonzero(latest > times)
-            self.state[RAISED_US] = max(self.state[RAISED_US], late_us)
-        self.state[NOW] = latest[-1]
-        return EventChunk(found.x, found.y, found.p, latest)
 
     def _unpacked(self, packet: EventPacket) -> EventChunk:
         encoding = packet.encoding
@@ -173,7 +141,7 @@ class EventDecoder:
         x, y, p = (np.empty(count, kind) for kind in (np.uint16, np.uint16, np.uint8))
         times, edges = np.empty(count, np.int64), np.empty((len(words) + 1, 3), np.int64)
         width, height = packet.width or EVT3.most_px, packet.height or EVT3.most_px
-        state[EDGES] = 0
+        state[EDGES] = outside = 0
         if self._lost:
             highs = np.flatnonzero(words >> 12 == _EVT3_HIGH)
             if not len(highs):  # when these events were is not known
@@ -181,22 +149,24 @@ class EventDecoder:
             at, self._lost, state[ROW] = int(highs[0]), False, _NO_ROW
         while at < len(words):
             at, filled = EVT3.decode(words, at, filled, state, width, height, x, y, p, times, edges)
-            if state[FAULT] == OUTSIDE:
-                self.outside += state[HAD] != _NO_ROW
+            if state[FAULT] == PLACE:
+                outside += state[HAD] != _NO_ROW
+                at += 1
+            elif state[FAULT] == FELL:  # the clock restarted: the import takes the longer part
+                state[HIGH_US] += (state[GOT] - state[HAD]) * _LOWS
+                state[HIGH], state[LOW], state[NOW] = state[GOT], 0, state[HIGH_US]
                 at += 1
             elif state[FAULT]:
-                raise FormatError(
-                    f"holds a time whose high part falls from {state[HAD]} to {state[GOT]}"
-                )
+                raise FormatError("holds events at a time that is out of range")
         if self._offset_us is None and state[HIGH] >= 0:
             first = int(times[0]) if filled else int(state[NOW])
             self._offset_us = packet.t_ns // 1000 - first if packet.t_ns else 0
         offset_us = self._offset_us or 0
-        self.state[RAISED] += state[RAISED]
-        self.state[RAISED_US] = max(self.state[RAISED_US], state[RAISED_US])
-        state[RAISED] = 0
         self.edges = edges[: state[EDGES]] + np.array([offset_us, 0, 0])
-        return EventChunk(x[:filled], y[:filled], p[:filled], times[:filled] + offset_us)
+        left_out = {OUTSIDE: int(outside)} if outside else {}
+        return ForeignChunk(
+            x[:filled], y[:filled], p[:filled], times[:filled] + offset_us, left_out
+        )
 
 
 def _words(packet: EventPacket, kind: str) -> npt.NDArray[Any]:

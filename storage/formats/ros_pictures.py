@@ -14,7 +14,6 @@ from sliplab.storage.formats.ros2_messages import Fields
 from sliplab.storage.streams import U8
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-_LATEST_NS = 1 << 62
 _AS_OPENCV = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16"}
 """Encodings that name the numbers of a pixel alone; OpenCV's colours are blue, green, red."""
 _BRIGHTNESS = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
@@ -42,17 +41,15 @@ class PictureDecoder:
         self.encoding = ""
         self._compressed = kind == COMPRESSED
         self._shape: tuple[int, ...] | None = None
-        self._last_ns = self._most = 0
+        self._most = 0
 
     def read(self, fields: Fields) -> tuple[int, U8]:
         """Return the time, ns, and the grey levels of a message, shape (height, width).
 
         Raises:
-            FormatError: it is damaged, of an unknown encoding, of another size than the frames
-                before it, or earlier.
+            FormatError: it is damaged, of an unknown encoding, or of another size than the frames
+                before it.
         """
-        if not self._last_ns <= fields.t_ns < _LATEST_NS:
-            raise FormatError(f"holds a frame at {fields.t_ns} ns after one at {self._last_ns} ns")
         if self._compressed:
             encoding = fields.text()
             levels = decode_picture(fields.block())
@@ -61,7 +58,7 @@ class PictureDecoder:
         if levels.shape != (self._shape or levels.shape):
             raise FormatError("holds a frame of another size than the first")
         self.encoding = self.encoding or encoding
-        self._shape, self._last_ns = levels.shape, fields.t_ns
+        self._shape = levels.shape
         return fields.t_ns, levels
 
     def warnings(self) -> list[str]:

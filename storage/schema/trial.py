@@ -260,6 +260,9 @@ class Imported(Part):
     """Labels that came with it."""
     lost: Lost | None = None
     """What is missing, of a trial that was salvaged from a damaged file."""
+    dropped: dict[str, Int] = Field(default_factory=dict)
+    """Numbers of rows that were left out because they cannot be right, by reason; written only
+    where there are any."""
 
 
 class StreamRecord(Part):

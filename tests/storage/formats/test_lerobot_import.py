@@ -124,7 +124,10 @@ def foreign(folder: Path) -> dict[str, Any]:
 def take(store: Path, path: Path) -> Json:
     kind = kind_of(path)
     assert (kind, skipped_in(path, kind)) == ("lerobot", [])
-    return import_trials(Store.create(store), "theirs", trials_in(path, kind), path, kind)
+    result = import_trials(Store.create(store), "theirs", trials_in(path, kind), path, kind)
+    for item in result.get("failed", ()):
+        raise InputError(path, "", None, item["reason"])
+    return result
 
 
 def test_frames_poses_forces_and_scalars_of_every_episode(tmp_path: Path) -> None:
