@@ -115,8 +115,9 @@ class StreamClock(StrictModel):
 
 Axis = Literal["taxel", "polarity", "step", "x", "y"]
 EventFormat = Literal[
-    "counts", "csv", "numpy", "aedat4", "dsec", "lab-hdf5", "raw", "es", "mcap", "lab-pickles"
-]
+    "counts", "csv", "numpy", "aedat4", "dsec", "lab-hdf5", "raw", "es", "mcap", "rosbag",
+    "lab-pickles",
+]  # fmt: skip
 _COUNTS = ("axes", "step_ms", "polarity_order")
 _TABLES = ("columns", "unit", "positive")
 

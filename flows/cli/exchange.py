@@ -59,9 +59,10 @@ def import_(
 ) -> None:
     """Import recordings of other programs into a new campaign; unknown values are marked.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw, es, croissant or lerobot; by default the
-    content decides, for each file of a folder. --adapter imports a data set with its labels and
-    factors, from a folder or .zip, as a campaign to train and evaluate on (docs/adapters.md).
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, rosbag, raw, es, croissant or lerobot; by
+    default the content decides, for each file of a folder. --adapter imports a data set with its
+    labels and factors, from a folder or .zip, as a campaign to train and evaluate on
+    (docs/adapters.md).
     """
     if adapter is not None:
         for option, given in (("KIND", path is not None), ("--simulated", simulated)):

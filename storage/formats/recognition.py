@@ -169,7 +169,7 @@ def skipped_in(path: Path, kind: str) -> list[Skipped]:
     Raises:
         InputError: as `trials_in`.
     """
-    if not path.is_dir() or kind in DATA_SETS:
+    if not path.is_dir() or kind in DATA_SETS or is_bag_folder(path):
         return []
     manifest = _read_manifest(path) if kind != LAB_PICKLES else None
     taken: set[str | None] = {EXPORT_MANIFEST}

@@ -32,7 +32,7 @@ from sliplab.storage.formats.evt import OUTSIDE as PLACE
 from sliplab.storage.formats.foreign import MOST_PX, OUTSIDE, ForeignChunk, FormatError
 from sliplab.storage.formats.ros2_messages import EVENTS, MONO, EventPacket, Fields, unpack_mono
 from sliplab.storage.kernels import njit
-from sliplab.storage.streams import EventChunk
+from sliplab.storage.streams import I64, EventChunk
 
 PACKETS = (EVENTS, "event_array_msgs/msg/EventArray")
 """Types of messages with encoded events; the second is the former name of the first."""
@@ -137,9 +137,8 @@ class EventDecoder:
     def _unpack_evt3(self, packet: EventPacket, words: npt.NDArray[np.uint16]) -> EventChunk:
         """Decode words of EVT 3.0, whose clock begins at the stamp of the first message."""
         state, at, filled = self._evt3, 0, 0
-        count = _ROOM * len(words) + ROOM
-        x, y, p = (np.empty(count, kind) for kind in (np.uint16, np.uint16, np.uint8))
-        times, edges = np.empty(count, np.int64), np.empty((len(words) + 1, 3), np.int64)
+        x, y, p, times = _room(_ROOM * len(words) + ROOM)
+        edges = np.empty((len(words) + 1, 3), np.int64)
         width, height = packet.width or EVT3.most_px, packet.height or EVT3.most_px
         state[EDGES] = outside = 0
         if self._lost:
@@ -167,6 +166,13 @@ class EventDecoder:
         return ForeignChunk(
             x[:filled], y[:filled], p[:filled], times[:filled] + offset_us, left_out
         )
+
+
+def _room(count: int) -> tuple[Any, Any, Any, I64]:
+    """Return columns to fill: of columns, rows, polarities and times."""
+    kinds = (np.uint16, np.uint16, np.uint8)
+    x, y, p = (np.empty(count, kind) for kind in kinds)
+    return x, y, p, np.empty(count, np.int64)
 
 
 def _words(packet: EventPacket, kind: str) -> npt.NDArray[Any]:
@@ -211,9 +217,7 @@ def _unpack_libcaer_cmp(packet: EventPacket, words: npt.NDArray[np.uint16]) -> E
     """
     if len(words) and int(words.max()) >> 12 > _VECT_8:
         raise FormatError(f"holds the word {int(words.max()):#06x}, which is none of libcaer_cmp")
-    count = 8 * len(words)
-    x, y, p = (np.empty(count, kind) for kind in (np.uint16, np.uint16, np.uint8))
-    times = np.empty(count, np.int64)
+    x, y, p, times = _room(8 * len(words))
     filled = _decode_libcaer_cmp(words, x, y, p, times)
     t_ns = _base_ns(packet) + times[:filled] * 1000
     return EventChunk(x[:filled], y[:filled], p[:filled], (t_ns + 500) // 1000)
@@ -230,7 +234,7 @@ def _decode_libcaer_cmp(words, x, y, p, t):  # type: ignore[no-untyped-def]
     higher = True
     filled = 0
     for i in range(len(words)):
-        word = np.int64(words[i])
+        word: Any = np.int64(words[i])
         kind, value = word >> 12, word & 0xFFF
         if kind == _TIME_HIGH:
             if value < high:

@@ -6,7 +6,7 @@ cannot be right is left out and counted; other topics are named in the record.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
@@ -77,7 +77,7 @@ class _Topic(Generic[D]):
     def __post_init__(self) -> None:
         self.decoder = self.make()
 
-    def messages(self) -> Iterator[Any]:
+    def messages(self) -> Generator[Any, None, None]:
         """Yield what each message holds, and None for one that cannot be right."""
         self.total, self.bad, self.decoder = 0, 0, self.make()
         for data in self.source.read(self.name):

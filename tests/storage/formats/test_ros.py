@@ -150,6 +150,7 @@ def test_the_parts_of_a_folder_are_one_trial(tmp_path: Path) -> None:
     assert line == "rec: lacks rec_4.mcap, a part of the recording that metadata.yaml names"
     assert skipped_in(tmp_path / "all", "rosbag") == []
     (rec / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    assert skipped_in(rec, "rosbag") == []
     result, (found,) = take(tmp_path / "again", rec)
     assert_events(found, sent)
     assert "has a damaged metadata.yaml" in result["warnings"][0]
