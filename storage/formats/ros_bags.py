@@ -186,12 +186,14 @@ def _sqlite(path: Path, *, whole: bool = True) -> Source:
             for row in _rows(database, topic, path, whole):
                 # one at a time: what is damaged costs no other
                 try:
-                    (data,) = database.execute(
+                    found = database.execute(
                         "SELECT data FROM messages WHERE id = ?", (row,)
                     ).fetchone()
                 except sqlite3.Error as error:
-                    data = FormatError(f"is in a damaged page: {error}")
-                yield data if isinstance(data, (bytes, FormatError)) else b""
+                    found = (FormatError(f"is in a damaged page: {error}"),)
+                if found is None or not isinstance(found[0], (bytes, FormatError)):
+                    found = (FormatError("is in a damaged row of the database"),)
+                yield found[0]
 
     warnings = [
         f"lies beside {path.name}{ending}, in which its recorder left messages that are not in it "

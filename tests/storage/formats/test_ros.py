@@ -337,6 +337,25 @@ def test_a_bag_without_an_index_says_what_mends_it(tmp_path: Path) -> None:
     assert "`rosbag reindex` writes one" in said
 
 
+@pytest.mark.parametrize("writer", ["bag", "bag lz4", "folder"])
+def test_flipped_bits_give_events_or_one_line(tmp_path: Path, writer: str) -> None:
+    name, store, write = WRITERS[writer]
+    write(tmp_path / name, [*ros.packets(store, "evt3", ros.sent()), *ros.frames(store)])
+    path = tmp_path / name / "a.db3" if writer == "folder" else tmp_path / name
+    whole, rng = path.read_bytes(), np.random.default_rng(7)
+    for number in range(12):
+        data = np.frombuffer(whole, np.uint8).copy()
+        data[rng.integers(0, len(data), 1 + 10 * (number % 3))] ^= np.uint8(1 << number % 8)
+        path.write_bytes(data.tobytes())
+        try:
+            result, _ = take(tmp_path / str(number), path)
+        except InputError as error:
+            assert "\n" not in error.message  # noqa: PT017
+            assert error.message.startswith(f"{path}: ")  # noqa: PT017
+        else:
+            assert result["events"] + result["frames"] > 0
+
+
 def test_messages_that_sqlite_left_beside_a_database_are_named(tmp_path: Path) -> None:
     ros.write_folder(tmp_path / "rec", ros.packets(ROS2, "mono", ros.sent()))
     (tmp_path / "rec" / "rec.db3-wal").write_bytes(b"more")
