@@ -19,7 +19,7 @@ from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
 from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
-from sliplab.storage.formats.recognition import LAB_PICKLES, name_of
+from sliplab.storage.formats.recognition import LAB_PICKLES, unique_names
 from sliplab.storage.formats.tables import Row, read_rows
 
 EVENTS, FRAMES, FRAME_TIMES, POSES = "events", "frames", "frames.times", "poses"
@@ -296,7 +296,7 @@ class _Finding:
 
     def _name(self, drafts: list[_Draft]) -> None:
         template = self._adapter.trials.id
-        sources: dict[str, str] = {}
+        texts: list[str] = []
         for draft in drafts:
             known = draft.all
             if template is not None:
@@ -311,7 +311,9 @@ class _Finding:
                 raise self._error(
                     "trials.id", None, f"is missing: {draft.source} has no column id and no file"
                 )
-            id_ = name_of(text)
+            texts.append(text)
+        sources: dict[str, str] = {}
+        for draft, id_ in zip(drafts, unique_names(texts), strict=True):
             if (other := sources.setdefault(id_, draft.source)) != draft.source:
                 raise self._error(
                     "trials.id", template, f"gives {other} and {draft.source} one id, {id_}; put "

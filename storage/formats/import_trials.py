@@ -413,7 +413,8 @@ def _write(campaign: Campaign, trial: ForeignTrial, kind: str, content: _Content
             pulses=0,
         )
         record = _record(campaign, trial, kind, rows, seen, content, streams)
-        writer.commit(record, Provenance.model_validate({"imported": now(), "from": trial.source}))
+        about = {"imported": now(), "from": _plain(trial.source)}
+        writer.commit(record, Provenance.model_validate(about))
     except BaseException:
         writer.discard()
         raise
@@ -599,6 +600,11 @@ def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) 
     return chunk
 
 
+def _plain(source: str) -> str:
+    """Return the name of a file, with bytes that are no text written out."""
+    return source.encode("utf-8", "backslashreplace").decode()
+
+
 def _loss_warnings(lost: Lost | None) -> list[str]:
     if lost is None:
         return []
@@ -661,7 +667,7 @@ def _record(
     missing = ("sensor size",) if counts.events else ("events",)
     origin: Json = {
         "format": trial.kind or kind,
-        "from": trial.source,
+        "from": _plain(trial.source),
         "epoch": trial.epoch,
         "unknown": [*trial.unknown, *(() if event_px else missing)],
         **trial.about,
