@@ -311,8 +311,11 @@ class AdaptedStreams(StrictModel):
 
     @model_validator(mode="after")
     def _some(self) -> AdaptedStreams:
-        if self.events is None and self.frames is None:
-            raise KeyedError(".events", None, "is missing; a trial needs events or frames")
+        if not any((self.events, self.frames, self.poses, self.wrenches, self.scalars)):
+            raise KeyedError(
+                ".events", None,
+                "is missing; a trial needs a stream: events, frames, poses, wrenches or scalars",
+            )  # fmt: skip
         if self.events is None and self.frames is not None and self.frames.clock is not None:
             raise KeyedError(
                 ".frames.clock", None, "is for streams beside events; without them its own counts"

@@ -397,6 +397,9 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> KeyedError:
     # An unknown key is most often the cause of a missing one beside it: say it first.
     first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
     loc = first["loc"]
+    if loc and loc[-1] == "[key]":  # pydantic's word for the name of an entry itself
+        said = re.sub("^Value error, |^[A-Z].* should", "", first["msg"]).strip()
+        return KeyedError(_key(loc[:-1]), None, f"is no right name: {said}")
     value: object | None = first.get("input")
     kind, context = first["type"], first.get("ctx", {})
     key = _key(loc)

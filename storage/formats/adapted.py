@@ -379,8 +379,11 @@ class _Opening:
         if seen.frames_ns is not None:
             line = self.clocks["frames"].map.to_reference
             ends.append((line(seen.frames_ns[0]), line(seen.frames_ns[1]) + 1000))
+        for name, (first, last) in seen.further_ns.items() if not ends else ():
+            line = self.clocks["arm" if name == POSES else name].map.to_reference
+            ends.append((line(first), line(last) + 1000))
         if not ends:
-            with self._named(EVENTS):
+            with self._named(next(iter(self.trial.files))):
                 raise FormatError("contains no event: its length is unknown")
         return min(a for a, _ in ends), max(b for _, b in ends)
 

@@ -29,7 +29,7 @@ from sliplab.storage.formats.foreign import (
     resolution_us,
 )
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
-from sliplab.storage.formats.numpy_files import array_of
+from sliplab.storage.formats.numpy_files import MAGIC, array_of
 from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
 from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
 from sliplab.storage.formats.tables import read_columns, times_ns
@@ -179,7 +179,13 @@ def read_events(
         FormatError: a file cannot be right.
     """
     if part.format == "counts":
-        return read_counts(array_of(folder.read(names[0])), part)
+        data = folder.read(names[0])
+        if not bytes(data[: len(MAGIC)]) == MAGIC:
+            raise FormatError(
+                "is no array of numpy (.npy), of which counts are read; readings of pressures or "
+                "forces are streams under scalars or wrenches, and a trial may be without events"
+            )
+        return read_counts(array_of(data), part)
     if part.format in {"csv", "numpy"}:
         return _event_table(folder, names[0], part)
     if part.format == LAB_PICKLES:

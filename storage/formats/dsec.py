@@ -37,7 +37,8 @@ from sliplab.storage.trials.hdf5_reader import RowFile, Rows
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
 PIECE = 1 << 20
-_SUPERBLOCK = 52
+_SUPERBLOCK, _FLAGS = 52, 12
+"""Bytes of a superblock, and of its beginning up to its flags."""
 _FEW_ROWS = 1 << 12
 _LAB = ("xs", "ys", "ps", "ts")
 _MOST_PACKED = 2000
@@ -135,6 +136,7 @@ def _dsec_trial(
     return ForeignTrial(
         name, path.name, events, "the event camera's own clock, us", triggers=triggers,
         simulated=simulated, unknown=("sync grade", "poses", "motion", "condition", "frames"),
+        notes=_open_note(path),
     )  # fmt: skip
 
 
@@ -208,6 +210,7 @@ def _lab_trial(
         name, path.name, events, "unknown; seconds as the file has them, rounded to us",
         lambda: size,
         unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
+        notes=_open_note(path),
     )  # fmt: skip
 
 
@@ -381,9 +384,15 @@ class _opened:
             end = _stated_end(self._path)
             if self._torn and end > size:
                 self._padded = _Padded(self._path, end)
-            self._file = RowFile(self._path, self._padded)
+            left_open = self._padded is None and _is_left_open(self._path)
+            self._file = RowFile(self._path, self._padded, swmr=left_open)
         except _FAULTS as error:
             self._close()
+            if _is_left_open(self._path):
+                raise Damage(
+                    f"was left open by a program that wrote it, or still is: once none writes it, "
+                    f"`h5clear -s {self._path.name}` makes it readable"
+                ) from None
             if read_head(self._path).startswith(SIGNATURE):
                 cut = f"is cut short: it says that it has {end} bytes, and has {size}"
                 raise Damage(cut if end > size else f"is damaged: {error}") from None
@@ -412,6 +421,17 @@ class _opened:
         if len(found.shape) != 1 or found.shape[0] > self._most:
             raise FormatError(f"{name} has the shape {found.shape}")
         return found
+
+
+def _is_left_open(path: Path) -> bool:
+    """Return whether a file says that a program has it open for writing (superblock 2 and 3)."""
+    head = read_head(path)[:_FLAGS]
+    return len(head) == _FLAGS and head.startswith(SIGNATURE) and head[8] in {2, 3} and head[-1] > 0
+
+
+def _open_note(path: Path) -> Callable[[], tuple[str, ...]]:
+    text = "was left open by its writer, or is still being written: what it holds now is imported"
+    return lambda: (text,) if _is_left_open(path) else ()
 
 
 def _stated_end(path: Path) -> int:

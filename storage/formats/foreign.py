@@ -140,10 +140,15 @@ class ForeignCampaign(Protocol):
 
 @dataclass(frozen=True)
 class Seen:
-    """First and last time of what was read of a trial, each on its own clock; None without any."""
+    """First and last time of what was read of a trial, each on its own clock; None without any.
+
+    Attributes:
+        further_ns: of poses and streams by name.
+    """
 
     events_us: tuple[int, int] | None
     frames_ns: tuple[int, int] | None
+    further_ns: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

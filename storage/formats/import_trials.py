@@ -223,6 +223,7 @@ class _Content:
         gates: those that the trial does not pass.
         counts: events and frames.
         size_px: columns and rows of the event camera. latest_px: largest column and row of events.
+        further_ns: first and last time of poses and streams.
         labelled: a label came with the trial.
     """
 
@@ -234,6 +235,7 @@ class _Content:
     counts: dict[str, int] = field(default_factory=lambda: {"events": 0, "frames": 0})
     size_px: tuple[int, int] | None = None
     latest_px: tuple[int, int] = (0, 0)
+    further_ns: dict[str, tuple[int, int]] = field(default_factory=dict)
     labelled: bool = False
 
     def ordered(self, stream: str, times: I64, done: int, last: int | None) -> Any:
@@ -404,6 +406,7 @@ def _write(campaign: Campaign, trial: ForeignTrial, kind: str, content: _Content
     try:
         seen = _fill(writer, trial, content)
         streams = _fill_further(writer, trial, content)
+        seen = replace(seen, further_ns=content.further_ns)
         if not sum(content.rows.values()) and trial.whole is None:
             raise NoEvents("contains no events; nothing to import")
         counts = writer.counts
@@ -414,7 +417,8 @@ def _write(campaign: Campaign, trial: ForeignTrial, kind: str, content: _Content
             pulses=0,
         )
         record = _record(campaign, trial, kind, rows, seen, content, streams)
-        writer.commit(record, Provenance.model_validate({"imported": now(), "from": trial.source}))
+        about = {"imported": now(), "from": _plain(trial.source)}
+        writer.commit(record, Provenance.model_validate(about))
     except BaseException:
         writer.discard()
         raise
@@ -597,7 +601,13 @@ def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) 
     if len(chunk):
         ends = int(chunk.t_ns[0]), int(chunk.t_ns[-1])
         content.check_times(name, ends, trial.resolution_us.get(name, 0.0))
+        content.further_ns[name] = ends
     return chunk
+
+
+def _plain(source: str) -> str:
+    """Return the name of a file, with bytes that are no text written out."""
+    return source.encode("utf-8", "backslashreplace").decode()
 
 
 def _loss_warnings(lost: Lost | None) -> list[str]:
@@ -627,7 +637,7 @@ def _seconds(seen: Seen, whole: Whole | None) -> float:
         return (whole.span_ns[1] - whole.span_ns[0]) / 1e9
     if seen.events_us is not None:
         return (seen.events_us[1] - seen.events_us[0]) / 1e6
-    first, last = seen.frames_ns or (0, 0)
+    first, last = seen.frames_ns or next(iter(seen.further_ns.values()), (0, 0))
     return (last // 1000 - first // 1000) / 1e6
 
 
@@ -639,8 +649,10 @@ def _clocks(
         "frames": trial.frames is not None,
         "arm": trial.poses is not None or (whole is not None and bool(whole.steps)),
     }
+    cameras = {"event camera": there["events"], "frame camera": there["frames"]}
+    devices = {**cameras, "arm": there["arm"], **dict.fromkeys(streams, True)}
     found: Json = {
-        "reference": "event camera" if there["events"] else "frame camera",
+        "reference": next((name for name, known in devices.items() if known), None),
         **{name: trial.clocks.get(name, _UNKNOWN) for name, known in there.items() if known},
     }
     if streams:
@@ -662,7 +674,7 @@ def _record(
     missing = ("sensor size",) if counts.events else ("events",)
     origin: Json = {
         "format": trial.kind or kind,
-        "from": trial.source,
+        "from": _plain(trial.source),
         "epoch": trial.epoch,
         "unknown": [*trial.unknown, *(() if event_px else missing)],
         **trial.about,

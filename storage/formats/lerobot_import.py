@@ -192,10 +192,10 @@ def _described(path: Path) -> _DataSet:
             raise InputError(info, f"features.{key}", feature, "must be a mapping")
         if key not in _GRID:
             _add(data, key, feature)
-    if not data.cameras:
+    if not data.cameras and not data.vectors:
         raise InputError(
             info, "features", ", ".join(features) or "none",
-            "must have an image or a video: a trial without a camera has no time line",
+            "must have an image, a video from a camera, or numbers: a trial needs a stream",
         )  # fmt: skip
     return data
 
@@ -347,13 +347,15 @@ def _trial(data: _DataSet, row: Json, seen: set[int]) -> ForeignTrial:
         name: _frames(_pictures(data, row, key, file, number, seconds), t_ns)
         for key, name in data.streams.items()
     }
-    first = next(cameras[FRAMES_KIND]())
+    frames = cameras.pop(FRAMES_KIND, None)
+    first = None if frames is None else next(frames())
+    size = None if first is None else (first.images.shape[2], first.images.shape[1])
     names = {name: key for key, name in data.streams.items() if name != FRAMES_KIND}
     tasks = row.get("tasks") or ()
     about = {
         "robot": data.robot or "unknown",
         "tasks": [str(task)[:500] for task in tasks][:100],
-        "camera": next(iter(data.cameras)),
+        "camera": next(iter(data.cameras), None),
         "streams": {**names, **found.sources},
         "left_out": data.left_out,
     }
@@ -363,7 +365,7 @@ def _trial(data: _DataSet, row: Json, seen: set[int]) -> ForeignTrial:
     return ForeignTrial(
         f"episode-{number:06d}", file.relative_to(data.folder).as_posix(), lambda: iter(()),
         "the episode's start; seconds of its rows, rounded to us",
-        frames=cameras.pop(FRAMES_KIND), frame_px=(first.images.shape[2], first.images.shape[1]),
+        frames=frames, frame_px=size,
         simulated=data.simulated, about=about, unknown=tuple(unknown), kind="lerobot",
         poses=found.poses, streams=found.streams, cameras=cameras,
     )  # fmt: skip

@@ -252,6 +252,7 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str,
             encoding="utf-8-sig", **types,
         )  # fmt: skip
 
+    line = 0
     while True:
         try:
             table = read()
@@ -263,7 +264,7 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str,
                 raise FormatError(f"is not CSV: {text}") from None
             if not width < int(wide[2]) <= _MOST_CELLS:
                 raise _too_wide(int(wide[2]), int(wide[1]), below) from None
-            width = int(wide[2])
+            width, line = int(wide[2]), line or int(wide[1])
     if table.empty:
         return {key: np.empty(0, np.int64) for key in wanted}, 0
     # separators at the ends of rows make empty cells
@@ -272,7 +273,7 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str,
     if 2 * int(good.sum()) <= len(good):
         at = int((~good).argmax())
         last = int(np.flatnonzero(beyond[at])[-1])
-        raise _too_wide(len(cells) + last + 1, 1 + headed + at, below)
+        raise _too_wide(len(cells) + last + 1, line or 1 + headed + at, below)
     for index in wanted.values():
         good &= pd.to_numeric(table[index], errors="coerce").notna().to_numpy()
     if good.all() or 2 * int(good.sum()) <= len(good):

@@ -352,7 +352,10 @@ class TrialRecord(Document):
             DocumentError, NewerFormat: as `load`.
         """
         found = super().parse(data, path)
-        seen = found.geometry.event_px is not None or found.geometry.frame_px is None
+        without = found.imported is not None and not found.counts.events
+        seen = found.geometry.event_px is not None or (
+            found.geometry.frame_px is None and not without
+        )
         if found.quality.passed and seen and found.clocks.events is None:
             raise DocumentError(f"{path}: clocks.events: is missing")
         return found

@@ -66,19 +66,21 @@ class RowFile:
 
     Args:
         content: its bytes as an open binary file, read in place of what is at `path`.
+        swmr: read beside a program that writes it (single writer, multiple readers).
 
     Raises:
         OSError: it cannot be opened, or is none.
     """
 
-    def __init__(self, path: Path, content: Any = None) -> None:
+    def __init__(self, path: Path, content: Any = None, *, swmr: bool = False) -> None:
         self.path = path
         name, access = os.fsencode(path), _access()
         if content is not None:
             access = access.copy()
             access.set_fileobj_driver(h5py.h5fd.fileobj_driver, content)
             name = repr(content).encode()
-        self._file = h5py.h5f.open(name, h5py.h5f.ACC_RDONLY, fapl=access)
+        flags = h5py.h5f.ACC_RDONLY | (h5py.h5f.ACC_SWMR_READ if swmr else 0)
+        self._file = h5py.h5f.open(name, flags, fapl=access)
         self._opened: dict[str, Rows] = {}
 
     def close(self) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +19,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.storage.files import safe_name
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.formats.flatbuffers import events_buffer
 from sliplab.storage.formats.foreign import Triggers
 from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import kind_of, trials_in
+from sliplab.storage.formats.recognition import kind_of, name_of, trials_in
 from sliplab.storage.streams import EventChunk, Json
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
@@ -396,3 +399,78 @@ def test_trials_that_fail_their_gates_are_in_no_part_of_a_split(tmp_path: Path) 
     campaign = bring(SLIDES, tmp_path / "set", tmp_path / "store")
     assert "ann_0.6_0" in campaign.committed()
     assert "ann_0.6_0" not in {trial.id for trial, _ in Collected(campaign).trials}
+
+
+def _left_open(path: Path, *, swmr: bool) -> None:
+    """Write a file in a process that dies with the file open."""
+    code = f"""
+import os, h5py, numpy as np
+file = h5py.File({str(path)!r}, "w", libver="latest")
+for name, values in dict(x=np.arange(500) % 40, y=np.arange(500) % 40, p=np.arange(500) % 2,
+                         t=np.arange(500) * 10).items():
+    file.create_dataset(f"events/{{name}}", data=values, chunks=(100,), maxshape=(None,))
+if {swmr}:
+    file.swmr_mode = True
+else:
+    file.close()
+    file = h5py.File({str(path)!r}, "r+", libver="latest")
+    file.attrs["more"] = 1
+file.flush()
+os._exit(1)
+"""
+    subprocess.run([sys.executable, "-c", code], check=False)
+
+
+def test_a_file_that_its_writer_left_open_is_read(tmp_path: Path) -> None:
+    _left_open(tmp_path / "a.h5", swmr=True)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, np.arange(500) * 10)
+    assert found.record.imported is not None
+    assert "was left open by its writer" in found.record.imported.warnings[0]
+
+
+def test_a_file_that_is_marked_as_written_says_what_clears_the_mark(tmp_path: Path) -> None:
+    _left_open(tmp_path / "a.h5", swmr=False)
+    done = here("import", tmp_path / "a.h5", "--store", tmp_path / "store", "--name", "x")
+    assert done.returncode == 1
+    assert "`h5clear -s a.h5` makes it readable" in done.stderr
+
+
+def test_names_in_any_script_stay_apart_and_are_in_the_record(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    stems = [
+        "测试",
+        "テスト",
+        "Проба 1",
+        "Проба 2",
+        "e\u0301",
+        "\u00e9",
+        "TRIAL",
+        "trial",
+        "a b",
+        "a:b",
+    ]
+    for stem in stems:
+        _dsec(folder / f"{stem}.h5", np.arange(COUNT))
+    store = Store.create(tmp_path / "store")
+    result = _take(store, folder)
+    names = result["imported"]
+    assert len({name.casefold() for name in names}) == len(stems)
+    assert all(name.isascii() for name in names)
+    records = [one.record for one in store.campaign("theirs").recordings()]
+    files = {record.imported.source: record.trial for record in records if record.imported}
+    assert set(files) == {f"{stem}.h5" for stem in stems}
+    assert files["测试.h5"].startswith("Ce_Shi-")
+    assert files["Проба 1.h5"].startswith("Proba_1-")
+    assert files["trial.h5"] == "trial"
+    assert _take(store, folder)["imported"] == []
+
+
+@pytest.mark.parametrize("name", ["a" * 251, "ü" * 125, "con", "trial.", "...", "\udcff"])
+def test_names_that_no_file_system_has_are_changed(name: str) -> None:
+    made = name_of(name)
+    assert len(made) <= 200
+    safe_name(made)
+    assert made.lower() not in {"con", "trial."}
+    assert not made.endswith(".")
