@@ -68,7 +68,8 @@ class Collected:
         if not has_plan(self.info):
             raise InputError("CAMPAIGN", "", self.name, _NO_PLAN)
         file = self.campaign.protocol_file
-        trials = tuple(map(_recorded_trial, self.campaign.recordings()))
+        recordings = (item for item in self.campaign.recordings() if item.record.quality.passed)
+        trials = tuple(map(_recorded_trial, recordings))
         return RecordedPlan(load_adapter(file), str(file), trials)
 
     @property

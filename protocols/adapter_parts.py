@@ -115,8 +115,9 @@ class StreamClock(StrictModel):
 
 Axis = Literal["taxel", "polarity", "step", "x", "y"]
 EventFormat = Literal[
-    "counts", "csv", "numpy", "aedat4", "dsec", "lab-hdf5", "raw", "es", "mcap", "lab-pickles"
-]
+    "counts", "csv", "numpy", "aedat4", "dsec", "lab-hdf5", "raw", "es", "mcap", "rosbag",
+    "lab-pickles",
+]  # fmt: skip
 _COUNTS = ("axes", "step_ms", "polarity_order")
 _TABLES = ("columns", "unit", "positive")
 
@@ -310,8 +311,11 @@ class AdaptedStreams(StrictModel):
 
     @rule
     def _some(self) -> AdaptedStreams:
-        if self.events is None and self.frames is None:
-            raise KeyedError(".events", None, "is missing; a trial needs events or frames")
+        if not any((self.events, self.frames, self.poses, self.wrenches, self.scalars)):
+            raise KeyedError(
+                ".events", None,
+                "is missing; a trial needs a stream: events, frames, poses, wrenches or scalars",
+            )  # fmt: skip
         if self.events is None and self.frames is not None and self.frames.clock is not None:
             raise KeyedError(
                 ".frames.clock", None, "is for streams beside events; without them its own counts"

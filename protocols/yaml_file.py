@@ -607,6 +607,9 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
     value: object | None = item.get("input")
     loc, kind, context = item["loc"], item["type"], item.get("ctx", {})
     key = f".{_key(loc)}" if loc else ""
+    if loc and loc[-1] == "[key]":  # pydantic's word for the name of an entry itself
+        said = re.sub("^Value error, |^[A-Z].* should", "", item["msg"]).strip()
+        return KeyedError(f".{_key(loc[:-1])}", None, f"is no right name: {said}")
     if kind == "value_error" and isinstance(context.get("error"), KeyedError):
         return KeyedError.joined(
             each.with_key(key + each.key) if each.below else each

@@ -15,6 +15,7 @@ from sliplab.analysis.windows.windows import list_events
 from sliplab.protocols.settings import Samples, Windows
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.array_file import Arrays, map_arrays, write_arrays
+from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 from sliplab.storage.trials.recording import Recording
 
 VERSION = 1
@@ -128,8 +129,33 @@ def recorded_span(recording: Recording) -> tuple[int, int]:
     if origin is not None and origin.span_ns is not None:
         return origin.span_ns
     recorded = [step for step in recording.record.steps if step.recorded]
+    if origin is not None and not recorded:
+        return _span_of_rows(recording)
     clock = recording.clock("arm")
     return clock.to_reference(recorded[0].start_ns), clock.to_reference(recorded[-1].end_ns)
+
+
+def _span_of_rows(recording: Recording) -> tuple[int, int]:
+    """Return first and last time of what an imported trial holds, of its events if it has any."""
+    record = recording.record
+    if record.counts.events:
+        with recording.open() as reader:
+            times = reader.event_times()[[0, -1]] * 1000
+        return tuple(map(int, recording.clock("events").to_reference(times)))
+    ends: list[int] = []
+    if record.counts.frames:
+        times = recording.frame_times()
+        ends += [int(times[0]), int(times[-1])]
+    if record.counts.poses:
+        with recording.open() as reader:
+            poses = reader.poses().t_ns[[0, -1]]
+        ends += map(int, recording.clock("arm").to_reference(poses))
+    for name, about in record.streams.items():
+        if about.rows and not about.of_camera:
+            with recording.open() as reader:
+                rows = reader.column(f"{STREAM_GROUP}/{name}/t")[[0, -1]]
+            ends += map(int, recording.clock(name).to_reference(rows))
+    return (min(ends), max(ends)) if ends else (0, 0)
 
 
 def trial_samples(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
-from sliplab.flows.cli.common import finish
+import typer
+
+from sliplab.flows.cli.common import FAULTS, finish, new_store, say_faults
 from sliplab.flows.collecting.requests import store_lock
 from sliplab.flows.running import console
 from sliplab.protocols.adapter import Adapter, load_adapter
@@ -56,32 +56,18 @@ def import_by_adapter(
             _list(found, parts, place, name, as_json)
             return
         bar = console.bar("import (trials)", len(found.trials))
-        with _new_store(place) as store, store_lock(store), bar as progress:
+        with new_store(place) as store, store_lock(store), bar as progress:
             result = import_adapted(
                 store, name, found, text, lambda trial: progress.advance(1, trial),
                 salvage=salvage,
             )  # fmt: skip
-        for warning in result.get("warnings", ()):
-            console.say(f"warning: {warning}")
+        say_faults(result)
         warnings = [*found.warnings, *result.get("warnings", ())]
         result |= {"split": dict(Counter(parts.values())), "warnings": warnings}
+        failed = "failed" in result
         _finish(result, found, f"imported into {place}", as_json)
-
-
-@contextmanager
-def _new_store(place: Path) -> Iterator[Store]:
-    """Yield the store at `place`; one that is made here is taken away again if it stays empty."""
-    there = place.is_dir() and any(place.iterdir())
-    existed = place.exists()
-    store = Store.create(place)
-    try:
-        yield store
-    except BaseException:
-        if not there and not store.campaigns():
-            shutil.rmtree(place)
-            if existed:
-                place.mkdir()
-        raise
+        if failed:
+            raise typer.Exit(console.FAILED)
 
 
 def _list(found: AdaptedSet, parts: dict[str, str], place: Path, name: str, as_json: bool) -> None:
@@ -135,6 +121,6 @@ def _finish(result: Json, found: AdaptedSet, title: str, as_json: bool) -> None:
         if key in result:
             result[key] = len(result[key])
     split = ", ".join(f"{count} {part}" for part, count in result.pop("split").items())
-    for key in ("warnings", "salvaged"):
+    for key in FAULTS:
         result.pop(key, None)
     finish({**result, "split": split, "skipped": len(skipped)}, title, False)

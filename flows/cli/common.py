@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sliplab.flows.running import console
 from sliplab.flows.steps import run_step
+
+if TYPE_CHECKING:
+    from sliplab.storage.trials.store import Store
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="A store's folder.")]
@@ -81,3 +86,33 @@ def finish(result: Mapping[str, object], title: str, as_json: bool) -> None:
         for key, value in result.items()
     }
     console.print_pairs(title, shown)
+
+
+FAULTS = ("warnings", "salvaged", "left_out", "failed")
+"""Keys of an import's result that are printed to stderr, a line each."""
+
+
+def say_faults(result: Mapping[str, Any]) -> None:
+    """Print the warnings of an import, and the trials that could not be imported."""
+    for text in result.get("warnings", ()):
+        console.say(f"warning: {text}")
+    for item in result.get("failed", ()):
+        console.say(f"not imported: {item['trial']}: {item['reason']}")
+
+
+@contextmanager
+def new_store(place: Path) -> Iterator[Store]:
+    """Yield the store at `place`; one that is made here is taken away again if it stays empty."""
+    there = place.is_dir() and any(place.iterdir())
+    existed = place.exists()
+    from sliplab.storage.trials.store import Store
+
+    store = Store.create(place)
+    try:
+        yield store
+    except BaseException:
+        if not there and not store.campaigns():
+            shutil.rmtree(place)
+            if existed:
+                place.mkdir()
+        raise

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, StoreOption, finish
+from sliplab.flows.cli.common import (
+    FAULTS,
+    CampaignOption,
+    JsonOption,
+    StoreArgument,
+    StoreOption,
+    finish,
+    new_store,
+    say_faults,
+)
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
@@ -51,9 +60,10 @@ def import_(
 ) -> None:
     """Import recordings of other programs into a new campaign; unknown values are marked.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, raw, es, croissant or lerobot; by default the
-    content decides, for each file of a folder. --adapter imports a data set with its labels and
-    factors, from a folder or .zip, as a campaign to train and evaluate on (docs/adapters.md).
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, mcap, rosbag, raw, es, croissant or lerobot; by
+    default the content decides, for each file of a folder. --adapter imports a data set with its
+    labels and factors, from a folder or .zip, as a campaign to train and evaluate on
+    (docs/adapters.md).
     """
     if adapter is not None:
         for option, given in (("KIND", path is not None), ("--simulated", simulated)):
@@ -71,14 +81,13 @@ def import_(
     if name is None:
         raise InputError("--name", "", None, "is missing: the name of the new campaign")
     from dataclasses import replace
-    from itertools import chain, islice
 
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
     from sliplab.storage.formats.import_trials import import_trials
     from sliplab.storage.formats.published_import import of_one_campaign
     from sliplab.storage.formats.recognition import KINDS, kind_of, skipped_in, trials_in
-    from sliplab.storage.trials.store import Store, StoreError
+    from sliplab.storage.trials.store import StoreError
 
     where = of_one_campaign(Path(kind_or_path) if path is None else path)
     kind = kind_of(where) if path is None else kind_or_path
@@ -90,25 +99,24 @@ def import_(
         raise InputError("--name", "", name, str(error)) from None
     skipped = skipped_in(where, kind)
     found = trials_in(where, kind, salvage=salvage)
-    first = list(islice(found, 1))  # where its header is refused, no store is made
-    opened = Store.create(store)
-    found = chain(first, found)
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
-    with store_lock(opened):
+    with new_store(store) as opened, store_lock(opened):
         result = import_trials(
             opened, name, found, where, kind, lambda trial: console.say(trial), salvage=salvage
         )
-    for text in result.get("warnings", ()):
-        console.say(f"warning: {text}")
+    say_faults(result)
     for item in skipped:
         console.say(f"skipped: {item.file}: {item.reason}")
     if skipped:
         result["skipped"] = [vars(item) for item in skipped]
+    failed = "failed" in result
     if not as_json:
-        for key in ("warnings", "salvaged", "skipped"):
+        for key in (*FAULTS, "skipped"):
             result.pop(key, None)
     finish(result, f"imported into {store}", as_json)
+    if failed:
+        raise typer.Exit(console.FAILED)
 
 
 @app.command()

@@ -99,7 +99,12 @@ def verify(
     """Check every checksum, count and clock of a store; close files that others left open."""
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
-    from sliplab.storage.trials.verify import quarantine_damaged, salvaged, trial_folders
+    from sliplab.storage.trials.verify import (
+        failed_gates,
+        quarantine_damaged,
+        salvaged,
+        trial_folders,
+    )
     from sliplab.storage.trials.verify import verify as look
 
     if is_url(store):
@@ -122,6 +127,11 @@ def verify(
     torn = salvaged(opened)
     for trial in torn:
         console.say(f"{trial}: was salvaged from a damaged file: intact, but not all of it")
+    failing = failed_gates(opened)
+    for trial, gates in failing.items():
+        console.say(
+            f"{trial}: does not pass {', '.join(gates)}: intact, but not used by later steps"
+        )
     if as_json:
         damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
         result = {
@@ -133,8 +143,10 @@ def verify(
             "problems": [vars(item) for item in problems],
             "quarantined": moved,
         }
-        result |= {"mended": [str(path) for path in mended]} if mended else {}
-        console.print_json(result | ({"salvaged": torn} if torn else {}))
+        further = {
+            "mended": [str(path) for path in mended], "salvaged": torn, "failed_gates": failing,
+        }  # fmt: skip
+        console.print_json(result | {key: found for key, found in further.items() if found})
     elif problems:
         rows = [[item.path, item.what] for item in problems]
         console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)

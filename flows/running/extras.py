@@ -17,7 +17,7 @@ EXTRAS = {
     "view": ("rerun",),
     "onnx": ("onnx", "onnxruntime"),
     "publish": ("mcap", "zstandard", "lz4"),
-    "formats": ("faery",),
+    "formats": ("faery", "rosbags"),
 }  # fmt: skip
 """Modules that each extra installs."""
 

@@ -33,13 +33,13 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.campaigns import Collected, has_plan
 from sliplab.analysis.force import has_forces, plate_forces
 from sliplab.analysis.labels.reviewed import label_key, state_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.running import stopping
-from sliplab.flows.ui.review import event_rate
+from sliplab.flows.ui.review import RATE_NS, event_rate
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
@@ -114,8 +114,12 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
         )
         try:
             forces = has_forces(subject.recording)
-            streams = subject.recording.record.streams.items()
-            further = {name: about.kind for name, about in streams if about.timing is not None}
+            record = subject.recording.record
+            further = {
+                name: about.kind
+                for name, about in record.streams.items()
+                if about.timing is not None or record.imported is not None
+            }
             shown = blueprint(library, forces=forces, further=further)
             stream.save(unfinished, default_blueprint=shown)
             counts = send(library, stream, subject)
@@ -213,6 +217,8 @@ BIN_NS = 5_000_000
 MOST_POINTS = 5_000_000
 """More events than this become pictures; as points they would take 40 MB and more."""
 MOST_IMAGES = 1000
+MOST_RATES = 1_000_000
+"""Points of the curve of the event rate; a longer recording has none."""
 POOL = 2
 MOST_FRAMES = 2000
 """Of more frames, every second, third, ... is taken."""
@@ -263,8 +269,10 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
     recording = subject.recording
     to = _Columns(library, stream)
     derived = Derived.of(subject.store, LABELS, subject.item.name)
-    key = label_key(recording, subject.item.settings.labelling)
-    fresh = derived.fresh(subject.trial, key)
+    key = ""
+    if has_plan(subject.item.info):
+        key = label_key(recording, subject.item.settings.labelling)
+    fresh = bool(key) and derived.fresh(subject.trial, key)
     label = derived.load(subject.trial, TrialLabel) if fresh else None
     arrays = derived.arrays(subject.trial) if fresh else {}
     condition = ", ".join(f"{name} {text}" for name, text in recording.record.condition.items())
@@ -289,8 +297,12 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
 
 def _events(to: _Columns, subject: Subject) -> None:
     recording = subject.recording
+    if not recording.record.counts.events:
+        return
     to.sent["events"] = _event_camera(to, recording, "events", "events")
     start, end = recorded_span(recording)
+    if (end - start) // RATE_NS > MOST_RATES:
+        return
     rate_s, rate = event_rate(recording, start, end)
     to.scalars("events/rate", np.round(rate_s * 1e9).astype(np.int64), rate)
 
@@ -304,8 +316,9 @@ def _event_camera(to: _Columns, recording: Recording, stream: str, path: str) ->
             _points(to, f"{path}/{name}", events, time_ns, events.p == polarity)
     else:
         about = recording.record.streams.get(stream)
-        size = None if about is None else about.size_px
-        _count_images(to, path, size or recording.event_px, events, time_ns)
+        size = recording.record.geometry.event_px if about is None else about.size_px
+        seen = int(events.x.max()) + 1, int(events.y.max()) + 1
+        _count_images(to, path, size or seen, events, time_ns)
     return len(events)
 
 
@@ -318,6 +331,11 @@ def _further(to: _Columns, recording: Recording) -> None:
         elif about.kind == FRAMES_KIND:
             _pictures(to, recording, name, path)
             to.sent[count] = about.rows
+        elif about.kind == WrenchChunk.KIND and recording.record.imported is not None:
+            wrench = recording.wrenches(name)
+            time_ns = np.asarray(recording.clock(name).to_reference(wrench.t_ns))
+            for axis, values in zip("xyz", wrench.force_n.T, strict=True):
+                to.scalars(f"{path}/f{axis}", time_ns, values, count if axis == "x" else "")
         elif about.kind == WrenchChunk.KIND and about.timing is not None:
             forces = plate_forces(recording, name)
             to.scalars(f"{path}/normal", forces.t_ns, forces.normal_n, count)
@@ -411,9 +429,9 @@ def _arm(to: _Columns, subject: Subject) -> None:
     recording = subject.recording
     with recording.open() as reader:
         poses = reader.poses()
-    time_ns = np.asarray(recording.clock("arm").to_reference(poses.t_ns))
-    if not len(time_ns):
+    if not len(poses):
         return
+    time_ns = np.asarray(recording.clock("arm").to_reference(poses.t_ns))
     turned = np.deg2rad(poses.rotvec_deg)
     angle = np.linalg.norm(turned, axis=1)
     axis = np.divide(turned, angle[:, None], out=np.zeros_like(turned), where=angle[:, None] > 0)
@@ -432,6 +450,8 @@ def _pulses(to: _Columns, subject: Subject) -> None:
         seen = {name: reader.pulses(f"{name}_pulses") for name in ("sync", "event", "arm")}
     seen["event"], seen["arm"] = (
         np.asarray(recording.clock(device).to_reference(seen[name]))
+        if len(seen[name])
+        else seen[name]
         for name, device in (("event", "events"), ("arm", "arm"))
     )
     for height, (name, title) in enumerate(

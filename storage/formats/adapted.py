@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,11 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.formats.adapted_labels import FoundTime, find_motion
 from sliplab.storage.formats.adapted_streams import (
+    NO_ROW,
     EventSource,
+    FrameNotes,
+    Samples,
+    SampleT,
     read_events,
     read_frames,
     read_poses,
@@ -33,8 +38,10 @@ from sliplab.storage.formats.adapted_trials import (
 from sliplab.storage.formats.foreign import (
     ForeignTrial,
     FormatError,
+    LabelError,
     Seen,
     Whole,
+    broken,
     refusal,
 )
 from sliplab.storage.formats.import_trials import import_trials
@@ -90,7 +97,10 @@ def _opened(
                 try:
                     made = _Opening(found, trial, stack, salvage).open(made)
                 except FormatError as error:
-                    raise refusal(error.file or found.folder.path, error) from None
+                    fault = refusal(error.file or found.folder.path, error)
+                    made = replace(broken(trial.id, trial.source, fault), campaign=campaign)
+                except InputError as error:
+                    made = replace(broken(trial.id, trial.source, error), campaign=campaign)
             yield made
 
 
@@ -175,6 +185,9 @@ class _Opening:
     salvage: bool
     clocks: dict[str, DeviceRecord] = field(default_factory=dict)
     unknown: list[str] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
+    resolution_us: dict[str, float] = field(default_factory=dict)
+    frame_notes: FrameNotes = field(default_factory=FrameNotes)
     span_ns: tuple[int, int] | None = None
 
     def open(self, made: ForeignTrial) -> ForeignTrial:
@@ -187,12 +200,13 @@ class _Opening:
         if self._names(EVENTS):
             made = self._with_events(made, self._read(EVENTS, self._open_events))
         if self._names(FRAMES) and (parts.frames is not None) and self._timed():
-            size, frames = self._read(FRAMES, self._open_frames)
+            size, frames, self.frame_notes = self._read(FRAMES, self._open_frames)
+            self.resolution_us[FRAMES] = self.frame_notes.resolution_us
             made = replace(made, frames=lambda: self._of(FRAMES, frames()), frame_px=size)
             self._clock(parts.frames.clock, "frames")
         if parts.poses is not None and self._names(POSES):
             read = partial(read_poses, self.found.folder, self._names(POSES)[0], parts.poses)
-            made = replace(made, poses=self._read(POSES, read))
+            made = replace(made, poses=self._samples(POSES, POSES, self._read(POSES, read)))
             self._clock(parts.poses.clock, "arm")
         if made.salvage is not None and parts.frames is not None:
             made = replace(made, salvage=partial(_salvaged, made.salvage, made))
@@ -204,6 +218,9 @@ class _Opening:
             simulated=adapter.simulated,
             experiment=adapter.experiment,
             about={"fields": trial.fields},
+            left_out=self.left_out,
+            resolution_us=self.resolution_us,
+            notes=lambda: tuple(dict.fromkeys(self.frame_notes.texts)),
             unknown=(*self.unknown, *(f"{name} (no file)" for name in trial.missing)),
             clocks=self.clocks,
             geometry=_geometry(adapter.markers),
@@ -245,6 +262,13 @@ class _Opening:
     def _of(self, stream: str, chunks: Iterator[T]) -> Iterator[T]:
         with self._named(stream):
             yield from chunks
+
+    def _samples(self, name: str, what: str, found: Samples[SampleT]) -> SampleT:
+        """Note the rows that were left out, and the resolution of the times of a table."""
+        self.resolution_us[name] = found.resolution_us
+        if found.wrong:
+            self.left_out[NO_ROW.format(what)] += found.wrong
+        return found.chunk
 
     def _open_events(self) -> EventSource:
         part = self.found.adapter.streams.events
@@ -297,12 +321,13 @@ class _Opening:
             for name in named:
                 if not (files := self._names(key := f"{kind}.{name}")):
                     continue
+                rows = f"rows of {name}"
                 if kind == "wrenches":
                     wrench = partial(read_wrench, folder, files[0], parts.wrenches[name])
-                    chunks[name] = self._read(key, wrench)
+                    chunks[name] = self._samples(name, rows, self._read(key, wrench))
                 else:
                     scalar = partial(read_scalar, folder, files[0], parts.scalars[name])
-                    chunks[name] = self._read(key, scalar)
+                    chunks[name] = self._samples(name, rows, self._read(key, scalar))
                 self._clock(named[name].clock, name)
         return chunks
 
@@ -337,10 +362,14 @@ class _Opening:
         """Return span, labels and steps.
 
         Raises:
-            FormatError: nothing was recorded. InputError: a label lies outside of the recording.
+            FormatError: nothing was recorded. LabelError: a label lies outside of the recording.
         """
         span = self.span_ns or self._span(seen)
-        return Whole(span, self._given(span), () if motion is None else self._steps(span, motion))
+        try:
+            steps = () if motion is None else self._steps(span, motion)
+            return Whole(span, self._given(span), steps)
+        except InputError as error:
+            raise LabelError(error.file, error.key, error.value, error.expected) from None
 
     def _span(self, seen: Seen) -> tuple[int, int]:
         """Return begin and end of events and frames on the time line."""
@@ -350,8 +379,11 @@ class _Opening:
         if seen.frames_ns is not None:
             line = self.clocks["frames"].map.to_reference
             ends.append((line(seen.frames_ns[0]), line(seen.frames_ns[1]) + 1000))
+        for name, (first, last) in seen.further_ns.items() if not ends else ():
+            line = self.clocks["arm" if name == POSES else name].map.to_reference
+            ends.append((line(first), line(last) + 1000))
         if not ends:
-            with self._named(EVENTS):
+            with self._named(next(iter(self.trial.files))):
                 raise FormatError("contains no event: its length is unknown")
         return min(a for a, _ in ends), max(b for _, b in ends)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from sliplab.protocols.adapter_parts import (
+    TIME_UNITS,
     EventFiles,
     FrameFiles,
     FrameTimes,
@@ -21,13 +22,14 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import (
     MOST_PX,
+    ForeignChunk,
     ForeignTrial,
     FormatError,
-    check_pixels,
     event_chunk,
+    resolution_us,
 )
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
-from sliplab.storage.formats.numpy_files import array_of
+from sliplab.storage.formats.numpy_files import MAGIC, array_of
 from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
 from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
 from sliplab.storage.formats.tables import read_columns, times_ns
@@ -42,9 +44,16 @@ from sliplab.storage.streams import (
     WrenchChunk,
 )
 
+SampleT = TypeVar("SampleT", PoseChunk, WrenchChunk, ScalarChunk)
 _BLOCK_CELLS = 1 << 24
 _BLOCK_EVENTS = 1 << 22
 _FRAMES_AT_ONCE = 32
+_FEW_FRAMES = 3
+"""Difference of the numbers of frames and of their times that is accepted; or a tenth."""
+UNKNOWN = 2
+"""A polarity that is left out."""
+NO_COUNT = "events of cells that hold no whole number"
+NO_ROW = "{} in rows that are not all numbers"
 MOST_EVENTS = 1 << 32
 """Events that an array of counts may state."""
 
@@ -110,32 +119,39 @@ def read_counts(array: Any, part: EventFiles) -> EventSource:
     def chunks() -> Iterator[EventChunk]:
         total = 0
         for first in range(0, steps, block):
-            counts = _whole(array[first : first + block], part)
+            counts, wrong = _whole(array[first : first + block], part)
             total += int(counts.sum())
             if total > MOST_EVENTS:
                 raise FormatError(f"holds more than {MOST_EVENTS} events")
-            yield _spread(counts, first, step_us, polarity)
+            chunk = _spread(counts, first, step_us, polarity)
+            yield replace(chunk, left_out={NO_COUNT: wrong}) if wrong else chunk
 
     return EventSource(chunks, lambda: (columns, rows), (0, steps * step_us))
 
 
-def _whole(counts: Any, part: EventFiles) -> I64:
+def _whole(counts: Any, part: EventFiles) -> tuple[I64, int]:
+    """Return counts with 0 in place of what is none, and the number of such cells.
+
+    Raises:
+        FormatError: there are as many of those as of counts above 0.
+    """
     if counts.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
             good = (counts >= 0) & (counts == np.floor(counts)) & (counts <= MOST_EVENTS)
     else:
         good = (counts >= 0) & (counts <= MOST_EVENTS)
-    if not good.all():
+    wrong = len(good.ravel()) - int(good.sum())
+    if wrong and wrong >= int((np.where(good, counts, 0) > 0).sum()):
         step, row, column, polarity = (int(i) for i in np.argwhere(~good)[0])
         raise FormatError(
             f"holds {counts[step, row, column, polarity]} where a count belongs: step {step} of "
             f"its block, row {row}, {'taxel' if 'taxel' in part.axes else 'column'} {column}, "
             f"polarity {polarity}"
         )
-    return np.asarray(counts, np.int64)
+    return np.asarray(np.where(good, counts, 0) if wrong else counts, np.int64), wrong
 
 
-def _spread(counts: I64, first: int, step_us: int, polarity: U8) -> EventChunk:
+def _spread(counts: I64, first: int, step_us: int, polarity: U8) -> ForeignChunk:
     step, y, x, p = np.nonzero(counts)
     each = counts[step, y, x, p]
     begin = np.repeat(np.cumsum(each) - each, each)
@@ -163,7 +179,13 @@ def read_events(
         FormatError: a file cannot be right.
     """
     if part.format == "counts":
-        return read_counts(array_of(folder.read(names[0])), part)
+        data = folder.read(names[0])
+        if not bytes(data[: len(MAGIC)]) == MAGIC:
+            raise FormatError(
+                "is no array of numpy (.npy), of which counts are read; readings of pressures or "
+                "forces are streams under scalars or wrenches, and a trial may be without events"
+            )
+        return read_counts(array_of(data), part)
     if part.format in {"csv", "numpy"}:
         return _event_table(folder, names[0], part)
     if part.format == LAB_PICKLES:
@@ -187,42 +209,35 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
     unit, size, positive = part.unit, part.size_px, part.positive
 
     def chunks() -> Iterator[EventChunk]:
-        found = read_columns(folder, name, part.format, columns)
+        found, wrong = read_columns(folder, name, part.format, columns)
         t_us = (times_ns(found["t"], unit) + 500) // 1000
-        x = _places(found["x"], "x")
-        y = _places(found["y"], "y") if "y" in found else np.zeros(len(x), np.int64)
+        resolution = resolution_us(found["t"], TIME_UNITS[unit] / 1000)
+        x = _places(found["x"])
+        y = _places(found["y"]) if "y" in found else np.zeros(len(x), np.int64)
+        p = np.ones(len(x), np.int8)
         if "p" in found:
-            _check_numbers(found["p"], "p")
-            p = np.isin(found["p"], positive) if positive else found["p"] > 0
-        else:
-            p = np.ones(len(x), bool)
+            p[:] = np.isin(found["p"], positive) if positive else found["p"] > 0
+            p[np.isnan(found["p"])] = UNKNOWN
         if len(t_us) and np.any(t_us[1:] < t_us[:-1]):
             order = np.argsort(t_us, kind="stable")
             t_us, x, y, p = t_us[order], x[order], y[order], p[order]
         for first in range(0, len(t_us), _BLOCK_EVENTS):
             cut = slice(first, first + _BLOCK_EVENTS)
-            chunk = event_chunk(x[cut], y[cut], p[cut], t_us[cut])
-            check_pixels(chunk, size)
+            chunk = event_chunk(x[cut], y[cut], p[cut], t_us[cut], resolution)
+            if wrong and not first:
+                chunk = replace(chunk, left_out={**chunk.left_out, NO_ROW.format("events"): wrong})
             yield chunk
 
     return EventSource(chunks, lambda: size)
 
 
-def _places(values: Any, name: str) -> Any:
+def _places(values: Any) -> Any:
+    """Return columns or rows of pixels, -1 for what is none."""
     if values.dtype.kind != "f":
         return values
     with np.errstate(invalid="ignore"):
         whole = values.astype(np.int64)
-        bad = np.flatnonzero(whole != values)
-    if len(bad):
-        raise FormatError(f"has {name} = {values[bad[0]]} in row {bad[0] + 1}, which is no place")
-    return whole
-
-
-def _check_numbers(values: Any, name: str | int) -> None:
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
-        at = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise FormatError(f"has {name} = {values[at]} in row {at + 1}")
+        return np.where(whole == values, whole, -1)
 
 
 def read_frames(
@@ -231,11 +246,14 @@ def read_frames(
     times: Sequence[str],
     part: FrameFiles,
     paths: Sequence[Path],
-) -> tuple[tuple[int, int], Callable[[], Iterator[FrameChunk]]]:
-    """Open the frames of a trial; return width and height, and what reads them.
+) -> tuple[tuple[int, int], Callable[[], Iterator[FrameChunk]], FrameNotes]:
+    """Open the frames of a trial; return width and height, what reads them, and notes.
+
+    Frames behind the last time are left out. Where the numbers of frames and of times differ, the
+    notes state it once the frames were read.
 
     Raises:
-        FormatError: a file cannot be right, or has another number of frames than of times.
+        FormatError: a file cannot be right.
         InputError: the file of times cannot be right.
     """  # fmt: skip
     images = _images(folder, names, part, paths)
@@ -243,41 +261,57 @@ def read_frames(
     if first is None:
         raise FormatError("holds no frame")
     size = (first.shape[1], first.shape[0])
-    stated = None if part.times is None else _frame_times(folder, times[0], part.times)
+    notes = FrameNotes()
+    stated = None
+    if part.times is not None:
+        stated, notes.resolution_us = _frame_times(folder, times[0], part.times)
 
     def chunks() -> Iterator[FrameChunk]:
         held: list[U8] = []
         count = 0
         for image in images():
-            if image.shape != first.shape:
-                raise FormatError(f"holds frames of {image.shape} and of {first.shape}")
-            held.append(image)
-            if len(held) == _FRAMES_AT_ONCE:
+            if held and (image.shape != held[0].shape or len(held) == _FRAMES_AT_ONCE):
                 yield _frames(held, count, stated, part)
                 count += len(held)
                 held = []
+            held.append(image)
         if held:
             yield _frames(held, count, stated, part)
         count += len(held)
         if stated is not None and count != len(stated):
-            raise FormatError(f"holds {count} frames, and {len(stated)} times of frames")
+            if abs(count - len(stated)) > max(_FEW_FRAMES, count // 10) or not len(stated):
+                raise FormatError(f"holds {count:,} frames, and {len(stated):,} times of frames")
+            notes.texts.append(
+                f"holds {count:,} frames, and {len(stated):,} times of frames; paired from the "
+                "first one on"
+            )
 
-    return size, chunks
+    return size, chunks, notes
 
 
-def _frame_times(folder: DataFolder, name: str, part: FrameTimes) -> I64:
+@dataclass
+class FrameNotes:
+    """What was found while frames were read: warnings, and the resolution of their times, us."""
+
+    texts: list[str] = field(default_factory=list)
+    resolution_us: float = 0.0
+
+
+def _frame_times(folder: DataFolder, name: str, part: FrameTimes) -> tuple[I64, float]:
+    """Return the times of frames, ns, and their resolution, us."""
     is_numpy = name.lower().endswith((".npy", ".npz"))
     try:
         if is_numpy:
-            stated = times_ns(_one_column(folder, name, part.column), part.unit)
+            found = _one_column(folder, name, part.column)
         else:
-            stated = times_ns(read_columns(folder, name, "csv", {"t": part.column})["t"], part.unit)
-        if np.any(stated[1:] <= stated[:-1]):
-            raise FormatError("has times of frames that do not rise")
+            columns, wrong = read_columns(folder, name, "csv", {"t": part.column})
+            if wrong:  # which frame is of which time is unknown from there on
+                raise FormatError(f"has {wrong} rows without a number")
+            found = columns["t"]
     except FormatError as error:
         where = "streams.frames.times"
         raise InputError(folder.place(name), where, None, str(error)) from None
-    return stated
+    return times_ns(found, part.unit), resolution_us(found, TIME_UNITS[part.unit] / 1000)
 
 
 def _one_column(folder: DataFolder, name: str, column: str | int) -> Any:
@@ -286,7 +320,7 @@ def _one_column(folder: DataFolder, name: str, column: str | int) -> Any:
         array = array_of(data)
         if array.ndim == 1 and array.dtype.kind in "iuf":
             return array
-    return read_columns(folder, name, "numpy", {"t": column})["t"]
+    return read_columns(folder, name, "numpy", {"t": column})[0]["t"]
 
 
 def _frames(images: list[U8], first: int, stated: I64 | None, part: FrameFiles) -> FrameChunk:
@@ -295,9 +329,9 @@ def _frames(images: list[U8], first: int, stated: I64 | None, part: FrameFiles) 
         t_ns = np.rint(number * (1e9 / float(part.rate_hz or 1))).astype(np.int64)
     else:
         t_ns = stated[first : first + len(images)]
-        if len(t_ns) != len(images):
-            raise FormatError(f"holds more than {first + len(t_ns)} frames, as there are times")
-    return FrameChunk(np.stack(images), number, t_ns, t_ns, np.zeros(len(images), np.uint8))
+        images, number = images[: len(t_ns)], number[: len(t_ns)]
+    levels = np.stack(images) if images else np.empty((0, 0, 0), np.uint8)
+    return FrameChunk(levels, number, t_ns, t_ns, np.zeros(len(images), np.uint8))
 
 
 def _images(
@@ -330,42 +364,54 @@ def _images(
     return from_video
 
 
-def read_poses(folder: DataFolder, name: str, part: PoseFiles) -> PoseChunk:
+@dataclass(frozen=True)
+class Samples(Generic[SampleT]):
+    """Rows of a table.
+
+    Attributes:
+        resolution_us: of the type of their times, us.
+        wrong: number of rows that were left out because they are not all numbers.
+    """
+
+    chunk: SampleT
+    resolution_us: float
+    wrong: int
+
+
+def read_poses(folder: DataFolder, name: str, part: PoseFiles) -> Samples[PoseChunk]:
     """Read the poses of a trial. Raises FormatError: the table cannot be right."""
-    t_ns, found = _samples(folder, name, part)
+    t_ns, found, about = _samples(folder, name, part)
     metres, radians = part.length == "m", part.angle == "rad"
     xyz = _vectors(found, ("x", "y", "z"), len(t_ns)) * (1000.0 if metres else 1.0)
     turned = _vectors(found, ("rx", "ry", "rz"), len(t_ns))
-    return PoseChunk(t_ns, t_ns, xyz, np.rad2deg(turned) if radians else turned)
+    return Samples(PoseChunk(t_ns, t_ns, xyz, np.rad2deg(turned) if radians else turned), *about)
 
 
-def read_wrench(folder: DataFolder, name: str, part: WrenchFiles) -> WrenchChunk:
+def read_wrench(folder: DataFolder, name: str, part: WrenchFiles) -> Samples[WrenchChunk]:
     """Read forces and torques. Raises FormatError: the table cannot be right."""
-    t_ns, found = _samples(folder, name, part)
+    t_ns, found, about = _samples(folder, name, part)
     force = _vectors(found, ("fx", "fy", "fz"), len(t_ns))
-    return WrenchChunk(t_ns, t_ns, force, _vectors(found, ("tx", "ty", "tz"), len(t_ns)))
+    torque = _vectors(found, ("tx", "ty", "tz"), len(t_ns))
+    return Samples(WrenchChunk(t_ns, t_ns, force, torque), *about)
 
 
-def read_scalar(folder: DataFolder, name: str, part: ScalarFiles) -> ScalarChunk:
+def read_scalar(folder: DataFolder, name: str, part: ScalarFiles) -> Samples[ScalarChunk]:
     """Read one quantity. Raises FormatError: the table cannot be right."""
-    t_ns, found = _samples(folder, name, part)
-    return ScalarChunk(t_ns, t_ns, found["value"].astype(np.float64), part.quantity_unit)
+    t_ns, found, about = _samples(folder, name, part)
+    values = found["value"].astype(np.float64)
+    return Samples(ScalarChunk(t_ns, t_ns, values, part.quantity_unit), *about)
 
 
 def _samples(
     folder: DataFolder, name: str, part: PoseFiles | WrenchFiles | ScalarFiles
-) -> tuple[I64, dict[str, Any]]:
+) -> tuple[I64, dict[str, Any], tuple[float, int]]:
+    """Return times, ns, and columns, with the resolution of the times, us, and rows left out."""
     columns = {
         key: column for key, column in part.columns.model_dump().items() if column is not None
     }
-    found = read_columns(folder, name, part.format, columns)
-    t_ns = times_ns(found["t"], part.unit)
-    if np.any(t_ns[1:] < t_ns[:-1]):
-        at = int(np.flatnonzero(t_ns[1:] < t_ns[:-1])[0])
-        raise FormatError(f"has times that run backwards after row {at + 1}")
-    for key, values in found.items():
-        _check_numbers(values, columns[key])
-    return t_ns, found
+    found, wrong = read_columns(folder, name, part.format, columns)
+    resolution = resolution_us(found["t"], TIME_UNITS[part.unit] / 1000)
+    return times_ns(found["t"], part.unit), found, (resolution, wrong)
 
 
 def _vectors(found: dict[str, Any], keys: tuple[str, str, str], rows: int) -> F64:

@@ -19,7 +19,7 @@ from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
 from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
-from sliplab.storage.formats.recognition import LAB_PICKLES, name_of
+from sliplab.storage.formats.recognition import LAB_PICKLES, unique_names
 from sliplab.storage.formats.tables import Row, read_rows
 
 EVENTS, FRAMES, FRAME_TIMES, POSES = "events", "frames", "frames.times", "poses"
@@ -135,8 +135,12 @@ class _Finding:
         for draft, files in zip(drafts, streams, strict=True):
             id_ = draft.built_in["id"]
             missing = tuple(key for key, names in files.items() if not names)
-            if lacking := next((key for key in self._needed if key in missing), None):
+            needed = self._needed
+            if lacking := next((key for key in needed if key in missing), None):
                 left_out[draft.source] = f"trial {id_} has no file of {lacking}"
+                continue
+            if not needed and len(missing) == len(files):
+                left_out[draft.source] = f"trial {id_} has no file of any stream"
                 continue
             for names in files.values():
                 self._used.update(names)
@@ -146,7 +150,8 @@ class _Finding:
                 id_, draft.source, draft.fields, self._condition(draft), there, label, missing
             ))  # fmt: skip
         if not trials:
-            self._none(f"streams.{self._needed[0]}.files", None)
+            key = next(iter(self._needed or streams[0]))
+            self._none(f"streams.{key}.files", None)
         trials.sort(key=lambda trial: natural(trial.id))
         self._warn_of_missing(trials)
         skipped = [
@@ -162,7 +167,11 @@ class _Finding:
 
     @property
     def _needed(self) -> tuple[str, ...]:
-        return (FRAMES, FRAME_TIMES) if self._adapter.streams.events is None else (EVENTS,)
+        """Streams without which a trial is left out; where there are none of these, any does."""
+        streams = self._adapter.streams
+        if streams.events is not None:
+            return (EVENTS,)
+        return () if streams.frames is None else (FRAMES, FRAME_TIMES)
 
     def _error(self, key: str, value: object, expected: str) -> InputError:
         return InputError(self._file, key, value, expected)
@@ -296,7 +305,7 @@ class _Finding:
 
     def _name(self, drafts: list[_Draft]) -> None:
         template = self._adapter.trials.id
-        sources: dict[str, str] = {}
+        texts: list[str] = []
         for draft in drafts:
             known = draft.all
             if template is not None:
@@ -311,7 +320,9 @@ class _Finding:
                 raise self._error(
                     "trials.id", None, f"is missing: {draft.source} has no column id and no file"
                 )
-            id_ = name_of(text)
+            texts.append(text)
+        sources: dict[str, str] = {}
+        for draft, id_ in zip(drafts, unique_names(texts), strict=True):
             if (other := sources.setdefault(id_, draft.source)) != draft.source:
                 raise self._error(
                     "trials.id", template, f"gives {other} and {draft.source} one id, {id_}; put "

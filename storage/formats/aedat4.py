@@ -30,12 +30,12 @@ from sliplab.storage.formats.flatbuffers import (
 from sliplab.storage.formats.foreign import (
     LATEST_US,
     MOST_PX,
+    NO_TIME_NS,
     Damage,
     ForeignTrial,
     FormatError,
     Triggers,
     as_damage,
-    check_pixels,
     event_chunk,
     grey,
 )
@@ -178,13 +178,9 @@ class Aedat4File:
             yield picture
 
     def _inside(self, number: int) -> Iterator[EventChunk]:
-        last = 0
         for data in self._packets(number):
             words = _event_words(data)
-            chunk = _empty(len(words) // 2)
-            last = _split(words, chunk, last)
-            check_pixels(chunk, self.streams[number].size)
-            yield chunk
+            yield _split(words, _empty(len(words) // 2))
 
     def _lost(self, kind: str) -> int | None:
         """Return the items of a stream behind the end, by the table that closes a whole file."""
@@ -207,10 +203,12 @@ class Aedat4File:
     def events(self, number: int) -> Iterator[EventChunk]:
         """Yield the events of a stream, packets together up to `_PACKET_EVENTS` events.
 
+        Events that cannot be right are left out; a packet with some is a chunk of its own.
+
         A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
         """
         room = _empty(_PACKET_EVENTS)
-        filled = last = 0
+        filled = 0
         for data in self._packets(number):
             words = _event_words(data)
             count = len(words) // 2
@@ -220,8 +218,15 @@ class Aedat4File:
                 room = _empty(_PACKET_EVENTS)
             if count > len(room):
                 room = _empty(count)
-            last = _split(words, _part(room, filled, filled + count), last)
-            filled += count
+            found = _split(words, _part(room, filled, filled + count))
+            if len(found) == count:
+                filled += count
+                continue
+            if filled:
+                yield _part(room, 0, filled)
+                filled = 0
+                room = _empty(_PACKET_EVENTS)
+            yield found
         if filled:
             yield _part(room, 0, filled)
 
@@ -233,19 +238,12 @@ class Aedat4File:
 
     def _trigger_packets(self, number: int) -> Iterator[list[tuple[int, int]]]:
         """Yield time, us, and kind of all triggers in a packet."""
-        last = 0
         for data in self._packets(number):
             tables = Table.root(data, b"TRIG").tables(0)
-            found = [(table.number(0, "<q"), table.number(1, "<B")) for table in tables]
-            for t_us, _ in found:
-                if not last <= t_us < LATEST_US:
-                    raise FormatError("contains triggers with decreasing or invalid times")
-                last = t_us
-            yield found
+            yield [(table.number(0, "<q"), table.number(1, "<B")) for table in tables]
 
     def pictures(self, number: int) -> Iterator[Picture]:
         """Yield the frames of a stream, colours as grey levels."""
-        last = -1
         for data in self._packets(number):
             table = Table.root(data, b"FRME")
             t_ns, form = _middle_ns(table), table.number(5, "<b")
@@ -257,9 +255,6 @@ class Aedat4File:
                     f"holds a frame of {width} x {height} with {count} bytes of kind {form}; read "
                     "are 8-bit frames with 1, 3 or 4 channels (kinds 0, 16 and 24)"
                 )
-            if not last <= t_ns < LATEST_US * 1000:
-                raise FormatError("contains frames with decreasing or invalid times")
-            last = t_ns
             levels = np.frombuffer(pixels, np.uint8).reshape(height, width, channels)
             yield Picture(grey(levels), t_ns)
 
@@ -323,9 +318,13 @@ def _middle_ns(frame: Table) -> int:
     The time stamp is the start of exposure in what dv-processing writes, and the middle in what
     older programs write, which leave start and end out.
     """
-    start, end = frame.number(_START_OF_EXPOSURE, "<q"), frame.number(_END_OF_EXPOSURE, "<q")
+    start, end, stamp = (
+        frame.number(field, "<q") for field in (_START_OF_EXPOSURE, _END_OF_EXPOSURE, 0)
+    )
+    if max(map(abs, (start, end, stamp))) >= LATEST_US:
+        return NO_TIME_NS
     if start <= 0 or end <= 0:
-        return frame.number(0, "<q") * 1000
+        return stamp * 1000 if stamp >= 0 else NO_TIME_NS
     if end < start:
         raise FormatError(f"holds a frame whose exposure starts at {start} us and ends at {end} us")
     return (start + end) * 500
@@ -340,31 +339,19 @@ def _event_words(data: memoryview) -> Any:
     return words
 
 
-def _split(words: Any, chunk: EventChunk, last: int) -> int:
-    """Fill a chunk from the words of its events; return the time of the last, us.
-
-    Args:
-        last: that of the event before.
-
-    Raises:
-        FormatError: a pixel or time is none, or a time earlier than the one before.
-    """
-    last = int(_split_events(words, chunk.x, chunk.y, chunk.p, chunk.t_us, last))
-    if last < 0:
-        event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
-        raise FormatError("contains events with decreasing times")
-    return last
+def _split(words: Any, chunk: EventChunk) -> EventChunk:
+    """Fill a chunk from the words of its events; return it without those that cannot be right."""
+    if _split_events(words, chunk.x, chunk.y, chunk.p, chunk.t_us):
+        return chunk
+    return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
 
 
 @njit(cache=True, nogil=True)
-def _split_events(words, x, y, p, t, last):  # type: ignore[no-untyped-def]
+def _split_events(words, x, y, p, t):  # type: ignore[no-untyped-def]
     """Fill the columns of events from two 64-bit words each: time, and pixel with polarity.
 
-    Args:
-        last: the time of the event before, us.
-
     Returns:
-        The time of the last event; -1 where a pixel is none, or a time earlier than the one before.
+        Whether every pixel and time can be right.
     """
     wrong: Any = False
     for i in range(len(words) // 2):
@@ -373,9 +360,8 @@ def _split_events(words, x, y, p, t, last):  # type: ignore[no-untyped-def]
         y[i] = row = place >> np.uint64(16) & np.uint64(0xFFFF)
         p[i] = place >> np.uint64(32) & np.uint64(1)
         t[i] = now
-        wrong |= now < last or column >= MOST_PX or row >= MOST_PX or now >= LATEST_US
-        last = now
-    return -1 if wrong else last
+        wrong |= now < 0 or column >= MOST_PX or row >= MOST_PX or now >= LATEST_US
+    return not wrong
 
 
 def _empty(count: int) -> EventChunk:

@@ -26,6 +26,7 @@ from sliplab.storage.formats.foreign import (
     as_damage,
     event_chunk,
     read_head,
+    resolution_us,
     rounded_us,
 )
 from sliplab.storage.schema.trial import Lost
@@ -34,7 +35,8 @@ from sliplab.storage.trials.hdf5_reader import FileContent, RowFile, Rows
 from sliplab.storage.trials.superblock import SIGNATURE
 
 PIECE = 1 << 20
-_SUPERBLOCK = 52
+_SUPERBLOCK, _FLAGS = 52, 12
+"""Bytes of a superblock, and of its beginning up to its flags."""
 _FEW_ROWS = 1 << 12
 _LAB = ("xs", "ys", "ps", "ts")
 _MOST_PACKED = 2000
@@ -98,7 +100,10 @@ def salvage_dsec(path: Path, name: str) -> ForeignTrial:
 
 
 def _offset(file: RowFile) -> int:
-    offset = int(_integers(file.rows("t_offset").read())) if file.has("t_offset") else 0
+    stated = _integers(file.rows("t_offset").read()) if file.has("t_offset") else np.zeros(1)
+    if stated.size != 1:
+        raise FormatError(f"t_offset has the shape {stated.shape}; one number is right")
+    offset = int(stated.reshape(())[()])
     if not 0 <= offset < LATEST_US:
         raise FormatError(f"t_offset = {offset}: is not a time")
     return offset
@@ -109,7 +114,8 @@ def _triggers(file: RowFile, rows: Callable[[str], Rows]) -> Triggers | None:
         return None
     kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
     found = Triggers(_integers(rows("triggers/t").read()), kinds)
-    _rising(found)
+    if len(found.t_us) != len(kinds):
+        raise FormatError("holds triggers whose columns have different lengths")
     return found
 
 
@@ -128,6 +134,7 @@ def _dsec_trial(
     return ForeignTrial(
         name, path.name, events, "the event camera's own clock, us", triggers=triggers,
         simulated=simulated, unknown=("sync grade", "poses", "motion", "condition", "frames"),
+        notes=_open_note(path),
     )  # fmt: skip
 
 
@@ -165,7 +172,7 @@ def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         def check(low: int, high: int) -> EventChunk:
             return _sorted(*_lab_events(columns, low, high))
 
-        count, lost = _whole_rows(path, columns, check, ordered=False)
+        count, lost = _whole_rows(path, columns, check)
         if count > _MOST_UNSORTED:
             raise FormatError(f"holds {count} events, too many events to sort")
         size = _resolution(file.integers("sensor_resolution"), columns, count)
@@ -177,18 +184,18 @@ def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
     return replace(_lab_trial(path, name, all_events, size), lost=lost)
 
 
-def _lab_events(columns: Mapping[str, Rows], low: int, high: int) -> tuple[I64, I64, Any, I64]:
-    """Return columns, rows, polarities and times, us, as the file orders them."""
+def _lab_events(
+    columns: Mapping[str, Rows], low: int, high: int
+) -> tuple[I64, I64, Any, I64, float]:
+    """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
     xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
-    t_us = rounded_us(ts, 1e6)
-    if len(t_us) and int(t_us.min()) < 0:
-        raise FormatError("contains an event before its own clock started")
-    return _pixels(xs), _pixels(ys), np.asarray(ps) > 0, t_us  # 0 and 1, or -1 and 1
+    positive = np.asarray(ps) > 0  # 0 and 1, or -1 and 1
+    return _pixels(xs), _pixels(ys), positive, rounded_us(ts, 1e6), resolution_us(ts, 1e6)
 
 
-def _sorted(x: I64, y: I64, p: Any, t_us: I64) -> EventChunk:
+def _sorted(x: I64, y: I64, p: Any, t_us: I64, resolution: float) -> EventChunk:
     order = np.argsort(t_us, kind="stable")
-    return event_chunk(x[order], y[order], p[order], t_us[order])
+    return event_chunk(x[order], y[order], p[order], t_us[order], resolution)
 
 
 def _lab_trial(
@@ -201,6 +208,7 @@ def _lab_trial(
         name, path.name, events, "unknown; seconds as the file has them, rounded to us",
         lambda: size,
         unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
+        notes=_open_note(path),
     )  # fmt: skip
 
 
@@ -217,15 +225,12 @@ def _piece(columns: Mapping[str, Rows]) -> int:
 def _whole_rows(
     path: Path,
     columns: Mapping[str, Rows],
-    check: Callable[[int, int], EventChunk],
-    *,
-    ordered: bool = True,
+    check: Callable[[int, int], object],
 ) -> tuple[int, Lost | None]:
     """Return the number of rows before the first that cannot be read in all columns.
 
     Args:
         check: reads rows low to high; raises where they cannot be right.
-        ordered: times must not decrease from one piece to the next.
     """
     size = path.stat().st_size
     lengths = {key: len(column) for key, column in columns.items()}
@@ -234,20 +239,17 @@ def _whole_rows(
     for key, column in columns.items():
         if (row := _rows_inside(column, count, size)) < count:
             count, reason = row, f"is cut short in the column events/{key}, at row {row}"
-    low, last, step = 0, 0, PIECE
+    low, step = 0, PIECE
     while low < count:
         high = min(low + step, count)
         try:
-            chunk = check(low, high)
-            if ordered and len(chunk) and int(chunk.t_us[0]) < last:
-                raise FormatError("contains events with decreasing times")
+            check(low, high)
         except (FormatError, *_FAULTS) as error:
             if step > (piece := _piece(columns)):
                 step = piece
                 continue
             count, reason = low, f"holds rows that cannot be read from row {low} on: {error}"
             break
-        last = int(chunk.t_us[-1]) if len(chunk) else last
         low = high
     if reason is None:
         return count, None
@@ -383,6 +385,11 @@ class _opened:
             self._file = RowFile(self._path, self._padded)
         except _FAULTS as error:
             self._close()
+            if _is_left_open(self._path):
+                raise Damage(
+                    f"was left open by a program that wrote it, or still is: once none writes it, "
+                    f"`h5clear -s {self._path.name}` makes it readable"
+                ) from None
             if read_head(self._path).startswith(SIGNATURE):
                 cut = f"is cut short: it says that it has {end} bytes, and has {size}"
                 raise Damage(cut if end > size else f"is damaged: {error}") from None
@@ -414,6 +421,17 @@ class _opened:
         return found
 
 
+def _is_left_open(path: Path) -> bool:
+    """Return whether a file says that a program has it open for writing (superblock 2 and 3)."""
+    head = read_head(path)[:_FLAGS]
+    return len(head) == _FLAGS and head.startswith(SIGNATURE) and head[8] in {2, 3} and head[-1] > 0
+
+
+def _open_note(path: Path) -> Callable[[], tuple[str, ...]]:
+    text = "was left open by its writer, or is still being written: what it holds now is imported"
+    return lambda: (text,) if _is_left_open(path) else ()
+
+
 def _stated_end(path: Path) -> int:
     """Return the number of bytes that a file says it has; 0 where it says none."""
     with path.open("rb") as file:
@@ -428,22 +446,14 @@ def _stated_end(path: Path) -> int:
 
 def _integers(values: Any) -> I64:
     found = np.asarray(values)
-    if found.dtype.kind not in "iu" or (found.size and int(found.max()) >= 1 << 62):
+    if found.dtype.kind not in "iu":
         raise FormatError("contains times that are not integers")
-    return found.astype(np.int64)
-
-
-def _rising(found: Triggers) -> None:
-    t = found.t_us
-    wrong = np.any(t < 0) or np.any(t >= LATEST_US) or np.any(t[1:] < t[:-1])
-    if len(t) != len(found.kind) or wrong:
-        raise FormatError("contains triggers with decreasing or invalid times")
+    return np.where(found < LATEST_US, found, LATEST_US).astype(np.int64)
 
 
 def _pixels(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind == "f":
-        if not np.isfinite(found).all() or np.any(found != np.rint(found)):
-            raise FormatError("contains coordinates that are not pixels")
-        found = np.clip(found, -1, 1 << 20)
+        with np.errstate(invalid="ignore"):
+            found = np.where(found == np.rint(found), np.clip(found, -1, 1 << 20), -1)
     return found.astype(np.int64)

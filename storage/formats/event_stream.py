@@ -21,7 +21,6 @@ from sliplab.storage.formats.foreign import (
     Damage,
     ForeignTrial,
     FormatError,
-    check_pixels,
     event_chunk,
     read_head,
 )
@@ -71,7 +70,6 @@ def salvage_es(path: Path, name: str) -> ForeignTrial:
     count, at = 0, size - rest
     try:
         for chunk in trial.events():
-            check_pixels(chunk, trial.event_px())
             count += len(chunk)
     except FormatError as error:
         packets = _whole_blocks(path)

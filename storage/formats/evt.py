@@ -3,9 +3,11 @@
 Layouts: docs.prophesee.ai, Encoding Formats and DAT File Format. A decoder takes words and its
 state, fills columns, and stops in front of a word that cannot be right. Indices in its loop are
 unsigned, which spares numba a test for negative ones. The higher part of an EVT
-time is sent alone and only grows, until it begins anew; one that falls otherwise is a fault. The
-lower part may fall, because events come from several sources: such a time is raised to the latest
-one, and so is a time of DAT. Events before the first high part have no time, and are dropped, as
+time is sent alone and grows until it begins again at 0. It may step back a little, and so may the
+lower part, because events come from several sources; a high part that falls further is a fault. An
+event has the time of the words before it, whatever times passed without an event, as in the maker's
+own decoders. One that is earlier than the event before it is raised to that time, and counted; so
+is one of DAT. Events before the first high part have no time, and are dropped, as
 the maker says for EVT 2.0; the row and the base of a vector, which EVT 3.0 sends alone, count from
 the first word on.
 """
@@ -25,14 +27,18 @@ from sliplab.storage.streams import I64
 
 OUTSIDE, FELL, LATE = 1, 2, 3
 """Faults of a word: a pixel that the camera has not, a high part that fell, a time too late."""
-NOW, HIGH_US, HIGH, ROW, BASE, ON, EDGES, X_BITS, Y_BITS, FAULT, GOT, HAD = range(12)
+(
+    NOW, HIGH_US, HIGH, LOW, ROW, BASE, ON, EDGE_US, EDGES, X_BITS, Y_BITS, FAULT, GOT, HAD, RAISED,
+    RAISED_US,
+) = range(16)  # fmt: skip
 """Places in a state (int64).
 
-NOW: time of the last word, us. HIGH_US: time of the last high part, with all turns of the clock
-before it; HIGH: its value, -1 before the first. ROW, BASE, ON: row, base column and polarity of the
-next vector. EDGES: rows filled in the table of edges. X_BITS, Y_BITS: bits of DAT's columns and
-rows. FAULT: of the word at which it stopped, or 0; GOT, HAD: its column and row, or its high part
-and the one before.
+NOW: time of the last event, us. HIGH_US: time of the last high part, with all turns of the clock
+before it; HIGH: its value, -1 before the first. LOW: the low part of EVT 3.0, us. ROW, BASE, ON:
+row, base column and polarity of the next vector. EDGE_US: time of the last edge; EDGES: rows filled
+in the table of edges. X_BITS, Y_BITS: bits of DAT's columns and rows. FAULT: of the word at which
+it stopped, or 0; GOT, HAD: its column and row, or its high part and the one before. RAISED: words
+with events that were earlier than the event before them; RAISED_US: by at most how much.
 """
 ROOM = 32
 """Rows that one word may fill."""
@@ -43,7 +49,9 @@ _TIME_LOW, _TIME_HIGH, _EXT_TRIGGER = 0x6, 0x8, 0xA
 _TILE = 1 << 11
 """Words of EVT 2.0 and DAT that are decoded together, and singly if one is out of the ordinary."""
 _HIGHS_3, _HIGHS_2 = 1 << 12, 1 << 28
-"""Values of the high part before it begins anew: of 4096 us each in EVT 3.0, else of 64 us."""
+"""Values of the high part before it begins again: of 4096 us each in EVT 3.0, else of 64 us."""
+_BACK = 10
+"""Values by which a high part may step back."""
 
 Decode = Callable[..., tuple[int, int]]
 
@@ -77,34 +85,56 @@ def _any_edge(words, type_bit):  # type: ignore[no-untyped-def]
     return found
 
 
+def raised_warning(state: I64) -> list[str]:
+    """Return a line about events that were earlier than those before them, if there were any."""
+    if not state[RAISED]:
+        return []
+    return [
+        f"{state[RAISED]:,} times of events step back, by up to {state[RAISED_US]:,} us: these "
+        "events have the time of the event before them"
+    ]
+
+
 def new_state(t0_us: int, x_bits: int = 0, y_bits: int = 0) -> I64:
     """Return the state before the first word; times count from `t0_us`."""
-    state = np.zeros(12, np.int64)
-    state[[NOW, HIGH_US, HIGH, X_BITS, Y_BITS]] = t0_us, t0_us, -1, x_bits, y_bits
+    state = np.zeros(RAISED_US + 1, np.int64)
+    state[[NOW, HIGH_US, EDGE_US, HIGH, X_BITS, Y_BITS]] = t0_us, t0_us, t0_us, -1, x_bits, y_bits
     return state
 
 
 @njit(cache=True, nogil=True)
 def _turned(value, high, high_us, highs, unit_us):  # type: ignore[no-untyped-def]
-    """Return the time of a new high part, us, or a fault as a negative number.
+    """Return the time of a new high part, us, and 0 or a fault.
 
-    It begins anew if it falls by half of its range or more. A step ahead by nearly all of it is a
-    fall, too, over the place where it begins anew.
+    It begins again at 0 if it falls by half of its range or more. A step ahead by nearly all of it
+    is a step back, too, over the place where it begins again.
 
     Args:
         high, high_us: the one before, -1 if there is none, and its time.
         highs: values of it; unit_us: of one.
     """
     if high < 0:
-        return high_us + value * unit_us
+        return high_us + value * unit_us, 0
     step = value - high
     if step <= -highs // 2:
         step += highs
         if high_us >= LAST_TURN_US:
-            return -LATE
-    if not 0 <= step < highs - 2:
-        return -FELL
-    return high_us + step * unit_us
+            return high_us, LATE
+    if step >= highs - _BACK:
+        step -= highs
+    if step < -_BACK:
+        return high_us, FELL
+    return high_us + step * unit_us, 0
+
+
+@njit(cache=True, nogil=True)
+def _raised(at, now, state):  # type: ignore[no-untyped-def]
+    """Return the time of an event at a time, which is not before `now`."""
+    if at < now:
+        state[RAISED] += 1
+        state[RAISED_US] = max(state[RAISED_US], now - at)
+        return now
+    return at
 
 
 @njit(cache=True, nogil=True)
@@ -133,7 +163,7 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
         Index of the first word not decoded, and rows filled. It stops at a fault, and where less
         than `ROOM` rows or no row of edges is left.
     """
-    now, high_us, high = state[NOW], state[HIGH_US], state[HIGH]
+    now, high_us, high, low = state[NOW], state[HIGH_US], state[HIGH], state[LOW]
     row, base, on, edge = state[ROW], state[BASE], state[ON], state[EDGES]
     fault = 0
     while at < len(words) and filled <= len(t) - ROOM and edge < len(edges):
@@ -145,14 +175,14 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
                 if column >= width or row >= height:
                     fault, state[GOT], state[HAD] = OUTSIDE, column, row
                     break
+                now = _raised(high_us + low, now, state)
                 to = np.uintp(filled)
                 x[to], y[to], p[to], t[to] = column, row, value >> 11, now
                 filled += 1
         elif kind == _ADDR_Y:
             row = value & 0x7FF
         elif kind == _TIME_LOW:
-            if high >= 0:
-                now = max(now, high_us + value)
+            low = value
         elif kind in (_VECT_12, _VECT_8):
             size = 12 if kind == _VECT_12 else 8
             valid = value & ((1 << size) - 1)
@@ -161,6 +191,7 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
                 if base + last >= width or row >= height:
                     fault, state[GOT], state[HAD] = OUTSIDE, base + last, row
                     break
+                now = _raised(high_us + low, now, state)
                 for bit in range(last + 1):  # without a branch: bits are hard to foresee
                     to = np.uintp(filled)
                     x[to], y[to], p[to], t[to] = base + bit, row, on, now
@@ -170,17 +201,18 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
             base, on = value & 0x7FF, value >> 11
         elif kind == _TIME_HIGH:
             if value != high:
-                found = _turned(value, high, high_us, _HIGHS_3, 4096)
-                if found < 0:
-                    fault, state[GOT], state[HAD] = -found, value, high
+                found, fault = _turned(value, high, high_us, _HIGHS_3, 4096)
+                if fault:
+                    state[GOT], state[HAD] = value, high
                     break
-                high, high_us = value, found
-                now = max(now, high_us)
+                high, high_us, low = value, found, 0
         elif kind == _EXT_TRIGGER and high >= 0:
-            edges[edge, 0], edges[edge, 1], edges[edge, 2] = now, value >> 8, value & 1
+            state[EDGE_US] = max(state[EDGE_US], high_us + low)
+            edges[edge, 0], edges[edge, 1] = state[EDGE_US], value >> 8
+            edges[edge, 2] = value & 1
             edge += 1
         at += 1
-    state[NOW], state[HIGH_US], state[HIGH] = now, high_us, high
+    state[NOW], state[HIGH_US], state[HIGH], state[LOW] = now, high_us, high, low
     state[ROW], state[BASE], state[ON], state[EDGES] = row, base, on, edge
     state[FAULT] = fault
     return at, filled
@@ -210,7 +242,7 @@ def _plain_evt2(words, state, width, height, x, y, p, t):  # type: ignore[no-unt
 
     Returns:
         Rows filled; -1, and the state as it was, where a word is of another kind or a fault, a time
-        falls or the clock begins anew.
+        falls or the clock begins again at 0.
     """
     high_us, high = state[HIGH_US], state[HIGH]
     odd = high < 0
@@ -220,7 +252,7 @@ def _plain_evt2(words, state, width, height, x, y, p, t):  # type: ignore[no-unt
         kind, value = word >> 28, word & (_HIGHS_2 - 1)
         seen = kind <= 1
         step = value - high
-        odd |= (not seen) & ((kind != _TIME_HIGH) | (step < 0) | (step >= _HIGHS_2 - 2))
+        odd |= (not seen) & ((kind != _TIME_HIGH) | (step < 0) | (step >= _HIGHS_2 - _BACK))
         high_us = high_us if seen else high_us + (step << 6)
         high = high if seen else value
         to = np.uintp(filled)
@@ -254,19 +286,20 @@ def _each_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # t
                 if column >= width or row >= height:
                     fault, state[GOT], state[HAD] = OUTSIDE, column, row
                     break
-                now = max(now, high_us + (value >> 22))
+                now = _raised(high_us + (value >> 22), now, state)
                 to = np.uintp(filled)
                 x[to], y[to], p[to], t[to] = column, row, kind, now
                 filled += 1
         elif kind == _TIME_HIGH:
-            found = _turned(value, high, high_us, _HIGHS_2, 64)
-            if found < 0:
-                fault, state[GOT], state[HAD] = -found, value, high
+            found, fault = _turned(value, high, high_us, _HIGHS_2, 64)
+            if fault:
+                state[GOT], state[HAD] = value, high
                 break
             high, high_us = value, found
         elif kind == _EXT_TRIGGER and high >= 0:
-            now = max(now, high_us + (value >> 22))
-            edges[edge, 0], edges[edge, 1], edges[edge, 2] = now, value >> 8 & 0x1F, value & 1
+            state[EDGE_US] = max(state[EDGE_US], high_us + (value >> 22))
+            edges[edge, 0], edges[edge, 1] = state[EDGE_US], value >> 8 & 0x1F
+            edges[edge, 2] = value & 1
             edge += 1
         at += 1
     state[NOW], state[HIGH_US], state[HIGH], state[EDGES] = now, high_us, high, edge
@@ -284,9 +317,9 @@ def decode_evt21(words, at, filled, state, width, height, x, y, p, t, edges):  #
         valid = np.int64(words[np.uintp(at)] & np.uint64(0xFFFFFFFF))
         kind, value = word >> 28, word & (_HIGHS_2 - 1)
         if kind == _TIME_HIGH:
-            found = _turned(value, high, high_us, _HIGHS_2, 64)
-            if found < 0:
-                fault, state[GOT], state[HAD] = -found, value, high
+            found, fault = _turned(value, high, high_us, _HIGHS_2, 64)
+            if fault:
+                state[GOT], state[HAD] = value, high
                 break
             high, high_us = value, found
         elif kind <= 1 and valid and high >= 0:
@@ -294,14 +327,15 @@ def decode_evt21(words, at, filled, state, width, height, x, y, p, t, edges):  #
             if base + last >= width or row >= height:
                 fault, state[GOT], state[HAD] = OUTSIDE, base + last, row
                 break
-            now = max(now, high_us + (value >> 22))
+            now = _raised(high_us + (value >> 22), now, state)
             for bit in range(last + 1):
                 to = np.uintp(filled)
                 x[to], y[to], p[to], t[to] = base + bit, row, kind, now
                 filled += valid >> bit & 1
         elif kind == _EXT_TRIGGER and high >= 0:
-            now = max(now, high_us + (value >> 22))
-            edges[edge, 0], edges[edge, 1], edges[edge, 2] = now, value >> 8 & 0x1F, value & 1
+            state[EDGE_US] = max(state[EDGE_US], high_us + (value >> 22))
+            edges[edge, 0], edges[edge, 1] = state[EDGE_US], value >> 8 & 0x1F
+            edges[edge, 2] = value & 1
             edge += 1
         at += 1
     state[NOW], state[HIGH_US], state[HIGH], state[EDGES] = now, high_us, high, edge
@@ -313,7 +347,7 @@ def decode_evt21(words, at, filled, state, width, height, x, y, p, t, edges):  #
 def decode_dat(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
     """Decode 64-bit words: 32 bits of time, column, row, and 4 bits above, 0 of an OFF event.
 
-    A time that falls by more than half of its range has begun anew.
+    A time that falls by more than half of its range has begun again at 0.
     """
     x_bits, y_bits = state[X_BITS], state[Y_BITS]
     state[FAULT] = 0
@@ -373,7 +407,7 @@ def _mend(x, y, t, state, width, height):  # type: ignore[no-untyped-def]
                 return i
             turned_us += 1 << 32
             state[HIGH_US] += 1 << 32
-        t[i] = now = max(now, t[i] + turned_us)
+        t[i] = now = _raised(t[i] + turned_us, now, state)
     return len(t)
 
 

@@ -87,11 +87,15 @@ def _source(recording: Recording) -> str:
 
 def _aedat4(recording: Recording, path: Path, stream: str) -> dict[str, int]:
     """Write everything on the event camera's clock, us; frames at the middle of their exposure."""
+    if not (_has_events(recording, stream) or recording.has_video):
+        raise ValueError("has neither events nor a video, and AEDAT4 holds those alone")
     triggers = _triggers(recording, stream)
     streams = {0: Stream(EVENTS, "events", _size(recording, stream), _source(recording))}
     frame_us = np.empty(0, np.int64)
     if recording.has_video:
-        frame_us = recording.clock(stream).to_device(recording.frame_times()) // 1000
+        frame_us = recording.frame_times() // 1000
+        if _has_events(recording, stream):
+            frame_us = recording.clock(stream).to_device(recording.frame_times()) // 1000
         first = recording.frame(0) if len(frame_us) else np.empty((1, 1))
         height, width = first.shape
         streams[1] = Stream(FRAMES, "frames", (width, height), _source(recording))
@@ -112,6 +116,8 @@ def _aedat4(recording: Recording, path: Path, stream: str) -> dict[str, int]:
 
 def _dsec(recording: Recording, path: Path, stream: str) -> dict[str, int]:
     """Write events and triggers; DSEC's event file holds no frames."""
+    if not _has_events(recording, stream):
+        raise ValueError("has no events, and DSEC's file holds those alone")
     triggers = _triggers(recording, stream)
     with recording.open(stream) as reader:
         events = reader.events()
@@ -125,10 +131,16 @@ _WRITERS: dict[str, Callable[[Recording, Path, str], dict[str, int]]] = {
 }
 
 
+def _has_events(recording: Recording, stream: str) -> bool:
+    return stream != EVENTS_KIND or recording.record.counts.events > 0
+
+
 def _pieces(recording: Recording, stream: str) -> Iterator[EventChunk]:
     """Yield all events, about `_PIECE` at a time."""
     with recording.open(stream) as reader:
         cuts = np.unique(reader.event_times()[::_PIECE]).tolist()
+        if not cuts:
+            return
         for start, end in zip(cuts, [*cuts[1:], None], strict=True):
             yield reader.events(start, end)
 

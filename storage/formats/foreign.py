@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
+from sliplab.storage.formats.time_order import in_order
 from sliplab.storage.schema.trial import DeviceRecord, Given, Lost, Step
 from sliplab.storage.streams import (
     I64,
@@ -20,10 +22,19 @@ from sliplab.storage.streams import (
     FrameChunk,
     Json,
     PoseChunk,
+    ScalarChunk,
     StreamChunk,
+    WrenchChunk,
 )
 from sliplab.storage.trials.store import Campaign
 
+OUTSIDE = "events outside of the sensor"
+UNKNOWN_POLARITY = "events with an unknown polarity"
+NO_TIME = "{} without a valid time"
+"""Reasons why rows are left out, by what they are."""
+NO_TIME_NS = -(1 << 63)
+"""In place of a time that is not a number or is out of range."""
+ChunkT = TypeVar("ChunkT", EventChunk, FrameChunk, PoseChunk, WrenchChunk, ScalarChunk)
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
 EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
@@ -47,6 +58,10 @@ class FormatError(ValueError):
         self.file = file
         self.key = ""
         super().__init__(message)
+
+
+class LabelError(InputError):
+    """A label that came with a recording does not fit it."""
 
 
 class Damage(FormatError):
@@ -77,6 +92,19 @@ def read_head(path: Path) -> bytes:
             return file.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+
+
+@dataclass(frozen=True)
+class ForeignChunk(EventChunk):
+    """Events of a foreign file, which may run back in time.
+
+    Attributes:
+        left_out: numbers of events that cannot be right and are left out, by reason.
+        resolution_us: of the type of its times at the latest one, us; 0 for integers.
+    """
+
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    resolution_us: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -112,10 +140,15 @@ class ForeignCampaign(Protocol):
 
 @dataclass(frozen=True)
 class Seen:
-    """First and last time of what was read of a trial, each on its own clock; None without any."""
+    """First and last time of what was read of a trial, each on its own clock; None without any.
+
+    Attributes:
+        further_ns: of poses and streams by name.
+    """
 
     events_us: tuple[int, int] | None
     frames_ns: tuple[int, int] | None
+    further_ns: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -138,7 +171,7 @@ class ForeignTrial:
 
     Attributes:
         name: its id in the store.
-        events: its events in order of time; read again by each call.
+        events: its events, in order of time but for faults; read again by each call.
         event_px: columns and rows of its camera, None if unknown; called once `events` were read.
         epoch: what the times count from, as text.
         about: further properties in the file, to be kept in the record.
@@ -148,6 +181,10 @@ class ForeignTrial:
         packets: packets that do; None where the format has none.
         poses: of the arm, on its own clock; cameras: frames of further cameras by stream.
         streams: forces and scalars by stream.
+        left_out: rows that were left out while it was opened, by reason.
+        resolution_us: of the type of the times of frames and streams, us, by stream.
+        notes: warnings about it, such as of files that contradict each other; called once all was
+            read.
         salvage: returns what stands whole in its file, if that turns out to be damaged; raises
             FormatError where that is nothing.
         campaign: the one that it is of; None for one of its own.
@@ -155,6 +192,7 @@ class ForeignTrial:
         geometry: further keys of the record's geometry.
         whole: what follows from all that was read; a trial with it may be without events. Raises
             InputError where that cannot be right.
+        error: fault because of which it cannot be read at all.
     """
 
     name: str
@@ -176,12 +214,21 @@ class ForeignTrial:
     salvage: Callable[[], ForeignTrial] | None = None
     poses: PoseChunk | None = None
     streams: Mapping[str, StreamChunk] = field(default_factory=dict)
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    resolution_us: Mapping[str, float] = field(default_factory=dict)
+    notes: Callable[[], tuple[str, ...]] = tuple
     cameras: Mapping[str, Callable[[], Iterator[FrameChunk]]] = field(default_factory=dict)
     campaign: ForeignCampaign | None = None
     clocks: Mapping[str, DeviceRecord] = field(default_factory=dict)
     experiment: str = "imported"
     geometry: Json = field(default_factory=dict)
     whole: Callable[[Seen], Whole] | None = None
+    error: FormatError | InputError | None = None
+
+
+def broken(name: str, source: str, error: FormatError | InputError) -> ForeignTrial:
+    """Return a trial that cannot be read: the import reports `error`, and continues."""
+    return ForeignTrial(name, source, lambda: iter(()), "unknown", error=error)
 
 
 def refusal(file: Path, error: FormatError) -> InputError:
@@ -208,66 +255,99 @@ def before_damage(
             raise error
         if salvage:
             return whole
-        count, last_us = 0, None
-        for chunk in whole.events():
-            count += len(chunk)
-            last_us = int(chunk.t_us[-1]) if len(chunk) else last_us
+        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in whole.events())]
+        times = np.concatenate(parts)
+        times = times[in_order(times)]
     except FormatError as fault:
         if fault is error:
             raise
         worse = fault if isinstance(fault, Damage) else error
         raise Damage(str(worse), error.file) from None
-    if last_us is None:
+    if not len(times):
         raise Damage(f"{error}; no event stands before that", error.file)
     packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
-    offer = f"--salvage imports {count:,} events up to {last_us} us{packets}"
+    offer = f"--salvage imports {len(times):,} events up to {times[-1]} us{packets}"
     raise Damage(f"{error}; {offer}", error.file)
 
 
-def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
-    """Check columns of a foreign file and return them as a chunk.
+def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -> ForeignChunk:
+    """Return columns of a foreign file as a chunk, without the events that cannot be right.
+
+    Those have a pixel, polarity or time that no camera has; polarities of -1 are OFF.
+
+    Args:
+        resolution_us: of the type of the times, us.
 
     Raises:
-        FormatError: they differ in length, a pixel or time is none, or times decrease.
+        FormatError: the columns differ in length, or are not integers.
     """
     columns = [np.asarray(column) for column in (x, y, p, t_us)]
     if any(c.ndim != 1 or len(c) != len(columns[3]) for c in columns):
         raise FormatError("contains event columns of different lengths")
     if any(c.dtype.kind not in "iub" for c in columns):
         raise FormatError("contains event values that are not integers")
-    times = np.ascontiguousarray(columns[3], np.int64)
-    ends = times[[0, -1]] if len(times) else times
-    limits = (("column", MOST_PX), ("row", MOST_PX), ("polarity", 2), ("time", LATEST_US))
-    for column, (what, most) in zip([*columns[:3], ends], limits, strict=True):
+    if columns[2].dtype.kind == "i" and len(columns[2]) and columns[2].min() == -1:
+        columns[2] = np.where(columns[2] == -1, 0, columns[2])
+    limits = (
+        (OUTSIDE, MOST_PX), (OUTSIDE, MOST_PX), (UNKNOWN_POLARITY, 2),
+        (NO_TIME.format("events"), LATEST_US),
+    )  # fmt: skip
+    good, left_out = None, Counter[str]()
+    for column, (reason, most) in zip(columns, limits, strict=True):
         if not len(column) or column.dtype.kind == "b":
             continue
-        negative = column.dtype.kind == "i" and int(column.min()) < 0
-        if negative or int(column.max()) >= most:
-            raise FormatError(f"holds an event whose {what} is {column.min()} or {column.max()}")
-    if np.any(times[1:] < times[:-1]):
-        raise FormatError("contains events with decreasing times")
-    return EventChunk(
-        np.ascontiguousarray(columns[0], np.uint16),
-        np.ascontiguousarray(columns[1], np.uint16),
-        np.ascontiguousarray(columns[2], np.uint8),
-        times,
-    )
+        if column.min() >= 0 and column.max() < most:
+            continue
+        right = (column >= 0) & (column < most)
+        right = right if good is None else right & good
+        wrong = (len(right) if good is None else int(good.sum())) - int(right.sum())
+        if wrong:
+            left_out[reason] += wrong
+        good = right
+    if good is not None:
+        columns = [column[good] for column in columns]
+    types = (np.uint16, np.uint16, np.uint8, np.int64)
+    made = (np.ascontiguousarray(c, kind) for c, kind in zip(columns, types, strict=True))
+    return ForeignChunk(*made, left_out, resolution_us)
 
 
-def check_pixels(chunk: EventChunk, size: tuple[int, int] | None) -> None:
-    """Check events against the size that their file gives its camera.
-
-    Raises:
-        FormatError: one lies outside.
-    """
+def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
+    """Return a chunk without the events outside of the size that their file gives its camera."""
     if size is None or not len(chunk):
-        return
-    x, y = int(chunk.x.max()), int(chunk.y.max())
-    if x >= size[0] or y >= size[1]:
-        raise FormatError(
-            f"holds events up to column {x} and row {y}, outside of the {size[0]} x {size[1]} "
-            "pixels that it gives its camera"
-        )
+        return chunk
+    if int(chunk.x.max()) < size[0] and int(chunk.y.max()) < size[1]:
+        return chunk
+    good = (chunk.x < size[0]) & (chunk.y < size[1])
+    left_out = Counter(left_out_of(chunk))
+    left_out[OUTSIDE] += len(good) - int(good.sum())
+    resolution = chunk.resolution_us if isinstance(chunk, ForeignChunk) else 0.0
+    columns = (column[good] for column in (chunk.x, chunk.y, chunk.p, chunk.t_us))
+    return ForeignChunk(*columns, left_out, resolution)
+
+
+def left_out_of(chunk: EventChunk) -> Mapping[str, int]:
+    """Return the numbers of events that were left out of a chunk, by reason."""
+    return chunk.left_out if isinstance(chunk, ForeignChunk) else {}
+
+
+def some_rows(chunk: ChunkT, good: Any) -> ChunkT:
+    """Return some rows of a chunk: of each of its arrays."""
+    values = {item.name: getattr(chunk, item.name) for item in fields(chunk)}
+    arrays = {key: value[good] for key, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(chunk, **arrays)
+
+
+def resolution_us(times: Any, per_unit: float) -> float:
+    """Return the step from the latest time to the next one that its type can tell, us.
+
+    Args:
+        per_unit: microseconds of one unit of the times.
+    """
+    found = np.asarray(times)
+    if found.dtype.kind != "f":
+        return 0.0
+    finite = np.abs(found[np.isfinite(found)])
+    return float(np.spacing(finite.max())) * per_unit if len(finite) else 0.0
 
 
 def grey(levels: U8) -> U8:
@@ -286,14 +366,12 @@ def grey(levels: U8) -> U8:
 def rounded_us(times: Any, per_unit: float) -> I64:
     """Round times in another unit to whole microseconds.
 
+    What is not a number, or beyond any time, becomes `NO_TIME_NS`, which `event_chunk` leaves out.
+
     Args:
         per_unit: microseconds of one unit.
-
-    Raises:
-        FormatError: one is not a number, or beyond any time.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what is beyond any number is found below
         found = np.asarray(times, np.float64) * per_unit
-    if len(found) and not (np.isfinite(found).all() and float(np.abs(found).max()) < LATEST_US):
-        raise FormatError("contains a time that is not a number or is out of range")
-    return np.rint(found).astype(np.int64)
+        good = np.abs(found) < LATEST_US
+    return np.where(good, np.rint(np.where(good, found, 0.0)), NO_TIME_NS).astype(np.int64)

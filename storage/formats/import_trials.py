@@ -1,6 +1,8 @@
 """Import of foreign trials into a campaign: each one complete or not at all.
 
-A trial is committed by the store's own rename after all of it was read and checked. Unknown
+A trial is committed by the store's own rename after all of it was read and checked. A trial that
+cannot be imported does not stop the others. Rows that cannot be right, or whose times run back, are
+left out and counted (`time_order`); where they are many, the trial is not imported. Unknown
 properties (relations of clocks, poses, conditions) are marked as unknown and never invented:
 the time line is the event camera's own clock, or that of the frames where there are no events. Of a
 damaged file what stands whole before the damage may be salvaged; the trial's record counts what is
@@ -10,9 +12,12 @@ lost.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import ValidationError
@@ -21,26 +26,35 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.files import json_text, safe_name
 from sliplab.storage.formats.foreign import (
+    LATEST_US,
+    NO_TIME,
+    OUTSIDE,
     RISING,
     Damage,
     ForeignCampaign,
+    ForeignChunk,
     ForeignTrial,
     FormatError,
+    LabelError,
     NoEvents,
     Seen,
     Whole,
     as_damage,
     before_damage,
-    check_pixels,
+    inside,
+    left_out_of,
     refusal,
+    some_rows,
 )
 from sliplab.storage.formats.original import StoredTrial
+from sliplab.storage.formats.time_order import Mask, falls, in_order
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
     Clocks,
     Counts,
     DeviceRecord,
+    Gate,
     Geometry,
     Lost,
     Provenance,
@@ -48,13 +62,34 @@ from sliplab.storage.schema.trial import (
     StreamRecord,
     TrialRecord,
 )
-from sliplab.storage.streams import FRAMES_KIND, Json, PulseChunk, ScalarChunk
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    FRAMES_KIND,
+    I64,
+    EventChunk,
+    FrameChunk,
+    Json,
+    PoseChunk,
+    PulseChunk,
+    ScalarChunk,
+    WrenchChunk,
+)
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
 from sliplab.storage.trials.writer import TrialWriter
 
 _LONG_GAP_US = 3_600_000_000
 _FRAME_RATE = 100
 """Time base of the video only; frames keep their own times."""
+BACK = "whose times run back"
+MOST_RESOLUTION_US = 1.0
+"""Step of the type of a stream's times from which on they carry too little information, us."""
+_SOME, _SHARE = 10, 0.1
+"""Number and share of the rows that cannot be right up to which a trial is imported without."""
+_LEAST_SHARE = 0.01
+"""Share of the rows that must be in order of time."""
+_MOST_RATE, _FEW = 1e8, 100
+"""Events a second that no camera sends; of fewer events the rate says nothing."""
+SampleT = TypeVar("SampleT", PoseChunk, WrenchChunk, ScalarChunk)
 _UNKNOWN = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
 
 
@@ -80,11 +115,13 @@ def import_trials(
 
     Returns:
         ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
-        and where there are any, ``warnings`` and ``salvaged``: what is lost of each trial.
+        and where there are any, ``warnings``, ``salvaged`` (what is lost of each trial),
+        ``left_out`` (rows left out of each trial, by reason) and ``failed``: trials that could not
+        be imported, of which nothing is left.
 
     Raises:
-        InputError: a file is damaged (`DamagedFile`) or cannot be right. Trials before it stay
-            committed; of this one nothing is left.
+        InputError: no trial could be imported, because the first file is damaged (`DamagedFile`) or
+            cannot be right; or the campaign is another one.
     """
     campaign = store.campaign(name)
     fresh = not campaign.folder.exists()
@@ -95,6 +132,11 @@ def import_trials(
     counts = {"events": 0, "frames": 0}
     warnings: list[str] = []
     salvaged: list[Json] = []
+    left_out: list[Json] = []
+    failed: list[Json] = []
+    first_error: InputError | None = None
+    label_error: InputError | None = None
+    labelled = False
     try:
         for trial in trials:
             on_trial(trial.name)
@@ -105,29 +147,46 @@ def import_trials(
             if trial.name in existing:
                 skipped.append(trial.name)
                 continue
-            if trial.name in imported:
-                raise InputError(
-                    origin, "", None,
-                    f"holds two files for the trial {trial.name}; import them one by one",
-                )  # fmt: skip
             try:
-                trial, (taken, warned) = _take_whole(store, campaign, trial, kind, salvage)
-            except FormatError as error:
-                file = error.file or (origin if origin.is_file() else origin / trial.source)
-                raise refusal(file, error) from None
-            imported.append(trial.name)
-            if trial.lost is not None:
+                if trial.error is not None:
+                    raise trial.error
+                if trial.name in imported:
+                    raise InputError(
+                        origin, "", None,
+                        f"holds two files for the trial {trial.name}; import them one by one",
+                    )  # fmt: skip
+                trial, found = _take_whole(store, campaign, trial, kind, salvage)
+            except (FormatError, InputError) as error:
+                if isinstance(error, FormatError):
+                    file = error.file or (origin if origin.is_file() else origin / trial.source)
+                    error = refusal(file, error)
+                first_error = first_error or error
+                if isinstance(error, LabelError):
+                    label_error = label_error or error
                 about = {"trial": trial.name, "file": trial.source}
+                failed.append({**about, "reason": error.message})
+                continue
+            imported.append(trial.name)
+            labelled |= found.labelled
+            about = {"trial": trial.name, "file": trial.source}
+            if trial.lost is not None:
                 salvaged.append({**about, **trial.lost.to_json()})
-            warnings += [f"{trial.source}: {text}" for text in warned]
-            counts = {key: counts[key] + taken[key] for key in counts}
+            if found.left_out:
+                left_out.append({**about, "left_out": dict(found.left_out)})
+            warnings += [f"{trial.source}: {text}" for text in found.warnings]
+            counts = {key: counts[key] + found.counts[key] for key in counts}
+        if label_error is not None and not labelled and fresh:
+            imported.clear()  # no label fits its trial
     finally:
         if fresh and not imported and campaign.folder.exists():
             shutil.rmtree(campaign.folder)
+    if first_error is not None and not imported and not skipped:
+        raise label_error or first_error
     result = {"campaign": name, "imported": imported, "there": skipped, **counts}
-    if salvaged:
-        result["salvaged"] = salvaged
-    return {**result, "warnings": warnings} if warnings else result
+    further = {
+        "salvaged": salvaged, "left_out": left_out, "failed": failed, "warnings": warnings
+    }  # fmt: skip
+    return result | {key: found for key, found in further.items() if found}
 
 
 @dataclass(frozen=True)
@@ -153,10 +212,144 @@ class _Imported:
         campaign.update(info, text, text.replace("protocol", "rig file"))
 
 
+@dataclass
+class _Content:
+    """What was read of a trial.
+
+    Attributes:
+        orders: rows that stay of streams whose times run back.
+        rows: numbers of rows that were written, by stream.
+        left_out: numbers of rows that were left out, by reason.
+        gates: those that the trial does not pass.
+        counts: events and frames.
+        size_px: columns and rows of the event camera. latest_px: largest column and row of events.
+        further_ns: first and last time of poses and streams.
+        labelled: a label came with the trial.
+    """
+
+    orders: Mapping[str, Mask] = field(default_factory=dict)
+    rows: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+    gates: dict[str, Gate] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=lambda: {"events": 0, "frames": 0})
+    size_px: tuple[int, int] | None = None
+    latest_px: tuple[int, int] = (0, 0)
+    further_ns: dict[str, tuple[int, int]] = field(default_factory=dict)
+    labelled: bool = False
+
+    def ordered(self, stream: str, times: I64, done: int, last: int | None) -> Any:
+        """Return which rows of a chunk stay: a slice of all, or a mask.
+
+        Args:
+            done: rows of the stream before the chunk. last: time of the row before it.
+
+        Raises:
+            _RunsBack: times run back, and the order is not known yet.
+        """
+        order = self.orders.get(stream)
+        if order is not None:
+            kept = order[done : done + len(times)]
+            self.leave_out(f"{_rows_of(stream)} {BACK}", int((~kept).sum()))
+            return kept
+        if falls(times) or (last is not None and len(times) and times[0] < last):
+            raise _RunsBack
+        return slice(None)
+
+    def leave_out(self, reason: str, count: int) -> None:
+        """Count rows that are left out."""
+        if count:
+            self.left_out[reason] += count
+
+    def check_majority(self, stream: str, kept: int) -> None:
+        """Check that few rows of a stream cannot be right. Raises FormatError."""
+        what = _rows_of(stream)
+        wrong = {
+            reason: count
+            for reason, count in self.left_out.items()
+            if reason.startswith(f"{what} ") and not reason.endswith(BACK)
+        }
+        count = sum(wrong.values())
+        if count and (count >= kept or count > max(_SOME, _SHARE * (kept + count))):
+            named = ", ".join(f"{count:,} {reason}" for reason, count in wrong.items())
+            if set(wrong) == {OUTSIDE} and self.size_px is not None:
+                width, height = self.size_px
+                named = (
+                    f"events up to column {self.latest_px[0]} and row {self.latest_px[1]}, outside "
+                    f"of the {width} x {height} pixels that it gives its camera: {named}"
+                )
+            raise FormatError(f"holds {named}, and {kept:,} that can be right")
+
+    def check_order(self, stream: str, kept: int, rows: int) -> None:
+        """Check that enough rows of a stream are in order of time. Raises FormatError."""
+        if kept < rows and kept < max(2, _LEAST_SHARE * rows):
+            raise FormatError(
+                f"contains {_rows_of(stream)} with decreasing times: {kept:,} of {rows:,} are in "
+                "order"
+            )
+
+    def check_times(self, stream: str, ends: tuple[int, int] | None, resolution: float) -> None:
+        """Check that the times of a stream carry information.
+
+        Args:
+            ends: first and last time, ns. resolution: of their type, us.
+        """
+        rows, what = self.rows[stream], _rows_of(stream)
+        if ends is None or rows < 2:
+            return
+        if resolution > MOST_RESOLUTION_US:
+            self._fail(
+                f"{stream}_time_resolution_us", resolution, MOST_RESOLUTION_US,
+                f"the times of {stream} have steps of {resolution:,.6g} us, for their type is too "
+                "short for such large numbers; times of 64 bits, or counted from the recording's "
+                "start, would be right",
+            )  # fmt: skip
+        if ends[0] == ends[1]:
+            self._fail(f"{stream}_times", "one time", None, f"all {rows:,} {what} have one time")
+        elif stream == EVENTS_KIND and rows >= _FEW:
+            rate = rows * 1e9 / (ends[1] - ends[0])
+            if rate > _MOST_RATE:
+                self._fail(
+                    "events_rate", rate, _MOST_RATE,
+                    f"{rate:,.3g} events a second are more than a camera sends; are the times in "
+                    "another unit?",
+                )  # fmt: skip
+
+    def check_images(self, stream: str, alike: int) -> None:
+        """Check that frames change; `alike` of them equal the one before."""
+        rows = self.rows[stream]
+        if rows > 1 and alike == rows - 1:
+            self._fail(
+                f"{stream}_change", "none", None, f"all {rows:,} frames of {stream} are alike"
+            )
+        elif alike > rows / 2:
+            self.warnings.append(f"{alike:,} of {rows:,} frames of {stream} repeat the one before")
+
+    def _fail(self, gate: str, value: float | str, limit: float | None, text: str) -> None:
+        self.gates[gate] = Gate(passed=False, value=value, limit=limit)
+        self.warnings.append(text)
+
+    def all_warnings(self, trial: ForeignTrial) -> list[str]:
+        """Return all warnings about a trial."""
+        left_out = [f"{count:,} {reason} left out" for reason, count in self.left_out.items()]
+        return [*_loss_warnings(trial.lost), *trial.notes(), *left_out, *self.warnings]
+
+
+def _rows_of(stream: str) -> str:
+    """Return the name of a stream's rows, for messages."""
+    return (
+        stream if stream in {EVENTS_KIND, FRAMES_KIND, "poses", "triggers"} else f"rows of {stream}"
+    )
+
+
+class _RunsBack(Exception):
+    """The times of a stream run back."""
+
+
 def _take_whole(
     store: Store, campaign: Campaign, trial: ForeignTrial, kind: str, salvage: bool
-) -> tuple[ForeignTrial, tuple[dict[str, int], list[str]]]:
-    """Commit one trial, or what stands whole of it; return it with its counts and warnings."""
+) -> tuple[ForeignTrial, _Content]:
+    """Commit one trial, or what stands whole of it; return it with what was read."""
     try:
         return trial, _take(store, campaign, trial, kind)
     except NoEvents:
@@ -174,26 +367,48 @@ def _take_whole(
         frame_px=whole.frame_px,
         lost=whole.lost,
         packets=whole.packets,
+        notes=whole.notes,
         salvage=None,
     )
     with as_damage():
         return trial, _take(store, campaign, trial, kind)
 
 
-def _take(
-    store: Store, campaign: Campaign, trial: ForeignTrial, kind: str
-) -> tuple[dict[str, int], list[str]]:
-    """Commit one trial; return its counts and warnings."""
+def _take(store: Store, campaign: Campaign, trial: ForeignTrial, kind: str) -> _Content:
+    """Commit one trial; return what was read."""
     if isinstance(trial, StoredTrial) and trial.original is not None:
         about = {"imported": now(), "from": trial.source}
         with as_damage():
             rows = trial.original.restore(store, campaign, safe_name(trial.name), about)
-        return {"events": rows.events, "frames": rows.frames}, []
+        return _Content(counts={"events": rows.events, "frames": rows.frames})
+    try:
+        return _write(campaign, trial, kind, _Content())
+    except _RunsBack:
+        return _write(campaign, trial, kind, _Content(_orders(trial)))
+
+
+def _orders(trial: ForeignTrial) -> dict[str, Mask]:
+    """Return which rows of events and frames are in order of time, by stream."""
+    unused = _Content()
+    events = [np.empty(0, np.int64), *(chunk.t_us for chunk in _events(trial, unused))]
+    found = {EVENTS_KIND: in_order(np.concatenate(events))}
+    cameras = {FRAMES_KIND: trial.frames, **trial.cameras}
+    for name, read in cameras.items():
+        if read is not None:
+            frames = [chunk.t_ns for chunk in _frames(name, read, trial.frame_px, unused)]
+            found[name] = in_order(np.concatenate([np.empty(0, np.int64), *frames]))
+    return found
+
+
+def _write(campaign: Campaign, trial: ForeignTrial, kind: str, content: _Content) -> _Content:
+    """Commit a trial whose rows are read in `content`'s orders."""
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
-        seen, warnings = _fill(writer, trial)
-        streams = _fill_further(writer, trial)
-        warnings = [*_loss_warnings(trial.lost), *warnings]
+        seen = _fill(writer, trial, content)
+        streams = _fill_further(writer, trial, content)
+        seen = replace(seen, further_ns=content.further_ns)
+        if not sum(content.rows.values()) and trial.whole is None:
+            raise NoEvents("contains no events; nothing to import")
         counts = writer.counts
         rows = Counts(
             events=counts["events/t"],
@@ -201,80 +416,198 @@ def _take(
             poses=counts.get("poses/t", 0),
             pulses=0,
         )
-        record = _record(campaign, trial, kind, rows, seen, warnings, streams)
-        writer.commit(record, Provenance.model_validate({"imported": now(), "from": trial.source}))
+        record = _record(campaign, trial, kind, rows, seen, content, streams)
+        about = {"imported": now(), "from": _plain(trial.source)}
+        writer.commit(record, Provenance.model_validate(about))
     except BaseException:
         writer.discard()
         raise
-    return {"events": rows.events, "frames": rows.frames}, warnings
+    content.warnings = content.all_warnings(trial)
+    content.counts = {"events": rows.events, "frames": rows.frames}
+    return content
 
 
-def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[Seen, list[str]]:
-    """Write events and frames; return what was seen of both, and warnings.
+def _events(trial: ForeignTrial, content: _Content) -> Iterator[EventChunk]:
+    """Yield the events of a trial that can be right, in the file's order."""
+    for chunk in trial.events():
+        content.size_px = trial.event_px()
+        if content.size_px is not None and len(chunk):
+            x, y = content.latest_px
+            content.latest_px = max(x, int(chunk.x.max())), max(y, int(chunk.y.max()))
+        chunk = inside(chunk, content.size_px)
+        content.left_out.update(left_out_of(chunk))
+        if len(chunk):
+            yield chunk
+
+
+def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
+    """Write events, triggers and frames; return first and last times.
 
     Raises:
-        FormatError: there is neither event nor frame, an event lies outside of the camera's pixels,
-            or times run backwards.
+        FormatError: many events or frames cannot be right. _RunsBack: as `_Content.ordered`.
     """
     first_us = last_us = None
     gap_us = gap_end_us = 0
-    for chunk in trial.events():
+    done, resolution = 0, 0.0
+    content.left_out.update(trial.left_out)
+    for chunk in _events(trial, content):
+        if isinstance(chunk, ForeignChunk):
+            resolution = max(resolution, chunk.resolution_us)
+        kept = content.ordered(EVENTS_KIND, chunk.t_us, done, last_us)
+        done += len(chunk)
+        if not isinstance(kept, slice):
+            chunk = some_rows(chunk, kept)
         if not len(chunk):
             continue
-        if last_us is not None and int(chunk.t_us[0]) < last_us:
-            raise FormatError("contains events with decreasing times")
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
         steps = np.diff(chunk.t_us, prepend=first_us if last_us is None else last_us)
         widest = int(steps.argmax())
         if int(steps[widest]) > gap_us:
             gap_us, gap_end_us = int(steps[widest]), int(chunk.t_us[widest])
         last_us = int(chunk.t_us[-1])
-        check_pixels(chunk, trial.event_px())
         writer.add_events(chunk)
+        content.rows[EVENTS_KIND] += len(chunk)
+    content.check_majority(EVENTS_KIND, done)
+    content.check_order(EVENTS_KIND, content.rows[EVENTS_KIND], done)
     if first_us is None and trial.lost is not None:
         raise Damage(f"{trial.lost.reason}; no event stands before that")
-    if trial.triggers is not None:
-        t_ns = trial.triggers.t_us * 1000
-        writer.add_triggers(t_ns, trial.triggers.kind)
-        writer.add_event_pulses(PulseChunk(t_ns[trial.triggers.kind == RISING]))
-    first_ns = last_ns = None
-    for frames in trial.frames() if trial.frames is not None else ():
-        height, width = frames.images.shape[1:]
-        if (width, height) != trial.frame_px:
-            raise FormatError(
-                f"holds a frame of {width} x {height} among others of {trial.frame_px}"
-            )
-        writer.add_frames(frames)
-        first_ns = int(frames.t_ns[0]) if first_ns is None else first_ns
-        last_ns = int(frames.t_ns[-1])
+    _fill_triggers(writer, trial, content)
+    times = None
+    if trial.frames is not None:
+        times, _ = _fill_frames(
+            FRAMES_KIND, trial.frames, trial.frame_px, content, writer.add_frames
+        )
+        content.check_times(FRAMES_KIND, times, trial.resolution_us.get(FRAMES_KIND, 0.0))
     events = None if first_us is None or last_us is None else (first_us, last_us)
-    times = None if first_ns is None or last_ns is None else (first_ns, last_ns)
-    if events is None and times is None and trial.whole is None:
-        raise NoEvents("contains no events; nothing to import")
-    return Seen(events, times), _gap_warnings(gap_us, gap_end_us)
+    if events is not None:
+        content.check_times(EVENTS_KIND, (events[0] * 1000, events[1] * 1000), resolution)
+    content.warnings += _gap_warnings(gap_us, gap_end_us)
+    return Seen(events, times)
 
 
-def _fill_further(writer: TrialWriter, trial: ForeignTrial) -> dict[str, StreamRecord]:
+def _fill_triggers(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> None:
+    if trial.triggers is None:
+        return
+    t_us, kind = trial.triggers.t_us, trial.triggers.kind
+    good = (t_us >= 0) & (t_us < LATEST_US)
+    content.leave_out(NO_TIME.format("triggers"), int((~good).sum()))
+    content.check_majority("triggers", int(good.sum()))
+    t_us, kind = t_us[good], kind[good]
+    kept = in_order(t_us)
+    content.leave_out(f"triggers {BACK}", int((~kept).sum()))
+    t_ns, kind = t_us[kept] * 1000, kind[kept]
+    writer.add_triggers(t_ns, kind)
+    writer.add_event_pulses(PulseChunk(t_ns[kind == RISING]))
+
+
+def _frames(
+    stream: str,
+    read: Callable[[], Iterator[FrameChunk]],
+    size: tuple[int, int] | None,
+    content: _Content,
+) -> Iterator[FrameChunk]:
+    """Yield the frames of a camera that can be right: of one size, with a time."""
+    for chunk in read():
+        if not len(chunk):
+            continue
+        height, width = chunk.images.shape[1:]
+        size = size or (width, height)
+        if (width, height) != size:
+            content.leave_out(f"{_rows_of(stream)} of another size", len(chunk))
+            continue
+        good = np.abs(chunk.t_ns // 1000) < LATEST_US
+        if not good.all():
+            what = _rows_of(stream)
+            content.leave_out(NO_TIME.format(what), int((~good).sum()))
+            chunk = some_rows(chunk, good)
+        if len(chunk):
+            yield chunk
+
+
+def _fill_frames(
+    stream: str,
+    read: Callable[[], Iterator[FrameChunk]],
+    size: tuple[int, int] | None,
+    content: _Content,
+    write: Callable[[FrameChunk], None],
+) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
+    """Write the frames of a camera; return their first and last time, ns, and their size."""
+    ends: tuple[int, int] | None = None
+    image = None
+    done = alike = repeated = 0
+    for chunk in _frames(stream, read, size, content):
+        kept = content.ordered(stream, chunk.t_ns, done, None if ends is None else ends[1])
+        done += len(chunk)
+        chunk = chunk if isinstance(kept, slice) else some_rows(chunk, kept)
+        if not len(chunk):
+            continue
+        size = size or (chunk.images.shape[2], chunk.images.shape[1])
+        write(chunk)
+        content.rows[stream] += len(chunk)
+        last = chunk.t_ns[0] - 1 if ends is None else ends[1]
+        repeated += int((np.diff(chunk.t_ns, prepend=last) == 0).sum())
+        ends = (int(chunk.t_ns[0]) if ends is None else ends[0], int(chunk.t_ns[-1]))
+        for each in chunk.images:
+            alike += image is not None and np.array_equal(image, each)
+            image = each
+    content.check_majority(stream, done)
+    content.check_order(stream, content.rows[stream], done)
+    content.check_images(stream, alike)
+    if repeated:
+        content.warnings.append(f"{repeated:,} frames of {stream} have the time of the one before")
+    return ends, size
+
+
+def _fill_further(
+    writer: TrialWriter, trial: ForeignTrial, content: _Content
+) -> dict[str, StreamRecord]:
     """Write poses, named streams and further cameras; return what the record says of them."""
     if trial.poses is not None:
-        writer.add_poses(trial.poses)
+        writer.add_poses(_samples("poses", trial.poses, trial, content))
     found: dict[str, StreamRecord] = {}
     for name, chunk in trial.streams.items():
+        chunk = _samples(name, chunk, trial, content)
         writer.add_stream(name, chunk)
         said = StreamRecord(kind=chunk.KIND, rows=len(chunk))
         if isinstance(chunk, ScalarChunk) and chunk.unit:
             said = StreamRecord(kind=chunk.KIND, rows=len(chunk), unit=chunk.unit)
         found[name] = said
     for name, read in trial.cameras.items():
-        size, rows = None, 0
-        for frames in read():
-            height, width = frames.images.shape[1:]
-            if (size := size or (width, height)) != (width, height):
-                raise FormatError(f"holds a frame of {width} x {height} among others of {size}")
-            writer.add_stream(name, frames)
-            rows += len(frames)
-        found[name] = StreamRecord(kind=FRAMES_KIND, rows=rows, size_px=size)
+        ends, size = _fill_frames(name, read, None, content, partial(writer.add_stream, name))
+        content.check_times(name, ends, trial.resolution_us.get(name, 0.0))
+        found[name] = StreamRecord(kind=FRAMES_KIND, rows=content.rows[name], size_px=size)
     return found
+
+
+def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) -> SampleT:
+    """Return the rows of poses, forces or readings that can be right, in order of time."""
+    what = _rows_of(name)
+    good = np.abs(chunk.t_ns // 1000) < LATEST_US
+    content.leave_out(NO_TIME.format(what), int((~good).sum()))
+    values = [getattr(chunk, each.name) for each in fields(chunk)]
+    numbers = [value for value in values if getattr(value, "dtype", None) == np.float64]
+    finite = np.all([np.isfinite(v.reshape(len(chunk), -1)).all(axis=1) for v in numbers], axis=0)
+    content.leave_out(f"{what} with a value that is not a number", int((good & ~finite).sum()))
+    good &= finite
+    content.check_majority(name, int(good.sum()))
+    if not good.all():
+        chunk = some_rows(chunk, good)
+    kept = in_order(chunk.t_ns)
+    if not kept.all():
+        content.leave_out(f"{what} {BACK}", int((~kept).sum()))
+        content.check_order(name, int(kept.sum()), len(kept))
+        chunk = some_rows(chunk, kept)
+    content.rows[name] = len(chunk)
+    if len(chunk):
+        ends = int(chunk.t_ns[0]), int(chunk.t_ns[-1])
+        content.check_times(name, ends, trial.resolution_us.get(name, 0.0))
+        content.further_ns[name] = ends
+    return chunk
+
+
+def _plain(source: str) -> str:
+    """Return the name of a file, with bytes that are no text written out."""
+    return source.encode("utf-8", "backslashreplace").decode()
 
 
 def _loss_warnings(lost: Lost | None) -> list[str]:
@@ -304,7 +637,7 @@ def _seconds(seen: Seen, whole: Whole | None) -> float:
         return (whole.span_ns[1] - whole.span_ns[0]) / 1e9
     if seen.events_us is not None:
         return (seen.events_us[1] - seen.events_us[0]) / 1e6
-    first, last = seen.frames_ns or (0, 0)
+    first, last = seen.frames_ns or next(iter(seen.further_ns.values()), (0, 0))
     return (last // 1000 - first // 1000) / 1e6
 
 
@@ -316,8 +649,10 @@ def _clocks(
         "frames": trial.frames is not None,
         "arm": trial.poses is not None or (whole is not None and bool(whole.steps)),
     }
+    cameras = {"event camera": there["events"], "frame camera": there["frames"]}
+    devices = {**cameras, "arm": there["arm"], **dict.fromkeys(streams, True)}
     found: Json = {
-        "reference": "event camera" if there["events"] else "frame camera",
+        "reference": next((name for name, known in devices.items() if known), None),
         **{name: trial.clocks.get(name, _UNKNOWN) for name, known in there.items() if known},
     }
     if streams:
@@ -331,7 +666,7 @@ def _record(
     kind: str,
     counts: Counts,
     seen: Seen,
-    warnings: list[str],
+    content: _Content,
     streams: dict[str, StreamRecord],
 ) -> TrialRecord:
     event_px = trial.event_px()
@@ -339,18 +674,21 @@ def _record(
     missing = ("sensor size",) if counts.events else ("events",)
     origin: Json = {
         "format": trial.kind or kind,
-        "from": trial.source,
+        "from": _plain(trial.source),
         "epoch": trial.epoch,
         "unknown": [*trial.unknown, *(() if event_px else missing)],
         **trial.about,
     }
-    if warnings:
+    if warnings := content.all_warnings(trial):
         origin["warnings"] = warnings
+    if content.left_out:
+        origin["dropped"] = dict(content.left_out)
     if trial.lost is not None:
         origin["lost"] = trial.lost
     if whole is not None:
         origin |= {"span_ns": whole.span_ns, "given": whole.given}
-    fields = {
+        content.labelled = whole.given is not None
+    values = {
         "format": TrialRecord.FORMAT,
         "trial": trial.name,
         "campaign": campaign.name,
@@ -364,7 +702,7 @@ def _record(
         "recorded_s": _seconds(seen, whole),
         "counts": counts,
         "clocks": _clocks(trial, counts, whole, streams),
-        "quality": Quality(passed=True, gates={}),
+        "quality": Quality(passed=not content.gates, gates=content.gates),
         "steps": () if whole is None else whole.steps,
         "geometry": Geometry.model_validate(
             {"event_px": event_px, "frame_px": trial.frame_px, **trial.geometry}
@@ -372,9 +710,9 @@ def _record(
         "imported": origin,
     }
     if streams:
-        fields["streams"] = streams
+        values["streams"] = streams
     try:
-        return TrialRecord.model_validate(fields)
+        return TrialRecord.model_validate(values)
     except ValidationError as error:
         key, value, expected = first_fault(error)
         raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None

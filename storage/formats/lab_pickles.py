@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.foreign import (
+    LATEST_US,
     Damage,
     ForeignTrial,
     FormatError,
@@ -33,6 +33,7 @@ from sliplab.storage.streams import EventChunk
 _FILE = re.compile(
     r"(?P<stem>.+?)(?P<events>_events)?_(?P<polarity>on|off)(?P<ending>\.(?:pickle|pkl|npy))?"
 )
+_STREAM = re.compile(r"(?P<stem>.+?)_events_stream(?:\.(?:h5|hdf5))?")
 _PART = re.compile(
     r"d(?P<depth>[0-9.]+)_s(?P<speed>[0-9.]+)_dir_(?P<direction>[A-Za-z0-9-]+)_r(?P<repetition>\d{1,6})"
 )
@@ -47,35 +48,86 @@ _RIGHT = f"the lab's files hold a list of times in ms for each pixel of {_KNOWN}
 
 @dataclass(frozen=True)
 class Pair:
-    """The two files of a trial; one of them may be missing."""
+    """The files of a recording, some of which may be missing.
+
+    Attributes:
+        stream: HDF5 file of the events of both polarities.
+        fault: why it cannot be read; empty where it can.
+        doubtful: the name of its one file does not say whether its events are ON or OFF.
+    """
 
     stem: str
     on: Path | None
     off: Path | None
+    stream: Path | None = None
+    fault: str = ""
+    doubtful: bool = False
 
     def names(self) -> set[str]:
         """Return the names of its files."""
-        return {path.name for path in (self.on, self.off) if path is not None}
+        return {path.name for path in (self.on, self.off, self.stream) if path is not None}
+
+    def __str__(self) -> str:
+        return " and ".join(sorted(self.names()))
 
 
 def pairs(files: list[Path]) -> list[Pair]:
-    """Files of the lab's names by trial; others are left out.
+    """Files of the lab's names by recording; others are left out."""
+    found: dict[str, dict[str, Path]] = {}
+    faults: dict[str, str] = {}
+    for path in files:
+        if (match := _STREAM.fullmatch(path.name)) is not None:
+            what = "stream"
+        elif (match := _FILE.fullmatch(path.name)) is not None and (
+            match["events"] or match["ending"] or _is_pickle(path)
+        ):
+            what = match["polarity"]
+        else:
+            continue
+        parts = found.setdefault(match["stem"], {})
+        if (other := parts.setdefault(what, path)) != path:
+            faults[match["stem"]] = (
+                f"holds the {what.upper()} events of {match['stem']}, as {other.name} does; keep "
+                "one of the two"
+            )
+    return [
+        Pair(stem, parts.get("on"), parts.get("off"), parts.get("stream"), faults.get(stem, ""))
+        for stem, parts in sorted(found.items())
+    ]
+
+
+def unnamed(files: list[Path]) -> list[Pair]:
+    """Return pickles whose names say no polarity, for folders that have no others."""
+    return [
+        Pair(path.stem, path, None, doubtful=True)
+        for path in files
+        if path.suffix in {".pickle", ".pkl"}
+        and _is_pickle(path)
+        and not path.name.startswith("timestamps_")
+    ]
+
+
+def is_stream(path: Path) -> bool:
+    """Return whether a file has the name of the lab's HDF5 files, ``NAME_events_stream``."""
+    return _STREAM.fullmatch(path.name) is not None
+
+
+def named_condition(stem: str) -> tuple[dict[str, str], int]:
+    """Return the condition and the repetition that a recording's name says; none: empty."""
+    named = _PART.fullmatch(stem)
+    if named is None:
+        return {}, 0
+    parts = named.groupdict()
+    return parts, int(parts.pop("repetition"))
+
+
+def count_events(path: Path) -> int:
+    """Return the number of events of one file.
 
     Raises:
-        InputError: a trial has two files of one polarity.
+        FormatError, InputError: it cannot be right.
     """
-    found: dict[str, dict[str, Path]] = {}
-    for path in files:
-        match = _FILE.fullmatch(path.name)
-        if match is None or not (match["events"] or match["ending"] or _is_pickle(path)):
-            continue
-        two = found.setdefault(match["stem"], {})
-        if (other := two.setdefault(match["polarity"], path)) != path:
-            raise InputError(
-                path, "", None, f"holds the {match['polarity'].upper()} events of "
-                f"{match['stem']}, as {other.name} does; keep one of the two",
-            )  # fmt: skip
-    return [Pair(stem, two.get("on"), two.get("off")) for stem, two in sorted(found.items())]
+    return len(_events(path, 1)[-1])
 
 
 def _is_pickle(path: Path) -> bool:
@@ -89,6 +141,8 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
     Raises:
         FormatError: a file cannot be right.
     """
+    if pair.fault:
+        raise FormatError(pair.fault)
     sides = [(path, polarity) for path, polarity in ((pair.on, 1), (pair.off, 0)) if path]
     missing = [] if len(sides) == 2 else ["OFF events" if pair.off is None else "ON events"]
     names = " and ".join(path.name for path, _ in sides)
@@ -112,12 +166,22 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
         order = np.lexsort((p, x, y, t))
         yield event_chunk(x[order], y[order], p[order], t[order])
 
-    named = _PART.fullmatch(pair.stem)
-    condition = {k: v for k, v in named.groupdict().items() if k != "repetition"} if named else {}
+    # the lab's newest script saves both by numpy under the name of the ON events, OFF last
+    overwritten = pair.off is None and pair.on is not None and read_head(pair.on).startswith(MAGIC)
+    doubtful = pair.doubtful or overwritten
+    missing = ["polarity"] if doubtful else missing
+    note = (
+        f"{names} may hold the OFF events: there is no file of those, and a script of the lab "
+        "writes them over the ON events; its polarity is unknown"
+        if overwritten
+        else f"the name of {names} does not say whether its events are ON or OFF; taken as ON"
+    )
+    condition, repetition = named_condition(pair.stem)
     return ForeignTrial(
         name, names, all_events, "unknown; ms as the files have them, rounded to us",
         lambda: next((shape[::-1] for shape in shapes), None),
-        condition=condition, repetition=int(named["repetition"]) if named else 0,
+        condition=condition, repetition=repetition,
+        notes=lambda: (note,) if doubtful else (),
         about={"resolution": "ms as stored; order within one time is lost"},
         unknown=("epoch", "units of the condition", "sync grade", "poses", "motion", "frames",
                  "polarity map", *missing),
@@ -152,12 +216,8 @@ def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, 
         raise FormatError(f"contains times that are not numbers; {_RIGHT}")
     try:
         t_us = rounded_us(times, 1000.0)
-    except OverflowError:
-        raise FormatError("contains a time out of range") from None
-    if len(t_us) and int(t_us.min()) < 0:
-        raise FormatError(
-            f"holds an event at {t_us.min() / 1000:g} ms, before its own clock started"
-        )
+    except OverflowError:  # an integer beyond any float
+        t_us = rounded_us([time if abs(time) < LATEST_US else math.nan for time in times], 1000.0)
     place = np.repeat(np.arange(len(cells)), counts)
     shape = (int(found.shape[0]), int(found.shape[1]))
     return shape, place % shape[1], place // shape[1], np.full(len(t_us), polarity), t_us

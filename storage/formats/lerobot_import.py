@@ -28,6 +28,7 @@ from sliplab.storage.formats.foreign import (
     Damage,
     ForeignTrial,
     FormatError,
+    broken,
     rounded_us,
 )
 from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
@@ -121,9 +122,13 @@ def read_lerobot(path: Path) -> Iterator[ForeignTrial]:
         InputError: it is of another version or layout, or damaged (`DamagedFile`).
     """
     data = _described(path)
+    seen: set[int] = set()
     with _refused(path):
         for row in _episodes(data):
-            yield _trial(data, row)
+            try:
+                yield _trial(data, row, seen)
+            except FormatError as error:
+                yield _broken(row, error)
 
 
 @contextmanager
@@ -145,6 +150,13 @@ def _damage(file: Path) -> Iterator[None]:
     except _DAMAGES as error:
         text = " ".join(str(error).split())[:200] or type(error).__name__
         raise Damage(f"is damaged: {text}", file) from None
+
+
+def _broken(row: Json, error: FormatError) -> ForeignTrial:
+    """Return an episode that cannot be read."""
+    number = row.get("episode_index")
+    name = f"episode-{number:06d}" if type(number) is int and 0 <= number < 10**9 else "episode"
+    return broken(name, INFO if error.file is None else error.file.name, error)
 
 
 def _described(path: Path) -> _DataSet:
@@ -180,10 +192,10 @@ def _described(path: Path) -> _DataSet:
             raise InputError(info, f"features.{key}", feature, "must be a mapping")
         if key not in _GRID:
             _add(data, key, feature)
-    if not data.cameras:
+    if not data.cameras and not data.vectors:
         raise InputError(
             info, "features", ", ".join(features) or "none",
-            "must have an image or a video: a trial without a camera has no time line",
+            "must have an image, a video from a camera, or numbers: a trial needs a stream",
         )  # fmt: skip
     return data
 
@@ -285,17 +297,12 @@ def _episodes(data: _DataSet) -> Iterator[Json]:
     files = sorted(folder.glob("chunk-*/file-*.parquet"))
     if not files:
         raise Damage("holds no file of episodes", folder)
-    seen: set[int] = set()
     for path in files:
         with _damage(path):
             file = data.file(path.relative_to(data.folder).as_posix())
             rows = [row for batch in _rows(file, keys) for row in batch.to_pylist()]
         for row in rows:
-            with _damage(path):
-                number = _whole(row, "episode_index", 10**9)
-                if number in seen:
-                    raise Damage(f"holds the episode {number} twice")
-            seen.add(number)
+            row["file"] = path
             yield row
 
 
@@ -311,8 +318,12 @@ def _place(row: Json, of: str) -> dict[str, int]:
     return {key: _whole(row, f"{of}/{key}", 10**6) for key in keys}
 
 
-def _trial(data: _DataSet, row: Json) -> ForeignTrial:
-    number, length = _whole(row, "episode_index", 10**9), _whole(row, "length", _MOST_ROWS)
+def _trial(data: _DataSet, row: Json, seen: set[int]) -> ForeignTrial:
+    with _damage(row["file"]):
+        number, length = _whole(row, "episode_index", 10**9), _whole(row, "length", _MOST_ROWS)
+        if number in seen:
+            raise Damage(f"holds the episode {number} twice")
+        seen.add(number)
     file = data.file(_LAYOUT["data_path"], **_place(row, "data"))
     keys = ["episode_index", "timestamp", *(vector.key for vector in data.vectors)]
     with _damage(file):
@@ -323,8 +334,10 @@ def _trial(data: _DataSet, row: Json) -> ForeignTrial:
             raise Damage(f"holds {count} rows of episode {number}, which has {length}")
         seconds = np.atleast_1d(_numbers(table["timestamp"].combine_chunks(), 1))
         times = rounded_us(seconds, 1e6)
-        if times[0] < 0 or times[-1] >= LATEST_US or np.any(np.diff(times) < 0):
-            raise Damage(f"holds decreasing or invalid times of episode {number}")
+        if times.min() < 0 or times[-1] >= LATEST_US or np.any(np.diff(times) < 0):
+            raise Damage(
+                f"holds decreasing or invalid times of episode {number}, or what is not a number"
+            )
         t_ns = times * 1000
         found = _Streams(t_ns, {*data.streams.values(), EVENTS_KIND, FRAMES_KIND})
         for vector in data.vectors:
@@ -334,13 +347,15 @@ def _trial(data: _DataSet, row: Json) -> ForeignTrial:
         name: _frames(_pictures(data, row, key, file, number, seconds), t_ns)
         for key, name in data.streams.items()
     }
-    first = next(cameras[FRAMES_KIND]())
+    frames = cameras.pop(FRAMES_KIND, None)
+    first = None if frames is None else next(frames())
+    size = None if first is None else (first.images.shape[2], first.images.shape[1])
     names = {name: key for key, name in data.streams.items() if name != FRAMES_KIND}
     tasks = row.get("tasks") or ()
     about = {
         "robot": data.robot or "unknown",
         "tasks": [str(task)[:500] for task in tasks][:100],
-        "camera": next(iter(data.cameras)),
+        "camera": next(iter(data.cameras), None),
         "streams": {**names, **found.sources},
         "left_out": data.left_out,
     }
@@ -350,7 +365,7 @@ def _trial(data: _DataSet, row: Json) -> ForeignTrial:
     return ForeignTrial(
         f"episode-{number:06d}", file.relative_to(data.folder).as_posix(), lambda: iter(()),
         "the episode's start; seconds of its rows, rounded to us",
-        frames=cameras.pop(FRAMES_KIND), frame_px=(first.images.shape[2], first.images.shape[1]),
+        frames=frames, frame_px=size,
         simulated=data.simulated, about=about, unknown=tuple(unknown), kind="lerobot",
         poses=found.poses, streams=found.streams, cameras=cameras,
     )  # fmt: skip
@@ -379,8 +394,6 @@ class _Streams:
         turn, per_degree = vector.of(("rx", "ry", "rz"), _ANGLES)
         if observed and place and turn and self.poses is None:
             xyz, rotation = values[:, place] * per_mm, values[:, turn] * per_degree
-            if not (np.isfinite(xyz).all() and np.isfinite(rotation).all()):
-                raise Damage(f"holds a pose in {vector.key} that is not a number")
             self.poses = PoseChunk(self.t_ns, self.t_ns, xyz, rotation)
             left = [at for at in left if at not in {*place, *turn}]
         force, _ = vector.of(("fx", "fy", "fz"), {"n": 1.0})

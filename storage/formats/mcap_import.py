@@ -1,9 +1,8 @@
-"""Reader of MCAP files with ROS 2 messages: those that SlipLab published, and other recordings.
+"""Reader of MCAP files with ROS messages: those that SlipLab published, and other recordings.
 
-A file of ours has a trial with all that belongs to it. Of any other file the first topic of
-`event_camera_msgs/msg/EventPacket` and the first one of `sensor_msgs/msg/Image` are read, with
-their ROS times. Records and chunks are read by the `mcap` library, within limits: a foreign file
-says how large its parts are.
+A file of ours has a trial with all that belongs to it; `ros_recording` makes one of any other.
+Records and chunks are read by the `mcap` library, within limits: a foreign file says how large its
+parts are.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,6 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import json_text, safe_name
 from sliplab.storage.formats import ros2_messages as ros2
 from sliplab.storage.formats.foreign import (
-    MOST_PX,
     Damage,
     ForeignTrial,
     FormatError,
@@ -43,10 +42,11 @@ from sliplab.storage.formats.mcap_trials import (
     SYNC_JSON,
 )
 from sliplab.storage.formats.original import CampaignTexts, Original, StoredTrial
+from sliplab.storage.formats.ros_recording import FRAMES, Source, recording
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.trial import Lost, Provenance, SyncResult, TrialRecord
-from sliplab.storage.streams import U8, EventChunk, FrameChunk, Json
+from sliplab.storage.streams import U8, EventChunk, Json
 from sliplab.storage.trials.checksums import PROVENANCE, RECORD
 from sliplab.storage.trials.store import INFO, PROTOCOL, RIG
 
@@ -58,8 +58,9 @@ _FAULTS = (
     struct.error, OverflowError, ValueError, KeyError, RuntimeError, MemoryError, OSError, EOFError,
 )  # fmt: skip
 """What the `mcap` library raises, besides its own errors, where a file is damaged."""
-_FRAMES_AT_ONCE = 32
-_LATEST_NS = 1 << 62
+_MOST_MESSAGES = 1 << 62
+_SCHEMAS = ("ros2msg", "ros2idl", "ros1msg")
+"""Encodings of the definitions of ROS messages."""
 DocumentT = TypeVar("DocumentT", bound=Document)
 
 
@@ -67,19 +68,15 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 class _Found:
     """What a file holds, but its events and frames."""
 
-    def first(self, kind: str) -> str | None:
-        """Return the first topic of a type of message."""
-        return next((topic for topic, of in self.topics.items() if of == kind), None)
-
     topics: dict[str, str] = field(default_factory=dict)
     """Message type by topic, in the order of the file."""
+    ros1: set[str] = field(default_factory=set)
+    """Topics whose messages are serialised as in ROS 1."""
     cameras: dict[str, str] = field(default_factory=dict)
     """Topic by the name of a camera, of a file of ours."""
     attached: dict[str, bytes] = field(default_factory=dict)
     about: dict[str, str] | None = None
     columns: dict[tuple[str, str], list[ros2.Rows]] = field(default_factory=dict)
-    size: tuple[int, int] | None = None
-    """Columns and rows of the events of other files, once they were read."""
     library: str = ""
     """The program that wrote the file."""
 
@@ -107,7 +104,16 @@ def read_mcap(path: Path, name: str) -> ForeignTrial:
     if found.about is not None:
         with as_damage():
             return _ours(path, found)
-    return _other(path, name, found, float("inf"))
+    return recording(path, name, _source(path, found))
+
+
+def mcap_source(path: Path) -> Source:
+    """Return the messages of a file as a recording by other programs has them.
+
+    Raises:
+        FormatError: it is damaged. ModuleNotFoundError: the extra `publish` is missing.
+    """
+    return _source(path, _scan(path))
 
 
 def salvage_mcap(path: Path, name: str) -> ForeignTrial:
@@ -119,10 +125,9 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
         ModuleNotFoundError: the extra `publish` is missing.
     """
     found, part = _Found(), _Part()
-    reader = _Checked(found)
     try:
-        for message in _messages(path, found, {ros2.EVENTS, ros2.IMAGE}, part=part):
-            reader.check(*message)
+        for _ in _messages(path, found, (), part=part):
+            pass
     except FormatError as error:
         reason = str(error)
     else:
@@ -133,14 +138,15 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
             "says whether it is simulated, is at its end: publish it again"
         )
     # topics behind the damage are not the file's any more
-    found, frames = _Found(), 0
-    for kind, topic, _ in _messages(path, found, {ros2.IMAGE}, part=_Part(part.at)):
-        frames += topic == found.first(kind)
+    found = _Found()
+    frames = Counter(topic for _, topic, _ in _messages(path, found, FRAMES, part=_Part(part.at)))
+    trial = recording(path, name, _source(path, found, part.at))
     lost = Lost(at_byte=part.at, unread_bytes=path.stat().st_size - part.at, reason=reason)
-    said = _messages_said(path, found.first(ros2.IMAGE))
+    said = _messages_said(path, trial.about.get("frame_topic"))
     if said is not None:
-        lost = lost.model_copy(update={"frames": max(said - frames, 0)})
-    return replace(_other(path, name, found, part.at), lost=lost, packets=part.records)
+        there = frames[trial.about["frame_topic"]]
+        lost = lost.model_copy(update={"frames": max(said - there, 0)})
+    return replace(trial, lost=lost, packets=part.records)
 
 
 def _messages_said(path: Path, topic: str | None) -> int | None:
@@ -166,7 +172,7 @@ def _messages_said(path: Path, topic: str | None) -> int | None:
             elif isinstance(record, Statistics):
                 counts = record.channel_message_counts
     found = None if counts is None else sum(counts.get(channel, 0) for channel in channels)
-    return found if found is not None and channels and found < _LATEST_NS else None
+    return found if found is not None and channels and found < _MOST_MESSAGES else None
 
 
 class _Within:
@@ -178,38 +184,6 @@ class _Within:
     def read(self, count: int) -> bytes:
         """Return up to `count` bytes."""
         return self._file.read(min(count, max(self._size - self._file.tell(), 0)))
-
-
-class _Checked:
-    """Checks events and frames of a recording by another program, message by message."""
-
-    def __init__(self, found: _Found) -> None:
-        self._found = found
-        self._last_us = self._last_ns = 0
-        self._frame_px: tuple[int, ...] | None = None
-
-    def check(self, kind: str, topic: str, data: bytes) -> None:
-        """Check one message. Raises FormatError where it cannot be right."""
-        if topic != self._found.first(kind):
-            return
-        if kind == ros2.EVENTS:
-            packet = ros2.EventPacket.parse(data)
-            chunk = _checked(ros2.unpack_mono(packet)[1], packet)
-            if len(chunk) and int(chunk.t_us[0]) < self._last_us:
-                raise FormatError("contains events with decreasing times")
-            self._last_us = int(chunk.t_us[-1]) if len(chunk) else self._last_us
-            return
-        one = ros2.Image.parse(data)
-        _check_time(one.t_ns, self._last_ns)
-        self._last_ns = one.t_ns
-        self._frame_px = self._frame_px or one.image.shape
-        if one.image.shape != self._frame_px:
-            raise FormatError("holds a frame of another size than the first")
-
-
-def _check_time(t_ns: int, last_ns: int) -> None:
-    if not last_ns <= t_ns < _LATEST_NS:
-        raise FormatError(f"holds a frame at {t_ns} ns after one at {last_ns} ns")
 
 
 def _scan(path: Path) -> _Found:
@@ -248,12 +222,21 @@ def _messages(
 
     def one(record: Any) -> Iterator[tuple[str, str, bytes]]:
         if isinstance(record, Schema):
-            schemas[record.id] = record.name if record.encoding == "ros2msg" else ""
+            schemas[record.id] = record.name if record.encoding in _SCHEMAS else ""
         elif isinstance(record, Channel):
-            kind = schemas.get(record.schema_id, "") if record.message_encoding == "cdr" else ""
+            ros1 = record.message_encoding == "ros1"
+            kind = (
+                schemas.get(record.schema_id, "")
+                if ros1 or record.message_encoding == "cdr"
+                else ""
+            )
+            if kind.count("/") == 1:  # as ROS 1 names it
+                kind = kind.replace("/", "/msg/")
             channels[record.id] = kind, record.topic
             if found is not None:
                 found.topics.setdefault(record.topic, kind)
+                if ros1:
+                    found.ros1.add(record.topic)
                 if (camera := record.metadata.get("camera")) is not None:
                     found.cameras[camera] = record.topic
         elif isinstance(record, Message):
@@ -414,7 +397,7 @@ def _column(parts: list[ros2.Rows]) -> npt.NDArray[np.generic]:
 def _our_events(path: Path, topic: str) -> Callable[[], Iterator[EventChunk]]:
     def read() -> Iterator[EventChunk]:
         for _, _, data in _messages(path, None, {ros2.EVENTS}, topic):
-            packet = ros2.EventPacket.parse(data)
+            packet = ros2.EventPacket.parse(ros2.Fields(data))
             t_ns, chunk = ros2.unpack_mono(packet)
             if np.any(t_ns % 1000):
                 raise FormatError("holds events between two microseconds of their camera")
@@ -439,43 +422,11 @@ def _checked(chunk: EventChunk, packet: ros2.EventPacket) -> EventChunk:
     return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
 
 
-def _other(path: Path, name: str, found: _Found, end: float) -> ForeignTrial:
-    """Return the trial of a recording by other programs, read up to the byte `end`."""
-    events, images = found.first(ros2.EVENTS), found.first(ros2.IMAGE)
-    if events is None:
-        there = ", ".join(sorted({kind for kind in found.topics.values() if kind})) or "none"
-        raise FormatError(
-            f"has no messages of {ros2.EVENTS}; its ROS 2 messages are: {there}"[:400]
-        )
-    left = sorted(topic for topic in found.topics if topic not in (events, images))
+def _source(path: Path, found: _Found, end: float = float("inf")) -> Source:
+    """Return the messages of a recording by other programs, read up to the byte `end`."""
 
-    def all_events() -> Iterator[EventChunk]:
-        for _, _, data in _messages(path, None, {ros2.EVENTS}, events, _Part(end)):
-            packet = ros2.EventPacket.parse(data)
-            if 0 < packet.width <= MOST_PX and 0 < packet.height <= MOST_PX:
-                found.size = packet.width, packet.height
-            yield _checked(ros2.unpack_mono(packet)[1], packet)
+    def read(topic: str) -> Iterator[bytes]:
+        for _, _, data in _messages(path, None, {found.topics[topic]}, topic, _Part(end)):
+            yield data
 
-    def all_frames() -> Iterator[FrameChunk]:
-        last = 0
-        messages = _messages(path, None, {ros2.IMAGE}, images, _Part(end))
-        for number, (_, _, data) in enumerate(messages):
-            one = ros2.Image.parse(data)
-            _check_time(one.t_ns, last)
-            last = one.t_ns
-            times = np.array([one.t_ns], np.int64)
-            yield FrameChunk(
-                one.image[None], np.array([number], np.int64), times, times, np.zeros(1, np.uint8)
-            )
-
-    frame_px = None
-    if images is not None:
-        with as_damage():
-            first = next(all_frames(), None)
-        frame_px = None if first is None else (first.images.shape[2], first.images.shape[1])
-    return ForeignTrial(
-        name, path.name, all_events, "ROS time, rounded to us", lambda: found.size,
-        frames=None if frame_px is None else all_frames, frame_px=frame_px,
-        about={"left_out": left} if left else {},
-        unknown=("sync grade", "poses", "motion", "condition"),
-    )  # fmt: skip
+    return Source(found.topics, read, frozenset(found.ros1))

@@ -3,9 +3,10 @@
 A file is a header of lines that begin with `% `, and words. The header ends at `% end`, or where a
 line is none of text; the words are decoded in `evt`. Where this deviates from faery, which tests
 compare it with, it follows the maker's documentation and decoders: events before the first time
-are dropped; vectors stand at their own base, and one that reaches beyond the camera is damage; the
-clock begins anew after a gap, too; it is not taken for begun anew where it only fell; what follows
-`% end` is no header. Times are microseconds, with the header's `T0` added, which faery writes.
+are dropped; times that no event used change no later one; vectors stand at their own base, and one
+that reaches beyond the camera is damage; the clock begins again at 0 after a gap, too, and not
+where it only fell; what follows `% end` is no header. Times are microseconds, with the header's
+`T0` added, which faery writes.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from sliplab.storage.formats.evt import (
     ROOM,
     Encoding,
     new_state,
+    raised_warning,
 )
 from sliplab.storage.formats.foreign import (
     RISING,
@@ -259,8 +261,11 @@ def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
     with as_damage():
         triggers, left_out = _triggers(path, header)
 
+    states: list[I64] = []
+
     def all_events() -> Iterator[EventChunk]:
-        for chunk, _ in _decoded(path, header):
+        states[:] = [new_state(header.t0_us, *header.bits)]
+        for chunk, _ in _decoded(path, header, states[0]):
             yield chunk
 
     unknown = ("sync grade", "poses", "motion", "condition", "frames")
@@ -269,6 +274,7 @@ def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
         lambda: header.size, triggers,
         about={"encoding": header.encoding.name, "left_out": left_out},
         unknown=unknown if triggers is not None else (*unknown, "triggers"),
+        notes=lambda: tuple(line for state in states for line in raised_warning(state)),
     )  # fmt: skip
 
 
@@ -280,16 +286,30 @@ def _triggers(path: Path, header: Header) -> tuple[Triggers | None, list[str]]:
     ):
         return None, []
     edges = np.concatenate([found for _, found in _decoded(path, header)])
+    return triggers_of(edges)
+
+
+def triggers_of(edges: I64) -> tuple[Triggers | None, list[str]]:
+    """Return the edges of the first trigger input, and the names of others.
+
+    Args:
+        edges: time (us), input, and 1 for a rising one, shape (n, 3).
+    """
     inputs = np.unique(edges[:, 1])
-    if not len(inputs):  # all of them stand before the first time
+    if not len(inputs):
         return None, []
     mine = edges[edges[:, 1] == inputs[0]]
     kind = np.where(mine[:, 2] == 1, RISING, _FALLING).astype(np.uint8)
     return Triggers(mine[:, 0].copy(), kind), [f"trigger input {one}" for one in inputs[1:]]
 
 
-def _decoded(path: Path, header: Header) -> Iterator[tuple[EventChunk, I64]]:
+def _decoded(
+    path: Path, header: Header, state: I64 | None = None
+) -> Iterator[tuple[EventChunk, I64]]:
     """Yield events, and the edges of trigger inputs among them: time (us), input, 1 if rising.
+
+    Args:
+        state: before the first word, a new one by default; changed.
 
     Raises:
         DamagedWord: after what stands before it was yielded.
@@ -297,7 +317,7 @@ def _decoded(path: Path, header: Header) -> Iterator[tuple[EventChunk, I64]]:
     most = header.encoding.most_px
     width, height = header.size or (most, most)
     item = np.dtype(header.encoding.dtype).itemsize
-    state = new_state(header.t0_us, *header.bits)
+    state = new_state(header.t0_us, *header.bits) if state is None else state
     edges = np.empty((_EDGES, 3), np.int64)
     chunk, filled = _empty(), 0
     for place, words in _blocks(path, header):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from stat import S_ISREG
 
@@ -25,7 +25,7 @@ from sliplab.storage.files import (
     write_bytes,
     write_json_aside,
 )
-from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError
+from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError, broken
 from sliplab.storage.formats.original import CampaignTexts, StoredTrial, check_arrays
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.label import LABELS, TrialLabel
@@ -87,7 +87,15 @@ def read_publication(path: Path) -> Iterator[ForeignTrial]:
         (where,) = found
         texts = _texts(where)
         for trial in trial_folders(where):
-            yield _trial(store, where, texts, trial, trial.relative_to(path).as_posix())
+            source = trial.relative_to(path).as_posix()
+            try:
+                found = _trial(store, where, texts, trial, source)
+            except InputError as error:
+                found = replace(broken(trial.name, source, error), campaign=texts)
+            except StoreError as error:
+                fault = DamagedFile(trial, "", None, str(error).removeprefix(f"{trial}: "))
+                found = replace(broken(trial.name, source, fault), campaign=texts)
+            yield found
     except StoreError as error:
         raise DamagedFile(path, "", None, str(error).removeprefix(f"{path}: ")) from None
 

@@ -7,11 +7,16 @@ a damaged file is rejected instead of skipped.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+import unicodedata
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from importlib import util
 from pathlib import Path
+
+from slugify import slugify
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
@@ -39,10 +44,20 @@ from sliplab.storage.formats.foreign import (
     FormatError,
     Skipped,
     before_damage,
+    broken,
     read_head,
     refusal,
 )
-from sliplab.storage.formats.lab_pickles import Pair, pairs, read_pair
+from sliplab.storage.formats.lab_pickles import Pair, is_stream, pairs, read_pair, unnamed
+from sliplab.storage.formats.lab_recordings import (
+    EVENTS_FOLDER,
+    check_polarity,
+    compare,
+    described,
+    is_of_run,
+    run_folder,
+    with_run,
+)
 from sliplab.storage.formats.lerobot_import import is_lerobot, read_lerobot
 from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
 from sliplab.storage.formats.prophesee import (
@@ -51,6 +66,14 @@ from sliplab.storage.formats.prophesee import (
     salvage_prophesee,
 )
 from sliplab.storage.formats.published_import import publication_at, read_publication
+from sliplab.storage.formats.ros_bags import (
+    BAG,
+    SQLITE,
+    is_bag_folder,
+    read_bag,
+    salvage_bag,
+)
+from sliplab.storage.formats.unread import unread
 from sliplab.storage.streams import Json
 
 Reader = Callable[[Path, str], ForeignTrial]
@@ -61,6 +84,7 @@ READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
     "raw": ((".raw", ".dat"), read_prophesee),
     "es": ((".es",), read_es),
     "mcap": ((".mcap",), read_mcap),
+    "rosbag": ((".bag", ".db3"), read_bag),
 }
 SALVAGE: dict[str, Reader] = {
     "aedat4": salvage_aedat4,
@@ -69,6 +93,7 @@ SALVAGE: dict[str, Reader] = {
     "raw": salvage_prophesee,
     "es": salvage_es,
     "mcap": salvage_mcap,
+    "rosbag": salvage_bag,
 }
 """Readers of what stands whole before the damage in a file, by format."""
 LAB_PICKLES = "lab-pickles"
@@ -81,6 +106,9 @@ KINDS = (*READERS, LAB_PICKLES, *DATA_SETS)
 MIXED = "mixed"
 """Files of several formats in one folder."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
+_RESERVED = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?")
+"""Names that no file has on Windows."""
+_LONGEST_NAME, _HASH = 200, 8
 
 
 def kind_of(path: Path) -> str:
@@ -93,6 +121,9 @@ def kind_of(path: Path) -> str:
         return whole
     found = _sort(path)
     if not found:
+        said = [(file, what) for file in _files(path) if (what := unread(file)) is not None]
+        if said:
+            raise InputError(said[0][0], "", None, said[0][1])
         raise InputError(
             path, "", None, f"contains no known file format; name one of {', '.join(KINDS)}"
         )
@@ -140,12 +171,35 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
         return
     wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)
     _check_names(path, wanted)
+    run = run_folder(path)
     for name, of, file in wanted:
-        yield (
-            replace(read_pair(file, name), kind=of)
-            if isinstance(file, Pair)
-            else _read(of, file, name, salvage)
-        )
+        stem = file.stem if isinstance(file, Pair) else _stem(file)
+        if isinstance(file, Pair):
+            found = _read_lab(of, file, name, salvage)
+        else:
+            found = check_polarity(_read(of, file, name, salvage), stem)
+        yield with_run(found, stem, run)
+
+
+def _read_lab(kind: str, pair: Pair, name: str, salvage: bool) -> ForeignTrial:
+    """Return a recording of the lab: of its stream, or else of its pickles."""
+    note = ""
+    try:
+        if pair.stream is not None:
+            try:
+                found = read_file(kind, pair.stream, name, salvage)
+                return described(compare(found, pair), pair.stem)
+            except FormatError as error:
+                if pair.on is None and pair.off is None:
+                    raise FormatError(str(error), pair.stream) from None
+                note = f"{pair.stream.name} is not imported: {error}"
+        found = replace(read_pair(pair, name), kind=LAB_PICKLES)
+    except (FormatError, InputError) as error:
+        if isinstance(error, FormatError):
+            first = next(path for path in (pair.stream, pair.on, pair.off) if path is not None)
+            error = refusal(error.file or first, error)
+        return broken(name, str(pair), error)
+    return replace(found, notes=lambda: (*((note,) if note else ()), *found.notes()))
 
 
 def skipped_in(path: Path, kind: str) -> list[Skipped]:
@@ -154,7 +208,7 @@ def skipped_in(path: Path, kind: str) -> list[Skipped]:
     Raises:
         InputError: as `trials_in`.
     """
-    if not path.is_dir() or kind in DATA_SETS:
+    if not path.is_dir() or kind in DATA_SETS or is_bag_folder(path):
         return []
     manifest = _read_manifest(path) if kind != LAB_PICKLES else None
     taken: set[str | None] = {EXPORT_MANIFEST}
@@ -166,9 +220,14 @@ def skipped_in(path: Path, kind: str) -> list[Skipped]:
             taken |= file.names() if isinstance(file, Pair) else {file.name}
         known = ", ".join(KINDS)
         other = f"is of no known format ({known})" if kind == MIXED else f"is no {kind} file"
+    run = run_folder(path)
+    entries = sorted(path.iterdir())
+    if run == path:
+        entries = [entry for entry in entries if not is_of_run(run, entry)]
+        entries += sorted((run / EVENTS_FOLDER).iterdir())
     return [
-        Skipped(entry.name, _reason(entry, other))
-        for entry in sorted(path.iterdir())
+        Skipped(entry.relative_to(path).as_posix(), _reason(entry, other))
+        for entry in entries
         if entry.name not in taken
     ]
 
@@ -178,7 +237,9 @@ def _reason(entry: Path, other: str) -> str:
         return "is a link"
     if entry.is_dir():
         return "is a folder; import it by itself"
-    return other if entry.is_file() else "is no regular file"
+    if not entry.is_file():
+        return "is no regular file"
+    return unread(entry) or other
 
 
 Wanted = tuple[str, str, "Path | Pair"]
@@ -188,12 +249,26 @@ Wanted = tuple[str, str, "Path | Pair"]
 def _sort(path: Path) -> list[Wanted]:
     """Return what is known in a file or folder, each with its own format, by name."""
     kinds = {file: _kind(file) for file in _files(path)}
+    lab = pairs([file for file, kind in kinds.items() if kind is None or _is_stream(file, kind)])
+    taken = {pair.stream for pair in lab}
     found: list[Wanted] = [
-        (name_of(_stem(file)), kind, file) for file, kind in kinds.items() if kind is not None
+        (_stem(file), kind, file)
+        for file, kind in kinds.items()
+        if kind is not None and file not in taken
     ]
-    left = [file for file, kind in kinds.items() if kind is None]
-    found += [(name_of(pair.stem), LAB_PICKLES, pair) for pair in pairs(left)]
-    return sorted(found, key=lambda item: item[0])
+    found += [(pair.stem, LAB_PICKLES if pair.stream is None else "lab-hdf5", pair) for pair in lab]
+    found = found or [(pair.stem, LAB_PICKLES, pair) for pair in unnamed(list(kinds))]
+    return sorted(_named(found), key=lambda item: item[0])
+
+
+def _named(found: list[Wanted]) -> list[Wanted]:
+    """Return recordings with the names of their trials in place of those of their files."""
+    names = unique_names([stem for stem, _, _ in found])
+    return [(name, kind, file) for name, (_, kind, file) in zip(names, found, strict=True)]
+
+
+def _is_stream(file: Path, kind: str | None) -> bool:
+    return kind in {"lab-hdf5", "dsec"} and is_stream(file)
 
 
 def _of_kind(path: Path, kind: str) -> list[Wanted]:
@@ -204,15 +279,18 @@ def _of_kind(path: Path, kind: str) -> list[Wanted]:
     """
     files = _files(path)
     if kind == LAB_PICKLES:
-        found = pairs(files)
+        found = pairs([file for file in files if not is_stream(file)]) or unnamed(files)
         if not found:
             raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
-        return [(name_of(pair.stem), kind, pair) for pair in found]
+        return _named([(pair.stem, kind, pair) for pair in found])
     wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
     if not wanted:
         endings = " or ".join(READERS[kind][0])
         raise InputError(path, "", None, f"holds no {kind} file; such files end in {endings}")
-    return [(name_of(_stem(file)), kind, file) for file in wanted]
+    lab = [pair for pair in pairs(files) if kind == "lab-hdf5" and pair.stream is not None]
+    taken = {pair.stream for pair in lab}
+    recordings: list[Wanted] = [(_stem(file), kind, file) for file in wanted if file not in taken]
+    return _named([*recordings, *((pair.stem, kind, pair) for pair in lab)])
 
 
 def _check_names(path: Path, wanted: list[Wanted]) -> None:
@@ -223,10 +301,7 @@ def _check_names(path: Path, wanted: list[Wanted]) -> None:
     seen: dict[str, Path | Pair] = {}
     for name, kind, file in wanted:
         if (other := seen.setdefault(name, file)) is not file:
-            one, two = (
-                item.name if isinstance(item, Path) else ", ".join(sorted(item.names()))
-                for item in (other, file)
-            )
+            one, two = (item.name if isinstance(item, Path) else item for item in (other, file))
             raise InputError(
                 path, "", None,
                 f"holds two files for the trial {name}: {one} and {two}; keep one of them, rename "
@@ -234,14 +309,61 @@ def _check_names(path: Path, wanted: list[Wanted]) -> None:
             )  # fmt: skip
         if kind == "es" and isinstance(file, Path):
             check_faery(file)
-        if kind == "mcap" and util.find_spec("mcap") is None:
-            raise ModuleNotFoundError("No module named 'mcap'", name="mcap")
+        if isinstance(file, Path) and (needed := _needs(kind, file)) is not None:
+            raise ModuleNotFoundError(f"No module named {needed!r}", name=needed)
+
+
+def _needs(kind: str, file: Path) -> str | None:
+    """Return the module that a file needs and that is not installed."""
+    needed = "mcap" if kind == "mcap" else None
+    if kind == "rosbag" and file.is_file() and read_head(file).startswith(BAG):
+        needed = "rosbags"
+    return needed if needed is not None and util.find_spec(needed) is None else None
 
 
 def name_of(stem: str) -> str:
-    """Make the name of a trial from a file's name: other characters become ``_``."""
-    plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", stem)).lstrip("=,._+-")[:200]
-    return plain or "trial"
+    """Make the name of a trial from a file's name.
+
+    Letters that are not Latin are transliterated, other characters become ``_``. Where that, or the
+    length, loses what tells names apart, the beginning of a hash of the file's name follows. Forms
+    of one text (Unicode's NFC and NFD) have one name.
+    """
+    text = unicodedata.normalize("NFC", stem)
+    plain = text
+    if not text.isascii():
+        plain = slugify(
+            text, entities=False, decimal=False, hexadecimal=False, lowercase=False, separator="_",
+            regex_pattern=_UNSAFE.pattern,
+        )  # fmt: skip
+    plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", plain)).lstrip("=,._+-").rstrip(".")
+    if _RESERVED.fullmatch(plain):
+        plain = f"trial_{plain}"
+    if text.isascii() and 0 < len(plain) <= _LONGEST_NAME:
+        return plain
+    return _with_hash(plain or "trial", text)
+
+
+def _with_hash(name: str, text: str) -> str:
+    digest = sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+    return f"{name[: _LONGEST_NAME - _HASH - 1]}-{digest[:_HASH]}"
+
+
+def unique_names(stems: Sequence[str]) -> list[str]:
+    """Return the names of trials from those of their files, also unique where case is ignored.
+
+    Of names that would be alike, those that had to be changed, or have capitals, end in a hash. The
+    same name twice stays so.
+    """
+    names = [name_of(stem) for stem in stems]
+    alike: dict[str, set[str]] = {}
+    for stem, name in zip(stems, names, strict=True):
+        alike.setdefault(name.casefold(), set()).add(stem)
+    return [
+        _with_hash(name, stem)
+        if len(alike[name.casefold()]) > 1 and not (name == stem == name.casefold())
+        else name
+        for stem, name in zip(stems, names, strict=True)
+    ]
 
 
 def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
@@ -250,6 +372,8 @@ def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     Raises:
         FormatError: it is damaged, or of another format.
     """
+    if (what := unread(file)) is not None:
+        raise FormatError(what)
     _, reader = READERS[kind]
     again = partial(SALVAGE[kind], file, name) if kind in SALVAGE else None
     try:
@@ -264,7 +388,7 @@ def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     try:
         return read_file(kind, file, name, salvage)
     except FormatError as error:
-        raise refusal(file, error) from None
+        return broken(name, file.name, refusal(error.file or file, error))
 
 
 def _stem(file: Path) -> str:
@@ -274,10 +398,18 @@ def _stem(file: Path) -> str:
 
 
 def _files(path: Path) -> list[Path]:
-    """List plain files; links are left out, for they may lead anywhere."""
-    if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
-    elif path.is_file():
+    """List plain files, and folders of one recording of ROS 2 each.
+
+    Links are left out, for they may lead anywhere.
+    """
+    if path.is_dir() and not is_bag_folder(path):
+        folder = path if (run := run_folder(path)) is None else run / EVENTS_FOLDER
+        found = sorted(
+            file
+            for file in folder.iterdir()
+            if (file.is_file() or is_bag_folder(file)) and not file.is_symlink()
+        )
+    elif path.exists():
         found = [path]
     else:
         raise InputError(path, "", None, "no such file or folder")
@@ -286,11 +418,15 @@ def _files(path: Path) -> list[Path]:
 
 def _possible(file: Path) -> tuple[str, ...]:
     """Return the formats that a file may have: by its first bytes, else by its name's ending."""
+    if file.is_dir():
+        return ("rosbag",)
     head = read_head(file)
     if head.startswith(LINE):
         return ("aedat4",)
     if head.startswith(MAGIC):
         return ("mcap",)
+    if head.startswith((SQLITE, BAG)):
+        return ("rosbag",)
     if head.startswith(SIGNATURE):
         return ("dsec", "lab-hdf5")
     if head.startswith(EVENT_STREAM):
@@ -302,12 +438,10 @@ def _possible(file: Path) -> tuple[str, ...]:
 
 
 def _kind(file: Path) -> str | None:
-    kinds = _possible(file)
+    kinds = () if unread(file) is not None else _possible(file)
     if "dsec" in kinds:
-        try:
+        with suppress(FormatError):  # its reader finds the same fault
             return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
-        except FormatError as error:
-            raise refusal(file, error) from None
     return kinds[0] if kinds else None
 
 

@@ -1,4 +1,4 @@
-"""ROS 2 messages that trials are published as: their definitions, and their bytes (CDR).
+"""ROS messages: those that trials are published as with their bytes (CDR), and their fields.
 
 Definitions are those of ROS 2 and of event_camera_msgs, with the messages that they contain, in the
 form that MCAP calls ``ros2msg``. Bytes are CDR as ROS 2 has it: four bytes that say little endian,
@@ -125,28 +125,34 @@ class CdrWriter:
         return bytes(self._data)
 
 
-class CdrReader:
+class Fields:
     """Fields of one message, one after the other, beginning with its header.
 
     Attributes:
         t_ns: stamp, ns.
 
+    Args:
+        ros1: it is one of ROS 1, whose fields follow each other without a gap.
+
     Raises:
         FormatError: it is not little-endian CDR, or ends early; also from every method.
     """
 
-    def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, 4
-        if data[:2] != b"\x00\x01":
+    def __init__(self, data: bytes, *, ros1: bool = False) -> None:
+        self._data, self._at, self.ros1 = data, 0 if ros1 else 4, ros1
+        if ros1:
+            self.number("I")  # counts messages
+        elif data[:2] != b"\x00\x01":
             raise FormatError("holds a message that is not little-endian CDR")
-        seconds, nanoseconds = self.number("i"), self.number("I")
+        seconds, nanoseconds = self.number("I" if ros1 else "i"), self.number("I")
         self.t_ns = seconds * 1_000_000_000 + nanoseconds
         self.frame = self.text()
 
     def number(self, kind: str) -> int:
         """Read an integer of a kind, a letter of `struct`."""
         size = struct.calcsize(kind)
-        self._at += -(self._at - 4) % size
+        if not self.ros1:
+            self._at += -(self._at - 4) % size
         (value,) = struct.unpack(f"<{kind}", self._take(size))
         return int(value)
 
@@ -162,6 +168,10 @@ class CdrReader:
         """Read a sequence of bytes."""
         return self._take(self.number("I"))
 
+    def rest(self) -> memoryview:
+        """Read all that is left."""
+        return self._take(len(self._data) - self._at)
+
     def _take(self, size: int) -> memoryview:
         end = self._at + size
         if end > len(self._data):
@@ -175,21 +185,22 @@ class CdrReader:
 class EventPacket:
     """A message of event_camera_msgs: events of one camera, encoded."""
 
+    t_ns: int
     width: int
     height: int
     time_base: int
     encoding: str
+    big_endian: bool
     data: memoryview
 
     @staticmethod
-    def parse(message: bytes) -> EventPacket:
+    def parse(fields: Fields) -> EventPacket:
         """Read one. Raises FormatError where it is damaged."""
-        cdr = CdrReader(message)
-        height, width = cdr.number("I"), cdr.number("I")
-        cdr.number("Q")
-        time_base, encoding = cdr.number("Q"), cdr.text()
-        cdr.number("B")
-        return EventPacket(width, height, time_base, encoding, cdr.block())
+        height, width = fields.number("I"), fields.number("I")
+        fields.number("Q")
+        time_base, encoding = fields.number("Q"), fields.text()
+        big = fields.number("B") != 0
+        return EventPacket(fields.t_ns, width, height, time_base, encoding, big, fields.block())
 
 
 @dataclass(frozen=True)
@@ -202,16 +213,16 @@ class Image:
     @staticmethod
     def parse(message: bytes) -> Image:
         """Read one. Raises FormatError where it is damaged or not ``mono8``."""
-        cdr = CdrReader(message)
-        height, width, encoding = cdr.number("I"), cdr.number("I"), cdr.text()
-        cdr.number("B")
-        step, data = cdr.number("I"), cdr.block()
+        fields = Fields(message)
+        height, width, encoding = fields.number("I"), fields.number("I"), fields.text()
+        fields.number("B")
+        step, data = fields.number("I"), fields.block()
         if encoding != MONO8:
             raise FormatError(f"holds frames as {encoding!r:.40}; {MONO8} is read")
         if width < 1 or height < 1 or step < width or len(data) != step * height:
             raise FormatError(f"holds a frame of {width} x {height} in {len(data)} bytes")
         rows = np.frombuffer(data, np.uint8).reshape(height, step)
-        return Image(cdr.t_ns, rows[:, :width])
+        return Image(fields.t_ns, rows[:, :width])
 
 
 @dataclass(frozen=True)
@@ -226,10 +237,10 @@ class Rows:
     @staticmethod
     def parse(message: bytes) -> Rows:
         """Read one. Raises FormatError where it is damaged."""
-        cdr = CdrReader(message)
-        file, column, unit, kind = (cdr.text() for _ in range(4))
-        shape = tuple(cdr.number("I") for _ in range(min(cdr.number("I"), 5)))
-        data = cdr.block()
+        fields = Fields(message)
+        file, column, unit, kind = (fields.text() for _ in range(4))
+        shape = tuple(fields.number("I") for _ in range(min(fields.number("I"), 5)))
+        data = fields.block()
         if kind not in {"<i8", "|u1", "<f4", "<f8"}:
             raise FormatError(f"holds {column!r:.40} as {kind!r:.40}, which no column is")
         row = np.dtype(kind).itemsize * int(np.prod(shape, dtype=object))
@@ -291,7 +302,7 @@ def unpack_mono(packet: EventPacket) -> tuple[npt.NDArray[np.int64], EventChunk]
         raise FormatError(f"holds events encoded as {packet.encoding!r:.40}; {MONO} is read")
     if len(packet.data) % 8 or not packet.time_base < 2**63 - 2**32:
         raise FormatError("holds a packet of events that is damaged")
-    words = np.frombuffer(packet.data, "<u8")
+    words = np.frombuffer(packet.data, ">u8" if packet.big_endian else "<u8")
     t_ns = packet.time_base + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)
     return t_ns, EventChunk(
         (words >> np.uint64(32) & np.uint64(0xFFFF)).astype(np.uint16),

@@ -22,11 +22,13 @@ import pandas as pd
 from sliplab.protocols.adapter_parts import TIME_UNITS
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.data_folder import MOST_BYTES, DataFolder
-from sliplab.storage.formats.foreign import LATEST_US, FormatError
+from sliplab.storage.formats.foreign import LATEST_US, NO_TIME_NS, FormatError
 from sliplab.storage.formats.numpy_files import ZIP_MAGIC, array_of, arrays_of
 from sliplab.storage.streams import I64
 
 MOST_TABLE = 1 << 26
+_MOST_CELLS = 1 << 14
+"""Cells of a row."""
 _SEPARATORS = "\t;, "
 _QUOTED = re.compile('"[^"]*"')
 _TOO_WIDE = re.compile(r"Expected \d+ fields in line (\d+), saw (\d+)")
@@ -171,7 +173,7 @@ def _from_csv(place: str, text: str) -> list[Row]:
 
 def read_columns(
     folder: DataFolder, name: str, form: str, columns: Mapping[str, str | int]
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], int]:
     """Read columns of numbers from a long table.
 
     Args:
@@ -180,10 +182,11 @@ def read_columns(
         columns: name or index of each column.
 
     Returns:
-        One-dimensional arrays of one length, by the keys of `columns`.
+        One-dimensional arrays of one length, by the keys of `columns`, and the number of rows of
+        CSV that were left out because they are no rows of numbers.
 
     Raises:
-        FormatError: it is damaged, lacks a column, or a cell is no number.
+        FormatError: it is damaged, lacks a column, or most rows are not of numbers.
     """
     data = folder.read(name)
     if form == "csv":
@@ -203,7 +206,7 @@ def read_columns(
     arrays = {key: _column(there, column) for key, column in columns.items()}
     if len({len(array) for array in arrays.values()}) > 1:
         raise FormatError("has columns of different lengths")
-    return arrays
+    return arrays, 0
 
 
 def _column(there: Mapping[str, Any], column: str | int) -> Any:
@@ -215,7 +218,7 @@ def _column(there: Mapping[str, Any], column: str | int) -> Any:
     return array
 
 
-def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
+def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str, Any], int]:
     lines = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace").split("\n")
     separator = _separator(lines[0])
     spaces = separator == " "  # any number of them
@@ -239,29 +242,47 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> dict[str, Any]:
             raise FormatError(f"has the column {column} twice")
     wanted = {key: int(there[str(column)]) for key, column in columns.items()}
     below = f"{'heading' if headed else 'first row'} of {len(cells)} columns"
-    try:
+    width = max(len(cells), len(second)) if headed else len(cells)
+
+    def read(**types: Any) -> pd.DataFrame:
         # all columns: with some of them alone pandas drops the cells that a row has too many
-        table = pd.read_csv(
+        return pd.read_csv(
             io.BytesIO(data), sep=r"\s+" if spaces else separator, header=None,
-            names=range(max(len(cells), len(second)) if headed else len(cells)), index_col=False,
-            skiprows=int(headed), low_memory=False, encoding="utf-8-sig",
+            names=range(width), index_col=False, skiprows=int(headed), low_memory=False,
+            encoding="utf-8-sig", **types,
         )  # fmt: skip
-    except (ValueError, OverflowError) as error:  # also pandas' own errors of parsing
-        text = " ".join(str(error).split())
-        if wide := _TOO_WIDE.search(text):
-            raise _too_wide(int(wide[2]), int(wide[1]), below) from None
-        raise FormatError(f"is not CSV: {text}") from None
+
+    line = 0
+    while True:
+        try:
+            table = read()
+            break
+        except (ValueError, OverflowError) as error:  # also pandas' own errors of parsing
+            text = " ".join(str(error).split())
+            wide = _TOO_WIDE.search(text)
+            if wide is None:
+                raise FormatError(f"is not CSV: {text}") from None
+            if not width < int(wide[2]) <= _MOST_CELLS:
+                raise _too_wide(int(wide[2]), int(wide[1]), below) from None
+            width, line = int(wide[2]), line or int(wide[1])
     if table.empty:
-        return {key: np.empty(0, np.int64) for key in wanted}
-    beyond = table.iloc[:, len(cells) :].notna()  # separators at the ends of rows make empty ones
-    if beyond.to_numpy().any():
-        at = int(beyond.any(axis=1).to_numpy().argmax())
-        last = int(np.flatnonzero(beyond.to_numpy()[at])[-1])
-        raise _too_wide(len(cells) + last + 1, 1 + headed + at, below)
-    return {
-        key: _numbers(table[index].to_numpy(), columns[key], 1 + headed)
-        for key, index in wanted.items()
-    }
+        return {key: np.empty(0, np.int64) for key in wanted}, 0
+    # separators at the ends of rows make empty cells
+    beyond = table.iloc[:, len(cells) :].notna().to_numpy()
+    good = ~beyond.any(axis=1)
+    if 2 * int(good.sum()) <= len(good):
+        at = int((~good).argmax())
+        last = int(np.flatnonzero(beyond[at])[-1])
+        raise _too_wide(len(cells) + last + 1, line or 1 + headed + at, below)
+    for index in wanted.values():
+        good &= pd.to_numeric(table[index], errors="coerce").notna().to_numpy()
+    if good.all() or 2 * int(good.sum()) <= len(good):
+        found = {key: table[index].to_numpy() for key, index in wanted.items()}
+    else:  # as text: an empty cell makes floats of whole numbers
+        words = read(dtype=dict.fromkeys(wanted.values(), str))[good]
+        found = {key: pd.to_numeric(words[index]).to_numpy() for key, index in wanted.items()}
+    rows = {key: _numbers(values, columns[key], 1 + headed) for key, values in found.items()}
+    return rows, len(table) - len(next(iter(rows.values())))
 
 
 def _cells(lines: list[str], separator: str) -> list[str]:
@@ -305,11 +326,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def times_ns(times: Any, unit: str, what: str = "time") -> I64:
+def times_ns(times: Any, unit: str) -> I64:
     """Return times in a unit as nanoseconds: whole ones exactly, fractions rounded.
 
-    Raises:
-        FormatError: one is not a number, or beyond any time.
+    What is not a number, or beyond any time, becomes `NO_TIME_NS`.
     """
     factor = TIME_UNITS[unit]
     limit = LATEST_US * 1000 // factor
@@ -319,9 +339,9 @@ def times_ns(times: Any, unit: str, what: str = "time") -> I64:
         good = np.isfinite(times) & (np.abs(np.where(np.isfinite(times), times, 0)) < limit)
     else:
         good = (times < limit) & (times > -limit if times.dtype.kind == "i" else True)
-    if not good.all():
-        at = int(np.flatnonzero(~good)[0])
-        raise FormatError(f"has a {what} that is no time in {unit}: row {at + 1} is {times[at]}")
+    times = np.where(good, times, 0)
     if times.dtype.kind == "f":
-        return np.asarray(np.rint(times.astype(np.float64) * factor), np.int64)
-    return np.asarray(times, np.int64) * factor
+        found = np.asarray(np.rint(times.astype(np.float64) * factor), np.int64)
+    else:
+        found = np.asarray(times, np.int64) * factor
+    return np.where(good, found, NO_TIME_NS)

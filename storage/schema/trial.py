@@ -260,6 +260,9 @@ class Imported(Part):
     """Labels that came with it."""
     lost: Lost | None = None
     """What is missing, of a trial that was salvaged from a damaged file."""
+    dropped: dict[str, Int] = Field(default_factory=dict)
+    """Numbers of rows that were left out because they cannot be right, by reason; written only
+    where there are any."""
 
 
 class StreamRecord(Part):
@@ -349,7 +352,10 @@ class TrialRecord(Document):
             DocumentError, NewerFormat: as `load`.
         """
         found = super().parse(data, path)
-        seen = found.geometry.event_px is not None or found.geometry.frame_px is None
+        without = found.imported is not None and not found.counts.events
+        seen = found.geometry.event_px is not None or (
+            found.geometry.frame_px is None and not without
+        )
         if found.quality.passed and seen and found.clocks.events is None:
             raise DocumentError(f"{path}: clocks.events: is missing")
         return found

@@ -135,3 +135,10 @@ def test_a_file_without_secrets_stays_as_it_is() -> None:
     for path in (*(ROOT / "rigs").glob("*.yaml"), *(ROOT / "protocols").glob("*.yaml")):
         if path.stem != "irb120":
             assert mask_secrets(path.read_text()) == path.read_text()
+
+
+def test_sections_called_key_hold_no_secret() -> None:
+    error = InputError("adapter.yaml", "factors.key.field", 7, "must be text")
+    assert error.message == "adapter.yaml: factors.key.field = 7: must be text"
+    assert MASK in InputError("rig.yaml", "devices.arm.key", "hunter2", "is unknown").message
+    assert MASK in InputError("rig.yaml", "devices.auth.user", "hunter2", "is unknown").message

@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from sliplab.protocols.adapter import load_adapter
+from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.adapted import import_adapted
 from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
@@ -82,13 +83,19 @@ SLIDES: dict[str, Any] = {
 
 
 def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = None) -> Campaign:
-    """Import `path` by an adapter into `store`, and return the campaign."""
+    """Import `path` by an adapter into `store`, and return the campaign.
+
+    Raises:
+        InputError: a trial could not be imported.
+    """
     file = store.parent / "adapter.yaml"
     file.write_text(yaml.safe_dump(adapter) if text is None else text)
     read = load_adapter(file)
     found = find_trials(read, file, DataFolder(path))
     opened = Store.create(store)
-    import_adapted(opened, read.name, found, file.read_text())
+    done = import_adapted(opened, read.name, found, file.read_text())
+    for item in done.get("failed", ()):
+        raise InputError(item["file"], "", None, item["reason"])
     assert not verify(opened)
     return opened.campaign(read.name)
 

@@ -281,9 +281,9 @@ def test_a_table_without_a_heading_keeps_its_first_row(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("1;on;2.5\n2;off;3\n")
     (tmp_path / "b.csv").write_text("t;how;x\n1;on;2.5\n")
     for name, rows in (("a.csv", 2), ("b.csv", 1)):
-        found = read_columns(folder, name, "csv", {"t": 0, "x": 2})
+        found, _ = read_columns(folder, name, "csv", {"t": 0, "x": 2})
         assert (len(found["t"]), found["x"][0]) == (rows, 2.5)
-    assert read_columns(folder, "b.csv", "csv", {"t": "t", "x": 2})["t"].tolist() == [1]
+    assert read_columns(folder, "b.csv", "csv", {"t": "t", "x": 2})[0]["t"].tolist() == [1]
     with pytest.raises(FormatError, match="has no column x; there are 1, on"):
         read_columns(folder, "a.csv", "csv", {"t": "x"})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from contextlib import closing
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
@@ -85,10 +86,10 @@ def test_frames_and_their_times_are_those_of_the_files(
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        (34, "holds more than 34 frames, as there are times"),
-        (36, "holds 35 frames, and 36 times of frames"),
-        pytest.param(32, "holds more than 32 frames", marks=FURTHER),
-        pytest.param(0, "holds more than 0 frames", marks=FURTHER),
+        (30, "holds 35 frames, and 30 times of frames"),
+        (40, "holds 35 frames, and 40 times of frames"),
+        pytest.param(64, "holds 35 frames, and 64 times of frames", marks=FURTHER),
+        pytest.param(0, "holds 35 frames, and 0 times of frames", marks=FURTHER),
     ],
 )
 def test_another_number_of_times_than_frames_is_refused(
@@ -107,7 +108,8 @@ def test_frames_that_are_none_are_refused_with_their_file(tmp_path: Path) -> Non
     write_frames(folder, "images", some_frames(2))
     other = np.zeros((12, 15), np.uint8)
     assert cv2.imwrite(str(folder / "img" / "10.png"), other)
-    refused(made, tmp_path, r"frames of \(12, 15\) and of \(12, 16\)")
+    assert imported(made, tmp_path).record.imported.dropped == {"frames of another size": 1}
+    shutil.rmtree(tmp_path / "store")
     (folder / "img" / "10.png").write_bytes(b"\x89PNG")
     refused(made, tmp_path, "an image that cannot be read: ann/img/10.png")
     (folder / "img" / "10.png").write_bytes(b"")
@@ -135,10 +137,8 @@ def test_wrong_times_of_frames_name_the_file_of_times(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     write_frames(folder, "numpy", some_frames(3))
     for times, column, message in (
-        ("1\n2\n2\n", 0, "times of frames that do not rise"),
-        ("1\nx\n2\n", 0, "column 0 that is not all numbers: row 2 is 'x'"),
+        ("1\nx\n2\n", 0, "has 1 rows without a number"),
         ("1\n2\n3\n", "t", "has no column t; there are 1"),
-        ("1\n2\ninf\n", 0, "row 3 is inf"),
     ):
         (folder / "times.csv").write_text(times)
         timed = {"files": "{who}/times.csv", "column": column, "unit": "ms"}

@@ -124,7 +124,10 @@ def foreign(folder: Path) -> dict[str, Any]:
 def take(store: Path, path: Path) -> Json:
     kind = kind_of(path)
     assert (kind, skipped_in(path, kind)) == ("lerobot", [])
-    return import_trials(Store.create(store), "theirs", trials_in(path, kind), path, kind)
+    result = import_trials(Store.create(store), "theirs", trials_in(path, kind), path, kind)
+    for item in result.get("failed", ()):
+        raise InputError(path, "", None, item["reason"])
+    return result
 
 
 def test_frames_poses_forces_and_scalars_of_every_episode(tmp_path: Path) -> None:
@@ -256,7 +259,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "no rate": (_info(fps=True), "fps = true"),
     "no features": (_info(features=[]), "features = "),
     "a feature that leads out": (_info(features={"../x": {}}), r"features = \.\./x"),
-    "no camera": (_info(features={"action": {"dtype": "float32", "shape": [2]}}), "a camera"),
+    "no stream": (_info(features={"task": {"dtype": "string", "shape": [1]}}), "a stream"),
     "info cut short": (_cut("meta/info.json"), "info.json"),
     "rows cut short": (_cut("data/chunk-000/file-000.parquet"), "file-000.parquet: is damaged"),
     "a video cut short": (_cut(f"{TOP}/chunk-000/file-000.mp4"), "file-000.mp4"),
@@ -326,3 +329,16 @@ def test_no_damaged_byte_ends_in_a_traceback(made: Path, tmp_path: Path) -> None
         shutil.rmtree(path)
     assert len(messages) > 150
     assert all(str(tmp_path) in text for text in messages)
+
+
+def test_a_data_set_without_a_camera_is_imported(tmp_path: Path) -> None:
+    made = foreign(tmp_path / "set")
+    _info(features={"action": {"dtype": "float32", "shape": [2]}})(tmp_path / "set")
+    take(tmp_path / "store", tmp_path / "set")
+    store = Store.open(tmp_path / "store")
+    assert verify(store) == []
+    first = store.campaign("theirs").recording("episode-000000")
+    np.testing.assert_array_equal(
+        first.scalars("action_1").value, made["state"][: LENGTHS[0], 1].astype(np.float64)
+    )
+    assert first.record.recorded_s == pytest.approx(4 / FPS, abs=1e-6)

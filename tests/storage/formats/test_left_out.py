@@ -1,0 +1,476 @@
+"""One wrong event, row, message, episode or file: left out and counted, and the rest imported."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.storage.files import safe_name
+from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.flatbuffers import events_buffer
+from sliplab.storage.formats.foreign import Triggers
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.recognition import kind_of, name_of, trials_in
+from sliplab.storage.streams import EventChunk, Json
+from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import failed_gates, verify
+from tests.command_line import here
+from tests.storage.formats.adapters import SLIDES, bring, slides
+from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
+from tests.storage.formats.test_lerobot_import import foreign
+
+BACK = "events whose times run back"
+NO_TIME = "events without a valid time"
+OUTSIDE = "events outside of the sensor"
+COUNT = 500
+
+
+def _take(store: Store, path: Path, *, salvage: bool = False) -> Json:
+    kind = kind_of(path)
+    found = trials_in(path, kind, salvage=salvage)
+    result = import_trials(store, "theirs", found, path, kind, salvage=salvage)
+    assert verify(store) == []
+    return result
+
+
+def _one(folder: Path, path: Path, *, salvage: bool = False) -> Recording:
+    store = Store.create(folder)
+    _take(store, path, salvage=salvage)
+    (found,) = store.campaign("theirs").recordings()
+    return found
+
+
+def _dropped(found: Recording) -> dict[str, int]:
+    assert found.record.imported is not None
+    return found.record.imported.dropped
+
+
+def _events(times: Any) -> EventChunk:
+    count = len(times)
+    column = np.arange(count, dtype=np.uint16) % 40
+    return EventChunk(column, column, (column % 2).astype(np.uint8), np.asarray(times, np.int64))
+
+
+def _aedat4(path: Path, *packets: Any) -> None:
+    with Aedat4Writer(path, {0: Stream("EVTS", "events", (40, 40), "camera")}) as file:
+        for times in packets:
+            file._write(0, events_buffer(_events(times)))
+
+
+def _dsec(path: Path, t: Any, **changed: Any) -> None:
+    events = _events(t)
+    columns = {"x": events.x, "y": events.y, "p": events.p, "t": t} | changed
+    with h5py.File(path, "w") as file:
+        for name, values in columns.items():
+            file[name if "offset" in name else f"events/{name}"] = np.asarray(values)
+
+
+@pytest.mark.parametrize("salvage", [False, True])
+def test_events_of_the_run_before_are_left_out(tmp_path: Path, salvage: bool) -> None:
+    times = 10**15 + np.arange(COUNT) * 10
+    _aedat4(tmp_path / "a.aedat4", times[:20] + 10**9, times[:300], times[300:])
+    found = _one(tmp_path / "store", tmp_path / "a.aedat4", salvage=salvage)
+    np.testing.assert_array_equal(found.events().t_us, times)
+    assert _dropped(found) == {BACK: 20}
+    assert found.record.lost is None
+    assert found.record.imported is not None
+    assert found.record.imported.warnings == (f"20 {BACK} left out",)
+
+
+def test_events_behind_a_restart_of_the_clock_are_left_out(tmp_path: Path) -> None:
+    times = np.arange(COUNT) * 10
+    _dsec(tmp_path / "a.h5", np.r_[times, times[:200]])
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, times)
+    assert _dropped(found) == {BACK: 200}
+
+
+def test_what_stands_before_damage_counts_no_events_that_run_back(tmp_path: Path) -> None:
+    times = np.arange(COUNT) * 10
+    path = tmp_path / "a.aedat4"
+    _aedat4(path, times[:20] + 10**9, times[:300], times[300:])
+    path.write_bytes(path.read_bytes()[:-9])
+    done = here("import", path, "--store", tmp_path / "s", "--name", "x")
+    assert done.returncode == 1
+    assert "--salvage imports 300 events up to 2990 us, in 2 whole packets" in done.stderr
+    found = _one(tmp_path / "store", path, salvage=True)
+    assert (len(found.events()), _dropped(found)) == (300, {BACK: 20})
+
+
+@pytest.mark.parametrize("offset", [7, [7], [[7]]])
+def test_offset_of_any_shape_with_one_number_is_added(tmp_path: Path, offset: Any) -> None:
+    _dsec(tmp_path / "a.h5", np.arange(COUNT), t_offset=offset)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, 7 + np.arange(COUNT))
+
+
+def test_polarities_of_minus_one_are_off(tmp_path: Path) -> None:
+    signed = np.where(np.arange(COUNT) % 3, 1, -1).astype(np.int8)
+    _dsec(tmp_path / "a.h5", np.arange(COUNT), p=signed)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().p, signed > 0)
+    assert _dropped(found) == {}
+
+
+def test_wrong_pixels_times_and_polarities_are_counted_by_reason(tmp_path: Path) -> None:
+    x, p, t = np.arange(COUNT) % 40, np.arange(COUNT) % 2, np.arange(COUNT) * 10
+    x[3], p[4], t[5:7] = -1, 9, (-7, 1 << 60)
+    x[[5, 4]] = 1 << 20  # wrong twice: counted once
+    _dsec(tmp_path / "a.h5", t, x=x, p=p)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(
+        found.events().t_us, np.delete(np.arange(COUNT) * 10, range(3, 7))
+    )
+    assert _dropped(found) == {OUTSIDE: 3, NO_TIME: 1}
+
+
+def test_a_file_of_many_wrong_events_is_not_imported(tmp_path: Path) -> None:
+    _dsec(tmp_path / "a.h5", np.r_[np.full(60, -5), np.arange(COUNT - 60)])
+    done = here("import", tmp_path / "a.h5", "--store", tmp_path / "store", "--name", "x")
+    assert done.returncode == 2
+    assert f"holds 60 {NO_TIME}, and 440 that can be right" in done.stderr
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0, 1e30])
+def test_floats_that_are_no_times_are_left_out(tmp_path: Path, wrong: float) -> None:
+    whole = lab_hdf5(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["events/ts"][7] = wrong
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, np.delete(whole.t_us, 7))
+    assert _dropped(found) == {NO_TIME: 1}
+
+
+@pytest.mark.usefixtures("small")
+def test_one_event_before_the_clock_costs_neither_file_nor_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "events"
+    folder.mkdir()
+    for number, times in enumerate(([10, 12], [-7, 10, 12], [10, 12])):
+        cells = lab_cells(SMALL, {(3, 5): times})
+        (folder / f"d3_s0.5_dir_up_r{number}_events_on").write_bytes(pickle.dumps(cells))
+    store = Store.create(tmp_path / "store")
+    result = _take(store, folder)
+    assert [len(one.events()) for one in store.campaign("theirs").recordings()] == [2, 2, 2]
+    (item,) = result["left_out"]
+    assert (item["trial"], item["left_out"]) == ("d3_s0.5_dir_up_r1", {NO_TIME: 1})
+
+
+def _folder(folder: Path) -> None:
+    folder.mkdir()
+    for name in ("a.h5", "c.h5", "e.h5"):
+        _dsec(folder / name, np.arange(COUNT))
+    (folder / "b.h5").write_bytes((folder / "a.h5").read_bytes()[:3000])
+    (folder / "d.h5").touch()
+    _aedat4(folder / "f.aedat4", np.arange(COUNT), np.arange(COUNT, 600))
+    (folder / "g.aedat4").write_bytes((folder / "f.aedat4").read_bytes()[:-9])
+
+
+def test_damaged_and_empty_files_of_a_folder_leave_the_others(tmp_path: Path) -> None:
+    _folder(tmp_path / "theirs")
+    line = ("import", tmp_path / "theirs", "--store", tmp_path / "store", "--name", "x")
+    done = here(*line, "--json")
+    assert done.returncode == 1
+    result = json.loads(done.stdout)
+    assert result["imported"] == ["a", "c", "e", "f"]
+    assert [item["trial"] for item in result["failed"]] == ["b", "d", "g"]
+    assert all(f"/{item['file']}: " in item["reason"] for item in result["failed"])
+    assert "not imported: g: " in done.stderr
+    assert "--salvage imports 500 events" in done.stderr
+    assert verify(Store.open(tmp_path / "store")) == []
+    again = here(*line)
+    assert again.returncode == 1
+    assert "not imported: b: " in again.stderr
+
+
+def _faulty_lerobot(folder: Path, number: int) -> None:
+    """Say a length of an episode that it has not."""
+    path = folder / "meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(path).to_pylist()
+    rows[number]["length"] = 3
+    pq.write_table(pa.Table.from_pylist(rows), path)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_one_bad_episode_leaves_the_others(tmp_path: Path, number: int) -> None:
+    foreign(tmp_path / "set")
+    _faulty_lerobot(tmp_path / "set", number)
+    store = Store.create(tmp_path / "store")
+    result = _take(store, tmp_path / "set")
+    assert result["imported"] == [f"episode-{1 - number:06d}"]
+    (failed,) = result["failed"]
+    assert failed["trial"] == f"episode-{number:06d}"
+    assert f"rows of episode {number}, which has 3" in failed["reason"]
+
+
+def _frames(path: Path, times: list[int], images: Any) -> None:
+    streams = {
+        0: Stream("EVTS", "events", (40, 40), "camera"),
+        1: Stream("FRME", "frames", (8, 6), "camera"),
+        2: Stream("TRIG", "triggers", None, "camera"),
+    }
+    with Aedat4Writer(path, streams) as file:
+        file.events(0, _events(np.arange(COUNT)))
+        file.triggers(2, Triggers(np.array([10, 5, 20, 30]), np.ones(4, np.uint8)))
+        for t_us, image in zip(times, images, strict=True):
+            file.picture(1, image, t_us)
+
+
+def test_frames_and_triggers_that_run_back_are_left_out(tmp_path: Path) -> None:
+    images = [np.full((6, 8), level, np.uint8) for level in range(5)]
+    images[3] = np.zeros((3, 4), np.uint8)
+    _frames(tmp_path / "a.aedat4", [900, 100, 200, 300, 400], images)
+    found = _one(tmp_path / "store", tmp_path / "a.aedat4")
+    assert (found.frame_times() // 1000).tolist() == [100, 200, 400]
+    assert [int(image[0, 0]) for image in found.frames()] == [1, 2, 4]
+    assert _dropped(found) == {
+        "frames of another size": 1, "frames whose times run back": 1,
+        "triggers whose times run back": 1,
+    }  # fmt: skip
+
+
+def _csv(folder: Path, change: Callable[[list[str]], list[str]]) -> Path:
+    path = folder / "rec" / "ann_0.6_0" / "events.csv"
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "row", ["x,1,1,1", "0.5,1,1", "0.5,1,1,1,1,1", ",1,1,1", "nan,1,1,1", "0.5,,1,1"]
+)
+def test_a_bad_row_of_a_table_is_left_out(tmp_path: Path, row: str) -> None:
+    slides(tmp_path / "set")
+    _csv(tmp_path / "set", lambda lines: [*lines[:40], row, *lines[40:]])
+    whole = bring(SLIDES, tmp_path / "set", tmp_path / "store").recording("ann_0.6_0")
+    assert _dropped(whole) == {"events in rows that are not all numbers": 1}
+    _csv(tmp_path / "set", lambda lines: [line for line in lines if line != row])
+    found = bring(SLIDES, tmp_path / "set", tmp_path / "again").recording("ann_0.6_0")
+    np.testing.assert_array_equal(found.events().t_us, whole.events().t_us)
+    assert _dropped(found) == {}
+
+
+def test_large_whole_numbers_beside_a_bad_row_stay_exact(tmp_path: Path) -> None:
+    from sliplab.storage.formats.data_folder import DataFolder
+    from sliplab.storage.formats.tables import read_columns
+
+    (tmp_path / "a.csv").write_text("t,x\n1700000000000000001,1\n,2\n1700000000000000003,3\n")
+    found, left_out = read_columns(DataFolder(tmp_path), "a.csv", "csv", {"t": "t", "x": "x"})
+    assert (found["t"].tolist(), left_out) == ([1700000000000000001, 1700000000000000003], 1)
+
+
+def test_one_file_without_a_column_leaves_the_others(tmp_path: Path) -> None:
+    slides(tmp_path / "set")
+    _csv(tmp_path / "set", lambda lines: [line.replace("polarity", "sign") for line in lines])
+    (tmp_path / "a.yaml").write_text(json.dumps(SLIDES))
+    line = ("import", "--adapter", tmp_path / "a.yaml", tmp_path / "set")
+    done = here(*line, "--store", tmp_path / "store", "--json")
+    assert done.returncode == 1
+    result = json.loads(done.stdout)
+    assert [item["trial"] for item in result["failed"]] == ["ann_0.6_0"]
+    assert "has no column polarity" in result["failed"][0]["reason"]
+    assert len(result["imported"]) == 3
+
+
+def test_one_label_outside_of_its_recording_leaves_the_others(tmp_path: Path) -> None:
+    slides(tmp_path / "set")
+    table = pd.read_csv(tmp_path / "set" / "onsets.csv")
+    table.loc[0, "full"] = 10**6
+    table.to_csv(tmp_path / "set" / "onsets.csv", index=False)
+    (tmp_path / "a.yaml").write_text(json.dumps(SLIDES))
+    line = ("import", "--adapter", tmp_path / "a.yaml", tmp_path / "set")
+    done = here(*line, "--store", tmp_path / "store", "--json")
+    assert done.returncode == 1
+    (failed,) = json.loads(done.stdout)["failed"]
+    assert failed["trial"] == table["trial"][0]
+    assert "lies outside of the recording" in failed["reason"]
+
+
+@pytest.mark.parametrize("change", [-2, 1])
+def test_a_video_and_its_times_of_different_lengths_are_paired(tmp_path: Path, change: int) -> None:
+    slides(tmp_path / "set")
+    path = tmp_path / "set" / "rec" / "ann_0.6_0" / "img" / "t.npy"
+    times = np.load(path)
+    count = len(times)
+    np.save(path, times[:change] if change < 0 else np.r_[times, times[-1] + 10])
+    found = bring(SLIDES, tmp_path / "set", tmp_path / "store").recording("ann_0.6_0")
+    assert len(found.frame_times()) == min(count, count + change)
+    assert found.record.imported is not None
+    text = f"holds {count} frames, and {count + change} times of frames"
+    assert any(text in each for each in found.record.imported.warnings)
+
+
+def test_samples_without_a_number_or_order_are_left_out(tmp_path: Path) -> None:
+    slides(tmp_path / "set")
+    path = tmp_path / "set" / "rec" / "ann_0.6_0" / "force.npz"
+    with np.load(path) as file:
+        arrays = {name: file[name].astype(float) for name in file.files}
+    count = len(arrays["t"])
+    arrays = {name: np.tile(values, 3) for name, values in arrays.items()}
+    arrays["t"] = np.arange(3.0 * count) * 1000
+    arrays["x"][2], arrays["t"][0], arrays["t"][3] = np.nan, 1e9, np.nan
+    np.savez(path, **arrays)
+    found = bring(SLIDES, tmp_path / "set", tmp_path / "store").recording("ann_0.6_0")
+    assert len(found.wrenches("force")) == 3 * count - 3
+    assert _dropped(found) == {
+        "rows of force without a valid time": 1,
+        "rows of force with a value that is not a number": 1,
+        "rows of force whose times run back": 1,
+    }
+
+
+def test_single_precision_unix_times_fail_their_gates(tmp_path: Path) -> None:
+    lab_hdf5(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        seconds = (1.7e9 + file["events/ts"][:]).astype(np.float32)
+        del file["events/ts"]
+        file["events/ts"] = seconds
+    done = here("import", tmp_path / "a.h5", "--store", tmp_path / "store", "--name", "theirs")
+    assert done.returncode == 0
+    assert "the times of events have steps of 1.28e+08 us" in done.stderr
+    assert "all 50 events have one time" in done.stderr
+    store = Store.open(tmp_path / "store")
+    (found,) = store.campaign("theirs").recordings()
+    quality = found.record.quality
+    assert (quality.passed, set(quality.gates)) == (
+        False, {"events_time_resolution_us", "events_times"}
+    )  # fmt: skip
+    assert catalogue(store)["passed"].tolist() == [False]
+    checked = here("verify", tmp_path / "store")
+    assert checked.returncode == 0
+    assert "theirs/a: does not pass events_time_resolution_us, events_times" in checked.stderr
+
+
+def test_single_precision_times_near_zero_pass(tmp_path: Path) -> None:
+    lab_hdf5(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        seconds = file["events/ts"][:].astype(np.float32)
+        del file["events/ts"]
+        file["events/ts"] = seconds
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    assert found.record.quality.passed
+    assert not failed_gates(Store.open(tmp_path / "store"))
+
+
+def test_times_in_another_unit_fail_their_gate(tmp_path: Path) -> None:
+    _dsec(tmp_path / "a.h5", np.arange(COUNT) // 300)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    assert set(found.record.quality.gates) == {"events_rate"}
+
+
+@pytest.mark.parametrize(("same", "gates"), [(True, {"frames_change"}), (False, set())])
+def test_frames_that_never_change_fail_their_gate(
+    tmp_path: Path, same: bool, gates: set[str]
+) -> None:
+    images = [np.full((6, 8), 7 if same else level, np.uint8) for level in range(4)]
+    _frames(tmp_path / "a.aedat4", [100, 200, 300, 400], images)
+    found = _one(tmp_path / "store", tmp_path / "a.aedat4")
+    assert set(found.record.quality.gates) == gates
+
+
+def test_frames_of_one_time_fail_their_gate(tmp_path: Path) -> None:
+    images = [np.full((6, 8), level, np.uint8) for level in range(4)]
+    _frames(tmp_path / "a.aedat4", [100] * 4, images)
+    found = _one(tmp_path / "store", tmp_path / "a.aedat4")
+    assert set(found.record.quality.gates) == {"frames_times"}
+
+
+def test_trials_that_fail_their_gates_are_in_no_part_of_a_split(tmp_path: Path) -> None:
+    slides(tmp_path / "set")
+    folder = tmp_path / "set" / "rec" / "ann_0.6_0" / "img"
+    first = cv2.imread(str(sorted(folder.glob("*.png"))[0]))
+    for path in folder.glob("*.png"):
+        cv2.imwrite(str(path), first)
+    campaign = bring(SLIDES, tmp_path / "set", tmp_path / "store")
+    assert "ann_0.6_0" in campaign.committed()
+    assert "ann_0.6_0" not in {trial.id for trial, _ in Collected(campaign).trials}
+
+
+def _left_open(path: Path, *, swmr: bool) -> None:
+    """Write a file in a process that dies with the file open."""
+    code = f"""
+import os, h5py, numpy as np
+file = h5py.File({str(path)!r}, "w", libver="latest")
+for name, values in dict(x=np.arange(500) % 40, y=np.arange(500) % 40, p=np.arange(500) % 2,
+                         t=np.arange(500) * 10).items():
+    file.create_dataset(f"events/{{name}}", data=values, chunks=(100,), maxshape=(None,))
+if {swmr}:
+    file.swmr_mode = True
+else:
+    file.close()
+    file = h5py.File({str(path)!r}, "r+", libver="latest")
+    file.attrs["more"] = 1
+file.flush()
+os._exit(1)
+"""
+    subprocess.run([sys.executable, "-c", code], check=False)
+
+
+def test_a_file_that_its_writer_left_open_is_read(tmp_path: Path) -> None:
+    _left_open(tmp_path / "a.h5", swmr=True)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, np.arange(500) * 10)
+    assert found.record.imported is not None
+    assert "was left open by its writer" in found.record.imported.warnings[0]
+
+
+def test_a_file_that_is_marked_as_written_says_what_clears_the_mark(tmp_path: Path) -> None:
+    _left_open(tmp_path / "a.h5", swmr=False)
+    done = here("import", tmp_path / "a.h5", "--store", tmp_path / "store", "--name", "x")
+    assert done.returncode == 1
+    assert "`h5clear -s a.h5` makes it readable" in done.stderr
+
+
+def test_names_in_any_script_stay_apart_and_are_in_the_record(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    stems = [
+        "测试",
+        "テスト",
+        "Проба 1",
+        "Проба 2",
+        "e\u0301",
+        "\u00e9",
+        "TRIAL",
+        "trial",
+        "a b",
+        "a:b",
+    ]
+    for stem in stems:
+        _dsec(folder / f"{stem}.h5", np.arange(COUNT))
+    store = Store.create(tmp_path / "store")
+    result = _take(store, folder)
+    names = result["imported"]
+    assert len({name.casefold() for name in names}) == len(stems)
+    assert all(name.isascii() for name in names)
+    records = [one.record for one in store.campaign("theirs").recordings()]
+    files = {record.imported.source: record.trial for record in records if record.imported}
+    assert set(files) == {f"{stem}.h5" for stem in stems}
+    assert files["测试.h5"].startswith("Ce_Shi-")
+    assert files["Проба 1.h5"].startswith("Proba_1-")
+    assert files["trial.h5"] == "trial"
+    assert _take(store, folder)["imported"] == []
+
+
+@pytest.mark.parametrize("name", ["a" * 251, "ü" * 125, "con", "trial.", "...", "\udcff"])
+def test_names_that_no_file_system_has_are_changed(name: str) -> None:
+    made = name_of(name)
+    assert len(made) <= 200
+    safe_name(made)
+    assert made.lower() not in {"con", "trial."}
+    assert not made.endswith(".")
