@@ -254,7 +254,8 @@ def before_damage(
             raise error
         if salvage:
             return whole
-        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in whole.events())]
+        chunks = (inside(chunk, whole.event_px()) for chunk in whole.events())
+        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in chunks)]
         times = np.concatenate(parts)
         times = times[in_order(times)]
     except FormatError as fault:
