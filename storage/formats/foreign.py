@@ -306,9 +306,14 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -
         good = right
     if good is not None:
         columns = [column[good] for column in columns]
-    types = (np.uint16, np.uint16, np.uint8, np.int64)
-    made = (np.ascontiguousarray(c, kind) for c, kind in zip(columns, types, strict=True))
-    return ForeignChunk(*made, left_out, resolution_us)
+    return ForeignChunk(
+        np.ascontiguousarray(columns[0], np.uint16),
+        np.ascontiguousarray(columns[1], np.uint16),
+        np.ascontiguousarray(columns[2], np.uint8),
+        np.ascontiguousarray(columns[3], np.int64),
+        left_out,
+        resolution_us,
+    )
 
 
 def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
@@ -321,8 +326,8 @@ def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
     left_out = Counter(left_out_of(chunk))
     left_out[OUTSIDE] += len(good) - int(good.sum())
     resolution = chunk.resolution_us if isinstance(chunk, ForeignChunk) else 0.0
-    columns = (column[good] for column in (chunk.x, chunk.y, chunk.p, chunk.t_us))
-    return ForeignChunk(*columns, left_out, resolution)
+    x, y, p, t_us = chunk.x[good], chunk.y[good], chunk.p[good], chunk.t_us[good]
+    return ForeignChunk(x, y, p, t_us, left_out, resolution)
 
 
 def left_out_of(chunk: EventChunk) -> Mapping[str, int]:
