@@ -34,7 +34,7 @@ NO_TIME = "{} without a valid time"
 """Reasons why rows are left out, by what they are."""
 NO_TIME_NS = -(1 << 63)
 """In place of a time that is not a number or is out of range."""
-ChunkT = TypeVar("ChunkT", EventChunk, FrameChunk, PoseChunk, WrenchChunk, ScalarChunk)
+ChunkT = TypeVar("ChunkT", bound=EventChunk | FrameChunk | PoseChunk | WrenchChunk | ScalarChunk)
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
 EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
