@@ -140,8 +140,9 @@ def _span_of_rows(recording: Recording) -> tuple[int, int]:
     record = recording.record
     if record.counts.events:
         with recording.open() as reader:
-            times = reader.event_times()[[0, -1]] * 1000
-        return tuple(map(int, recording.clock("events").to_reference(times)))
+            first, last = (int(t) * 1000 for t in reader.event_times()[[0, -1]])
+        line = recording.clock("events").to_reference
+        return int(line(first)), int(line(last))
     ends: list[int] = []
     if record.counts.frames:
         times = recording.frame_times()

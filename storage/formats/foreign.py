@@ -34,7 +34,7 @@ NO_TIME = "{} without a valid time"
 """Reasons why rows are left out, by what they are."""
 NO_TIME_NS = -(1 << 63)
 """In place of a time that is not a number or is out of range."""
-ChunkT = TypeVar("ChunkT", EventChunk, FrameChunk, PoseChunk, WrenchChunk, ScalarChunk)
+ChunkT = TypeVar("ChunkT", bound=EventChunk | FrameChunk | PoseChunk | WrenchChunk | ScalarChunk)
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
 EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
@@ -255,7 +255,8 @@ def before_damage(
             raise error
         if salvage:
             return whole
-        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in whole.events())]
+        chunks = (inside(chunk, whole.event_px()) for chunk in whole.events())
+        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in chunks)]
         times = np.concatenate(parts)
         times = times[in_order(times)]
     except FormatError as fault:
@@ -306,9 +307,14 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -
         good = right
     if good is not None:
         columns = [column[good] for column in columns]
-    types = (np.uint16, np.uint16, np.uint8, np.int64)
-    made = (np.ascontiguousarray(c, kind) for c, kind in zip(columns, types, strict=True))
-    return ForeignChunk(*made, left_out, resolution_us)
+    return ForeignChunk(
+        np.ascontiguousarray(columns[0], np.uint16),
+        np.ascontiguousarray(columns[1], np.uint16),
+        np.ascontiguousarray(columns[2], np.uint8),
+        np.ascontiguousarray(columns[3], np.int64),
+        left_out,
+        resolution_us,
+    )
 
 
 def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
@@ -321,8 +327,8 @@ def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
     left_out = Counter(left_out_of(chunk))
     left_out[OUTSIDE] += len(good) - int(good.sum())
     resolution = chunk.resolution_us if isinstance(chunk, ForeignChunk) else 0.0
-    columns = (column[good] for column in (chunk.x, chunk.y, chunk.p, chunk.t_us))
-    return ForeignChunk(*columns, left_out, resolution)
+    x, y, p, t_us = chunk.x[good], chunk.y[good], chunk.p[good], chunk.t_us[good]
+    return ForeignChunk(x, y, p, t_us, left_out, resolution)
 
 
 def left_out_of(chunk: EventChunk) -> Mapping[str, int]:

@@ -89,7 +89,7 @@ _LEAST_SHARE = 0.01
 """Share of the rows that must be in order of time."""
 _MOST_RATE, _FEW = 1e8, 100
 """Events a second that no camera sends; of fewer events the rate says nothing."""
-SampleT = TypeVar("SampleT", PoseChunk, WrenchChunk, ScalarChunk)
+SampleT = TypeVar("SampleT", bound=PoseChunk | WrenchChunk | ScalarChunk)
 _UNKNOWN = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
 
 

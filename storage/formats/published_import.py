@@ -89,13 +89,13 @@ def read_publication(path: Path) -> Iterator[ForeignTrial]:
         for trial in trial_folders(where):
             source = trial.relative_to(path).as_posix()
             try:
-                found = _trial(store, where, texts, trial, source)
+                made = _trial(store, where, texts, trial, source)
             except InputError as error:
-                found = replace(broken(trial.name, source, error), campaign=texts)
+                made = replace(broken(trial.name, source, error), campaign=texts)
             except StoreError as error:
                 fault = DamagedFile(trial, "", None, str(error).removeprefix(f"{trial}: "))
-                found = replace(broken(trial.name, source, fault), campaign=texts)
-            yield found
+                made = replace(broken(trial.name, source, fault), campaign=texts)
+            yield made
     except StoreError as error:
         raise DamagedFile(path, "", None, str(error).removeprefix(f"{path}: ")) from None
 

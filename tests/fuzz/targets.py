@@ -206,6 +206,8 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
             import_trials(made, "again", found, where, "mcap", salvage=salvage)
             return
         for trial in trials_in(where, kind_of(where), salvage=bool(len(data) % 2)):
+            if trial.error is not None:
+                raise trial.error
             sum(len(chunk) for chunk in trial.events())
             sum(len(chunk) for chunk in (trial.frames or (lambda: iter(())))())
             json.dumps([trial.about, trial.condition], allow_nan=False)

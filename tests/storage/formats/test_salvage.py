@@ -236,16 +236,20 @@ def _table(rows: list[tuple[int, int, int, int]]) -> bytes:
     return struct.pack("<I", len(made)) + bytes(made)
 
 
-def test_a_packet_with_an_event_outside_of_the_camera_is_damaged(tmp_path: Path) -> None:
+def test_an_event_outside_of_the_camera_is_no_damage(tmp_path: Path) -> None:
     path, whole = tmp_path / "a.aedat4", all_events()
-    whole.x[17 * PACKET + 5] = 640
+    wrong = 17 * PACKET + 5
+    whole.x[wrong] = 640
     with Aedat4Writer(path, {0: Stream("EVTS", "events", (640, 480), "camera")}) as file:
         for low in range(0, COUNT, PACKET):
             file.events(0, part_of(whole, low, low + PACKET))
-    plain, saved = _try(tmp_path, "aedat4", path.read_bytes())
-    assert "outside of the 640 x 480 pixels" in str(plain.error)
-    assert saved.found is not None
-    assert _is_prefix(saved.found) == 17 * PACKET
+    for outcome in _try(tmp_path, "aedat4", path.read_bytes()):
+        assert outcome.found is not None
+        expected = np.delete(whole.t_us, wrong)
+        np.testing.assert_array_equal(outcome.found.events().t_us, expected)
+        imported = outcome.found.record.imported
+        assert imported is not None
+        assert imported.dropped == {"events outside of the sensor": 1}
 
 
 def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
