@@ -237,10 +237,11 @@ def _short_turns() -> Iterator[None]:
 @contextmanager
 def _counting(request: DetectRequest) -> Iterator[Counting]:
     """Yield the model's network; in a process of its own where there is a safe state to go to."""
-    if request.timeouts is None:
+    limit_ns = None if request.timeouts is None else request.timeouts.decision_ns
+    if limit_ns is None:
         yield counting_of(request.fitted)
         return
-    answer_s = PATIENT_S if request.rig.in_virtual_time else request.timeouts.decision_ns / 1e9
+    answer_s = PATIENT_S if request.rig.in_virtual_time else limit_ns / 1e9
     try:
         network = NetworkProcess(request.model, answer_s)
     except NetworkLost as error:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 
 class HostClock:
@@ -29,18 +30,24 @@ STEP_S = 0.1
 
 
 class StallTimer:
-    """Measures how long a value that ought to change has not changed; call it regularly."""
+    """Measures how long a value that ought to change has not changed; call it regularly.
 
-    def __init__(self) -> None:
-        self._mark: int | None = None
+    Args:
+        now_ns: clock; left out, the host's monotonic one.
+        step_s: longest time between two calls that is counted, s.
+    """
+
+    def __init__(self, now_ns: Callable[[], int] | None = None, step_s: float = STEP_S) -> None:
+        self._now_ns, self._step_ns = now_ns, round(step_s * 1e9)
+        self._mark: object = None
         self._last_ns = self._waited_ns = 0
 
-    def waited_s(self, mark: int) -> float:
+    def waited_s(self, mark: object) -> float:
         """Return how long `mark` has been the same, s."""
-        now_ns = time.monotonic_ns()
+        now_ns = (self._now_ns or time.monotonic_ns)()
         if mark != self._mark:
             self._mark, self._waited_ns = mark, 0
         else:
-            self._waited_ns += min(now_ns - self._last_ns, round(STEP_S * 1e9))
+            self._waited_ns += min(now_ns - self._last_ns, self._step_ns)
         self._last_ns = now_ns
         return self._waited_ns / 1e9
