@@ -49,10 +49,10 @@ class ForceLimitError(RigError):
 class ForceWatch:
     """A force sensor that is read for its limit; it streams from now on.
 
-    Where a decision hangs on its readings (there is a limit, or a press ends at a force) a reading
-    that is none is a fault, as is a sensor without a new sample for `SILENT_S`, and one whose
-    readings stay exactly the same while the arm moves `BLIND_MM` in contact. Clear of the plate an
-    ideal simulated sensor is constant; in contact none is.
+    A force that is not finite is a fault. Where a decision hangs on the readings (there is a limit,
+    or a press ends at a force) so is a sensor without a newer sample for `SILENT_S`, and one whose
+    forces stay exactly the same while the arm moves `BLIND_MM` in contact, and not outwards. Clear
+    of the plate an ideal simulated sensor is constant; in contact none is.
 
     Args:
         limit_n: largest force on the plate, in any direction; None for no limit.
@@ -117,7 +117,7 @@ class ForceWatch:
         self._check_shape(chunk)
         if len(chunk):
             forces = chunk.force_n @ self._to_plate.T
-            if self.needed and not np.isfinite(forces).all():
+            if not np.isfinite(forces).all():
                 bad = chunk.force_n[~np.isfinite(chunk.force_n).all(axis=1)][0]
                 raise _unusable(f"reads a force that is no number: {bad.tolist()} N")
             self._keep(chunk, forces[:, 2])
@@ -204,10 +204,9 @@ class ForceWatch:
 
     def _keep(self, chunk: WrenchChunk, normal_n: _F64) -> None:
         """Keep what the line is laid through: samples newer than all before them."""
-        rows = np.concatenate([chunk.force_n, chunk.torque_nm], axis=1)
-        if self._last is None or (rows != self._last).any():
+        if self._last is None or (chunk.force_n != self._last).any():
             self._changed_at = None
-        self._last = rows[-1]
+        self._last = chunk.force_n[-1].copy()
         t_ns, host_ns = chunk.t_ns, chunk.host_ns
         floor = self._t_ns[-1:] if len(self._t_ns) else np.array([np.iinfo(np.int64).min])
         newer = t_ns > np.maximum.accumulate(np.concatenate([floor, t_ns[:-1]]))
