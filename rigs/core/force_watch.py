@@ -116,10 +116,11 @@ class ForceWatch:
         chunk = self._sensor.read()
         self._check_shape(chunk)
         if len(chunk):
+            finite = np.isfinite(chunk.force_n).all(axis=1)
+            if not finite.all():
+                bad = chunk.force_n[~finite][0].tolist()
+                raise _unusable(f"reads a force that is no number: {bad} N")
             forces = chunk.force_n @ self._to_plate.T
-            if not np.isfinite(forces).all():
-                bad = chunk.force_n[~np.isfinite(chunk.force_n).all(axis=1)][0]
-                raise _unusable(f"reads a force that is no number: {bad.tolist()} N")
             self._keep(chunk, forces[:, 2])
             self._check_limit(forces)
         if self.needed:
