@@ -124,26 +124,36 @@ class Guard:
             default=math.inf,
         )
 
-    def check(
-        self,
-        begin: Pose,
-        path: Sequence[Segment],
-        plate: PlateFrame | None = None,
-        closed_mm: float = 0.0,
-    ) -> None:
-        """Check a path that starts at `begin` against the limits.
+    def check(self, begin: Pose, path: Sequence[Segment]) -> None:
+        """Check a path that starts at `begin` against the arm's limits.
 
-        `begin` itself may be outside: an arm that was jogged there must be able to return. With
-        `plate` a path may also end outside, if no farther than it began.
+        `begin` itself may be outside: an arm that was jogged there must be able to return.
+
+        Raises:
+            GuardError: the first violation, with its value and its limit.
+            RigError: a number that is not finite.
+        """
+        self._check(begin, path, None, 0.0)
+
+    def check_segment(
+        self, begin: Pose, segment: Segment, plate: PlateFrame, closed_mm: float = 0.0
+    ) -> None:
+        """Check a segment against all limits, in the frame that the rig uses.
+
+        A segment from outside may end outside, if no farther than it began.
 
         Args:
-            plate: frame of the rig's own limits.
             closed_mm: what the fingers add to the depth.
 
         Raises:
             GuardError: the first violation, with its value and its limit.
             RigError: a number that is not finite.
         """
+        self._check(begin, [segment], plate, closed_mm)
+
+    def _check(
+        self, begin: Pose, path: Sequence[Segment], plate: PlateFrame | None, closed_mm: float
+    ) -> None:
         at = begin
         for index, segment in enumerate(path):
             where = f"segment {index + 1} of {len(path)}"

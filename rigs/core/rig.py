@@ -401,7 +401,7 @@ class Rig:
 
     def _send(self, segment: Segment, begin: Pose) -> None:
         """Check a segment, and send it: the one place from which the arm receives its motion."""
-        self.guard.check(begin, [segment], self.plate_frame, self._closed_mm)
+        self.guard.check_segment(begin, segment, self.plate_frame, self._closed_mm)
         self.arm.start([segment])
         self._motion = MotionWatch(
             self.guard, segment, begin, self.plate_frame, self._closed_mm, self.clock.now_ns,

@@ -91,25 +91,25 @@ def at(x: float, y: float, depth: float) -> Pose:
 
 def test_limits_of_the_rig_count_in_the_frame_it_uses() -> None:
     held = Guard(None, PlateLimits(depth_mm=3.0, reach_mm=10.0, speed_mm_s=20.0, rim_mm=10.0))
-    held.check(at(0, 0, -5), [Segment(at(8, 6, 3.0), 20.0)], FRAME)
+    held.check_segment(at(0, 0, -5), Segment(at(8, 6, 3.0), 20.0), FRAME)
     for frame, closed_mm in ((FRAME.with_zero(-0.5), 0.0), (FRAME, 0.5)):
         with pytest.raises(DepthError, match=r"depth in contact 3\.5 mm is beyond its limit 3 mm"):
-            held.check(at(0, 0, -5), [Segment(at(0, 0, 3.0), 20.0)], frame, closed_mm)
+            held.check_segment(at(0, 0, -5), Segment(at(0, 0, 3.0), 20.0), frame, closed_mm)
     with pytest.raises(WorkspaceError, match=r"distance from the plate's centre 10\.3"):
-        held.check(at(0, 0, -5), [Segment(at(8, 6.5, 0), 20.0)], FRAME)
+        held.check_segment(at(0, 0, -5), Segment(at(8, 6.5, 0), 20.0), FRAME)
     with pytest.raises(SpeedError, match=r"rim at 120 deg/s: 20\.94 mm/s"):
-        held.check(at(0, 0, -5), [Segment(at(0, 0, -5), 10.0, turn_deg_s=120.0)], FRAME)
+        held.check_segment(at(0, 0, -5), Segment(at(0, 0, -5), 10.0, turn_deg_s=120.0), FRAME)
     assert held.speed_mm_s == 20.0
 
 
 def test_path_from_outside_may_end_no_farther_outside() -> None:
     held = Guard(None, PlateLimits(3.0, 10.0, 20.0))
     begin = at(14, 0, 4)
-    held.check(begin, [Segment(at(14, 0, -5), 5.0)], FRAME)
-    held.check(begin, [Segment(at(0, 0, -5), 5.0)], FRAME)
+    held.check_segment(begin, Segment(at(14, 0, -5), 5.0), FRAME)
+    held.check_segment(begin, Segment(at(0, 0, -5), 5.0), FRAME)
     for end in (at(14.1, 0, -5), at(0, 0, 4.1)):
         with pytest.raises(GuardError):
-            held.check(begin, [Segment(end, 5.0)], FRAME)
+            held.check_segment(begin, Segment(end, 5.0), FRAME)
 
 
 def test_measured_poses_may_scatter_about_a_limit() -> None:
