@@ -29,7 +29,7 @@ from sliplab.protocols.program import (
     Step,
     Twist,
 )
-from sliplab.protocols.timing import Timing
+from sliplab.protocols.timing import ForceTiming, Timing
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.capabilities import (
     Arm,
@@ -356,16 +356,13 @@ class Rig:
             leaving: the arm moves clear of the plate.
         """
         assert self.force is not None
-        timing = self.timing.force
-        shortest, longest = (
-            (0.0, 0.0) if timing is None
-            else (timing.delay.shortest_us * 1e-6, timing.delay.longest_us * 1e-6)
-        )  # fmt: skip
+        delay = (self.timing.force or ForceTiming()).delay
         zeroed = self._zeroed or self.force.zeroing != "trial"
         limit_n = None if turns and not zeroed else self.force_limit_n
         self._forces = ForceWatch(
-            self.force, self.plate_frame, limit_n, shortest, longest_s=longest,
-            now_ns=self.clock.now_ns, zeroed=zeroed, leaving=leaving,
+            self.force, self.plate_frame, limit_n, delay.shortest_us * 1e-6,
+            longest_s=delay.longest_us * 1e-6, now_ns=self.clock.now_ns, zeroed=zeroed,
+            leaving=leaving,
         )  # fmt: skip
         self._forces.needed = self.force_limit_n is not None
         return self._forces
@@ -680,10 +677,10 @@ class Rig:
             raise arm_fault(progress.state, phase)
         if not progress.finished:
             raise ArmFault("arm", f"was stopped from outside in the phase '{phase}'")
-        self._check_end(segment, phase)
+        self._check_end(segment, phase, sink)
         return *progress.finished[-1], False
 
-    def _check_end(self, segment: Segment, phase: str) -> None:
+    def _check_end(self, segment: Segment, phase: str, sink: Sink | None) -> None:
         """Check that the arm is where its path ends; a pose may show it a little later.
 
         Raises:
@@ -695,7 +692,7 @@ class Rig:
                 off = f"{distance_mm(here, segment.to):.1f} mm, {angle_deg(here, segment.to):.1f}"
                 text = f"reports the phase '{phase}' as finished, and its pose is {off} deg off"
                 raise ArmFault("arm", f"{text}: check the arm before the next move")
-            self.clock.wait(force_watch.POLL_S)
+            self.wait(force_watch.POLL_S, sink)
 
     def wait(self, seconds: float, sink: Sink | None = None) -> None:
         """Let time pass; read streams and check for stop requests every `poll_s`.

@@ -213,6 +213,23 @@ def test_force_that_rises_while_the_arm_moves_clear_stops_it() -> None:
     assert rig.arm.progress().done
 
 
+def test_limit_passed_by_one_sample_between_two_readings_is_seen() -> None:
+    rig = make_rig(limit_n=20.0)
+    sensor = rig.force
+    assert sensor is not None
+    read = sensor.read
+
+    def spiked() -> WrenchChunk:
+        chunk = read()
+        if rig.position().x_mm > 1.0:
+            chunk.force_n[len(chunk) // 2 : len(chunk) // 2 + 1, 0] = -21.0
+        return chunk
+
+    sensor.read = spiked  # type: ignore[method-assign]
+    with pytest.raises(ForceLimitError, match=r"21\.\d+ N on the plate"):
+        watched_trial(rig)
+
+
 def test_load_before_the_first_zero_is_no_fault_but_more_is() -> None:
     """A sensor that was never zeroed shows the weight of its tool."""
     rig = make_rig(limit_n=2.0)
