@@ -19,6 +19,8 @@ from sliplab.rigs.levels import with_level
 from sliplab.rigs.rig_file import ReflexSettings, RigFile, check_plan, load_rig_file
 from sliplab.storage.files import sha256
 
+UNSAFE_NS = 500_000_000
+"""Shortest silence of the stream that ends a trial with a reflex and without a safe state, ns."""
 POLL_S = 0.005
 """Period of reading the streams, s."""
 SHOWN = 6
@@ -60,7 +62,7 @@ class DetectRequest:
         settings = self.rig.reflex or ReflexSettings()
         stream_ns = round(settings.stream_timeout * 10**9)
         if self.safe is None:
-            return Timeouts(stream_ns, None)
+            return Timeouts(max(stream_ns, UNSAFE_NS), None)
         return Timeouts(stream_ns, round(settings.decision_timeout * 10**9))
 
     @property

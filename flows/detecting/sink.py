@@ -148,7 +148,7 @@ class DetectSink(NullSink):
         if self.guarded and self._timeouts is not None and silent_ns > self._timeouts.stream_ns:
             raise SenseLost(
                 f"event camera: neither events nor pulses for {silent_ns / 1e6:.0f} ms, and "
-                f"reflex.stream_timeout is {self._timeouts.stream_ns / 1e6:g} ms"
+                f"at most {self._timeouts.stream_ns / 1e6:g} ms are allowed (reflex.stream_timeout)"
             )
         if len(chunk):
             self._camera.observe(int(chunk.t_ns.max()) // 1000, here_ns)

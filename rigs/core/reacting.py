@@ -189,7 +189,7 @@ def run_watched(
             watcher.step(step.phase, acting)
             watcher.armed = acting
             try:
-                made = _take(rig, index, step, course.at, watcher, reflex, streaming)
+                made = _take(rig, index, step, course.at, watcher, reflex, safe, streaming)
             except (SenseLost, RigError) as lost:
                 if isinstance(lost, SenseLost) and safe is None:
                     device, found, text = str(lost).partition(": ")
@@ -215,6 +215,7 @@ def _take(
     at: Position,
     watcher: Watcher,
     reflex: Reflex | None,
+    safe: Reflex | None,
     streaming: bool,
 ) -> Reaction | None:
     """Carry out a step, or as much of it as a reflex leaves, and the reflex."""
@@ -222,6 +223,7 @@ def _take(
         rig.take_step(index, step, at, watcher if streaming else None)
     except SlipDetected as slip:
         assert reflex is not None
+        watcher.guarded = safe is not None  # without one nothing depends on slip any more
         made = _react(rig, step.phase, reflex, watcher, watcher, slip.evidence)
         rig.wait(reflex.hold_s, watcher)
         return made
