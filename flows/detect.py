@@ -199,13 +199,18 @@ def _move(request: DetectRequest, rig: Rig, sink: DetectSink) -> Reaction | None
     plan, trial = request.plan, request.trial
     assert plan is not None
     assert trial is not None
+    mass = plan.mass_kg(trial)
+
+    def mounted() -> bool:
+        return mass is None or rig.plate is None or abs(rig.plate.mass_kg() - mass) < 1e-3
+
     for task in plan.changeovers(None, trial):
-        mass = plan.mass_kg(trial)
-        mounted = mass is None or rig.plate is None or abs(rig.plate.mass_kg() - mass) < 1e-3
-        if task.mounts_plate and mounted:
+        if task.mounts_plate and mounted():
             continue
         if not rig.operator.ask(task.request, task.prompt, task.expected):
             raise RigError("operator", f"'{task.prompt}' was not confirmed")
+        if task.mounts_plate and not mounted():
+            raise RigError("plate", f"{task.prompt}: the rig detects another mass")
     collection = plan.protocol.collection
     rezero = collection.maintenance.rezero
     if rezero is not None:
@@ -237,10 +242,11 @@ def _short_turns() -> Iterator[None]:
 @contextmanager
 def _counting(request: DetectRequest) -> Iterator[Counting]:
     """Yield the model's network; in a process of its own where there is a safe state to go to."""
-    if request.timeouts is None:
+    limit_ns = None if request.timeouts is None else request.timeouts.decision_ns
+    if limit_ns is None:
         yield counting_of(request.fitted)
         return
-    answer_s = PATIENT_S if request.rig.in_virtual_time else request.timeouts.decision_ns / 1e9
+    answer_s = PATIENT_S if request.rig.in_virtual_time else limit_ns / 1e9
     try:
         network = NetworkProcess(request.model, answer_s)
     except NetworkLost as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ from sliplab.rigs.core.further import (
     FurtherScalars,
     FurtherStream,
 )
+from sliplab.rigs.core.guard import Guard, PlateLimits
 from sliplab.rigs.core.host_clock import HostClock
 from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
 from sliplab.rigs.core.plate_frame import PlateFrame
@@ -125,6 +127,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         plate=devices.plate,
         force=devices.force,
         force_limit_n=force_limit(file),
+        guard=Guard(None, plate_limits(file)),
         further=tuple(
             further_stream(name, file.streams[name], device, taught_frame(file))
             for name, device in devices.further.items()
@@ -216,7 +219,8 @@ def _driven_rig(
         if "events" in file.cameras:
             events = devices.event_camera_driver.build(devices.event_camera)
             undo.callback(events.close)
-        arm = devices.arm_driver.build(calibrated_arm(file, devices))
+        settings = calibrated_arm(file, devices)
+        arm = devices.arm_driver.build(settings)
         further = []
         for name, stream in file.streams.items():
             further.append(_driven_stream(name, stream, shown, arm, taught_frame(file)))
@@ -237,6 +241,7 @@ def _driven_rig(
             plate=plate,
             force=_force_sensor(file, devices, arm),
             force_limit_n=force_limit(file),
+            guard=Guard(settings.limits, plate_limits(file)),
             further=tuple(further),
             gripper=_gripper(devices),
             grip_opening_mm=file.grip_opening_mm or 0.0,
@@ -319,6 +324,13 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
         text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
         raise RigError(f"{name} (scalar sensor)", text)
     return FurtherScalars(name, device, StreamRecord(**said, unit=stream.unit))
+
+
+def plate_limits(file: RigFile) -> PlateLimits:
+    """Return the limits of a rig file, which hold for every motion of the rig."""
+    limits, skin = file.limits, file.skin
+    rim_mm = max(math.hypot(x, y) for x, y in skin.layout_mm()) + float(skin.radius)
+    return PlateLimits(float(limits.depth), float(limits.reach), float(limits.speed), rim_mm)
 
 
 def force_limit(file: RigFile) -> float | None:

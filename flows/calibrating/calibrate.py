@@ -45,9 +45,15 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
         prompt = "lay the board flat on the plate" if number == 0 else how
         if not rig.operator.ask("board", f"{prompt} ({number + 1} of {views})", f"view {number}"):
             raise StopRequested
-        pictures.append(grab_frames(rig).images[-1])
-        if not pictures[-1].size:
+        picture = grab_frames(rig).images[-1]
+        if not picture.size:
             raise RigError("frame camera", "provides tracks and no images: use a rig with `video`")
+        if pictures and np.array_equal(picture, pictures[-1]):
+            text = (
+                "sent exactly the image of the picture before: the board did not move, or it hangs"
+            )
+            raise RigError("frame camera", f"{text}; nothing was written")
+        pictures.append(picture)
         console.say(f"picture {number + 1} of {views} taken")
     rig.operator.ask("board", "take the board away", "away")
     return pictures

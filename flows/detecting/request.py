@@ -16,9 +16,11 @@ from sliplab.protocols.program import ACTING, Move, Program
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.levels import with_level
-from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
+from sliplab.rigs.rig_file import ReflexSettings, RigFile, check_plan, load_rig_file
 from sliplab.storage.files import sha256
 
+UNSAFE_NS = 500_000_000
+"""Shortest silence of the stream that ends a trial with a reflex and without a safe state, ns."""
 POLL_S = 0.005
 """Period of reading the streams, s."""
 SHOWN = 6
@@ -51,11 +53,17 @@ class DetectRequest:
 
     @property
     def timeouts(self) -> Timeouts | None:
-        """When slip counts as not detectable; None without a safe state."""
-        said = self.rig.reflex
-        if self.safe is None or said is None:
+        """When slip counts as not detectable; None without a reflex that depends on it.
+
+        Without a safe state decisions may be late, as they may be computed in this process.
+        """
+        if self.reflex is None:
             return None
-        return Timeouts(round(said.stream_timeout * 10**9), round(said.decision_timeout * 10**9))
+        settings = self.rig.reflex or ReflexSettings()
+        stream_ns = round(settings.stream_timeout * 10**9)
+        if self.safe is None:
+            return Timeouts(max(stream_ns, UNSAFE_NS), None)
+        return Timeouts(stream_ns, round(settings.decision_timeout * 10**9))
 
     @property
     def simulated(self) -> str:

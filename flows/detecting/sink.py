@@ -39,10 +39,15 @@ KEPT = 100_000
 
 @dataclass(frozen=True)
 class Timeouts:
-    """Longest times without data of the camera, and from events to a decision, rig's clock, ns."""
+    """Longest times on the rig's clock, ns.
+
+    Attributes:
+        stream_ns: without newer data of the camera.
+        decision_ns: from events to the decision on them; None for any.
+    """
 
     stream_ns: int
-    decision_ns: int
+    decision_ns: int | None
 
 
 class Times(TypedDict):
@@ -100,6 +105,7 @@ class DetectSink(NullSink):
         self._clock, self._on_decision, self._every_poll = clock, on_decision, every_poll
         self._timeouts = timeouts
         self._alive_ns: int | None = None
+        self._newest_ns = dict.fromkeys(("events", "pulses"), -1)
         self._camera = FreshestArrival()
         self._latency: deque[float] = deque(maxlen=KEPT)
         self._compute: deque[float] = deque(maxlen=KEPT)
@@ -122,7 +128,7 @@ class DetectSink(NullSink):
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
         if len(chunk):
             self.events += len(chunk)
-            self._alive_ns = here_ns
+            self._note_life("events", int(chunk.t_us.max()) * 1000, here_ns)
             self._camera.observe(int(chunk.t_us.max()), here_ns)
         self._report(self._decided(lambda: self.detector.push(chunk)), here_ns, began_ns)
 
@@ -134,13 +140,15 @@ class DetectSink(NullSink):
             SenseLost: as `add_events`; or neither events nor pulses came for too long.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
-        if len(chunk) or self._alive_ns is None:
+        if len(chunk):
+            self._note_life("pulses", int(chunk.t_ns.max()), here_ns)
+        if self._alive_ns is None:
             self._alive_ns = here_ns
         silent_ns = here_ns - self._alive_ns
         if self.guarded and self._timeouts is not None and silent_ns > self._timeouts.stream_ns:
             raise SenseLost(
                 f"event camera: neither events nor pulses for {silent_ns / 1e6:.0f} ms, and "
-                f"reflex.stream_timeout is {self._timeouts.stream_ns / 1e6:g} ms"
+                f"at most {self._timeouts.stream_ns / 1e6:g} ms are allowed (reflex.stream_timeout)"
             )
         if len(chunk):
             self._camera.observe(int(chunk.t_ns.max()) // 1000, here_ns)
@@ -151,6 +159,11 @@ class DetectSink(NullSink):
             made = self._decided(lambda: self.detector.advance(now_us - late_us))
             self._report(made, here_ns, began_ns)
         self._every_poll()
+
+    def _note_life(self, stream: str, newest_ns: int, here_ns: int) -> None:
+        """Note that data of the camera came, where they are newer than those before."""
+        if newest_ns > self._newest_ns[stream]:
+            self._newest_ns[stream], self._alive_ns = newest_ns, here_ns
 
     def _decided(self, work: Callable[[], list[Decision]]) -> list[Decision]:
         """Return the decisions of `work`; a failing detector is a lost sense while `guarded`."""
@@ -165,10 +178,11 @@ class DetectSink(NullSink):
     def _report(self, made: list[Decision], here_ns: int, began_ns: int) -> None:
         slip: Evidence | None = None
         late_ns = self._clock.now_ns() - here_ns if made else 0
-        if self.guarded and self._timeouts is not None and late_ns > self._timeouts.decision_ns:
+        most_ns = None if self._timeouts is None else self._timeouts.decision_ns
+        if self.guarded and most_ns is not None and late_ns > most_ns:
             raise SenseLost(
                 f"network: a decision took {late_ns / 1e6:.0f} ms, and reflex.decision_timeout is "
-                f"{self._timeouts.decision_ns / 1e6:g} ms"
+                f"{most_ns / 1e6:g} ms"
             )
         for decision in made:
             compute_ms = (decision.decided_ns - began_ns) / 1e6

@@ -14,13 +14,27 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.program import Move, Position, Step, Twist, step_seconds
-from sliplab.rigs.core.capabilities import ForceSensor, RigError
+from sliplab.rigs.core.capabilities import ForceSensor, Pose, RigError
+from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.storage.streams import WrenchChunk
 
 POLL_S = 0.02
 """Interval at which forces are read, s: how late a limit, an overload or the end of a press may be
 seen. A simulated rig without a limit reads them with its other streams."""
+SILENT_S = 0.25
+"""Longest time without a new sample, s, besides the delay that the rig file states."""
+BLIND_MM = 1.0
+"""Longest motion in contact without any change of the readings, mm."""
+RIM_MM_PER_DEG = 0.2
+"""Motion of the skin's rim (a radius of some 11 mm) in a turn on the spot."""
+DEVICE = "force sensor"
+_OUTWARD_MM = 0.01
+"""Depth by which a motion goes outwards: there contact may end, and an ideal sensor reads zero."""
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "t_ns": (), "host_ns": (), "force_n": (3,), "torque_nm": (3,),
+}  # fmt: skip
 _LINE_NS = 10_000_000
 _FEWEST = 5
 """Samples through which a straight line is laid: those of the last 10 ms, at least five."""
@@ -28,12 +42,27 @@ _I64 = npt.NDArray[np.int64]
 _F64 = npt.NDArray[np.float64]
 
 
+class ForceLimitError(RigError):
+    """A force on the plate above the rig's limit."""
+
+
 class ForceWatch:
     """A force sensor that is read for its limit; it streams from now on.
+
+    A force that is not finite is a fault. Where a decision hangs on the readings (there is a limit,
+    or a press ends at a force) so is a sensor without a newer sample for `SILENT_S`, and one whose
+    forces stay exactly the same while the arm moves `BLIND_MM` in contact, and not outwards. Clear
+    of the plate an ideal simulated sensor is constant; in contact none is.
 
     Args:
         limit_n: largest force on the plate, in any direction; None for no limit.
         delay_s: shortest time from a load to the host that has its sample.
+        longest_s: longest such time.
+        now_ns: clock by which silence is measured; left out, the host's.
+        zeroed: False where the present load was not taken for zero: the limit then applies to the
+            difference from the first readings.
+        leaving: True while the arm moves clear of the plate, perhaps from a force above the limit:
+            it may not rise.
     """
 
     def __init__(
@@ -42,13 +71,35 @@ class ForceWatch:
         plate: PlateFrame,
         limit_n: float | None,
         delay_s: float = 0.0,
+        *,
+        longest_s: float = 0.0,
+        now_ns: Callable[[], int] | None = None,
+        zeroed: bool = True,
+        leaving: bool = False,
     ) -> None:
         self._sensor, self._limit_n, self._delay_s = sensor, limit_n, delay_s
+        self._silent_s, self._now_ns = SILENT_S + longest_s, now_ns
+        self._zeroed, self._leaving = zeroed, leaving
         self._to_plate = np.array(plate.force_matrix(sensor.mounting))
+        self.needed = limit_n is not None
+        """A decision hangs on the readings."""
+        self.start()
+
+    def start(self) -> None:
+        """Start the sensor's stream; earlier samples are discarded."""
+        self._stall = StallTimer(self._now_ns)
         self._t_ns: _I64 = np.empty(0, np.int64)
         self._host_ns: _I64 = np.empty(0, np.int64)
         self._normal_n: _F64 = np.empty(0)
-        sensor.start()
+        self._first_n: _F64 | None = None
+        self._last: _F64 | None = None
+        self._changed_at: tuple[Pose, float] | None = None
+        self._sensor.start()
+
+    @property
+    def fresh(self) -> bool:
+        """True once a sample has arrived."""
+        return self._last is not None
 
     @property
     def normal_n(self) -> float:
@@ -59,21 +110,74 @@ class ForceWatch:
         """Return the forces since the last call.
 
         Raises:
-            RigError: the limit is exceeded, or the sensor is at fault.
+            ForceLimitError: the limit is exceeded.
+            RigError: the sensor is at fault, or its readings cannot be used.
         """
         chunk = self._sensor.read()
-        if not len(chunk):
-            return chunk
-        forces = chunk.force_n @ self._to_plate.T
-        self._keep(chunk, forces[:, 2])
-        most = float(np.linalg.norm(forces, axis=1).max())
-        if self._limit_n is not None and most > self._limit_n:
-            raise RigError(
-                "force sensor",
-                f"{most:.2f} N on the plate, above limits.force = {self._limit_n:g} N of "
+        self._check_shape(chunk)
+        if len(chunk):
+            finite = np.isfinite(chunk.force_n).all(axis=1)
+            if not finite.all():
+                bad = chunk.force_n[~finite][0].tolist()
+                raise _unusable(f"reads a force that is no number: {bad} N")
+            forces = chunk.force_n @ self._to_plate.T
+            self._keep(chunk, forces[:, 2])
+            self._check_limit(forces)
+        if self.needed:
+            newest = int(self._t_ns[-1]) if len(self._t_ns) else None
+            silent_s = self._stall.waited_s((newest,))
+            if silent_s > self._silent_s:
+                why = "no sample came" if newest is None else "no newer sample came"
+                raise _unusable(f"{why} for {silent_s:.2f} s")
+        return chunk
+
+    def follow(self, pose: Pose, depth_mm: float) -> None:
+        """Hold the readings so far against a motion of the arm that they should show.
+
+        Args:
+            pose: measured now.
+            depth_mm: in contact, with what the fingers add; negative clear of the plate.
+
+        Raises:
+            RigError: the readings have not changed at all.
+        """
+        before = self._changed_at
+        if before is None or depth_mm <= 0 or depth_mm < before[1] - _OUTWARD_MM:
+            self._changed_at = pose, depth_mm
+            return
+        moved_mm = max(distance_mm(before[0], pose), depth_mm - before[1])
+        if before[0].rotvec_deg != pose.rotvec_deg:
+            moved_mm = max(moved_mm, RIM_MM_PER_DEG * angle_deg(before[0], pose))
+        if self.needed and moved_mm > BLIND_MM:
+            raise _unusable(f"reads exactly the same since the arm moved {moved_mm:.1f} mm")
+
+    def _check_shape(self, chunk: WrenchChunk) -> None:
+        """Raise RigError if a chunk does not hold one force for each time."""
+        if not isinstance(chunk, WrenchChunk):
+            raise _unusable(f"returned {type(chunk).__name__}, not a WrenchChunk")
+        count = len(chunk)
+        for name, shape in _SHAPES.items():
+            found = np.shape(getattr(chunk, name))
+            if found != (count, *shape):
+                raise _unusable(f"returned {name} of the shape {found}, not {(count, *shape)}")
+
+    def _check_limit(self, forces: _F64) -> None:
+        """Raise ForceLimitError if one of the forces on the plate, (n, 3), is above the limit."""
+        if self._limit_n is None:
+            return
+        if self._first_n is None:
+            self._first_n = forces[0].copy()
+            if self._leaving:
+                self._limit_n = max(self._limit_n, float(np.linalg.norm(forces, axis=1).max()))
+        loads = forces if self._zeroed else forces - self._first_n
+        most = float(np.linalg.norm(loads, axis=1).max())
+        if not most <= self._limit_n:
+            since = "" if self._zeroed else " more than at first (the sensor is not zeroed yet)"
+            raise ForceLimitError(
+                DEVICE,
+                f"{most:.2f} N on the plate{since}, above limits.force = {self._limit_n:g} N of "
                 "the rig; the arm was stopped: press less, or see what it touches",
             )
-        return chunk
 
     def seconds_to(self, force_n: float, now_ns: int) -> float:
         """Return the time until the normal force will be `force_n`, if it goes on as it does.
@@ -100,13 +204,25 @@ class ForceWatch:
         return float(missing_n / rate)
 
     def _keep(self, chunk: WrenchChunk, normal_n: _F64) -> None:
-        """Keep what the line is laid through."""
-        t_ns = np.concatenate([self._t_ns, chunk.t_ns])
+        """Keep what the line is laid through: samples newer than all before them."""
+        if self._last is None or (chunk.force_n != self._last).any():
+            self._changed_at = None
+        self._last = chunk.force_n[-1].copy()
+        t_ns, host_ns = chunk.t_ns, chunk.host_ns
+        floor = self._t_ns[-1:] if len(self._t_ns) else np.array([np.iinfo(np.int64).min])
+        newer = t_ns > np.maximum.accumulate(np.concatenate([floor, t_ns[:-1]]))
+        if not newer.all():
+            t_ns, host_ns, normal_n = t_ns[newer], host_ns[newer], normal_n[newer]
+        t_ns = np.concatenate([self._t_ns, t_ns])
         first = int(np.searchsorted(t_ns, t_ns[-1] - _LINE_NS, side="right"))
         kept = slice(max(min(first, len(t_ns) - _FEWEST), 0), None)
         self._t_ns = t_ns[kept]
-        self._host_ns = np.concatenate([self._host_ns, chunk.host_ns])[kept]
+        self._host_ns = np.concatenate([self._host_ns, host_ns])[kept]
         self._normal_n = np.concatenate([self._normal_n, normal_n])[kept]
+
+
+def _unusable(text: str) -> RigError:
+    return RigError(DEVICE, f"{text}; the arm was stopped: check the sensor and its cable")
 
 
 @dataclass

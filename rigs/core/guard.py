@@ -1,13 +1,15 @@
-"""Check of a move against the rig's limits before it is sent to an arm.
+"""Checks of motion against limits: of a path before it is sent, and of poses while it runs.
 
 The controller has its own limits; these are the rig's, and protect the sensor and the plate. A
-straight move stays inside a box if both its ends do, so only the ends are checked.
+straight move stays inside a box if both its ends do, so only the ends of a path are checked. The
+rig checks every segment before any driver receives it; drivers check their own limits once more.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from sliplab.rigs.core.arm_settings import Limits
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
@@ -15,14 +17,16 @@ from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg
 
 _EPS = 1e-6
+MEASURED_MM = 0.2
+"""Largest distance of a measured pose beyond a limit: repeatability and noise of arms."""
 
 
 class GuardError(RigError):
-    """A move that the rig's limits forbid; nothing was sent to the arm.
+    """A motion that the rig's limits forbid: refused before it was sent, or stopped on its way.
 
     Attributes:
         what: name of the limited quantity.
-        value: requested value, in `unit`.
+        value: requested or measured value, in `unit`.
         limit: allowed value, in `unit`.
     """
 
@@ -34,7 +38,7 @@ class GuardError(RigError):
 
 
 class WorkspaceError(GuardError):
-    """A tool centre point outside the workspace box."""
+    """A tool centre point outside the workspace."""
 
 
 class SpeedError(GuardError):
@@ -53,26 +57,75 @@ class SingularityError(GuardError):
     """Joints too close to the wrist singularity, where two wrist axes align."""
 
 
+@dataclass(frozen=True)
+class PlateLimits:
+    """Limits in the frame of the plate that the rig uses, with the depth zero that was touched.
+
+    Attributes:
+        depth_mm: largest depth in contact: the arm's, and what a gripper's fingers add.
+        reach_mm: largest distance of the sensor's centre from the plate's.
+        speed_mm_s: of the sensor's centre, and of its rim in a turn on the spot.
+        rim_mm: distance of the rim from the centre.
+    """
+
+    depth_mm: float
+    reach_mm: float
+    speed_mm_s: float
+    rim_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A limited coordinate of a pose, mm."""
+
+    error: type[GuardError]
+    what: str
+    value: float
+    low: float
+    high: float
+
+    @property
+    def excess(self) -> float:
+        """Distance beyond the limits, mm; negative inside, NaN for a value that is none."""
+        return max(self.low - self.value, self.value - self.high)
+
+    def fault(self, where: str) -> GuardError:
+        limit = self.low if self.value < self.low else self.high
+        return self.error(self.what, self.value, limit, "mm", where)
+
+
 class Guard:
-    """Checks paths against one rig's limits.
+    """Checks motion against one rig's limits.
+
+    Args:
+        limits: of the arm; None for none.
+        plate_limits: of the rig file; None for none. Their frame is given with every check.
 
     Raises:
         ValueError: limits in the plate's frame without a plate.
     """
 
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
+    def __init__(self, limits: Limits | None, plate_limits: PlateLimits | None = None) -> None:
+        self._limits, self._plate_limits = limits, plate_limits
+        self._frame: PlateFrame | None = None
+        if limits is None:
+            return
         plate = limits.plate
         if plate is None and (limits.frame == "plate" or limits.depth_mm is not None):
             raise ValueError("limits in the plate's frame need the taught plate (limits.plate)")
-        self._frame = (
-            PlateFrame.taught((plate.centre_mm, plate.right_mm, plate.above_mm))
-            if plate is not None
-            else None
+        if plate is not None:
+            self._frame = PlateFrame.taught((plate.centre_mm, plate.right_mm, plate.above_mm))
+
+    @property
+    def speed_mm_s(self) -> float:
+        """Largest speed of a move."""
+        return min(
+            (each.speed_mm_s for each in (self._limits, self._plate_limits) if each is not None),
+            default=math.inf,
         )
 
     def check(self, begin: Pose, path: Sequence[Segment]) -> None:
-        """Check a path that starts at `begin` against the limits.
+        """Check a path that starts at `begin` against the arm's limits.
 
         `begin` itself may be outside: an arm that was jogged there must be able to return.
 
@@ -80,21 +133,73 @@ class Guard:
             GuardError: the first violation, with its value and its limit.
             RigError: a number that is not finite.
         """
+        self._check(begin, path, None, 0.0)
+
+    def check_segment(
+        self, begin: Pose, segment: Segment, plate: PlateFrame, closed_mm: float = 0.0
+    ) -> None:
+        """Check a segment against all limits, in the frame that the rig uses.
+
+        A segment from outside may end outside, if no farther than it began.
+
+        Args:
+            closed_mm: what the fingers add to the depth.
+
+        Raises:
+            GuardError: the first violation, with its value and its limit.
+            RigError: a number that is not finite.
+        """
+        self._check(begin, [segment], plate, closed_mm)
+
+    def _check(
+        self, begin: Pose, path: Sequence[Segment], plate: PlateFrame | None, closed_mm: float
+    ) -> None:
         at = begin
         for index, segment in enumerate(path):
             where = f"segment {index + 1} of {len(path)}"
             numbers = (*segment.to.xyz_mm, *segment.to.rotvec_deg, segment.speed_mm_s)
             if not all(map(math.isfinite, numbers)):
                 raise RigError("arm", f"{where} contains a number that is not finite")
-            self._speed(segment.speed_mm_s, where)
-            if segment.turn_deg_s is not None and not 0 < segment.turn_deg_s < math.inf:
-                raise RigError("arm", f"{where} turns at {segment.turn_deg_s} deg/s")
-            self._box(segment.to, where)
-            self._depth(segment.to, where)
+            self._speed(segment, where)
+            before = [] if plate is None else list(self._places(begin, plate, closed_mm))
+            for number, place in enumerate(self._places(segment.to, plate, closed_mm)):
+                allowed = max(before[number].excess, 0.0) if before else 0.0
+                if not place.excess <= allowed + _EPS:
+                    raise place.fault(where)
             turn = angle_deg(at, segment.to)
-            if turn > self._limits.tilt_deg + _EPS:
-                raise TiltError("turn of the tool", turn, self._limits.tilt_deg, "deg", where)
+            most = math.inf if self._limits is None else self._limits.tilt_deg
+            if not turn <= most + _EPS:
+                raise TiltError("turn of the tool", turn, most, "deg", where)
             at = segment.to
+
+    def check_measured(
+        self, pose: Pose, begin: Pose, plate: PlateFrame, closed_mm: float = 0.0
+    ) -> None:
+        """Check a pose that was measured on the way of a path, within `MEASURED_MM`.
+
+        Args:
+            begin: pose at which the path began, which may be outside; the path may not go farther.
+
+        Raises:
+            GuardError: the pose is outside.
+        """
+        before: list[_Place] | None = None
+        for number, place in enumerate(self._places(pose, plate, closed_mm)):
+            if place.excess <= MEASURED_MM:
+                continue
+            before = before or list(self._places(begin, plate, closed_mm))
+            if not place.excess <= max(before[number].excess, 0.0) + MEASURED_MM:
+                raise place.fault("the arm was stopped on its way, where its pose shows")
+
+    def check_depth(self, depth_mm: float, what: str) -> None:
+        """Check a measured depth in contact, in the rig's frame, that fingers would lead to.
+
+        Raises:
+            DepthError: it is beyond the limit.
+        """
+        own = self._plate_limits
+        if own is not None and not depth_mm <= own.depth_mm + MEASURED_MM:
+            raise DepthError("depth in contact", depth_mm, own.depth_mm, "mm", what)
 
     def check_joints(self, joints_deg: Sequence[float]) -> None:
         """Check six joint angles (degrees) against the wrist singularity.
@@ -102,34 +207,49 @@ class Guard:
         Raises:
             SingularityError: joint 5 is within `singular_deg` of 0 or 180 degrees.
         """
+        if self._limits is None:
+            return
         off = abs(math.remainder(joints_deg[4], 180.0))
         limit = self._limits.singular_deg
-        if off < limit - _EPS:
+        if not off >= limit - _EPS:
             raise SingularityError(
                 "joint 5, off its singular position by", off, limit, "deg", "joints now"
             )
 
-    def _speed(self, speed_mm_s: float, where: str) -> None:
-        limit = self._limits.speed_mm_s
-        if speed_mm_s <= 0 or speed_mm_s > limit + _EPS:
-            raise SpeedError("speed", speed_mm_s, limit, "mm/s", where)
-
-    def _box(self, pose: Pose, where: str) -> None:
-        limits = self._limits
-        place: tuple[float, ...] = pose.xyz_mm
-        if limits.frame == "plate" and self._frame is not None:
-            seen = self._frame.position(pose.xyz_mm)
-            place = (seen.x_mm, seen.y_mm, seen.depth_mm)
-        for axis, value, low, high in zip("xyz", place, limits.low_mm, limits.high_mm, strict=True):
-            if not low - _EPS <= value <= high + _EPS:
-                limit = low if value < low else high
-                name = f"{axis} in the {limits.frame} frame"
-                raise WorkspaceError(name, value, limit, "mm", where)
-
-    def _depth(self, pose: Pose, where: str) -> None:
-        limit = self._limits.depth_mm
-        if limit is None or self._frame is None:
+    def _speed(self, segment: Segment, where: str) -> None:
+        limit = self.speed_mm_s
+        if not 0 < segment.speed_mm_s <= limit + _EPS:
+            raise SpeedError("speed", segment.speed_mm_s, limit, "mm/s", where)
+        turn = segment.turn_deg_s
+        if turn is None:
             return
-        depth = self._frame.position(pose.xyz_mm).depth_mm
-        if depth > limit + _EPS:
-            raise DepthError("depth", depth, limit, "mm", where)
+        if not 0 < turn < math.inf:
+            raise RigError("arm", f"{where} turns at {turn} deg/s")
+        if self._plate_limits is not None:
+            rim = math.radians(turn) * self._plate_limits.rim_mm
+            if not rim <= self._plate_limits.speed_mm_s + _EPS:
+                name = f"speed of the sensor's rim at {turn:g} deg/s:"
+                raise SpeedError(name, rim, self._plate_limits.speed_mm_s, "mm/s", where)
+
+    def _places(self, pose: Pose, plate: PlateFrame | None, closed_mm: float) -> Iterator[_Place]:
+        """Return the limited coordinates of a pose."""
+        limits, own = self._limits, self._plate_limits
+        if limits is not None:
+            taught = None if self._frame is None else self._frame.position(pose.xyz_mm)
+            xyz: tuple[float, ...] = pose.xyz_mm
+            if limits.frame == "plate" and taught is not None:
+                xyz = (taught.x_mm, taught.y_mm, taught.depth_mm)
+            for axis, value, low, high in zip(
+                "xyz", xyz, limits.low_mm, limits.high_mm, strict=True
+            ):
+                name = f"{axis} in the {limits.frame} frame"
+                yield _Place(WorkspaceError, name, value, low, high)
+            if limits.depth_mm is not None and taught is not None:
+                yield _Place(DepthError, "depth", taught.depth_mm, -math.inf, limits.depth_mm)
+        if own is not None and plate is not None:
+            here = plate.position(pose.xyz_mm)
+            depth = here.depth_mm + closed_mm
+            yield _Place(DepthError, "depth in contact", depth, -math.inf, own.depth_mm)
+            reach = math.hypot(here.x_mm, here.y_mm)
+            name = "distance from the plate's centre"
+            yield _Place(WorkspaceError, name, reach, -math.inf, own.reach_mm)

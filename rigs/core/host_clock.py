@@ -39,12 +39,12 @@ class StallTimer:
 
     def __init__(self, now_ns: Callable[[], int] | None = None, step_s: float = STEP_S) -> None:
         self._now_ns, self._step_ns = now_ns, round(step_s * 1e9)
-        self._mark: int | None = None
+        self._mark: object = None
         self._last_ns = self._waited_ns = 0
 
-    def waited_s(self, mark: int) -> float:
+    def waited_s(self, mark: object) -> float:
         """Return how long `mark` has been the same, s."""
-        now_ns = time.monotonic_ns() if self._now_ns is None else self._now_ns()
+        now_ns = (self._now_ns or time.monotonic_ns)()
         if mark != self._mark:
             self._mark, self._waited_ns = mark, 0
         else:

@@ -159,7 +159,8 @@ def run_watched(
     Args:
         seed: seed of a simulated trial's randomness.
         reflex: None to monitor slip without a reaction.
-        safe: reaction when slip can no longer be detected; None: a failure as any other.
+        safe: reaction when slip can no longer be detected; None: a failure as any other, where a
+            reflex depends on it.
 
     Returns:
         the outcome of the reflex; None if there was none.
@@ -177,7 +178,7 @@ def run_watched(
             step = course.step(planned)
             if step.recorded and not streaming:
                 rig.start_streams(seed, rate_hz, False, with_further=False)
-                streaming, watcher.guarded = True, safe is not None
+                streaming, watcher.guarded = True, reflex is not None or safe is not None
             if streaming and not step.recorded:
                 watcher.guarded = False
                 rig.stop_streams(watcher, False)
@@ -188,8 +189,12 @@ def run_watched(
             watcher.step(step.phase, acting)
             watcher.armed = acting
             try:
-                made = _take(rig, index, step, course.at, watcher, reflex, streaming)
+                made = _take(rig, index, step, course.at, watcher, reflex, safe, streaming)
             except (SenseLost, RigError) as lost:
+                if isinstance(lost, SenseLost) and safe is None:
+                    device, found, text = str(lost).partition(": ")
+                    why = f"{text or lost}; slip cannot be detected, and the arm was stopped"
+                    raise RigError(device if found else "reflex", why) from lost
                 ends = isinstance(lost, RigError) and lost.device not in _SENSES
                 if ends or not streaming or safe is None:
                     raise
@@ -210,6 +215,7 @@ def _take(
     at: Position,
     watcher: Watcher,
     reflex: Reflex | None,
+    safe: Reflex | None,
     streaming: bool,
 ) -> Reaction | None:
     """Carry out a step, or as much of it as a reflex leaves, and the reflex."""
@@ -217,6 +223,7 @@ def _take(
         rig.take_step(index, step, at, watcher if streaming else None)
     except SlipDetected as slip:
         assert reflex is not None
+        watcher.guarded = safe is not None  # without one nothing depends on slip any more
         made = _react(rig, step.phase, reflex, watcher, watcher, slip.evidence)
         rig.wait(reflex.hold_s, watcher)
         return made
@@ -273,7 +280,7 @@ def _react(
     if reflex.kind == "press":
         # measured depths scatter about the command; the limit applies all the same
         depth = min(here.depth_mm + reflex.deeper_mm, reflex.deepest_mm)
-        if depth > here.depth_mm:
+        if not depth <= here.depth_mm:  # a depth that is no number is refused by the rig
             deep = Position(here.x_mm, here.y_mm, depth)
             rig.move(Move("reflex", deep, reflex.speed_mm_s), here, sink)
     if rig.gripper is not None and closed_mm:
@@ -300,7 +307,7 @@ def _grip(rig: Rig, reflex: Reflex) -> float:
     closed_mm = min(reflex.deeper_mm, room_mm)
     if closed_mm <= 0:
         return 0.0
-    rig.gripper.move(rig.grip_opening_mm - closed_mm, reflex.speed_mm_s, reflex.force_n)
+    rig.move_fingers(rig.grip_opening_mm - closed_mm, reflex.speed_mm_s, reflex.force_n)
     return closed_mm
 
 

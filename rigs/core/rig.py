@@ -7,6 +7,7 @@ stop.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -28,7 +29,7 @@ from sliplab.protocols.program import (
     Step,
     Twist,
 )
-from sliplab.protocols.timing import Timing
+from sliplab.protocols.timing import ForceTiming, Timing
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.capabilities import (
     Arm,
@@ -43,6 +44,7 @@ from sliplab.rigs.core.capabilities import (
     GripperState,
     Operator,
     Plate,
+    Pose,
     RigError,
     Segment,
     Simulation,
@@ -50,15 +52,19 @@ from sliplab.rigs.core.capabilities import (
     SyncBox,
     Truth,
 )
-from sliplab.rigs.core.force_watch import Course, ForceWatch
+from sliplab.rigs.core.force_watch import Course, ForceLimitError, ForceWatch
 from sliplab.rigs.core.further import FurtherStream
+from sliplab.rigs.core.gripper_check import check_move, check_state
+from sliplab.rigs.core.guard import Guard
+from sliplab.rigs.core.motion_watch import MotionWatch, check_pose, is_near
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.core.pose import angle_deg
+from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.rigs.core.pulse_code import SEEDS
-from sliplab.rigs.core.touching import POLL_S, QUIET_S, RateTouch, count_central
-from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
+from sliplab.rigs.core.touching import POLL_S, QUIET_S, NoiseWatch, RateTouch, count_central
+from sliplab.storage.streams import EventChunk, Json, PathSegment, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
+"""Speed of moves that no protocol names; a rig's lower limit applies."""
 TAIL_S = 0.1
 """Default time for which cameras are read after the last pulse."""
 FINGERS_S = 10.0
@@ -69,6 +75,10 @@ FINGERS_POLL_S = 0.002
 FORCE = "force"
 """Name of the force sensor's stream."""
 _MOVE_GRACE_S = 10.0
+_END_S = 0.5
+"""Longest time for the pose to show the end of a path that was reported as finished."""
+_TURN_DEG = 1.0
+"""Turn of the tool from which the weight of the tool may show in a force sensor."""
 _STOP_RETRIES = 10
 """Attempts at a stop that Ctrl-C interrupts."""
 
@@ -123,6 +133,7 @@ class Rig:
             busy host reads them late.
         force: a force/torque sensor, or None.
         force_limit_n: largest force on the plate, in any direction, before the arm is stopped.
+        guard: limits of all motion, whatever the arm's driver checks itself.
         further: devices with streams of their own names.
         gripper: its fingers hold the sensor; or None.
         grip_opening_mm: opening at which the arm's depth is the depth in contact; every trial
@@ -147,6 +158,7 @@ class Rig:
     plate: Plate | None = None
     force: ForceSensor | None = None
     force_limit_n: float | None = None
+    guard: Guard = field(default_factory=lambda: Guard(None))
     further: tuple[FurtherStream, ...] = ()
     gripper: Gripper | None = None
     grip_opening_mm: float = 0.0
@@ -159,6 +171,14 @@ class Rig:
     """The further devices while they are recorded."""
     _forces: ForceWatch | None = field(default=None, init=False)
     """Forces while they are watched, whether or not they are recorded."""
+    _motion: MotionWatch | None = field(default=None, init=False)
+    """The arm's motion while it is watched."""
+    _noise: NoiseWatch | None = field(default=None, init=False)
+    """The event camera's noise while the arm approaches the plate."""
+    _zeroed: bool = field(default=False, init=False)
+    """The present load was taken for zero since the sensor was connected."""
+    _fingers_mm: float | None = field(default=None, init=False)
+    """Opening to which the fingers were last sent; None before."""
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _twisted: bool = field(default=False, init=False)
@@ -202,6 +222,7 @@ class Rig:
         """
         self.sync.connect()
         self.arm.connect()
+        self._zeroed = False
         if self.force is not None:
             self.force.connect()
         if self.gripper is not None:
@@ -284,8 +305,8 @@ class Rig:
             self.begin_trial(program.home, seed, nuisances_of(program))
             if self.simulation is not None:
                 sink = self.simulation.sink(sink)
-            if self.force is not None:
-                self._watch_forces()
+            if self.force is not None and self._forces is None:
+                self._watch_forces()  # a simulated sensor without a limit has its range
             steps, path = [], []
             course, recording, reference = Course(program.home), False, 0
             for index, planned in enumerate(program.steps):
@@ -313,23 +334,108 @@ class Rig:
                 tuple(steps), self.plate_frame.zero_mm, truth, tuple(path), course.pressed_mm
             )
 
-    def _watch_forces(self) -> ForceWatch:
-        """Read forces from now on, and hold them against the limit."""
+    @property
+    def _often(self) -> bool:
+        """Whether forces and poses are looked at every `force_watch.POLL_S`.
+
+        Not on a simulated rig without a limit of force, where an overload breaks nothing.
+        """
+        return self.simulation is None or self.force_limit_n is not None
+
+    @property
+    def _closed_mm(self) -> float:
+        """What the fingers add to the arm's depth."""
+        return 0.0 if self._fingers_mm is None else max(self.grip_opening_mm - self._fingers_mm, 0)
+
+    def _watch_forces(self, turns: bool = False, leaving: bool = False) -> ForceWatch:
+        """Read forces from now on, and hold them against the limit.
+
+        Args:
+            turns: the tool turns, so that its weight changes the readings of a sensor whose load
+                was never taken for zero: these have no limit then.
+            leaving: the arm moves clear of the plate.
+        """
         assert self.force is not None
-        timing = self.timing.force
-        delay_s = 0.0 if timing is None else timing.delay.shortest_us * 1e-6
-        self._forces = ForceWatch(self.force, self.plate_frame, self.force_limit_n, delay_s)
+        delay = (self.timing.force or ForceTiming()).delay
+        zeroed = self._zeroed or self.force.zeroing != "trial"
+        limit_n = None if turns and not zeroed else self.force_limit_n
+        self._forces = ForceWatch(
+            self.force, self.plate_frame, limit_n, delay.shortest_us * 1e-6,
+            longest_s=delay.longest_us * 1e-6, now_ns=self.clock.now_ns, zeroed=zeroed,
+            leaving=leaving,
+        )  # fmt: skip
+        self._forces.needed = self.force_limit_n is not None
         return self._forces
+
+    def _end_watch(self) -> None:
+        """Read no forces any more."""
+        if self._forces is not None and self.force is not None:
+            self._forces = None
+            self.force.stop()
+
+    def at_most(self, speed_mm_s: float) -> float:
+        """Return a speed, or the rig's limit if that is lower."""
+        return min(speed_mm_s, self.guard.speed_mm_s)
+
+    @contextmanager
+    def moving(self, segment: Segment) -> Iterator[None]:
+        """Send one segment to the arm, and watch forces and poses while the block waits.
+
+        Raises:
+            GuardError: a limit forbids the segment, and nothing was sent; or the arm's pose left
+                the limits on the way.
+            ArmFault: the arm's pose cannot be used.
+        """
+        begin = self.pose()
+        unzeroed = not self._zeroed and self.force is not None and self.force.zeroing == "trial"
+        if self._often and self.force is not None and (self._forces is None or unzeroed):
+            self._watch_forces(turns=angle_deg(begin, segment.to) > _TURN_DEG)
+        self._send(segment, begin)
+        try:
+            yield
+        finally:
+            self._motion = None
+
+    def _send(self, segment: Segment, begin: Pose) -> None:
+        """Check a segment, and send it: the one place from which the arm receives its motion."""
+        self.guard.check_segment(begin, segment, self.plate_frame, self._closed_mm)
+        self.arm.start([segment])
+        self._motion = MotionWatch(
+            self.guard, segment, begin, self.plate_frame, self._closed_mm, self.clock.now_ns,
+            self.poll_s,
+        )  # fmt: skip
+
+    def move_fingers(self, opening_mm: float, speed_mm_s: float, force_n: float) -> None:
+        """Start to move the gripper's fingers and return at once; forces are watched.
+
+        Raises:
+            RigError: no gripper, a value out of its range, or closing would pass the limit of
+                depth; nothing was sent.
+        """
+        gripper = self.gripper
+        if gripper is None:
+            raise RigError("gripper", "this rig has none to move")
+        check_move(gripper.range, opening_mm, speed_mm_s, force_n)
+        closed_mm = max(self.grip_opening_mm - opening_mm, 0.0)
+        if closed_mm > self._closed_mm:
+            self.guard.check_depth(self.position().depth_mm + closed_mm, "gripper")
+        if self._often and self.force is not None and self._forces is None:
+            self._watch_forces()
+        gripper.move(opening_mm, speed_mm_s, force_n)
+        self._fingers_mm = opening_mm
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm up the skin: press at the plate's centre and release, `times` times."""
         home = Position(0.0, 0.0, -clearance_mm)
         with self.safely(home):
-            self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
+            out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+            self.move(Move("home", home, out_mm_s), self.position(), None)
+            if self._often:
+                self._zero_forces()
             for _ in range(times):
                 deep = Position(0.0, 0.0, depth_mm)
                 self.move(Move("warm up", deep, speed_mm_s), home, None)
-                self.move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
+                self.move(Move("warm up", home, out_mm_s), deep, None)
 
     def rezero(self, asked: Rezero, seed: int) -> TouchedZero:
         """Find depth zero as a protocol asks for: the mean of several touches.
@@ -370,17 +476,20 @@ class Rig:
         with self.safely(start):
             self.begin_trial(start, seed)
             self.events.start()
-            self.wait(QUIET_S)
-            zero = self._approach_until_touch(
-                search_mm, speed_mm_s, RateTouch(self.central_events())
-            )
+            zero = self._approach_until_touch(search_mm, speed_mm_s, self.measure_noise())
             self.events.stop()
-            self.move(Move("release", start, RETRACT_SPEED_MM_S), self.position(), None)
+            out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+            self.move(Move("release", start, out_mm_s), self.position(), None)
         self.plate_frame = self.plate_frame.with_zero(zero)
         return zero
 
     def listen(self, seconds: float, sink: Sink, rate_hz: int) -> None:
-        """Record events, poses and pulses to `sink` without moving anything."""
+        """Record events, poses and pulses to `sink` without moving anything.
+
+        Raises:
+            RigError: a device is at fault, or the limit of force is exceeded.
+            StopRequested: as `wait`.
+        """
         if self.simulation is not None:
             self.simulation.begin_trial(0)
         with ExitStack() as stopping:
@@ -389,25 +498,30 @@ class Rig:
             stopping.callback(self.sync.stop)
             if self.force is not None:
                 stopping.callback(self.force.stop)
+            stopping.callback(self._end_watch)
             for device in self.further:
                 stopping.callback(device.stop)
             self.start_streams(0, rate_hz, False)
-            self.wait(seconds, sink)
+            try:
+                self.wait(seconds, sink)
+            except ForceLimitError:
+                self._stop_arm()  # it is not moved by this program
+                raise
             self.stop_streams(sink, False)
 
     def _approach_until_touch(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
-        self.arm.start([Segment(self.plate_frame.pose(target), speed_mm_s)])
-        while not self.arm.progress().done:
-            self.wait(POLL_S)
-            depth = self.plate_frame.position(self.arm.pose().xyz_mm).depth_mm
-            if rate.touched(self.central_events(), depth, self.clock.now_ns()):
-                self.arm.stop()
-                break
-        else:
-            state = self.arm.state()
-            if not state.healthy:  # the arm was stopped; the taught plane may still be right
-                raise arm_fault(state, "touching off")
+        with self.moving(Segment(self.plate_frame.pose(target), speed_mm_s)):
+            while not self.arm.progress().done:
+                self.wait(POLL_S)
+                depth = self.position().depth_mm
+                if rate.touched(self.central_events(), depth, self.clock.now_ns()):
+                    self.arm.stop()
+                    break
+            else:
+                state = self.arm.state()
+                if not state.healthy:  # the arm was stopped; the taught plane may still be right
+                    raise arm_fault(state, "touching off")
         surface = rate.surface_mm(speed_mm_s)
         if surface is not None:
             return surface - self.touch_mm
@@ -417,10 +531,33 @@ class Rig:
             "teach the contact plane again",
         )
 
+    def measure_noise(self) -> RateTouch:
+        """Measure the event camera's noise at rest for `QUIET_S`, to detect a touch by it.
+
+        Raises:
+            RigError: a real camera sent no event at all.
+        """
+        self._noise = None
+        self.wait(QUIET_S)
+        chunk = self.events.read()
+        self._noise = NoiseWatch(
+            chunk, self.clock.now_ns, may_be_silent=self.simulation is not None
+        )
+        return RateTouch(self._count_central(chunk))
+
     def central_events(self) -> int:
-        """Read the events; return their number around the centre papilla."""
-        size = self.events.width, self.events.height
-        return count_central(self.events.read(), size, self.centre_px)
+        """Read the events; return their number around the centre papilla.
+
+        Raises:
+            RigError: no event came any more, not even noise.
+        """
+        chunk = self.events.read()
+        if self._noise is not None:
+            self._noise.check(chunk)
+        return self._count_central(chunk)
+
+    def _count_central(self, chunk: EventChunk) -> int:
+        return count_central(chunk, (self.events.width, self.events.height), self.centre_px)
 
     def take_step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
         """Carry out one step of a program from `at`, the arm's position; call it inside `safely`.
@@ -471,9 +608,12 @@ class Rig:
         if self.force is None:
             raise RigError("force sensor", f"this rig has none to press to {force_n:g} N")
         forces = self._forces or self._watch_forces()
+        forces.needed = True
         arm, goes_on_s = self.arm, 0.0
         if isinstance(arm, StoppingArm):
             goes_on_s = arm.stopping_s(step.speed_mm_s)
+            if not 0.0 <= goes_on_s < math.inf:
+                raise RigError("arm", f"states {goes_on_s} s as its time to stop")
 
         def left_s() -> float:
             return forces.seconds_to(force_n, self.clock.now_ns()) - goes_on_s
@@ -481,7 +621,8 @@ class Rig:
         seconds = at.distance_mm(step.to) / step.speed_mm_s
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         start, end, stopped = self._follow(segment, seconds, step.phase, None, left_s)
-        if not stopped and forces.normal_n < force_n:
+        forces.needed = self.force_limit_n is not None
+        if not stopped and not forces.normal_n >= force_n:
             raise RigError(
                 "force sensor",
                 f"reads {forces.normal_n:.2f} N at the deepest place, {step.to.depth_mm:g} mm, not "
@@ -492,7 +633,8 @@ class Rig:
     def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Turn about the plate's normal on the spot; as `move`."""
         seconds = abs(step.to.twist_deg - at.twist_deg) / step.speed_deg_s
-        segment = Segment(self.plate_frame.pose(step.to), RETRACT_SPEED_MM_S, step.speed_deg_s)
+        bound_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+        segment = Segment(self.plate_frame.pose(step.to), bound_mm_s, step.speed_deg_s)
         return self._follow(segment, seconds, step.phase, sink)[:2]
 
     def _follow(
@@ -515,27 +657,42 @@ class Rig:
         start = self.arm.now_ns()
         if seconds == 0:
             return start, start, False
-        self.arm.start([segment])
-        deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
-        while not (progress := self.arm.progress()).done:
-            if not progress.state.healthy:
-                raise arm_fault(progress.state, phase)
-            if self.clock.now_ns() > deadline:
-                raise ArmFault("arm", f"did not finish the phase '{phase}' in time")
-            most = self.poll_s
-            if left_s is not None:
-                stop_s = left_s()
-                if stop_s <= 0:
-                    self.arm.stop()
-                    return start, self.arm.now_ns(), True
-                most = min(stop_s / 2, force_watch.POLL_S)
-            left = seconds - (self.arm.now_ns() - start) / 1e9
-            self.wait(max(min(most, left), 1e-3), sink)
+        with self.moving(segment):
+            deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
+            while not (progress := self.arm.progress()).done:
+                if not progress.state.healthy:
+                    raise arm_fault(progress.state, phase)
+                if self.clock.now_ns() > deadline:
+                    raise ArmFault("arm", f"did not finish the phase '{phase}' in time")
+                most = self.poll_s
+                if left_s is not None:
+                    stop_s = left_s()
+                    if not stop_s > 0:
+                        self.arm.stop()
+                        return start, self.arm.now_ns(), True
+                    most = min(stop_s / 2, force_watch.POLL_S)
+                left = seconds - (self.arm.now_ns() - start) / 1e9
+                self.wait(max(min(most, left), 1e-3), sink)
         if not progress.state.healthy:
             raise arm_fault(progress.state, phase)
         if not progress.finished:
             raise ArmFault("arm", f"was stopped from outside in the phase '{phase}'")
+        self._check_end(segment, phase, sink)
         return *progress.finished[-1], False
+
+    def _check_end(self, segment: Segment, phase: str, sink: Sink | None) -> None:
+        """Check that the arm is where its path ends; a pose may show it a little later.
+
+        Raises:
+            ArmFault: it is not.
+        """
+        deadline = self.clock.now_ns() + round(_END_S * 1e9)
+        while not is_near(here := self.pose(), segment.to):
+            if self.clock.now_ns() > deadline:
+                off = f"{distance_mm(here, segment.to):.1f} mm, {angle_deg(here, segment.to):.1f}"
+                text = f"reports the phase '{phase}' as finished, and its pose is {off} deg off"
+                raise ArmFault("arm", f"{text}: check the arm before the next move")
+            self.wait(force_watch.POLL_S, sink)
 
     def wait(self, seconds: float, sink: Sink | None = None) -> None:
         """Let time pass; read streams and check for stop requests every `poll_s`.
@@ -552,21 +709,29 @@ class Rig:
                 raise StopRequested
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
-        """Let time pass; forces are read after it, and often meanwhile.
-
-        Not on a simulated rig without a limit, where an overload breaks nothing.
-        """
-        if self._forces is None:
+        """Let time pass; forces and the moving arm's pose are looked at after it, and meanwhile."""
+        if self._forces is None and self._motion is None:
             self.clock.wait(seconds)
             return
-        often = self.simulation is None or self.force_limit_n is not None
-        most_s = force_watch.POLL_S if often else seconds
+        most_s = force_watch.POLL_S if self._often else seconds
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
             self.clock.wait(min(most_s, left / 1e9))
-            forces = self._forces.read()
-            if sink is not None:
-                sink.add_stream(FORCE, forces)
+            if self._forces is not None:
+                forces = self._forces.read()
+                if sink is not None:
+                    sink.add_stream(FORCE, forces)
+            if self._motion is not None:
+                self._look(self._motion)
+
+    def _look(self, motion: MotionWatch) -> None:
+        """Hold the moving arm's pose against its motion, its limits and the forces."""
+        asked_ns = self.clock.now_ns()
+        pose = self.pose()
+        motion.look(pose, asked_ns)
+        if self._forces is not None and self._forces.needed:
+            depth_mm = self.plate_frame.position(pose.xyz_mm).depth_mm + self._closed_mm
+            self._forces.follow(pose, depth_mm)
 
     def start_streams(
         self,
@@ -582,7 +747,11 @@ class Rig:
         self._streaming = self.event_camera if with_events else None
         if self._streaming is not None:
             self._streaming.start()
-        if self.force is not None:
+        if self._forces is not None:
+            self._forces.start()
+        elif self.force is not None and self._often:
+            self._watch_forces()
+        elif self.force is not None:
             self.force.start()
         self._reading = self.further if with_further else ()
         for device in self._reading:
@@ -622,7 +791,10 @@ class Rig:
         if self._streaming is not None:
             sink.add_events(self._streaming.read())
             sink.add_event_pulses(self._streaming.read_pulses())
-        sink.add_poses(self.arm.read_poses())
+        poses = self.arm.read_poses()
+        if not (np.isfinite(poses.xyz_mm).all() and np.isfinite(poses.rotvec_deg).all()):
+            raise ArmFault("arm", "reports poses that are not finite; check its controller's state")
+        sink.add_poses(poses)
         sink.add_arm_pulses(self.arm.read_pulses())
         sink.add_sync_pulses(self.sync.read_pulses())
         if self.frame_camera is not None:
@@ -647,41 +819,85 @@ class Rig:
         """
         if self._twisted:  # an earlier trial ended in its twist
             here = self.position()
-            left = angle_deg(self.arm.pose(), self.plate_frame.pose(here))
+            left = angle_deg(self.pose(), self.plate_frame.pose(here))
             self.twist(Twist("untwist", here, UNTWIST_DEG_S), replace(here, twist_deg=left))
             self._twisted = False
-        self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
+        out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+        self.move(Move("home", home, out_mm_s), self.position(), None)
         if self.gripper is not None:
             self._open_fingers(self.gripper)
-        if self.simulation is not None:
-            self.simulation.begin_trial(seed, nuisances)
-        if self.force is not None and self.force.zeroing == "trial":
-            self.force.zero()
+        self.begin_clear(seed, nuisances)
         for device in self.further:
             device.prepare()
+
+    def begin_clear(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
+        """Let the simulation draw its random values, and zero the force sensor.
+
+        The sensor is clear of the plate. Forces are watched from now on, where they have a limit.
+
+        Raises:
+            RigError: the force sensor is at fault.
+        """
+        if self.force is not None and self.force_limit_n is not None:
+            forces = self._forces or self._watch_forces()
+            while not forces.fresh:  # or the sensor is silent, which it raises
+                self.wait(POLL_S)
+        self._end_watch()
+        if self.simulation is not None:
+            self.simulation.begin_trial(seed, nuisances)
+        self._zero_forces()
+
+    def _zero_forces(self) -> None:
+        """Take the present load for zero, if the rig does so, and watch forces from now on."""
+        if self.force is None:
+            return
+        self._end_watch()
+        if self.force.zeroing == "trial":
+            self.force.zero()
+            self._zeroed = True
+        if self._often:
+            self._watch_forces()
 
     def _open_fingers(self, gripper: Gripper) -> None:
         """Move the fingers to the opening with which a trial begins, and wait for it."""
         opening_mm, allowed = self.grip_opening_mm, gripper.range
-        state = gripper.state()
-        if state.moving or abs(state.opening_mm - opening_mm) > max(allowed.step_mm, FINGERS_MM):
-            gripper.move(opening_mm, allowed.speed_mm_s[0], allowed.force_n[0])
-            self.await_fingers(gripper)
+        state = check_state(allowed, gripper.state())
+        if state.moving or not self._is_open(gripper, state, opening_mm):
+            self.move_fingers(opening_mm, allowed.speed_mm_s[0], allowed.force_n[0])
+            state = self.await_fingers(gripper)
+            if not self._is_open(gripper, state, opening_mm):
+                raise RigError(
+                    "gripper",
+                    f"stalled at {state.opening_mm:g} mm, on its way to the {opening_mm:g} mm with "
+                    "which a trial begins: look what holds it",
+                )
+        self._fingers_mm = opening_mm
+
+    def _is_open(self, gripper: Gripper, state: GripperState, opening_mm: float) -> bool:
+        """Return whether the fingers are at an opening, to a step of them."""
+        return abs(state.opening_mm - opening_mm) <= max(gripper.range.step_mm, FINGERS_MM)
 
     def await_fingers(self, gripper: Gripper, sink: Sink | None = None) -> GripperState:
         """Wait for the fingers to end their move; bounded.
 
         Raises:
-            RigError: they still move after `FINGERS_S`, or the gripper is at fault.
+            RigError: they still move after `FINGERS_S`, or ended elsewhere without a stall, or the
+                gripper is at fault.
             StopRequested: as `wait`.
         """
         deadline = self.clock.now_ns() + round(FINGERS_S * 1e9)
-        while (state := gripper.state()).moving:
+        while (state := check_state(gripper.range, gripper.state())).moving:
             if self.clock.now_ns() > deadline:
                 raise RigError(
                     "gripper", f"still moves {FINGERS_S:g} s after its command: look what holds it"
                 )
             self.wait(min(self.poll_s, FINGERS_POLL_S), sink)
+        to_mm = self._fingers_mm
+        if to_mm is not None and not state.stalled and not self._is_open(gripper, state, to_mm):
+            raise RigError(
+                "gripper",
+                f"ended at {state.opening_mm:g} mm, not at the {to_mm:g} mm to which it was sent",
+            )
         return state
 
     def _segment(
@@ -691,12 +907,16 @@ class Rig:
         return PathSegment(times.start_ns, times.end_ns, *places, speed)
 
     def position(self) -> Position:
-        """Return the current tool centre point in plate coordinates."""
-        return self.plate_frame.position(self.arm.pose().xyz_mm)
+        """Return the current tool centre point in plate coordinates. Raises ArmFault."""
+        return self.plate_frame.position(self.pose().xyz_mm)
+
+    def pose(self) -> Pose:
+        """Return the arm's current pose. Raises ArmFault if it is none."""
+        return check_pose(self.arm.pose())
 
     @contextmanager
     def safely(self, clear: Position) -> Iterator[None]:
-        """Stop on any exception inside: stop the arm, retract it if healthy, stop the cameras.
+        """Stop on any exception inside: stop arm and fingers, retract the arm, stop the rest.
 
         A device that fails to stop does not keep the others from being stopped. The first error is
         raised; but an arm that could not be stopped or moved clear, and a plate that was not
@@ -709,8 +929,11 @@ class Rig:
             fault: RigError | None = None
             try:
                 fault = self._stop_arm()
+                if self.gripper is not None:
+                    with suppress(Exception):
+                        self.gripper.stop()
                 if fault is None and not isinstance(error, StaysInContact):
-                    fault = self._retract(clear)
+                    fault = self._retract(clear, error)
             finally:
                 for device in self._devices()[1:]:
                     with suppress(Exception):
@@ -724,6 +947,8 @@ class Rig:
             if uncaught and isinstance(error, RigError):
                 raise self._with_plate_warning(error) from error
             raise
+        with suppress(Exception):  # the motion is over
+            self._end_watch()
 
     def _with_plate_warning(self, error: RigError) -> RigError:
         """Return the error with a warning if the plate was released and not caught."""
@@ -749,8 +974,11 @@ class Rig:
             return None
         return ArmFault("arm", "could not be confirmed at rest: its stop was interrupted")
 
-    def _retract(self, clear: Position) -> RigError | None:
+    def _retract(self, clear: Position, error: BaseException) -> RigError | None:
         """Retract straight out along the plate's normal if the arm is healthy, bounded in time.
+
+        Forces are watched, unless `error` is a fault of their sensor, which must not keep the arm
+        in contact.
 
         Returns:
             the error if a healthy arm did not come clear, in which case it has been stopped.
@@ -758,15 +986,19 @@ class Rig:
         try:
             if not self.arm.state().healthy:
                 return None
-            at = self.position()
+            begin, at = self.pose(), self.position()
             out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
             if at.distance_mm(out) == 0:
                 return None
-            pose = self.plate_frame.pose(out)
+            pose, speed_mm_s = self.plate_frame.pose(out), self.at_most(RETRACT_SPEED_MM_S)
             if self._twisted:  # straight out as it stands; it turns back where it is clear
-                pose = replace(pose, rotvec_deg=self.arm.pose().rotvec_deg)
-            self.arm.start([Segment(pose, RETRACT_SPEED_MM_S)])
-            polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
+                pose = replace(pose, rotvec_deg=begin.rotvec_deg)
+            blind = _of_sensor(error) and not isinstance(error, ForceLimitError)
+            if self.force is not None and self._often and not blind:
+                with suppress(RigError):
+                    self._watch_forces(leaving=True)
+            self._send(Segment(pose, speed_mm_s), begin)
+            polls = int((at.distance_mm(out) / speed_mm_s + 2.0) / self.poll_s) + 1
             for _ in range(polls):
                 if (progress := self.arm.progress()).done:
                     if progress.finished:
@@ -774,13 +1006,31 @@ class Rig:
                     raise ArmFault(
                         "arm", f"did not come clear of the plate: {progress.state.value}"
                     )
-                self.clock.wait(self.poll_s)
+                self._pass_leaving(self.poll_s)
             raise ArmFault("arm", "did not come clear of the plate in time")
         except RigError as fault:
             return self._stop_arm() or fault
         except BaseException:
             self._stop_arm()
             raise
+        finally:
+            self._motion = self._forces = None
+
+    def _pass_leaving(self, seconds: float) -> None:
+        """Let time pass while the arm moves clear; a force sensor that fails is no longer read."""
+        try:
+            self._pass(seconds, None)
+        except ForceLimitError:
+            raise
+        except RigError as fault:
+            if not _of_sensor(fault):
+                raise
+            self._forces = None
+
+
+def _of_sensor(error: BaseException) -> bool:
+    """Return whether an error is one of the force sensor."""
+    return isinstance(error, RigError) and error.device == force_watch.DEVICE
 
 
 def nuisances_of(program: Program) -> TrialNuisances | None:

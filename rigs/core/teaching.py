@@ -6,6 +6,7 @@ for stop requests every 10 ms. On any failure the arm is stopped before anything
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,9 +16,10 @@ import numpy.typing as npt
 
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
-from sliplab.rigs.core.touching import POLL_S, QUIET_S, MarkerTouch, RateTouch
+from sliplab.rigs.core.touching import POLL_S, MarkerTouch, RateTouch
 from sliplab.storage.streams import FrameChunk
 
 F64 = npt.NDArray[np.float64]
@@ -31,6 +33,8 @@ APPROACH_MM_S = 5.0
 MAX_CREEP_MM_S = 1.0
 OBLIQUE_SLOPE = 0.1
 """Lateral motion of an oblique approach per mm of depth."""
+STILL_S = 1.0
+"""Longest time without a new image, s, while the markers move in it."""
 _POSE_INVALID = {ArmState.PROTECTIVE_STOP, ArmState.EMERGENCY_STOP, ArmState.DISCONNECTED}
 _APPROACH_POLL_S = 0.05
 _GRACE_S = 5.0
@@ -106,14 +110,13 @@ def touch(
         at = rig.position()
         out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
         across = Position(clear.x_mm, clear.y_mm, out.depth_mm)
-        rig.move(Move("out", out, RETRACT_SPEED_MM_S), at)
-        rig.move(Move("across", across, RETRACT_SPEED_MM_S), out)
-        if rig.simulation is not None:
-            rig.simulation.begin_trial(seed)
+        out_mm_s = rig.at_most(RETRACT_SPEED_MM_S)
+        rig.move(Move("out", out, out_mm_s), at)
+        rig.move(Move("across", across, out_mm_s), out)
+        rig.begin_clear(seed)
         # on any failure `safely` stops the streams, after the arm
         _start(rig, seed, find is not None)
-        rig.wait(QUIET_S)
-        rate = RateTouch(rig.central_events())
+        rate = rig.measure_noise()
         _approach(rig, across, clear, rate)
         detector = _TouchDetector(rig, creep, rate, find)
         _creep(rig, clear, deepest, detector)
@@ -121,9 +124,7 @@ def touch(
             with suppress(RigError):
                 device.stop()
         at = rig.position()
-        rig.move(
-            Move("release", Position(at.x_mm, at.y_mm, clear.depth_mm), RETRACT_SPEED_MM_S), at
-        )
+        rig.move(Move("release", Position(at.x_mm, at.y_mm, clear.depth_mm), out_mm_s), at)
     if detector.touched_mm is None:
         raise detector.not_found()
     return Touch(x_mm, y_mm, detector.touched_mm, detector.deepest_mm)
@@ -146,20 +147,21 @@ def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None
     distance = begin.distance_mm(end)
     if distance == 0.0:
         return
-    rig.arm.start([Segment(rig.plate_frame.pose(end), APPROACH_MM_S)])
-    deadline = rig.clock.now_ns() + int((2 * distance / APPROACH_MM_S + _GRACE_S) * 1e9)
-    while not (progress := rig.arm.progress()).done:
-        if rig.clock.now_ns() > deadline:
-            raise ArmFault("arm", "did not finish its approach to the plate in time")
-        rig.wait(_APPROACH_POLL_S)
-        if rig.central_events() > rate.limit:
-            rig.arm.stop()
-            depth = rig.position().depth_mm
-            raise RigError(
-                "arm",
-                f"made contact {-depth:.1f} mm before the plane that the rig assumes, during the "
-                "fast approach: begin farther away (--clearance), or teach by hand",
-            )
+    speed_mm_s = rig.at_most(APPROACH_MM_S)
+    with rig.moving(Segment(rig.plate_frame.pose(end), speed_mm_s)):
+        deadline = rig.clock.now_ns() + int((2 * distance / speed_mm_s + _GRACE_S) * 1e9)
+        while not (progress := rig.arm.progress()).done:
+            if rig.clock.now_ns() > deadline:
+                raise ArmFault("arm", "did not finish its approach to the plate in time")
+            rig.wait(_APPROACH_POLL_S)
+            if rig.central_events() > rate.limit:
+                rig.arm.stop()
+                depth = rig.position().depth_mm
+                raise RigError(
+                    "arm",
+                    f"made contact {-depth:.1f} mm before the plane that the rig assumes, during "
+                    "the fast approach: begin farther away (--clearance), or teach by hand",
+                )
     if not progress.state.healthy:
         raise arm_fault(progress.state, "approach")
     if not progress.finished:
@@ -172,6 +174,8 @@ class _TouchDetector:
     def __init__(self, rig: Rig, creep: Creep, rate: RateTouch, find: MarkerFinder | None) -> None:
         self._rig, self._creep, self._rate, self._find = rig, creep, rate, find
         self._markers = MarkerTouch()
+        self._images = StallTimer(rig.clock.now_ns)
+        self._image: tuple[int | None] = (None,)
         self._host_ns: list[int] = []
         self._depth_mm: list[float] = []
         self._by_events_mm: float | None = None
@@ -194,10 +198,24 @@ class _TouchDetector:
             self._depth_mm.append(depth)
             chunk = rig.frames.read()
             rig.sync.read_pulses()
+            self._check_images(chunk)
             when = self._markers.add(self._find(chunk), chunk.host_ns) if len(chunk) else None
             if when is not None:
                 self.touched_mm = float(np.interp(when, self._host_ns, self._depth_mm))
         return self.touched_mm is not None or depth > self._limit_mm
+
+    def _check_images(self, chunk: FrameChunk) -> None:
+        """Raise RigError if the camera's image has not changed for too long."""
+        if len(chunk):
+            last = chunk.images[-1] if chunk.markers_px is None else chunk.markers_px[-1]
+            self._image = (zlib.crc32(last.tobytes()),)
+        still_s = self._images.waited_s(self._image)
+        if still_s > STILL_S:
+            raise RigError(
+                "frame camera",
+                f"sent no new image for {still_s:.1f} s while the sensor moves in it; the arm was "
+                "stopped: check the camera's trigger and cable, or use --by events",
+            )
 
     def end(self) -> None:
         """Look at the events of the whole creep, if no touch was noticed on the way."""
@@ -234,15 +252,15 @@ class _TouchDetector:
 
 def _creep(rig: Rig, clear: Position, deepest: Position, detector: _TouchDetector) -> None:
     seconds = clear.distance_mm(deepest) / detector.speed_mm_s
-    rig.arm.start([Segment(rig.plate_frame.pose(deepest), detector.speed_mm_s)])
-    deadline = rig.clock.now_ns() + int((2 * seconds + _GRACE_S) * 1e9)
-    while not rig.arm.progress().done:
-        rig.wait(POLL_S)
-        if detector.poll():
-            break
-        if rig.clock.now_ns() > deadline:
-            raise ArmFault("arm", "did not finish creeping in time")
-    rig.arm.stop()
+    with rig.moving(Segment(rig.plate_frame.pose(deepest), detector.speed_mm_s)):
+        deadline = rig.clock.now_ns() + int((2 * seconds + _GRACE_S) * 1e9)
+        while not rig.arm.progress().done:
+            rig.wait(POLL_S)
+            if detector.poll():
+                break
+            if rig.clock.now_ns() > deadline:
+                raise ArmFault("arm", "did not finish creeping in time")
+        rig.arm.stop()
     state = rig.arm.state()
     if not state.healthy:  # a stopped arm finds no plate, though the taught plane may be right
         raise arm_fault(state, "creeping")
@@ -266,9 +284,9 @@ def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
         state = rig.arm.state()
         if state in _POSE_INVALID:  # in others, such as local control, the pose is still right
             raise arm_fault(state, word)
-        pose = rig.arm.pose()
+        pose = rig.pose()
         rig.wait(0.2)
-        if not np.allclose(rig.arm.pose().xyz_mm, pose.xyz_mm, atol=0.05):
+        if not np.allclose(rig.pose().xyz_mm, pose.xyz_mm, atol=0.05):
             raise RigError("arm", f"is still moving after '{word}': let it stop, then confirm")
         poses.append(pose)
     return poses
@@ -317,11 +335,11 @@ def press_in_circles(
     with rig.safely(home):
         at = rig.position()
         out = Position(at.x_mm, at.y_mm, min(at.depth_mm, home.depth_mm))
-        rig.move(Move("out", out, RETRACT_SPEED_MM_S), at)
-        rig.move(Move("home", home, RETRACT_SPEED_MM_S), out)
-        if rig.simulation is not None:
-            rig.simulation.begin_trial(seed)
-        rig.move(Move("press", middle, 2.0), home)
+        out_mm_s = rig.at_most(RETRACT_SPEED_MM_S)
+        rig.move(Move("out", out, out_mm_s), at)
+        rig.move(Move("home", home, out_mm_s), out)
+        rig.begin_clear(seed)
+        rig.move(Move("press", middle, rig.at_most(2.0)), home)
         rig.wait(1.0)
         rig.events.start()
         at = middle
@@ -332,5 +350,5 @@ def press_in_circles(
                 chunk = rig.events.read()
                 np.add.at(count[number], (chunk.y, chunk.x), 1)
         rig.events.stop()
-        rig.move(Move("release", home, RETRACT_SPEED_MM_S), at)
+        rig.move(Move("release", home, out_mm_s), at)
     return count

@@ -7,12 +7,15 @@ outside camera sees its white tip stop moving with the others.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.storage.streams import EventChunk
 
 F64 = npt.NDArray[np.float64]
@@ -37,6 +40,51 @@ def count_central(
     column, row = centre_px or (size_px[0] // 2, size_px[1] // 2)
     x, y = np.abs(chunk.x - np.float64(column)), np.abs(chunk.y - np.float64(row))
     return int(np.count_nonzero((x < TOUCH_HALF_PX) & (y < TOUCH_HALF_PX)))
+
+
+class NoiseWatch:
+    """Detects an event camera that has gone silent: the noise that it showed at rest ends.
+
+    Args:
+        chunk: events of the last `QUIET_S` at rest, of the whole array.
+        now_ns: the rig's clock.
+        may_be_silent: True for a simulated camera, which may have no noise.
+
+    Raises:
+        RigError: no event came at all.
+    """
+
+    SILENT_S: ClassVar[float] = 0.2
+    """Shortest silence that is a fault."""
+    EXPECTED: ClassVar[int] = 30
+    """Events of the noise that a silence must have lasted for: by chance it is below 1e-9."""
+
+    def __init__(self, chunk: EventChunk, now_ns: Callable[[], int], may_be_silent: bool) -> None:
+        if not len(chunk) and not may_be_silent:
+            text = f"sent no event within {QUIET_S:g} s, not even noise: a touch would not show"
+            raise RigError("event camera", f"{text}; check its lens, settings and cable")
+        rate = len(chunk) / QUIET_S
+        self._longest_s = max(self.SILENT_S, self.EXPECTED / rate) if rate else np.inf
+        self._stall = StallTimer(now_ns)
+        self._newest_us: int | None = None
+        self.check(chunk)
+
+    def check(self, chunk: EventChunk) -> None:
+        """Hold the events since the last call against the noise.
+
+        Raises:
+            RigError: no newer event has come for too long.
+        """
+        newest_us = int(chunk.t_us.max()) if len(chunk) else None
+        if newest_us is not None and (self._newest_us is None or newest_us > self._newest_us):
+            self._newest_us = newest_us
+        silent_s = self._stall.waited_s((self._newest_us,))
+        if silent_s > self._longest_s:
+            raise RigError(
+                "event camera",
+                f"sent no newer event for {silent_s:.2f} s, not even noise, so a touch would not "
+                "show; the arm was stopped: check its cable",
+            )
 
 
 class RateTouch:

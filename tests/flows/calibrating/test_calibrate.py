@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.core.teaching import Creep
 from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.streams import FrameChunk
 from tests.command_line import answer, here, sliplab
 from tests.conftest import ROOT
 
@@ -210,6 +212,23 @@ def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
     # another size of square than was printed: the scale follows, the picture cannot tell
     large = calibrate.calibrate_lens(pictures, Board(square_mm=6.06, marker_mm=4.545), here.today)
     assert large.figures["scale_px_per_mm"] == pytest.approx(20.0 * 6.0 / 6.06, rel=3e-4)
+
+
+def test_camera_that_repeats_its_image_gives_no_pictures_of_a_board(tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(MOCK)
+    here = session(path)
+    read, first = here.rig.frames.read, []
+
+    def frozen() -> FrameChunk:
+        chunk = read()
+        first.extend(chunk.images[:1])
+        images = np.repeat(first[0][None], len(chunk), 0) if first else chunk.images
+        return replace(chunk, images=images)
+
+    here.rig.frames.read = frozen  # type: ignore[method-assign]
+    with pytest.raises(RigError, match="frame camera: sent exactly the image of the picture befo"):
+        calibrate.see_boards(here, 4)
 
 
 def test_a_camera_of_tracks_has_no_pictures_of_a_board(tmp_path: Path) -> None:

@@ -186,6 +186,50 @@ def test_without_a_safe_state_a_failure_moves_the_arm_clear(
     assert stands_clear(rigs[0])
 
 
+@pytest.mark.parametrize("how", ["silent", "frozen"])
+@pytest.mark.parametrize("settings", [None, {}], ids=["no safe state", "safe state"])
+def test_events_that_stop_or_freeze_stop_a_reflex_trial(
+    settings: dict[str, Any] | None, how: str, model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    """With a safe state the arm stays; without one it moves clear, as after any failure."""
+    rigs: list[Rig] = []
+
+    def build(file: RigFile) -> Rig:
+        rig = keeping(rigs)(file)
+        read, pulses = rig.events.read, rig.events.read_pulses
+
+        def lost() -> bool:
+            return rig.position().x_mm > 0
+
+        def events() -> EventChunk:
+            chunk = read()
+            if not lost():
+                return chunk
+            if how == "frozen" and len(chunk):
+                rows = np.zeros(len(chunk), int)
+                kept = {name: column[rows] for name, column in vars(chunk).items()}
+                return EventChunk(**kept | {"t_us": np.full(len(chunk), stamps[-1], np.int64)})
+            if len(chunk):
+                stamps.append(int(chunk.t_us.max()))
+            return EventChunk(*(column[:0] for column in vars(chunk).values()))
+
+        stamps = [0]
+        rig.events.read = events  # type: ignore[method-assign]
+        rig.events.read_pulses = (  # type: ignore[method-assign]
+            lambda: type(pulses())(np.empty(0, np.int64)) if lost() else pulses()
+        )
+        return rig
+
+    change = {} if settings is None else {"reflex": {"safe_state": "stop", **settings}}
+    order = gripping(model, protocol, tmp_path, {"reflex": None} | change)
+    expected = RigError if settings is None else SafeState
+    said = "event camera: neither events nor pulses|event camera: .*clock|fell back"
+    with pytest.raises(expected, match=said):
+        detect(order, counting=quiet, build=build)
+    assert rigs[0].arm.progress().done
+    assert (rigs[0].position().depth_mm < 0) == (settings is None)
+
+
 def test_the_command_says_what_was_lost_and_fails(
     model: Path, protocol: Path, tmp_path: Path
 ) -> None:

@@ -180,9 +180,9 @@ def read_in_a_press(limit_n: float | None) -> list[np.ndarray]:
         found.append(chunk.force_n)
         return chunk
 
-    sensor.read = noted  # type: ignore[method-assign]
     with rig.safely(home):
         rig.begin_trial(home, 5)
+        sensor.read = noted  # type: ignore[method-assign]
         rig._watch_forces()
         rig.take_step(0, Move("press", Position(0.0, 0.0, 2.8), 1.0), home, None)
     rig.close()

@@ -7,17 +7,21 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from sliplab.protocols.program import Position
 from sliplab.rigs.core.arm_settings import Limits
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.guard import (
+    MEASURED_MM,
     DepthError,
     Guard,
     GuardError,
+    PlateLimits,
     SingularityError,
     SpeedError,
     TiltError,
     WorkspaceError,
 )
+from sliplab.rigs.core.plate_frame import PlateFrame
 
 DOWN = (180.0, 0.0, 0.0)
 BEGIN = Pose((400.0, 0.0, 300.0), DOWN)
@@ -76,6 +80,48 @@ def test_joint_5_keeps_off_its_singular_positions(joint: float) -> None:
     with pytest.raises(SingularityError):
         guard().check_joints((0, -90, 90, -90, joint, 0))
     guard().check_joints((0, -90, 90, -90, 90, 0))
+
+
+FRAME = PlateFrame.taught((PLATE["centre_mm"], PLATE["right_mm"], PLATE["above_mm"]))
+
+
+def at(x: float, y: float, depth: float) -> Pose:
+    return FRAME.pose(Position(x, y, depth))
+
+
+def test_limits_of_the_rig_count_in_the_frame_it_uses() -> None:
+    held = Guard(None, PlateLimits(depth_mm=3.0, reach_mm=10.0, speed_mm_s=20.0, rim_mm=10.0))
+    held.check_segment(at(0, 0, -5), Segment(at(8, 6, 3.0), 20.0), FRAME)
+    for frame, closed_mm in ((FRAME.with_zero(-0.5), 0.0), (FRAME, 0.5)):
+        with pytest.raises(DepthError, match=r"depth in contact 3\.5 mm is beyond its limit 3 mm"):
+            held.check_segment(at(0, 0, -5), Segment(at(0, 0, 3.0), 20.0), frame, closed_mm)
+    with pytest.raises(WorkspaceError, match=r"distance from the plate's centre 10\.3"):
+        held.check_segment(at(0, 0, -5), Segment(at(8, 6.5, 0), 20.0), FRAME)
+    with pytest.raises(SpeedError, match=r"rim at 120 deg/s: 20\.94 mm/s"):
+        held.check_segment(at(0, 0, -5), Segment(at(0, 0, -5), 10.0, turn_deg_s=120.0), FRAME)
+    assert held.speed_mm_s == 20.0
+
+
+def test_path_from_outside_may_end_no_farther_outside() -> None:
+    held = Guard(None, PlateLimits(3.0, 10.0, 20.0))
+    begin = at(14, 0, 4)
+    held.check_segment(begin, Segment(at(14, 0, -5), 5.0), FRAME)
+    held.check_segment(begin, Segment(at(0, 0, -5), 5.0), FRAME)
+    for end in (at(14.1, 0, -5), at(0, 0, 4.1)):
+        with pytest.raises(GuardError):
+            held.check_segment(begin, Segment(end, 5.0), FRAME)
+
+
+def test_measured_poses_may_scatter_about_a_limit() -> None:
+    held = Guard(Limits(**BOX), PlateLimits(3.0, 10.0, 20.0))
+    inside, outside = at(0, 0, 0), at(0, 0, 4)
+    held.check_measured(at(0, 0, 3 + 0.9 * MEASURED_MM), inside, FRAME)
+    held.check_measured(at(0, 0, 4 + 0.9 * MEASURED_MM), outside, FRAME)
+    for pose, begin in ((at(0, 0, 3 + 1.1 * MEASURED_MM), inside), (at(0, 0, 4.3), outside)):
+        with pytest.raises(DepthError, match="stopped on its way"):
+            held.check_measured(pose, begin, FRAME)
+    with pytest.raises(WorkspaceError, match="z in the base frame"):
+        held.check_measured(Pose((450.0, 0.0, 400.3), DOWN), Pose((450.0, 0.0, 300.0), DOWN), FRAME)
 
 
 def test_numbers_that_are_none_are_refused() -> None:

@@ -20,3 +20,13 @@ def test_only_time_that_somebody_watched_counts(monkeypatch: pytest.MonkeyPatch)
     assert stall.waited_s(1) == pytest.approx(0.05 + STEP_S)
     now_s = 20.1
     assert stall.waited_s(2) == 0.0  # it moved
+
+
+def test_stall_timer_counts_on_the_clock_and_step_given() -> None:
+    now_ns = [0]
+    stall = StallTimer(lambda: now_ns[0], step_s=1.0)
+    assert stall.waited_s((None,)) == 0.0
+    now_ns[0] = 700_000_000
+    assert stall.waited_s((None,)) == pytest.approx(0.7)
+    now_ns[0] = 9_000_000_000
+    assert stall.waited_s((None,)) == pytest.approx(1.7)

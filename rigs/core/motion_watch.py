@@ -1,0 +1,107 @@
+"""Measured poses while the arm follows a segment: within the limits, and showing the motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from sliplab.rigs.core.capabilities import ArmFault, Pose, Segment
+from sliplab.rigs.core.guard import Guard, SpeedError
+from sliplab.rigs.core.host_clock import STEP_S, StallTimer
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.pose import angle_deg, distance_mm
+
+END_MM, END_DEG = 1.0, 1.0
+"""Largest distance from its end at which a path may be reported as finished."""
+STUCK_S, STUCK_MM = 3.0, 0.5
+"""Time, and motion at the commanded speed, in which the pose must change. A driver that knows its
+pose only between pieces of a move updates it every two seconds at worst."""
+SPEED_S, SPEED_SHARE, SPEED_MM = 0.2, 0.2, 1.0
+"""Shortest time over which a speed is measured, and by how much it may be above the limit: poses
+are noisy, and may be some packets old."""
+
+_NUMBERS = 6
+
+
+def check_pose(pose: Pose) -> Pose:
+    """Return the pose.
+
+    Raises:
+        ArmFault: it does not hold six finite numbers.
+    """
+    try:
+        numbers = (*pose.xyz_mm, *pose.rotvec_deg)
+        usable = len(numbers) == _NUMBERS and all(map(math.isfinite, numbers))
+    except (AttributeError, TypeError):
+        usable = False
+    if not usable:
+        raise ArmFault("arm", f"reports {pose!r}, which is no pose; check its controller's state")
+    return pose
+
+
+def is_near(pose: Pose, end: Pose) -> bool:
+    """Return whether a pose is at the end of a path, within `END_MM` and `END_DEG`."""
+    if not distance_mm(pose, end) <= END_MM:
+        return False
+    return pose.rotvec_deg == end.rotvec_deg or angle_deg(pose, end) <= END_DEG
+
+
+class MotionWatch:
+    """The motion along one segment, which was checked and sent.
+
+    Args:
+        begin: measured pose at which it begins.
+        plate: the plate's frame as the rig uses it.
+        closed_mm: what the fingers add to the depth.
+        now_ns: the rig's clock.
+        poll_s: period at which poses are read.
+    """
+
+    def __init__(
+        self,
+        guard: Guard,
+        segment: Segment,
+        begin: Pose,
+        plate: PlateFrame,
+        closed_mm: float,
+        now_ns: Callable[[], int],
+        poll_s: float,
+    ) -> None:
+        self._guard, self._segment, self._begin = guard, segment, begin
+        self._plate, self._closed_mm, self._now_ns = plate, closed_mm, now_ns
+        self._stall = StallTimer(now_ns, max(STEP_S, 2 * poll_s))
+        self._stall.waited_s(begin)
+        self._stuck_s = STUCK_S + STUCK_MM / (segment.turn_deg_s or segment.speed_mm_s)
+        self._past = now_ns(), begin
+
+    def look(self, pose: Pose, asked_ns: int) -> None:
+        """Hold a measured pose against the limits and the motion.
+
+        Args:
+            asked_ns: the rig's clock before the pose was read.
+
+        Raises:
+            GuardError: pose or speed is beyond a limit.
+            ArmFault: the pose does not change although the arm should move.
+        """
+        self._guard.check_measured(pose, self._begin, self._plate, self._closed_mm)
+        still_s = self._stall.waited_s(pose)
+        if still_s > self._stuck_s and not is_near(pose, self._segment.to):
+            raise ArmFault(
+                "arm",
+                f"has reported the same pose for {still_s:.1f} s while it should move; the arm "
+                "was stopped: check its connection, and whether it moves",
+            )
+        self._check_speed(pose, asked_ns)
+
+    def _check_speed(self, pose: Pose, asked_ns: int) -> None:
+        """Hold the mean speed since an earlier pose against the limit."""
+        limit, (past_ns, past) = self._guard.speed_mm_s, self._past
+        seconds = (self._now_ns() - past_ns) * 1e-9
+        if pose == past or seconds < SPEED_S:
+            return  # the time at which a pose was first seen counts
+        gone_mm = distance_mm(past, pose)
+        if not gone_mm <= (1.0 + SPEED_SHARE) * limit * seconds + SPEED_MM:
+            where = "the arm was stopped on its way, where its poses show"
+            raise SpeedError("speed", gone_mm / seconds, limit, "mm/s", where)
+        self._past = asked_ns, pose

@@ -1,0 +1,748 @@
+"""Motion of any kind: forces, poses, fingers and events are watched by the rig, not by callers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.protocols.program import Dwell, Move, Position, Program, Twist
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.capabilities import ArmFault, GripperState, Pose, RigError, Segment
+from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
+from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, WorkspaceError
+from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
+from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
+from sliplab.rigs.mock.force import MockForceSensor
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.rig_file import RigFile, RigLimits, load_rig_file
+from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
+from tests.conftest import ROOT
+
+LIMIT_N = 0.6
+HOME = Position(0.0, 0.0, -2.0)
+DEEP = Position(0.0, 0.0, 2.4)
+PROGRAM = Program(HOME, (
+    Move("press", DEEP, 2.0),
+    Dwell("hold", 0.1, recorded=True),
+    Move("slide", Position(3.0, 0.0, 2.4), 3.0, recorded=True),
+    Move("release", HOME, 10.0),
+))  # fmt: skip
+
+
+def make_rig(name: str = "mock-force", limit_n: float | None = LIMIT_N, **scene: Any) -> Rig:
+    """A simulated rig with a small event camera, that starts near the plate."""
+    file, _ = load_rig_file(Path(name))
+    data = file.scene.model_dump()
+    data["arm"] |= {"start_xyz_mm": (395.0, 0.0, 300.0)}
+    data["event_camera"] |= {"width": 64, "height": 64}
+    data["frame_camera"] |= {"level": "tracks"}
+    data["force"] = data["force"] or {}
+    for key, change in scene.items():
+        data[key] = {**(data[key] or {}), **change}
+    file = file.model_copy(update={"mock": MockSettings.model_validate(data)})
+    rig = build_rig(file)
+    rig.force_limit_n = limit_n
+    rig.connect()
+    return rig
+
+
+class Watcher(NullSink):
+    """A watcher that says slip as soon as it is armed, or never."""
+
+    def __init__(self, slip: bool = False) -> None:
+        self.armed = self.guarded = False
+        self._slip = slip
+
+    def step(self, phase: str, acting: bool) -> None:
+        """A step begins."""
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        if self.armed and self._slip:
+            raise SlipDetected
+
+
+def deaf(rig: Rig) -> Rig:
+    """The rig, to which no touch shows in the events."""
+    rig.central_events = lambda: 0  # type: ignore[method-assign]
+    return rig
+
+
+def trial(rig: Rig) -> None:
+    rig.run_trial(PROGRAM, NullSink(), 1, None, 100)
+
+
+def watched_trial(rig: Rig) -> None:
+    run_watched(rig, PROGRAM, Watcher(), 1, 100, None)
+
+
+def warm_up(rig: Rig) -> None:
+    rig.press(2.4, 2.0, 2.0, 2)
+
+
+def touching_off(rig: Rig) -> None:
+    deaf(rig).touch_off(1.0, 2.4, 1)
+
+
+def taught_touch(rig: Rig) -> None:
+    touch(deaf(rig), 0.0, 0.0, Creep(1.0, 2.4, 1.0), 1)
+
+
+def circles(rig: Rig) -> None:
+    press_in_circles(rig, 2.4, 1.0, 2.0, 1)
+
+
+def lone_move(rig: Rig) -> None:
+    with rig.safely(HOME):
+        rig.begin_clear(1)
+        rig.move(Move("press", DEEP, 2.0), rig.position())
+
+
+MOTIONS = [trial, watched_trial, warm_up, touching_off, taught_touch, circles, lone_move]
+each_motion = pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.__name__)
+
+
+def true_forces(rig: Rig) -> list[float]:
+    """Keep the true normal force at every look at the arm's pose."""
+    sensor = rig.force
+    assert isinstance(sensor, MockForceSensor)
+    world, found = sensor._world, [0.0]
+    pose = rig.arm.pose
+
+    def looked() -> Pose:
+        if world.physics.wrench is not None:
+            end_ns = world.advance()
+            found.append(float(world.physics.wrench.at(np.array([end_ns], np.int64))[0, 2]))
+        return pose()
+
+    rig.arm.pose = looked  # type: ignore[method-assign]
+    return found
+
+
+# -- the limit of force ----------------------------------------------------------------------
+
+
+@each_motion
+def test_limit_of_force_stops_any_motion(motion: Callable[[Rig], None]) -> None:
+    rig = make_rig()
+    forces = true_forces(rig)
+    with pytest.raises(ForceLimitError, match=r"above limits.force = 0.6 N of the rig"):
+        motion(rig)
+    assert LIMIT_N - 0.1 < max(forces) < LIMIT_N + 0.25  # two millimetres a second, every 20 ms
+    assert rig.arm.progress().done
+    assert rig.position().depth_mm < 0.0  # moved clear
+
+
+@each_motion
+def test_motion_below_the_limit_runs_to_its_end(motion: Callable[[Rig], None]) -> None:
+    rig = make_rig(limit_n=30.0)
+    if motion in (touching_off, taught_touch):  # a touch that does not show ends at its hard limit
+        with pytest.raises(RigError, match="found no plate within"):
+            motion(rig)
+    else:
+        motion(rig)
+    assert rig._forces is None
+    rig.close()
+
+
+@pytest.mark.parametrize("kind", ["press", "grip"])
+def test_limit_of_force_stops_what_a_reflex_adds(kind: Any) -> None:
+    """The press of 2.4 mm stays below the limit; 1.5 mm more do not."""
+    rig = make_rig("mock-gripper", 4.0)
+    reflex = Reflex(kind, 4.0, 1.5, 20.0 if kind == "grip" else 2.0, 50.0, 0.1)
+    stopped: list[float] = []
+    assert rig.gripper is not None
+    stop = rig.gripper.stop
+
+    def noted() -> None:
+        stopped.append(rig.position().depth_mm)
+        stop()
+
+    rig.gripper.stop = noted  # type: ignore[method-assign]
+    with pytest.raises(ForceLimitError):
+        run_watched(rig, PROGRAM, Watcher(slip=True), 1, 100, reflex)
+    assert stopped[0] > 2.0  # fingers are stopped before the arm moves clear
+    assert rig.gripper.state().opening_mm > 40.0 - 1.5
+    assert rig.position().depth_mm < 0.0
+
+
+def test_limit_of_force_holds_while_the_arm_rests_after_a_reflex() -> None:
+    rig, watcher = make_rig(limit_n=4.0), Watcher(slip=True)
+    sensor = rig.force
+    assert sensor is not None
+    read, pushed = sensor.read, [0.0]
+
+    def push() -> WrenchChunk:
+        chunk = read()
+        return replace(chunk, force_n=chunk.force_n + pushed[0])
+
+    sensor.read = push  # type: ignore[method-assign]
+    watcher.step = lambda phase, acting: pushed.append(pushed.pop() + 3.0 * (phase == "reflex"))  # type: ignore[method-assign]
+    with pytest.raises(ForceLimitError):
+        run_watched(rig, PROGRAM, watcher, 1, 100, Reflex("stop", 4.0, hold_s=1.0))
+    assert pushed == [3.0]
+
+
+def test_force_that_rises_while_the_arm_moves_clear_stops_it() -> None:
+    rig = make_rig()
+    sensor = rig.force
+    assert sensor is not None
+    read = sensor.read
+    stops: list[bool] = []
+
+    def rising() -> WrenchChunk:
+        chunk = read()
+        if stops and len(chunk):
+            stops.append(True)
+            return replace(chunk, force_n=chunk.force_n + 0.5 * len(stops))
+        return chunk
+
+    sensor.read = rising  # type: ignore[method-assign]
+    stop = rig.arm.stop
+    rig.arm.stop = lambda: (stops.append(True), stop())[1]  # type: ignore[method-assign, func-returns-value]
+    with pytest.raises(RigError, match=r"above limits\.force"):
+        trial(rig)
+    assert rig.position().depth_mm > 0.0
+    assert rig.arm.progress().done
+
+
+def test_limit_passed_by_one_sample_between_two_readings_is_seen() -> None:
+    rig = make_rig(limit_n=20.0)
+    sensor = rig.force
+    assert sensor is not None
+    read = sensor.read
+
+    def spiked() -> WrenchChunk:
+        chunk = read()
+        if rig.position().x_mm > 1.0:
+            chunk.force_n[len(chunk) // 2 : len(chunk) // 2 + 1, 0] = -21.0
+        return chunk
+
+    sensor.read = spiked  # type: ignore[method-assign]
+    with pytest.raises(ForceLimitError, match=r"21\.\d+ N on the plate"):
+        watched_trial(rig)
+
+
+def test_load_before_the_first_zero_is_no_fault_but_more_is() -> None:
+    """A sensor that was never zeroed shows the weight of its tool."""
+    rig = make_rig(limit_n=2.0)
+    sensor = rig.force
+    assert sensor is not None
+    read, weight_n, hit_n = sensor.read, np.array([0.0, -5.0, 0.0]), [0.0]
+
+    def weighed() -> WrenchChunk:
+        chunk = read()
+        hit_n[0] += 0.2 if len(hit_n) > 1 else 0.0
+        return replace(chunk, force_n=chunk.force_n + weight_n + hit_n[0])
+
+    sensor.read = weighed  # type: ignore[method-assign]
+    with rig.safely(HOME):
+        rig.move(Move("home", Position(5.0, 0.0, -3.0), 10.0), rig.position())
+    hit_n.append(1.0)
+    with pytest.raises(ForceLimitError, match=r"more than at first \(the sensor is not zeroed yet"):
+        rig.move(Move("home", Position(-5.0, 0.0, -3.0), 1.0), rig.position())
+
+
+def test_listening_sees_a_sensor_that_is_dead() -> None:
+    rig = make_rig()
+    breaks(rig, "nan")
+    with pytest.raises(RigError, match="force sensor: reads a force that is no number"):
+        rig.listen(1.0, NullSink(), 100)
+
+
+# -- force sensors that say nothing usable -----------------------------------------------------
+
+FAULTS = {
+    "nan": "no number", "one axis": "no number", "inf": "no number", "none": "not a WrenchChunk",
+    "empty": "no (newer )?sample", "frozen": "no newer sample", "replayed": "no newer sample",
+    "shape": r"of the shape \(\d+, 2\)", "zeros": "exactly the same", "stuck": "exactly the same",
+}  # fmt: skip
+
+
+def breaks(rig: Rig, how: str, broken: Callable[[], bool] = lambda: True) -> list[int]:
+    """Break the force sensor while `broken`; return the rig's clock when it broke."""
+    sensor = rig.force
+    assert sensor is not None
+    read, since, kept = sensor.read, [], []
+
+    def bad() -> Any:
+        chunk = read()
+        if not len(chunk):
+            return chunk
+        kept.append(chunk)
+        if not broken():
+            return chunk
+        since.append(rig.clock.now_ns())
+        force = chunk.force_n.copy()
+        if how == "none":
+            return None
+        if how == "empty":
+            return WrenchChunk.empty()
+        if how == "replayed":
+            return kept[0]
+        if how == "frozen":
+            return replace(chunk, t_ns=np.full_like(chunk.t_ns, kept[0].t_ns[0]))
+        if how == "shape":
+            return replace(chunk, force_n=force[:, :2])
+        if how == "one axis":
+            force[-1, 1] = np.nan
+        elif how == "stuck":
+            force[:] = kept[0].force_n[0]
+        else:
+            force[:] = {"nan": np.nan, "inf": -np.inf, "zeros": 0.0}[how]
+        return replace(chunk, force_n=force)
+
+    sensor.read = bad  # type: ignore[method-assign]
+    return since
+
+
+@pytest.mark.parametrize("how", FAULTS)
+def test_sensor_at_fault_before_a_trial_keeps_the_arm_out_of_contact(how: str) -> None:
+    rig = make_rig()
+    breaks(rig, how)
+    deepest = depths(rig)
+    with pytest.raises(RigError, match=rf"force sensor: .*{FAULTS[how]}"):
+        trial(rig)
+    assert max(deepest) < (1.1 if FAULTS[how] == "exactly the same" else 0.0)
+    assert rig.arm.progress().done
+
+
+@pytest.mark.parametrize("how", FAULTS)
+@pytest.mark.parametrize("motion", [trial, watched_trial], ids=lambda motion: motion.__name__)
+def test_sensor_that_dies_in_mid_slide_stops_the_arm(
+    motion: Callable[[Rig], None], how: str
+) -> None:
+    rig = make_rig(limit_n=30.0)
+    x_mm = [0.0]
+    since = breaks(rig, how, lambda: rig.arm.pose().xyz_mm != () and rig.position().x_mm > 1.0)
+    pose = rig.arm.pose
+
+    def noted() -> Pose:
+        found = pose()
+        x_mm[0] = max(x_mm[0], rig.plate_frame.position(found.xyz_mm).x_mm)
+        return found
+
+    rig.arm.pose = noted  # type: ignore[method-assign]
+    with pytest.raises(RigError, match=rf"force sensor: .*{FAULTS[how]}"):
+        motion(rig)
+    assert since
+    # at 3 mm/s, within its silence or a millimetre
+    assert x_mm[0] < 1.0 + max(3.0 * (SILENT_S + 0.1), 1.2)
+    assert rig.position().depth_mm < 0.0  # a dead sensor does not keep the arm in contact
+
+
+@pytest.mark.parametrize("how", ["nan", "empty", "frozen", "zeros"])
+def test_sensor_without_a_limit_is_held_where_a_press_ends_by_it(how: str) -> None:
+    rig = make_rig(limit_n=None)
+    breaks(rig, how)
+    deepest = depths(rig)
+    press = Move("press", Position(0.0, 0.0, 3.6), 2.0, until_force_n=1.5)
+    with pytest.raises(RigError, match=rf"force sensor: .*{FAULTS[how]}"):
+        rig.run_trial(Program(HOME, (press, *PROGRAM.steps[1:])), NullSink(), 1, None, 100)
+    assert max(deepest) < 1.2
+
+
+def test_ideal_sensor_without_noise_is_no_dead_one() -> None:
+    ideal = {
+        "noise_n": 0, "noise_nm": 0, "drift_n_per_min": 0, "drift_nm_per_min": 0,
+        "cross_talk_share": 0,
+    }  # fmt: skip
+    rig = make_rig(limit_n=30.0, force=ideal, arm={"vibration_um": 0, "pose_noise_um": 0})
+    trial(rig)
+    twisted = Program(HOME, (
+        PROGRAM.steps[0], Dwell("hold", 0.1, recorded=True),
+        Twist("twist", replace(DEEP, twist_deg=15.0), 5.0, recorded=True), PROGRAM.steps[-1],
+    ))  # fmt: skip
+    rig.run_trial(twisted, NullSink(), 1, None, 100)
+
+
+# -- poses -------------------------------------------------------------------------------------
+
+
+def depths(rig: Rig) -> list[float]:
+    """Keep every depth that the rig reads."""
+    found, pose = [-99.0], rig.arm.pose
+
+    def noted() -> Pose:
+        here = pose()
+        found.append(rig.plate_frame.position(here.xyz_mm).depth_mm)
+        return here
+
+    rig.arm.pose = noted  # type: ignore[method-assign]
+    return found
+
+
+class PlugInArm:
+    """An arm of another driver, which checks nothing: a simulated one that is moved off its path.
+
+    Args:
+        lie: changes a pose on its way to the rig.
+    """
+
+    def __init__(self, arm: Any, lie: Callable[[Pose], Any] = lambda pose: pose) -> None:
+        self._arm, self._lie = arm, lie
+        self.started: list[Segment] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def start(self, path: Any) -> None:
+        self.started += path
+        self._arm.start(path)
+
+    def pose(self) -> Any:
+        return self._lie(self._arm.pose())
+
+
+def with_arm(rig: Rig, lie: Callable[[Pose], Any] = lambda pose: pose) -> PlugInArm:
+    rig.arm = arm = PlugInArm(rig.arm, lie)  # type: ignore[assignment]
+    return arm
+
+
+def plain_rig() -> Rig:
+    """A rig without forces."""
+    rig = make_rig("rehearsal", None)
+    rig.force, rig.poll_s = None, 0.05
+    return rig
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.__name__)
+def test_pose_that_is_not_finite_stops_any_motion(
+    motion: Callable[[Rig], None], number: float
+) -> None:
+    rig = plain_rig()
+    looks = iter(range(100_000))
+
+    def lie(pose: Pose) -> Pose:
+        x, _, z = pose.xyz_mm
+        return Pose((x, number, z), pose.rotvec_deg) if next(looks) > 12 else pose
+
+    with_arm(rig, lie)
+    with pytest.raises(ArmFault, match="which is no pose"):
+        motion(rig)
+    assert rig.arm.progress().done
+
+
+def test_recorded_poses_that_are_not_finite_stop_the_arm() -> None:
+    rig = plain_rig()
+    read = rig.arm.read_poses
+
+    def bad() -> PoseChunk:
+        chunk = read()
+        chunk.xyz_mm[-1:, 2] = np.nan
+        return chunk
+
+    rig.arm.read_poses = bad  # type: ignore[method-assign]
+    with pytest.raises(ArmFault, match="poses that are not finite"):
+        trial(rig)
+
+
+def test_pose_that_never_changes_stops_the_arm() -> None:
+    rig = plain_rig()
+    stood = rig.arm.pose()
+    with_arm(rig, lambda pose: stood)
+    with pytest.raises(ArmFault, match=r"has reported the same pose for 3\.\d s while it should"):
+        rig.move(Move("slide", Position(0.0, 0.0, -50.0), 5.0), rig.position())
+
+
+def test_path_that_ends_elsewhere_than_reported_is_a_fault() -> None:
+    """The press takes 1.2 s, too short for a pose to count as frozen."""
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    stood = rig.arm.pose()
+    with_arm(rig, lambda pose: stood)
+    with pytest.raises(ArmFault, match=r"phase 'press' as finished, and its pose is 4\.4 mm"):
+        rig.move(Move("press", DEEP, 4.0), HOME)
+
+
+def drifting(rig: Rig, way: tuple[float, float, float], mm_s: float) -> None:
+    """Let the true arm drift off its path in plate coordinates, from now on."""
+    began = rig.clock.now_ns()
+    axes = rig.plate_frame.axes
+
+    def lie(pose: Pose) -> Pose:
+        off = mm_s * (rig.clock.now_ns() - began) * 1e-9 * np.array(way) @ axes
+        x, y, z = (np.array(pose.xyz_mm) + off).tolist()
+        return Pose((x, y, z), pose.rotvec_deg)
+
+    with_arm(rig, lie)
+
+
+@pytest.mark.parametrize(
+    ("way", "mm_s", "error", "said"),
+    [
+        ((0, 0, 1), 2.0, DepthError, r"depth in contact 4\.\d+ mm is beyond its limit 4 mm"),
+        ((1, 0, 0), 8.0, WorkspaceError, r"centre 15\.\d+ mm is beyond its limit 15 mm"),
+        ((0, -1, 0), 150.0, (SpeedError, WorkspaceError), "beyond its limit"),
+    ],
+)
+def test_measured_pose_beyond_a_limit_stops_the_arm(
+    way: Any, mm_s: float, error: Any, said: str
+) -> None:
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    rig.move(Move("press", DEEP, 10.0), HOME)
+    drifting(rig, way, mm_s)
+    with pytest.raises(error, match=said):
+        rig.move(Move("slide", Position(5.0, 0.0, 2.4), 1.0), DEEP)
+
+
+def test_arm_faster_than_the_limit_is_stopped_by_its_poses() -> None:
+    rig = plain_rig()
+    rig.guard = Guard(None, replace_limits(rig, speed_mm_s=10.0))
+    start = rig.arm.start
+    rig.arm.start = lambda path: start([replace(path[0], speed_mm_s=60.0)])  # type: ignore[method-assign]
+    with pytest.raises(SpeedError, match=r"speed 60 mm/s is beyond its limit 10 mm/s"):
+        rig.move(Move("home", Position(0.0, 0.0, -50.0), 10.0), rig.position())
+
+
+def replace_limits(rig: Rig, **change: float) -> Any:
+    limits = rig.guard._plate_limits
+    assert limits is not None
+    return replace(limits, **change)
+
+
+# -- limits before anything is sent ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("to", "speed", "error"),
+    [
+        (Position(0.0, 0.0, 4.1), 2.0, DepthError),
+        (Position(15.2, 0.0, -2.0), 2.0, WorkspaceError),
+        (Position(11.0, -11.0, -2.0), 2.0, WorkspaceError),
+        (DEEP, 101.0, SpeedError),
+        (DEEP, float("nan"), RigError),
+        (Position(0.0, float("nan"), 1.0), 2.0, RigError),
+    ],
+)
+def test_move_beyond_the_rigs_limits_is_sent_to_no_driver(
+    to: Position, speed: float, error: type[RigError]
+) -> None:
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    arm = with_arm(rig)
+    with pytest.raises(error):
+        rig.move(Move("slide", to, speed), HOME)
+    assert arm.started == []
+
+
+@pytest.mark.parametrize("rate", [0.0, -5.0, float("nan"), 1000.0])
+def test_turn_beyond_the_rigs_limits_is_sent_to_no_driver(rate: float) -> None:
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    arm = with_arm(rig)
+    segment = Segment(rig.plate_frame.pose(replace(HOME, twist_deg=10.0)), 10.0, rate)
+    with pytest.raises(RigError, match=r"turns at|sensor's rim at 1000 deg/s"), rig.moving(segment):
+        pass
+    assert arm.started == []
+
+
+def test_limits_of_the_arm_are_held_for_a_driver_that_holds_none() -> None:
+    rig = plain_rig()
+    box = Limits(low_mm=(300, -50, 200), high_mm=(399, 50, 400), tilt_deg=10)
+    rig.guard = Guard(box)
+    arm = with_arm(rig)
+    with pytest.raises(WorkspaceError, match="x in the base frame"):
+        rig.move(Move("press", DEEP, 2.0), rig.position())
+    assert arm.started == []
+
+
+def test_depth_counts_from_the_touched_zero() -> None:
+    rig = plain_rig()
+    rig.plate_frame = rig.plate_frame.with_zero(-0.5)
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    with pytest.raises(DepthError):
+        rig.move(Move("press", Position(0.0, 0.0, 4.1), 2.0), HOME)
+    rig.move(Move("press", Position(0.0, 0.0, 3.9), 2.0), HOME)
+
+
+def test_jogged_arm_beyond_a_limit_may_return_and_go_no_farther() -> None:
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    far = Position(14.0, 0.0, 3.0)
+    rig.arm.start([Segment(rig.plate_frame.pose(replace(far, x_mm=18.0)), 20.0)])  # by a person
+    while not rig.arm.progress().done:
+        rig.clock.wait(0.05)
+    here = rig.position()
+    with pytest.raises(WorkspaceError):
+        rig.move(Move("slide", replace(here, x_mm=18.5), 5.0), here)
+    with pytest.raises(OSError, match="disk"), rig.safely(HOME):
+        raise OSError("disk")
+    assert rig.position().depth_mm == pytest.approx(-2.0)
+    rig.move(Move("home", HOME, 10.0), rig.position())
+
+
+def test_moves_that_no_protocol_names_keep_the_rigs_speed() -> None:
+    rig = plain_rig()
+    rig.guard = Guard(None, replace_limits(rig, speed_mm_s=4.0))
+    arm = with_arm(rig)
+    rig.press(1.0, 2.0, 2.0, 1)
+    with pytest.raises(RigError):
+        touch(deaf(rig), 0.0, 0.0, Creep(1.0, 0.5, 3.0), 1)
+    assert max(segment.speed_mm_s for segment in arm.started) == 4.0
+
+
+def test_shipped_rigs_hold_the_limits_of_their_files() -> None:
+    for name in ("mock", "rehearsal", "mock-gripper"):
+        file, _ = load_rig_file(Path(name))
+        limits = build_rig(file).guard._plate_limits
+        assert limits is not None
+        assert (limits.depth_mm, limits.reach_mm, limits.speed_mm_s) == (4.0, 15.0, 100.0)
+        assert limits.rim_mm == pytest.approx(13.2)
+    assert all(RigLimits.model_fields[name].is_required() for name in ("depth", "reach", "speed"))
+    assert RigFile.model_fields["limits"].is_required()
+
+
+SENDS = re.compile(r"\.arm\.start\(|gripper\.move\(")
+
+
+def test_only_the_rig_sends_motion() -> None:
+    """No caller reaches an arm or a gripper except by what checks and watches it."""
+    found = [
+        f"{path.relative_to(ROOT)}: {line.strip()}"
+        for folder in ("rigs/core", "flows", "analysis", "storage", "protocols")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if SENDS.search(line)
+    ]
+    assert found == [
+        "rigs/core/rig.py: self.arm.start([segment])",
+        "rigs/core/rig.py: gripper.move(opening_mm, speed_mm_s, force_n)",
+    ]
+
+
+# -- fingers -----------------------------------------------------------------------------------
+
+
+def test_fingers_close_no_deeper_than_the_rigs_limit() -> None:
+    rig = make_rig("mock-gripper", None)
+    rig.begin_trial(HOME, 1)
+    rig.move(Move("press", Position(0.0, 0.0, 3.0), 5.0), HOME)
+    assert rig.gripper is not None
+    with pytest.raises(DepthError, match=r"gripper: depth in contact 4\.3"):
+        rig.move_fingers(38.7, 20.0, 50.0)
+    rig.move_fingers(39.2, 20.0, 50.0)
+    rig.await_fingers(rig.gripper)
+    with pytest.raises(DepthError):  # the arm's own move counts what the fingers add
+        rig.move(Move("press", Position(0.0, 0.0, 3.5), 5.0), Position(0.0, 0.0, 3.0))
+    for wrong in ((float("nan"), 20.0, 50.0), (39.0, 1e6, 50.0), (39.0, 20.0, float("nan"))):
+        with pytest.raises(RigError, match=r"gripper: .* is out of its range"):
+            rig.move_fingers(*wrong)
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        (GripperState(float("nan"), False, False), "reports an opening of nan mm"),
+        (GripperState(-50.0, False, False), "reports an opening of -50"),
+        (GripperState(31.0, False, True), "stalled at 31 mm, on its way to the 40 mm"),
+        (GripperState(31.0, False, False), "ended at 31 mm, not at the 40 mm"),
+        (GripperState(31.0, True, False), "still moves 10 s after"),
+    ],
+)
+def test_gripper_whose_state_cannot_be_used_keeps_a_trial_from_its_start(
+    state: GripperState, said: str
+) -> None:
+    rig = make_rig("mock-gripper", None)
+    assert rig.gripper is not None
+    rig.gripper.state = lambda: state  # type: ignore[method-assign]
+    deepest = depths(rig)
+    with pytest.raises(RigError, match=f"gripper: {said}"):
+        trial(rig)
+    assert max(deepest) < 0.0
+
+
+def test_reflex_press_stops_at_the_rigs_limit_of_depth() -> None:
+    rig = make_rig("mock-gripper", None)
+    arm = with_arm(rig)
+    with pytest.raises(DepthError):
+        run_watched(rig, PROGRAM, Watcher(slip=True), 1, 100, Reflex("press", 9.0, 3.0, 2.0))
+    deepest = max(rig.plate_frame.position(s.to.xyz_mm).depth_mm for s in arm.started)
+    assert deepest == pytest.approx(2.4)
+
+
+# -- events and frames that stop ---------------------------------------------------------------
+
+
+def stops_at(rig: Rig, depth_mm: float, then: Callable[[EventChunk], EventChunk]) -> None:
+    read = rig.events.read
+
+    def silent() -> EventChunk:
+        chunk = read()
+        return then(chunk) if rig.position().depth_mm > depth_mm else chunk
+
+    rig.events.read = silent  # type: ignore[method-assign]
+
+
+def nothing(chunk: EventChunk) -> EventChunk:
+    return EventChunk(*(column[:0] for column in vars(chunk).values()))
+
+
+def frozen(chunk: EventChunk) -> EventChunk:
+    return replace(chunk, t_us=np.zeros_like(chunk.t_us))
+
+
+@pytest.mark.parametrize("then", [nothing, frozen])
+@pytest.mark.parametrize(
+    "seek",
+    [
+        lambda rig: rig.touch_off(0.5, 1.5, 1),
+        lambda rig: touch(rig, 0.0, 0.0, Creep(0.5, 1.5, 1.0), 1),
+    ],
+    ids=["touch_off", "touch"],
+)
+def test_events_that_stop_while_the_plate_is_sought_stop_the_arm(
+    then: Callable[[EventChunk], EventChunk], seek: Callable[[Rig], Any]
+) -> None:
+    rig = make_rig("rehearsal", None, event_camera={"width": 640, "height": 480})
+    stops_at(rig, -0.5, then)
+    deepest = depths(rig)
+    with pytest.raises(RigError, match=r"event camera: sent no newer event for 0\.2\d s"):
+        seek(rig)
+    assert max(deepest) < -0.3
+    assert rig.arm.progress().done
+
+
+def test_real_camera_without_any_noise_is_refused_before_the_approach() -> None:
+    rig = plain_rig()
+    rig.simulation = None
+    rig.events.start()
+    rig.events.read = lambda: nothing(EventChunk(*[np.zeros(1, np.int64)] * 4))  # type: ignore[method-assign]
+    with pytest.raises(RigError, match=r"event camera: sent no event within 0\.5 s, not even"):
+        rig.measure_noise()
+
+
+@pytest.mark.parametrize("how", ["empty", "frozen"])
+def test_frames_that_never_change_stop_a_touch_by_markers(how: str) -> None:
+    rig = make_rig("rehearsal", None, event_camera={"width": 640, "height": 480})
+    read, kept = rig.frames.read, []
+
+    def bad() -> FrameChunk:
+        chunk = read()
+        if rig.position().depth_mm < -1.5 or not len(chunk):
+            return chunk
+        assert chunk.markers_px is not None
+        kept.append(chunk.markers_px[-1])
+        if how == "empty":
+            return replace(chunk, **{name: column[:0] for name, column in vars(chunk).items()
+                                     if column is not None})  # fmt: skip
+        return replace(chunk, markers_px=np.repeat(kept[0][None], len(chunk), 0))
+
+    rig.frames.read = bad  # type: ignore[method-assign]
+
+    def find(chunk: FrameChunk) -> Any:
+        assert chunk.markers_px is not None
+        return chunk.markers_px.astype(np.float64)
+
+    with pytest.raises(RigError, match=r"frame camera: sent no new image for 1\.0"):
+        touch(rig, 0.0, 0.0, Creep(0.5, 1.5, 2.0), 1, find)
+    assert rig.arm.progress().done
