@@ -15,7 +15,7 @@ from sliplab.storage.formats.export_trials import export_trials
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
-from tests.command_line import here
+from tests.command_line import here, sliplab
 from tests.storage.formats.adapters import bring
 
 TABLE = {"files": "{kind}/trial{n}.csv", "format": "csv", "unit": "s"}
@@ -112,7 +112,7 @@ def test_later_steps_give_a_result_or_one_line(campaign: Campaign, tmp_path: Pat
         done = here("export", store, "pressures", "--output", tmp_path / kind, "--format", kind)
         assert (done.returncode, done.stderr.count("error: ")) == (2, 1)
         assert said in done.stderr
-    done = here("train", store)
+    done = sliplab("train", store)
     assert done.returncode == 1
     assert "campaign 'pressures' was recorded without events" in done.stderr
 

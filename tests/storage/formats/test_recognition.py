@@ -23,6 +23,7 @@ from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
+from tests.command_line import here
 from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
 
 SIZE = SMALL[::-1]
@@ -99,11 +100,15 @@ def test_cameras_of_the_lab_and_lists_of_one_length(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_two_files_of_one_polarity_are_refused(tmp_path: Path) -> None:
-    for name in ("a_events_on", "a_events_on.pickle"):
-        _pickled(tmp_path / name, lab_cells(SIZE, {}))
-    with pytest.raises(InputError, match="ON events of a, as a_events_on does"):
-        kind_of(tmp_path)
+def test_two_files_of_one_polarity_cost_their_recording_alone(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    for name in ("a_events_on", "a_events_on.pickle", "b_events_on"):
+        _pickled(tmp_path / "run" / name, lab_cells(SIZE, {(1, 2): [3.0]}))
+    done = here("import", tmp_path / "run", "--store", tmp_path / "store", "--name", "x", "--json")
+    assert done.returncode == 1
+    found = json.loads(done.stdout)
+    assert found["imported"] == ["b"]
+    assert "ON events of a, as a_events_on does" in str(found["failed"])
 
 
 def _aedat4(path: Path, chunk: EventChunk) -> None:
