@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.storage.errors import StoreError
+from sliplab.storage.interrupts import uninterrupted
 
 _BLOCK = 1 << 20
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
@@ -67,10 +68,12 @@ def write_bytes(path: Path, data: bytes, mode: int = 0o666) -> None:
     write_blocks(path, (data,), mode)
 
 
+@uninterrupted
 def write_blocks(path: Path, blocks: Iterable[bytes], mode: int = 0o666) -> None:
     """Write the `blocks` to `path` atomically; its folder must exist.
 
-    An error of `blocks` leaves `path` as it was.
+    An error of `blocks` leaves `path` as it was. Where they take long, their generator is
+    `interrupts.interruptible`.
 
     Args:
         mode: as `write_bytes`.
@@ -98,6 +101,7 @@ def read_blocks(path: Path) -> Iterator[bytes]:
             yield block
 
 
+@uninterrupted
 def write_new_json(path: Path, data: Any) -> bool:
     """Write JSON, complete and flushed, under a name that is free.
 

@@ -22,6 +22,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.storage.errors import NoStore, StoreError, masked
 from sliplab.storage.files import json_text, make_folder, read_blocks, write_blocks
+from sliplab.storage.interrupts import interruptible
 from sliplab.storage.trials.checksums import Checksum
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
@@ -250,6 +251,7 @@ class Remote:
         except RemoteMissing:
             pass
 
+    @interruptible
     def _checked(self, key: str, known: Checksum) -> Iterator[bytes]:
         """Yield an object's bytes, and raise `RemoteDamaged` at their end if they do not match."""
         digest, size = hashlib.sha256(), 0
