@@ -12,19 +12,23 @@ import subprocess
 import sys
 import threading
 import weakref
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sliplab.storage.errors import masked
-from sliplab.storage.streams import Json
+
+if TYPE_CHECKING:
+    from sliplab.storage.streams import Json
 
 _COMMAND_CHARACTERS = 300
 _STARTED = 19
 """Field of /proc/PID/stat after the name: when it started, ticks since the machine did."""
+_OF_TERMINAL = signal.SIGINT, signal.SIGHUP
+"""Signals that a terminal sends to all of its processes."""
 _F_SETSIG = 10
 """Linux's `fcntl` command that chooses the signal of O_ASYNC; Python has no name for it."""
 
@@ -136,11 +140,25 @@ def leave_to_parent() -> None:
     A parent that is killed handles nothing: its children end with it. By themselves they would
     stay, each waiting at a pipe whose other end the next one holds open.
     """
-    for number in (signal.SIGINT, signal.SIGHUP):
+    for number in _OF_TERMINAL:
         signal.signal(number, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), name="parent", daemon=True).start()
+
+
+@contextmanager
+def out_of_reach() -> Iterator[None]:
+    """Start child processes in the block: a signal of the terminal does not reach them.
+
+    They inherit the mask of blocked signals, so that none interrupts them before they have come to
+    `leave_to_parent`. This process gets those that came meanwhile when the block ends.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_TERMINAL)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_with(parent: BaseProcess) -> None:

@@ -95,10 +95,13 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check every checksum, count and clock of a store; read-only unless --quarantine."""
+    """Check every checksum, count and clock of a store; read-only unless --quarantine.
+
+    Unfinished trials, and the one that is being recorded, are named and are no damage.
+    """
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
-    from sliplab.storage.trials.verify import quarantine_damaged, salvaged, trial_folders
+    from sliplab.storage.trials.verify import DAMAGED, quarantine_damaged, salvaged, trial_folders
     from sliplab.storage.trials.verify import verify as look
 
     if is_url(store):
@@ -108,6 +111,7 @@ def verify(
     total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
     with console.bar("verify (trials)", total) as bar:
         problems = look(opened, lambda name: bar.advance(1, name))
+    wrong = [item for item in problems if item.kind == DAMAGED]
     moved: list[str] = []
     if quarantine and any(item.trial for item in problems):
         from sliplab.flows.collecting.requests import store_lock
@@ -125,17 +129,21 @@ def verify(
             "whole": total - damaged,
             "damaged": damaged,
             "format": opened.format,
-            "ok": not problems,
+            "ok": not wrong,
             "problems": [vars(item) for item in problems],
             "quarantined": moved,
         }
         console.print_json(result | ({"salvaged": torn} if torn else {}))
-    elif problems:
-        rows = [[item.path, item.what] for item in problems]
-        console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
     else:
-        console.show(f"{total} trials, all intact")
-    if problems:
+        for item in problems:
+            if item.kind != DAMAGED:
+                console.say(f"{item.path}: {item.what}")
+        if wrong:
+            rows = [[item.path, item.what] for item in wrong]
+            console.print_table(f"{len(wrong)} problems", ["where", "what is wrong"], rows)
+        else:
+            console.show(f"{total} trials, all intact")
+    if wrong:
         raise typer.Exit(console.FAILED)
 
 

@@ -279,7 +279,8 @@ class _Work:
         self.started = True
         self.on_start()
         try:
-            self.result = self._do(argument)
+            with stopping.signals():  # around a flow Prefect has its own handler of SIGTERM
+                self.result = self._do(argument)
         except BaseException as error:
             self.error = error
             raise
@@ -339,6 +340,7 @@ def _reported(
 ) -> Any:
     """Do the work as a flow run that the server knows, and keep in the store how it ended."""
     from prefect import Flow
+    from prefect.exceptions import TerminationSignal
     from prefect.flow_engine import run_flow
 
     def do(argument: Opaque[Any]) -> Any:
@@ -377,8 +379,11 @@ def _reported(
         run_records.end(store, run_id, *work.end, "flow")
     if work.error is not None:
         raise work.error
+    if isinstance(interrupted, TerminationSignal):  # of Prefect's own handler of SIGTERM
+        stopping.stop()
     if interrupted is not None:
         raise interrupted
+    stopping.check()  # Prefect swallows a Ctrl-C that comes when the end has been reported
     return work.result
 
 

@@ -82,7 +82,9 @@ class LibraryProcess:
         module, function = serve.split(":")
         given = ", ".join(map(repr, (theirs.fileno(), *arguments)))
         code = (
-            f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function}; "
+            # a stop of all processes is the parent's to handle, too: it stops the arm through this
+            "import signal, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+            f"sys.path[:] = {sys.path!r}; from {module} import {function}; "
             f"{function}({given})"
         )
         with theirs:

@@ -35,6 +35,7 @@ from sliplab.storage.formats.foreign import (
     refusal,
 )
 from sliplab.storage.formats.original import StoredTrial
+from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
@@ -180,6 +181,7 @@ def _take_whole(
         return trial, _take(store, campaign, trial, kind)
 
 
+@uninterrupted
 def _take(
     store: Store, campaign: Campaign, trial: ForeignTrial, kind: str
 ) -> tuple[dict[str, int], list[str]]:
@@ -209,6 +211,7 @@ def _take(
     return {"events": rows.events, "frames": rows.frames}, warnings
 
 
+@interruptible
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[Seen, list[str]]:
     """Write events and frames; return what was seen of both, and warnings.
 
@@ -254,6 +257,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[Seen, list[str]]:
     return Seen(events, times), _gap_warnings(gap_us, gap_end_us)
 
 
+@interruptible
 def _fill_further(writer: TrialWriter, trial: ForeignTrial) -> dict[str, StreamRecord]:
     """Write poses, named streams and further cameras; return what the record says of them."""
     if trial.poses is not None:

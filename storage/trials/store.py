@@ -268,7 +268,7 @@ class Campaign:
         for name, cause in self.damaged().items():
             left[self.folder / "trials" / name] = f"damaged: {cause}"
         moving = [path for path in self._folders("trials") if (path / CAUSE).exists()]
-        left |= {path: "interrupted" for path in moving}
+        left |= dict.fromkeys(moving, "interrupted")
         for path, cause in left.items():
             if known_cause(path) is None:
                 self.quarantine(path, cause)

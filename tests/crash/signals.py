@@ -1,6 +1,6 @@
 """Signals at exact lines of a collection: in campaign files, begin, commit and clean-up.
 
-A trace function counts the lines that run in the modules that write a trial, and sends the signal at
+A trace function counts the lines that run in the modules that write a trial, and sends a signal at
 one of them. SIGINT, SIGTERM and SIGHUP come once, twice or ten times; SIGKILL once.
 """
 
@@ -13,6 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,9 +23,9 @@ from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
+from tests.conftest import ROOT
 from tests.crash.campaign import NAME, collect, hashes, run_request, wrong, wrong_at_the_end
 from tests.crash.process import live
-from tests.conftest import ROOT
 
 SOFT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PHASES = ("campaign", "trial", "motion")
@@ -32,9 +33,9 @@ MODULES = {
     str(ROOT / name)
     for name in (
         "flows/collecting/session.py", "flows/planning/run_request.py", "storage/files.py",
-        "storage/trials/checksums.py", "storage/trials/control.py", "storage/trials/frame_writer.py",
-        "storage/trials/hdf5_writer.py", "storage/trials/store.py", "storage/trials/writer.py",
-        "storage/trials/lock.py", "storage/trials/recovery.py",
+        "storage/trials/checksums.py", "storage/trials/control.py", "storage/trials/store.py",
+        "storage/trials/frame_writer.py", "storage/trials/hdf5_writer.py", "storage/trials/lock.py",
+        "storage/trials/recovery.py", "storage/trials/writer.py",
     )
 }  # fmt: skip
 """Files whose lines are counted."""
@@ -147,10 +148,7 @@ def send(folder: Path, signals: int, seed: int, trials: int) -> dict[str, Any]:
                 raise RuntimeError(f"not complete after {MOST_LIVES} lives")
             plan = _plan(rng, lengths, trials) if sum(sent.values()) < signals else None
 
-            def work(plan: Plan | None = plan, notes: Path = notes) -> None:
-                _interrupted(plan, notes, lambda: collect(wanted))
-
-            end = live(work)
+            end = live(partial(_interrupted, plan, notes, partial(collect, wanted)))
             complete = not end.killed and end.code == 0
             if plan is not None and not complete:
                 sent[plan.number.name] += 1

@@ -29,6 +29,7 @@ import numpy as np
 from sliplab.analysis.bench.feeding import BenchError
 from sliplab.analysis.bench.interface import Detector, Evidence
 from sliplab.protocols.errors import InputError
+from sliplab.storage.process import start_tethered
 from sliplab.storage.streams import EventChunk
 
 HEAD = struct.Struct("<4sIq")
@@ -57,12 +58,9 @@ class Program(Detector):
         self._command, self._answer_s, self._end_s = command, answer_s, end_s
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
         try:
-            self._process = subprocess.Popen(
-                words,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._said,
-                start_new_session=True,  # Ctrl-C ends it by `close`
+            # Ctrl-C ends it by `close`
+            self._process = start_tethered(
+                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said
             )
         except OSError as error:
             self._said.close()
