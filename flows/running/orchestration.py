@@ -277,9 +277,9 @@ class _Work:
     def do(self, argument: Any) -> Any:
         """Do it, and keep its result or its error."""
         self.started = True
-        self.on_start()
         try:
             with stopping.signals():  # around a flow Prefect has its own handler of SIGTERM
+                self.on_start()
                 self.result = self._do(argument)
         except BaseException as error:
             self.error = error
