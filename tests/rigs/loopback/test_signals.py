@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,14 @@ from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer
 from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.live import rig_yaml, stage_of
 
+PARENT = """
+import time
+from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer
+
+if __name__ == "__main__":
+    print(DvxplorerServer(list, realtime=False)._process.pid, flush=True)
+    time.sleep(600)
+"""
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 OF_TERMINAL = {signal.SIGINT, signal.SIGHUP}
 
@@ -42,3 +53,17 @@ def test_dvxplorer_server_survives_signals_of_the_terminal() -> None:
         for number in OF_TERMINAL:
             os.kill(pid, number)
         assert not server.answered  # it has not died
+
+
+def test_fakes_end_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        server = os.pidfd_open(int(parent.stdout.readline()))
+        parent.kill()
+        parent.wait(30)
+        try:
+            assert select.select([server], [], [], 30)[0] == [server]
+        finally:
+            os.close(server)
