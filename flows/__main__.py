@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from contextlib import suppress
 
@@ -31,6 +32,9 @@ def main() -> None:
         code = _fail("interrupted", 130)
     except (ImportError, MemoryError, OSError, SystemError) as error:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
+    if getattr(sys.modules["__main__"], "main", None) is main:  # not called by another program
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: os._exit(code))  # all has been said
     orchestration = sys.modules.get("sliplab.flows.running.orchestration")
     if orchestration is not None and not orchestration.close():
         os._exit(code)

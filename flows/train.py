@@ -44,6 +44,7 @@ from sliplab.flows.steps import StepResult
 from sliplab.flows.ui.train_view import training_progress
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes, write_json
+from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -74,11 +75,23 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
         )
     for warning in fitted.warnings:
         console.say(f"warning: {warning}")
+    _keep(model, fitted, ModelSamples(train=len(train), validation=len(validation)))
+    if model.classes:
+        console.say(
+            f"{model.title}: {len(train)} windows of {len(model.classes)} classes; epoch "
+            f"{fitted.chosen_epoch}, validation {100 * fitted.chosen.val_strict:.1f} %"
+        )
+    return model.seed
+
+
+@uninterrupted
+def _keep(model: Model, fitted: training.Fitted, samples: ModelSamples) -> None:
+    """Write a network and its description, and delete the states of its training."""
     model_file.save(model.path, fitted)
     info = TrainedModel(
         key=model.key,
         seed=model.seed,
-        samples=ModelSamples(train=len(train), validation=len(validation)),
+        samples=samples,
         chosen_epoch=fitted.chosen_epoch,
         validation=ValidationAccuracy(
             argmax=fitted.chosen.val_argmax,
@@ -88,14 +101,8 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
         warnings=fitted.warnings,
     )
     write_json(model.info_path, info.to_json())
-    if model.classes:
-        console.say(
-            f"{model.title}: {len(train)} windows of {len(model.classes)} classes; epoch "
-            f"{fitted.chosen_epoch}, validation {100 * fitted.chosen.val_strict:.1f} %"
-        )
     for left in model.path.parent.glob(f"{model.path.stem}.*.state"):
         left.unlink()
-    return model.seed
 
 
 @flow(name="train", validate_parameters=False, persist_result=False)

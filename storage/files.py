@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.storage.errors import StoreError
+from sliplab.storage.interrupts import uninterrupted
 
 MOST_BYTES = 1 << 30
 """Of a file that `read_plain` reads: far more than any model has."""
@@ -93,10 +94,12 @@ def write_bytes(path: Path, data: bytes, mode: int = 0o666) -> None:
     write_blocks(path, (data,), mode)
 
 
+@uninterrupted
 def write_blocks(path: Path, blocks: Iterable[bytes], mode: int = 0o666) -> None:
     """Write the `blocks` to `path` atomically; its folder must exist.
 
-    An error of `blocks` leaves `path` as it was.
+    An error of `blocks` leaves `path` as it was. Where they take long, their generator is
+    `interrupts.interruptible`.
 
     Args:
         mode: as `write_bytes`.
@@ -141,6 +144,7 @@ def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
         return file.read(most)
 
 
+@uninterrupted
 def write_new_json(path: Path, data: Any) -> bool:
     """Write JSON, complete and flushed, under a name that is free.
 

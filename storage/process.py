@@ -1,21 +1,36 @@
-"""Identity of a process: its pid and start time, since pids are reused."""
+"""Processes: their identity (pid and start time, since pids are reused), and children's ends."""
 
 from __future__ import annotations
 
+import fcntl
 import getpass
+import multiprocessing
 import os
 import signal
 import socket
+import subprocess
 import sys
+import threading
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sliplab.storage.errors import masked
-from sliplab.storage.streams import Json
+
+if TYPE_CHECKING:
+    from sliplab.storage.streams import Json
 
 _COMMAND_CHARACTERS = 300
 _STARTED = 19
 """Field of /proc/PID/stat after the name: when it started, ticks since the machine did."""
+_OF_TERMINAL = signal.SIGINT, signal.SIGHUP
+"""Signals that a terminal sends to all of its processes."""
+_F_SETSIG = 10
+"""Linux's `fcntl` command that chooses the signal of O_ASYNC; Python has no name for it."""
 
 
 def this_process() -> Json:
@@ -117,3 +132,63 @@ def _boot() -> str:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
         return ""
+
+
+def leave_to_parent() -> None:
+    """Leave Ctrl-C and a closed terminal, which reach every process of it, to the parent.
+
+    A parent that is killed handles nothing: its children end with it. By themselves they would
+    stay, each waiting at a pipe whose other end the next one holds open.
+    """
+    for number in _OF_TERMINAL:
+        signal.signal(number, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), name="parent", daemon=True).start()
+
+
+@contextmanager
+def out_of_reach() -> Iterator[None]:
+    """Start child processes in the block: a signal of the terminal does not reach them.
+
+    They inherit the mask of blocked signals, so that none interrupts them before they have come to
+    `leave_to_parent`. This process gets those that came meanwhile when the block ends.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_TERMINAL)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()  # bounded by the parent's life
+    os._exit(1)
+
+
+def start_tethered(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a foreign program in a session of its own, out of reach of the terminal's signals.
+
+    The kernel kills it and its process group when this process ends, however it ends: it does so
+    when the last writer of a pipe is gone that the program inherits.
+
+    Args:
+        options: of `subprocess.Popen`.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    theirs, ours = os.pipe()
+    try:
+        process = subprocess.Popen(command, start_new_session=True, pass_fds=[theirs], **options)
+        weakref.finalize(process, os.close, ours)
+        with suppress(OSError):  # a kernel without it
+            fcntl.fcntl(theirs, fcntl.F_SETOWN, -process.pid)
+            fcntl.fcntl(theirs, _F_SETSIG, signal.SIGKILL)
+            fcntl.fcntl(theirs, fcntl.F_SETFL, os.O_ASYNC)
+    except BaseException:
+        os.close(ours)
+        raise
+    finally:
+        os.close(theirs)
+    return process

@@ -35,6 +35,7 @@ from sliplab.flows.bench.scenes import Drawn
 from sliplab.flows.running import console, stopping
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json
+from sliplab.storage.process import out_of_reach
 from sliplab.storage.schema.bench import BenchDetector, BenchResult, KeptDetector
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.workers import WORKERS
@@ -244,7 +245,9 @@ def _judge_each(jobs: Sequence[Job], workers: int, done: Callable[[KeptDetector]
         ProcessPoolExecutor(min(workers, len(jobs)), WORKERS, stopping.leave_to_parent) as pool,
     ):
         try:
-            for judged_one in as_completed([pool.submit(_judge, job) for job in jobs]):
+            with out_of_reach():
+                futures = [pool.submit(_judge, job) for job in jobs]
+            for judged_one in as_completed(futures):
                 found = judged_one.result()
                 done(found)
                 bar.advance(1, found.row.name)

@@ -96,10 +96,14 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check every checksum, count and clock of a store; close files that others left open."""
+    """Check every checksum, count and clock of a store; close files that others left open.
+
+    Unfinished trials, and the one that is being recorded, are named and are no damage.
+    """
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
     from sliplab.storage.trials.verify import (
+        DAMAGED,
         failed_gates,
         quarantine_damaged,
         salvaged,
@@ -117,6 +121,7 @@ def verify(
         problems = look(opened, lambda name: bar.advance(1, name), mended.append)
     for path in mended:
         console.say(f"{path}: another program had left it open for writing; as committed again")
+    wrong = [item for item in problems if item.kind == DAMAGED]
     moved: list[str] = []
     if quarantine and any(item.trial for item in problems):
         from sliplab.flows.collecting.requests import store_lock
@@ -139,7 +144,7 @@ def verify(
             "whole": total - damaged,
             "damaged": damaged,
             "format": opened.format,
-            "ok": not problems,
+            "ok": not wrong,
             "problems": [vars(item) for item in problems],
             "quarantined": moved,
         }
@@ -147,12 +152,16 @@ def verify(
             "mended": [str(path) for path in mended], "salvaged": torn, "failed_gates": failing,
         }  # fmt: skip
         console.print_json(result | {key: found for key, found in further.items() if found})
-    elif problems:
-        rows = [[item.path, item.what] for item in problems]
-        console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
     else:
-        console.show(f"{total} trials, all intact")
-    if problems:
+        for item in problems:
+            if item.kind != DAMAGED:
+                console.say(f"{item.path}: {item.what}")
+        if wrong:
+            rows = [[item.path, item.what] for item in wrong]
+            console.print_table(f"{len(wrong)} problems", ["where", "what is wrong"], rows)
+        else:
+            console.show(f"{total} trials, all intact")
+    if wrong:
         raise typer.Exit(console.FAILED)
 
 

@@ -30,6 +30,7 @@ from sliplab.flows.running import console, stopping
 from sliplab.protocols import Trial
 from sliplab.protocols.claims import Stopping, section_hash
 from sliplab.storage.files import write_json
+from sliplab.storage.process import out_of_reach
 from sliplab.storage.schema.claims import (
     CHOICES,
     STOPPING,
@@ -90,7 +91,8 @@ class ClaimWatch:
             work = self._work(trial.id)
             if not self._kept.fresh(trial.id, work.key):
                 job = trial_job(self._store, work, figures.trial_figures)
-                self._making[trial.id] = self._pool.submit(make_in_process, job)
+                with out_of_reach():  # the first one starts the process
+                    self._making[trial.id] = self._pool.submit(make_in_process, job)
 
     def _work(self, trial: str) -> TrialWork:
         return self._judge.work(self._campaign.recording(trial), self._campaign.name)

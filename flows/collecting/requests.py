@@ -21,6 +21,7 @@ from sliplab.protocols import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage import process
 from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import Kind, Request
@@ -56,6 +57,7 @@ def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iter
         yield
 
 
+@uninterrupted
 def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]:
     """Carry out all open requests; the caller holds the store's lock.
 

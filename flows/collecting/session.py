@@ -36,6 +36,7 @@ from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import sweep_temporary
+from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.trial import (
     Geometry,
     Provenance,
@@ -47,9 +48,12 @@ from sliplab.storage.schema.trial import (
 )
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
+from sliplab.storage.trials.checksums import RECORD
+from sliplab.storage.trials.recovery import recover
 from sliplab.storage.trials.store import Campaign, SessionRecord, Store
 from sliplab.storage.trials.writer import TrialWriter
 
+interruptible(Rig.run_trial)
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 
 
@@ -134,6 +138,7 @@ def _recover(store: Store, run_request: RunRequest) -> Campaign:
     """Clean up after a crash, and carry out open requests."""
     clean_up(store)
     campaign = describe_campaign(store, run_request)
+    recover(campaign)
     campaign.sweep()
     carry_out(store)
     return campaign
@@ -292,8 +297,13 @@ class TrialCollector:
             self.retaken += 1
         self._finish(trial, "committed")
 
+    @uninterrupted
     def _attempt(self, trial: Trial, number: int) -> bool:
-        """Record one attempt at a trial; commit it, or quarantine it if it fails a gate."""
+        """Record one attempt at a trial; commit it, or quarantine it if it fails a gate.
+
+        A signal stops the motion at once. One that comes before or after it waits: nothing moves
+        then, and what was recorded completely is committed.
+        """
         collection = self.plan.protocol.collection
         rate_hz = collection.recording.sync_rate
         frame_px, frame_rate_hz = (
@@ -306,6 +316,7 @@ class TrialCollector:
         started = datetime.now(UTC)
         try:
             seed = hash_integer(trial.seed, number)
+            stopping.check()
             run = self.rig.run_trial(
                 self.plan.program(trial), writer, seed, frame_px, rate_hz, with_events
             )
@@ -323,31 +334,28 @@ class TrialCollector:
             )
             record = self._record(trial, number, run, found, frame_px)
             provenance = self._provenance(started)
+            self.taken += 1
+            if found.passed:
+                writer.commit(record, provenance)
+            else:
+                cause = {"cause": f"gate: {found.causes}", "trial": trial.id, "attempt": number}
+                target = self.campaign.quarantine_path(trial.id)
+                writer.quarantine(target, record, provenance, cause)
         except BaseException as error:
             self._abandon(writer, error)
             raise
-        self.taken += 1
-        if not found.passed:
-            cause = {"cause": f"gate: {found.causes}", "trial": trial.id, "attempt": number}
-            target = self.campaign.quarantine_path(trial.id)
-            writer.quarantine(target, record, provenance, cause)
-            return False
-        try:
-            writer.commit(record, provenance)
-        except (OSError, RuntimeError) as error:
-            self._abandon(writer, error)
-            raise
-        return True
+        return found.passed
 
     def _abandon(self, writer: TrialWriter, error: BaseException) -> None:
         """Quarantine the data written of a trial, with the cause, as far as the disk allows.
 
-        What cannot be moved now is quarantined by the recovery of the next session.
+        What cannot be moved now is quarantined by the recovery of the next session. That commits
+        a trial that has its record already, so such a folder stays.
         """
         with suppress(OSError, RuntimeError):
             writer.abandon()
         with suppress(OSError):
-            if writer.folder.exists():
+            if writer.folder.exists() and not (writer.folder / RECORD).exists():
                 self.campaign.quarantine(writer.folder, _cause(error))
 
     def _record(

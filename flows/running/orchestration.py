@@ -333,9 +333,10 @@ class _Work:
         """Do it, and keep its result or its error."""
         self.started = True
         try:
-            self.on_start()
-            self._result = self._do(argument)
-            self._done = True
+            with stopping.signals():  # around a flow Prefect has its own handler of SIGTERM
+                self.on_start()
+                self._result = self._do(argument)
+                self._done = True
         except BaseException as error:
             self.error = error
             raise
@@ -413,7 +414,7 @@ def _reported(
 ) -> Any:
     """Do the work as a flow run that the server knows, and keep in the store how it ended."""
     from prefect import Flow
-    from prefect.exceptions import CancelledRun, PausedRun, PrefectSignal
+    from prefect.exceptions import CancelledRun, PausedRun, PrefectSignal, TerminationSignal
     from prefect.flow_engine import run_flow
 
     def do(argument: Opaque[Any]) -> Any:
@@ -455,8 +456,12 @@ def _reported(
         if not delivered:
             run_records.record_undelivered_end(store, run_id, *work.end)
         run_records.end(store, run_id, *work.end, "flow")
+    if work.error is None and isinstance(interrupted, TerminationSignal):
+        stopping.stop()  # of Prefect's own handler of SIGTERM
     if work.error is None and interrupted is not None:
         raise interrupted
+    if work.error is None:
+        stopping.check()  # Prefect swallows a Ctrl-C that comes when the end has been reported
     return work.outcome()
 
 

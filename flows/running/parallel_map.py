@@ -25,6 +25,7 @@ from sliplab.analysis.trial_work import Make, TrialWork
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, Pickled, run
 from sliplab.flows.running.run_records import timed
+from sliplab.storage.process import out_of_reach
 from sliplab.storage.remote.mirror import open_for_trial, place_of
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.trial import SyncResult
@@ -104,7 +105,8 @@ def _local_chunk(
 ) -> int:
     """Run some pieces on all cores; each result is passed on as soon as it is ready."""
     piece, jobs, start, pool, done = argument.content
-    futures = {pool.submit(piece, job): start + k for k, job in enumerate(jobs)}
+    with out_of_reach():
+        futures = {pool.submit(piece, job): start + k for k, job in enumerate(jobs)}
     for future in as_completed(futures):
         done(futures[future], future.result())
     return len(jobs)

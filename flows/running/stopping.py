@@ -4,19 +4,24 @@ Python delivers a signal as an exception wherever it happens to be. Inside a des
 reference's callback that exception is dropped, and the program continues, which an arm must not. So
 the handler also raises a flag: the rig looks at it in every poll, progress bars at every step. The
 trace that Python prints of a dropped one is left out: the request is kept.
+
+While files are written that belong together, only the flag is raised, and the exception when they
+are complete (`sliplab.storage.interrupts`).
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing.process import BaseProcess
 from types import FrameType
+
+from sliplab.storage import interrupts
+from sliplab.storage.process import leave_to_parent
+
+__all__ = ["SIGNALS", "check", "leave_to_parent", "request", "requested", "signals", "stop", "wait"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, a request to end, and a terminal that was closed: the arm stops first on each."""
@@ -25,24 +30,8 @@ _requested = threading.Event()
 
 def _handle(number: int, frame: FrameType | None) -> None:
     _requested.set()
-    raise KeyboardInterrupt
-
-
-def leave_to_parent() -> None:
-    """Ignore Ctrl-C, which reaches every process of a terminal: only the parent handles it.
-
-    A parent that is killed handles nothing: its children end with it. By themselves they would
-    stay, each waiting at a pipe whose other end the next one holds open.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), name="parent", daemon=True).start()
-
-
-def _end_with(parent: BaseProcess) -> None:
-    parent.join()  # bounded by the parent's life
-    os._exit(1)
+    if not interrupts.defer(frame):
+        raise KeyboardInterrupt
 
 
 def requested() -> bool:

@@ -43,6 +43,7 @@ from sliplab.flows.ui.review import RATE_NS, event_rate
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
+from sliplab.storage.process import start_tethered
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import (
     EVENTS_KIND,
@@ -161,9 +162,7 @@ def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.
     It has its own session, because it starts another program, which outlives it otherwise.
     """
     # what it prints is for people: standard output has nothing but the command's result
-    process = subprocess.Popen(
-        [program(), *ALONE, *arguments], env=environment, stdout=2, start_new_session=True
-    )
+    process = start_tethered([program(), *ALONE, *arguments], env=environment, stdout=2)
     try:
         yield process
     finally:

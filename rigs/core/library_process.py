@@ -203,7 +203,9 @@ class LibraryProcess:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
         given = ", ".join(map(repr, (theirs.fileno(), *arguments)))
         code = (
-            f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function}; "
+            # a stop of all processes is the parent's to handle, too: it stops the arm through this
+            "import signal, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+            f"sys.path[:] = {sys.path!r}; from {module} import {function}; "
             f"{function}({given})"
         )
         with theirs:

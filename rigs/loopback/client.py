@@ -29,6 +29,7 @@ from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.stream_settings import EventStream, Stream
+from sliplab.storage.process import leave_to_parent, out_of_reach
 from sliplab.storage.streams import FrameChunk, Sink
 from sliplab.storage.workers import WORKERS
 
@@ -82,9 +83,11 @@ class Loopback:
         self._process = WORKERS.Process(
             target=_serve,
             args=(theirs, their_frames, settings, timing, devices, further),
-            name="stand-ins",
+            name="simulation server",
+            daemon=True,  # ended with this process, where nothing closed it
         )
-        self._process.start()
+        with out_of_reach():
+            self._process.start()
         theirs.close()
         their_frames.close()
         self._calls = PipeCalls(ours, self._process.kill, pending=1)
@@ -249,6 +252,7 @@ def _serve(
     further: Mapping[str, tuple[str, FurtherEventCamera]],
 ) -> None:
     """Run the process; it ends with its parent, without waiting for libraries to shut down."""
+    leave_to_parent()
     from sliplab.rigs.loopback.simulation_server import SimulationServer
 
     sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes

@@ -48,6 +48,7 @@ from sliplab.storage.formats.foreign import (
 )
 from sliplab.storage.formats.original import StoredTrial
 from sliplab.storage.formats.time_order import Mask, falls, in_order
+from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
@@ -374,6 +375,7 @@ def _take_whole(
         return trial, _take(store, campaign, trial, kind)
 
 
+@uninterrupted
 def _take(store: Store, campaign: Campaign, trial: ForeignTrial, kind: str) -> _Content:
     """Commit one trial; return what was read."""
     if isinstance(trial, StoredTrial) and trial.original is not None:
@@ -440,6 +442,7 @@ def _events(trial: ForeignTrial, content: _Content) -> Iterator[EventChunk]:
             yield chunk
 
 
+@interruptible
 def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
     """Write events, triggers and frames; return first and last times.
 
@@ -558,6 +561,7 @@ def _fill_frames(
     return ends, size
 
 
+@interruptible
 def _fill_further(
     writer: TrialWriter, trial: ForeignTrial, content: _Content
 ) -> dict[str, StreamRecord]:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_bytes, write_json
 from sliplab.storage.formats.foreign import ForeignTrial, FormatError
+from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Counts, Provenance, SyncResult, TrialRecord
 from sliplab.storage.streams import (
@@ -128,6 +129,7 @@ class Original:
             return self.record.geometry.frame_px or (1, 1)  # tracks, whose frames nobody has
         return first.shape[1], first.shape[0]
 
+    @uninterrupted
     def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
         """Commit the trial with its label and clocks; as `Restorable`."""
         writer = campaign.begin(name, self.frame_px(), self.rate_hz)
@@ -157,6 +159,7 @@ class Original:
             raise FormatError(f"holds no whole trial: {path.name}: {text}")
         writer.commit(self.record, provenance)
 
+    @interruptible
     def _fill(self, writer: TrialWriter) -> None:
         data = {name: values for (file, name), values in self.columns.items() if file == DATA}
         for chunk in self._events(EVENTS_KIND):

@@ -27,6 +27,7 @@ from sliplab.storage.files import (
 )
 from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError, broken
 from sliplab.storage.formats.original import CampaignTexts, StoredTrial, check_arrays
+from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Counts, Provenance, SyncResult
@@ -158,6 +159,7 @@ class PublishedTrial:
     counts: Counts
     derived: dict[str, list[Path]]
 
+    @uninterrupted
     def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
         """Commit the trial with its label and clocks.
 
@@ -182,6 +184,7 @@ class PublishedTrial:
         sync_folder(target.parent)
         return self.counts
 
+    @interruptible
     def _copy(self, incoming: Path, about: Json) -> None:
         for file in sorted(self.folder.iterdir()):
             if not S_ISREG(file.lstat().st_mode):

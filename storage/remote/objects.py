@@ -30,6 +30,7 @@ from sliplab.storage.files import (
     sweep_marked,
     write_blocks,
 )
+from sliplab.storage.interrupts import interruptible
 from sliplab.storage.trials.checksums import Checksum
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
@@ -284,6 +285,7 @@ class Remote:
         except RemoteMissing:
             pass
 
+    @interruptible
     def _checked(self, key: str, known: Checksum) -> Iterator[bytes]:
         """Yield an object's bytes, and raise `RemoteDamaged` at their end if they do not match."""
         digest, size = hashlib.sha256(), 0

@@ -23,6 +23,7 @@ from sliplab.storage.files import (
     write_bytes,
     write_json,
 )
+from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.remote.manifest import (
     Manifest,
     check_against_sums,
@@ -278,7 +279,12 @@ class _Pull:
                         f"{folder / name}: differs from that at {self.remote.url}; pull into "
                         "another store"
                     )
-        files = {name: self._read_object(about, name) for name in lacks}
+        self._write({name: self._read_object(about, name) for name in lacks})
+
+    @uninterrupted
+    def _write(self, files: dict[str, bytes]) -> None:
+        """Write the campaign's own files."""
+        folder = self.campaign.folder
         if CHECKSUMS in files:
             (folder / CHECKSUMS).unlink(missing_ok=True)
             sync_folder(folder)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import inside, read_json, safe_name, write_bytes, write_json
+from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat, Part
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
@@ -71,6 +72,7 @@ class Derived:
         """Return whether `name` was made with `key`."""
         return self.key(name) == key
 
+    @uninterrupted
     def write(self, name: str, key: str, data: Json | Part, arrays: Arrays | None = None) -> None:
         """Keep a result; the JSON with its key is written last and decides."""
         self.folder.mkdir(parents=True, exist_ok=True)

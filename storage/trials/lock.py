@@ -89,6 +89,23 @@ def exclusive(
         os.close(handle)  # frees the lock
 
 
+def current_holder(path: Path) -> Json | None:
+    """Return who holds the lock file at `path`; None if nobody does. Nothing is changed."""
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _holder(handle)
+    except OSError:
+        return None
+    finally:
+        os.close(handle)
+    return None
+
+
 def _open(path: Path, mode: int) -> int:
     """Open a lock file, making it if it is missing.
 

@@ -37,6 +37,7 @@ from sliplab.storage.files import (
     write_bytes,
     write_json,
 )
+from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import CHECKSUMS, PROVENANCE, Fetch, incomplete, write_sums
@@ -60,6 +61,14 @@ AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that a person wants anew; mark of a failed attempt that counts no
 longer."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
+
+
+def known_cause(folder: Path) -> Json | None:
+    """Return why a folder is, or is to be, in quarantine; None if that is not known."""
+    try:
+        return read_json(folder / CAUSE)
+    except (OSError, ValueError):
+        return None
 
 
 def _holds(path: Path, data: bytes) -> bool:
@@ -171,6 +180,7 @@ class Campaign:
         """The copy of the protocol this campaign runs by."""
         return self.folder / PROTOCOL
 
+    @uninterrupted
     def update(self, info: CampaignInfo, protocol_text: str, rig_text: str) -> None:
         """Write the campaign's description and its copies of protocol and rig file.
 
@@ -223,7 +233,10 @@ class Campaign:
     def begin(
         self, trial_id: str, frame_px: tuple[int, int] | None, rate_hz: int, *, spool: bool = False
     ) -> TrialWriter:
-        """Begin to write a trial; an interrupted attempt under its id is quarantined first."""
+        """Begin to write a trial; an interrupted attempt under its id is quarantined first.
+
+        Call it in a function that is `interrupts.uninterrupted` until the writer has ended.
+        """
         incoming, target = self.places(trial_id)
         return TrialWriter(incoming, target, frame_px, rate_hz, spool=spool)
 
@@ -254,16 +267,25 @@ class Campaign:
         left = dict.fromkeys(self._folders("incoming"), "interrupted")
         for name, cause in self.damaged().items():
             left[self.folder / "trials" / name] = f"damaged: {cause}"
+        moving = [path for path in self._folders("trials") if (path / CAUSE).exists()]
+        left |= dict.fromkeys(moving, "interrupted")
         for path, cause in left.items():
-            self.quarantine(path, cause)
+            if known_cause(path) is None:
+                self.quarantine(path, cause)
+            else:  # a killed program was about to move it
+                self._move_to_quarantine(path)
         for path in self._folders("quarantine"):
             sweep_temporary(path)
         return len(left)
 
+    @uninterrupted
     def quarantine(self, folder: Path, cause: str, **more: object) -> Path:
         """Move a folder that is not a trial, or no longer one, to quarantine, with its cause."""
         sweep_temporary(folder)
         write_json(folder / CAUSE, {"cause": masked(cause), "trial": folder.name, **more})
+        return self._move_to_quarantine(folder)
+
+    def _move_to_quarantine(self, folder: Path) -> Path:
         target = self.quarantine_path(folder.name)
         os.rename(folder, target)
         sync_folder(target.parent)
@@ -281,11 +303,7 @@ class Campaign:
         """Return cause, trial and folder of everything in quarantine."""
         causes: list[QuarantineEntry] = []
         for path in self._folders("quarantine"):
-            try:
-                known = read_json(path / CAUSE)
-            except (OSError, ValueError):
-                known = {}
-            known.setdefault("cause", "unknown")
+            known = {"cause": "unknown", **(known_cause(path) or {})}
             trial_id = path.name.rpartition(".")[0]
             entry = {**known, "trial": trial_id, "folder": path.name}
             causes.append(cast("QuarantineEntry", entry))
@@ -407,6 +425,7 @@ class Store:
         return False
 
     @staticmethod
+    @uninterrupted
     def create(folder: Path) -> Store:
         """Open the store in `folder`; make it if there is none.
 

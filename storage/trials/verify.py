@@ -5,6 +5,7 @@ Nothing is changed but a file that another program left open for writing: it is 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.storage.errors import StoreError, own_fault
 from sliplab.storage.files import read_json, temporary_files
+from sliplab.storage.process import named
 from sliplab.storage.schema.document import NewerFormat
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import EVENTS_KIND
@@ -35,24 +37,35 @@ from sliplab.storage.trials.checksums import (
 )
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import COLUMNS, INDEX, STREAM_GROUP, TIMING, TRACKS
-from sliplab.storage.trials.store import CAUSE, IMPORTED, INFO, PROTOCOL, RIG, Campaign, Store
+from sliplab.storage.trials.lock import STORE_LOCK, current_holder
+from sliplab.storage.trials.store import (
+    CAUSE,
+    IMPORTED,
+    INFO,
+    PROTOCOL,
+    RIG,
+    Campaign,
+    Store,
+    known_cause,
+)
 from sliplab.storage.trials.superblock import left_open
 from sliplab.storage.trials.video import count_frames
 
 _KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
-DAMAGED, UNFINISHED = "damaged", "unfinished"
+DAMAGED, UNFINISHED, RECORDING = "damaged", "unfinished", "recording"
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
+    """One thing that is wrong, or not finished.
 
     Attributes:
         path: the file or folder.
         what: what is wrong with it.
-        kind: ``damaged``, or ``unfinished`` for what a killed program left, which the next
-            collection clears up.
+        kind: ``damaged``; ``unfinished`` for what a killed program left, which the next collection
+            clears up; or ``recording`` for a trial that a running program writes. Only the first
+            is a fault.
         campaign: its campaign; empty for the store's own files.
         trial: the committed trial that it belongs to; empty for any other file.
     """
@@ -69,7 +82,9 @@ def verify(
     on_trial: Callable[[str], None] | None = None,
     on_mended: Callable[[Path], None] | None = None,
 ) -> list[Problem]:
-    """Check every trial of every campaign; an empty list means all is well.
+    """Check every trial of every campaign; all is well where no problem is ``damaged``.
+
+    A collection may run meanwhile.
 
     Args:
         on_trial: called with each trial's id before it is checked.
@@ -96,6 +111,8 @@ def _campaign(
     on_mended: Callable[[Path], None] | None,
 ) -> list[Problem]:
     problems = _description(store, campaign)
+    if problems and current_holder(store.folder / STORE_LOCK) is not None:
+        problems = _description(store, campaign)  # it may have been written meanwhile
     for trial in trial_folders(campaign):
         if on_trial is not None:
             on_trial(trial.name)
@@ -105,7 +122,7 @@ def _campaign(
             for path in were_open:
                 if not left_open(path):
                     on_mended(path)
-    return problems + _leftovers(campaign)
+    return problems + _leftovers(store, campaign)
 
 
 def trial_folders(campaign: Campaign) -> list[Path]:
@@ -152,10 +169,13 @@ def failed_gates(store: Store) -> dict[str, list[str]]:
 
 def verify_trial(folder: Path) -> list[Problem]:
     """Check checksums, sizes, counts and clocks of one committed trial."""
-    return [
-        Problem(str(path), what, DAMAGED, folder.parent.parent.name, folder.name)
-        for path, what in _trial(folder)
-    ]
+    name, found = folder.parent.parent.name, _trial(folder)
+    if not os.path.lexists(folder):
+        return []  # a running program moved it to quarantine meanwhile
+    if known_cause(folder) is not None:
+        what = "is to be moved to quarantine; the next `sliplab collect` does it"
+        return [Problem(str(folder), what, UNFINISHED, name)]
+    return [Problem(str(path), what, DAMAGED, name, folder.name) for path, what in found]
 
 
 Found = list[tuple[Path, str]]
@@ -393,13 +413,25 @@ def _frame_problems(data: Path, video: Path, tracks: list[str], counts: dict[str
     return problems
 
 
-def _leftovers(campaign: Campaign) -> list[Problem]:
+def _leftovers(store: Store, campaign: Campaign) -> list[Problem]:
     """Find unfinished trials, and what is in quarantine without a cause."""
     found = []
     folder = campaign.folder / "incoming"
-    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-        what = "is an unfinished trial; the next `sliplab collect` quarantines it"
-        found.append(Problem(str(path), what, UNFINISHED, campaign.name))
+    unfinished = sorted(folder.iterdir()) if folder.is_dir() else []
+    holder = current_holder(store.folder / STORE_LOCK)
+    writes = holder is not None and holder.get("collects") in {None, campaign.name}
+    for path in unfinished:
+        if writes and holder is not None:
+            verb = "recorded" if holder.get("collects") else "written"
+            what, kind = f"is being {verb} by {named(holder)}", RECORDING
+        elif not path.exists():
+            continue  # it was committed meanwhile
+        elif (path / RECORD).exists():
+            what, kind = "is not committed yet; the next `sliplab collect` does it", UNFINISHED
+        else:
+            what = "is an unfinished trial; the next `sliplab collect` quarantines it"
+            kind = UNFINISHED
+        found.append(Problem(str(path), what, kind, campaign.name))
     folder = campaign.folder / "quarantine"
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         try:

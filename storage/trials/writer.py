@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -43,6 +42,33 @@ from sliplab.storage.trials.checksums import (
 )
 from sliplab.storage.trials.frame_writer import FrameWriter
 from sliplab.storage.trials.hdf5_writer import STREAM_NAME, StreamFile
+
+
+def data_files(folder: Path) -> list[str]:
+    """Return the names of a trial's files that hold data."""
+    first = [name for name in (DATA, FRAMES) if (folder / name).exists()]
+    return first + sorted(filter(is_stream_file, os.listdir(folder)))
+
+
+def make_visible(folder: Path, target: Path) -> None:
+    """Rename a complete folder to `target`, and flush that."""
+    os.rename(folder, target)
+    sync_folder(target.parent)
+
+
+def finish_folder(folder: Path, cause: Json | None = None) -> None:
+    """Write the checksums of a trial's folder that has data and record, and flush its entries.
+
+    Args:
+        cause: why it goes to quarantine, if it does.
+    """
+    sums = {name: Checksum.of(folder / name) for name in (*data_files(folder), RECORD)}
+    write_json_aside(folder / CHECKSUMS, as_json(sums))
+    if cause is not None:
+        write_json_aside(folder / "cause.json", cause)
+    for name in (*sums, CHECKSUMS, PROVENANCE):
+        protect(folder / name)
+    sync_folder(folder)
 
 
 class TrialWriter:
@@ -172,8 +198,7 @@ class TrialWriter:
         if self.target.exists():
             raise FileExistsError(f"{self.target}: this trial is already committed")
         self._finish_folder(record, provenance)
-        os.rename(self.folder, self.target)
-        sync_folder(self.target.parent)
+        make_visible(self.folder, self.target)
         return self.target
 
     def quarantine(
@@ -181,30 +206,21 @@ class TrialWriter:
     ) -> None:
         """End a complete but unwanted attempt: keep it in `target`, with its record and cause."""
         self.seal()
-        write_json_aside(
-            self.folder / "cause.json", {**cause, "cause": masked(str(cause["cause"]))}
-        )
-        self._finish_folder(record, provenance)
-        os.rename(self.folder, target)
-        sync_folder(target.parent)
+        self._finish_folder(record, provenance, {**cause, "cause": masked(str(cause["cause"]))})
+        make_visible(self.folder, target)
 
-    def _finish_folder(self, record: TrialRecord, provenance: Provenance) -> None:
-        write_json_aside(self.folder / RECORD, record.to_json())
-        write_json_aside(self.folder / PROVENANCE, provenance.to_json())
-        data = [name for name in (DATA, FRAMES) if (self.folder / name).exists()]
-        data += self._stream_files()
-        for name in data:
+    def _finish_folder(
+        self, record: TrialRecord, provenance: Provenance, cause: Json | None = None
+    ) -> None:
+        """Write what makes the folder complete.
+
+        The record is written when the data are safe: a recovery trusts a folder that has one.
+        """
+        for name in data_files(self.folder):
             sync_file(self.folder / name)
-        sums = {name: Checksum.of(self.folder / name) for name in (*data, RECORD)}
-        write_json_aside(self.folder / CHECKSUMS, as_json(sums))
-        for name in (*sums, CHECKSUMS, PROVENANCE):
-            protect(self.folder / name)
-        sync_folder(self.folder)
-
-    def _stream_files(self) -> Iterator[str]:
-        """Yield the names of the files of further cameras."""
-        if self._further:
-            yield from sorted(filter(is_stream_file, os.listdir(self.folder)))
+        write_json_aside(self.folder / PROVENANCE, provenance.to_json())
+        write_json_aside(self.folder / RECORD, record.to_json())
+        finish_folder(self.folder, cause)
 
     def abandon(self) -> None:
         """Close what is open and leave the folder as it is, for quarantine."""

@@ -1,9 +1,13 @@
-"""`python -m tests.crash --kills N --seed S`: a store under faults, in four parts.
+"""`python -m tests.crash --kills N --seed S`: a store under faults, in five parts.
 
 **kills**: a campaign of small simulated trials is taken once undisturbed. Then it is taken again in
 lives that end by SIGKILL, at a random time or in a random write, fsync or rename, until it is
 complete; and again from the beginning until there were N kills. After every kill each trial that is
 there must be byte for byte the undisturbed one; at the end all of them, and nothing else.
+
+**signals**: the same with Ctrl-C, SIGTERM, SIGHUP and SIGKILL at lines of the code that writes
+campaigns and trials. Nothing that was recorded completely is lost, and a program that was asked to
+stop leaves nothing behind.
 
 **power**: the calls of a collection are recorded, and the power is cut after each of them.
 **full**: the disk fills up at every 64 KiB of a trial with a video. **read_only**: it is read-only.
@@ -25,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 KINDS = ("time", "write", "fsync", "rename", "any")
-PARTS = ("kills", "power", "full", "read_only")
+PARTS = ("kills", "signals", "power", "full", "read_only")
 MAX_LIVES = 2000
 
 
@@ -90,7 +94,7 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--kills", type=int, default=200, help="kills or signals of a part")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--trials", type=int, default=40)
     parser.add_argument("--every", type=int, default=1, help="power: states that are gone on from")
@@ -117,9 +121,12 @@ def main() -> int:
 def _part(part: str, folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from tests.crash.full import fill, read_only
     from tests.crash.power import cut
+    from tests.crash.signals import send
 
     if part == "kills":
         return crash(folder, asked.kills, asked.seed, asked.trials, asked.video)
+    if part == "signals":
+        return send(folder, asked.kills, asked.seed, asked.trials)
     if part == "power":
         return cut(folder, asked.seed, video=asked.video, every=asked.every)
     if part == "full":

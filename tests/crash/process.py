@@ -56,6 +56,8 @@ def live(
                 install(watched, policy)
             work()
             code = 0
+        except SystemExit as end:
+            code = int(end.code or 0)
         except BaseException:
             traceback.print_exc()
         finally:

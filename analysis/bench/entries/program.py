@@ -30,6 +30,7 @@ import numpy as np
 from sliplab.analysis.bench.feeding import BenchError
 from sliplab.analysis.bench.interface import Detector, Evidence
 from sliplab.protocols.errors import InputError
+from sliplab.storage.process import start_tethered, started_ticks
 from sliplab.storage.streams import EventChunk
 
 HEAD = struct.Struct("<4sIq")
@@ -58,12 +59,9 @@ class Program(Detector):
         self._command, self._answer_s, self._end_s = command, answer_s, end_s
         self._open = True
         try:
-            self._process = subprocess.Popen(
-                words,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,  # Ctrl-C ends it by `close`
+            # Ctrl-C ends it by `close`
+            self._process = start_tethered(
+                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
             )
         except OSError as error:
             text = f"cannot be started: {error.strerror}"
@@ -181,7 +179,7 @@ class Program(Detector):
         with suppress(ProcessLookupError):  # before it is reaped: its number is not reused yet
             os.killpg(self._process.pid, signal.SIGKILL)
         for pid, began in started:
-            if _began(pid) == began:  # the same process still
+            if started_ticks(pid) == began:  # the same process still
                 with suppress(ProcessLookupError, PermissionError):
                     os.kill(pid, signal.SIGKILL)
         self._process.wait()
@@ -194,24 +192,15 @@ def _ended(pid: int) -> bool:
     return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
 
-def _began(pid: int) -> str | None:
-    """Return the start time of a process as the kernel counts it; None if there is none."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return None
-    return stat.rpartition(")")[2].split()[19]
-
-
-def _descendants(pid: int) -> set[tuple[int, str]]:
+def _descendants(pid: int) -> set[tuple[int, int]]:
     """Return the processes that a process has started, and those started by them, with times."""
-    found: set[tuple[int, str]] = set()
+    found: set[tuple[int, int]] = set()
     todo = [pid]
     while todo:
         for children in Path(f"/proc/{todo.pop()}/task").glob("*/children"):
             with suppress(OSError):
                 for child in map(int, children.read_text().split()):
-                    if (began := _began(child)) is not None and (child, began) not in found:
+                    if (began := started_ticks(child)) is not None and (child, began) not in found:
                         found.add((child, began))
                         todo.append(child)
     return found

@@ -27,6 +27,7 @@ from sliplab.rigs.devices.dvxplorer.fake_stream import (
 )
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.storage.process import leave_to_parent, out_of_reach
 from sliplab.storage.streams import I64, EventChunk
 from sliplab.storage.workers import WORKERS, check_work
 
@@ -79,7 +80,8 @@ class DvxplorerServer:
         self._process = WORKERS.Process(
             target=_serve, args=(theirs, source, realtime, stall_after, size), daemon=True
         )
-        self._process.start()
+        with out_of_reach():
+            self._process.start()
         theirs.close()
         try:
             self.events_port, self.triggers_port = self._expect("ready", READY_S)
@@ -189,6 +191,7 @@ def _serve(
     size: tuple[int, int],
 ) -> None:
     """Run the serving process; never returns."""
+    leave_to_parent()
     status = 1
     try:
         packets = [_made(*packet) for packet in source()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import threading
 import time
 from contextlib import suppress
@@ -52,6 +53,14 @@ def test_calls_and_refusals(process: LibraryProcess) -> None:
     process.end()
     with pytest.raises(LibraryError, match="the echo has exited"):
         process.call("any", within_s=20.0)
+    process.end()
+
+
+def test_child_survives_signals_that_all_processes_get(process: LibraryProcess) -> None:
+    """The arm is stopped through it: the parent ends it afterwards."""
+    assert os.getsid(process.pid) == process.pid  # those of a terminal do not reach it
+    os.kill(process.pid, signal.SIGTERM)
+    assert process.call("any", within_s=20.0) == "any"
     process.end()
 
 

@@ -1,0 +1,134 @@
+"""Trials whose program was killed after their record was written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sliplab.storage.schema.trial import Provenance
+from sliplab.storage.trials.recovery import recover
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
+from tests.storage.trial_files import FRAME, campaign, commit, fail, fill, record
+
+
+def killed(where: Campaign, trial: str = "t", **changes: object) -> Path:
+    """Write a trial up to its last rename."""
+    target = commit(where, trial, **changes)
+    folder = where.folder / "incoming" / trial
+    os.rename(target, folder)
+    return folder
+
+
+def torn(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:20])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: None,
+        lambda folder: (folder / "checksums.json").unlink(),
+        lambda folder: torn(folder / "checksums.json"),
+    ],
+    ids=["before the rename", "before the checksums", "in the checksums"],
+)
+def test_killed_commit_is_completed(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    where = campaign(tmp_path / "s")
+    whole = commit(where, "u")
+    damage(killed(where))
+    (problem,) = verify(Store.open(tmp_path / "s"))
+    assert problem.kind == "unfinished"
+    assert problem.path.endswith("incoming/t")
+    assert recover(where) == ["t"]
+    assert where.sweep() == 0
+    assert verify(Store.open(tmp_path / "s")) == []
+    assert where.committed() == {"t", "u"}
+    for name in ("data.h5", "frames.mkv"):
+        assert (where.folder / "trials" / "t" / name).read_bytes() == (whole / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: (folder / "record.json").unlink(),
+        lambda folder: torn(folder / "record.json"),
+        lambda folder: torn(folder / "data.h5"),
+        lambda folder: [torn(folder / "data.h5"), (folder / "checksums.json").unlink()],
+        lambda folder: [(folder / "frames.mkv").unlink(), (folder / "checksums.json").unlink()],
+        lambda folder: (folder / "provenance.json").unlink(),
+        lambda folder: (folder / "elsewhere.json").write_text("{}"),
+        lambda folder: (folder / "frames.raw").write_text("x"),
+    ],
+)
+def test_incomplete_trial_is_quarantined(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    where = campaign(tmp_path / "s")
+    damage(killed(where))
+    assert recover(where) == []
+    assert where.sweep() == 1
+    assert where.committed() == set()
+    assert [item["cause"] for item in where.quarantined()] == ["interrupted"]
+
+
+def test_trial_of_another_name_or_of_a_failed_gate_is_not_committed(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    killed(where, "t", quality={"passed": False, "gates": {}})
+    killed(where, "u")
+    shutil.move(where.folder / "incoming" / "u", where.folder / "incoming" / "v")
+    assert recover(where) == []
+
+
+def test_failed_attempt_killed_before_its_rename_keeps_its_cause(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    fail(where, "t", 0)
+    os.rename(where.folder / "quarantine" / "t.1", where.folder / "incoming" / "t")
+    assert recover(where) == []
+    assert where.sweep() == 1
+    assert where.failed_attempts() == {"t": 1}
+
+
+def test_trial_killed_on_its_way_to_quarantine_is_unfinished_and_moved(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    commit(where, "t")
+    target = where.quarantine(where.folder / "trials" / "t", "again: dust")
+    os.rename(target, where.folder / "trials" / "t")
+    assert [item.kind for item in verify(Store.open(tmp_path / "s"))] == ["unfinished"]
+    assert where.sweep() == 1
+    assert [item["cause"] for item in where.quarantined()] == ["again: dust"]
+    assert verify(Store.open(tmp_path / "s")) == []
+
+
+def test_committed_trial_is_not_replaced(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    killed(where)
+    commit(where, "u")
+    os.rename(where.folder / "trials" / "u", where.folder / "trials" / "t")
+    before = (where.folder / "trials" / "t" / "record.json").read_bytes()
+    assert recover(where) == []
+    assert (where.folder / "trials" / "t" / "record.json").read_bytes() == before
+
+
+def test_data_are_flushed_before_the_record_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A record on the disk says that the data are, too."""
+    order: list[str] = []
+    real = os.fsync
+
+    def fsync(handle: int) -> None:
+        order.append(Path(os.readlink(f"/proc/self/fd/{handle}")).name)
+        real(handle)
+
+    where = campaign(tmp_path / "s")
+    writer = where.begin("t", FRAME, 100)
+    fill(writer)
+    writer.seal()
+    monkeypatch.setattr(os, "fsync", fsync)
+    writer.commit(record("t"), Provenance())
+    names = {name: order.index(name) for name in ("data.h5", "frames.mkv", "record.json")}
+    assert max(names["data.h5"], names["frames.mkv"]) < names["record.json"]
+    assert order.index("provenance.json") < names["record.json"] < order.index("checksums.json")
