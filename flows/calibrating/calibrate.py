@@ -39,7 +39,7 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
     """
     rig, camera = session.rig, session.file.frame_camera
     rig.frames.set_region(camera.width_px, camera.height_px)
-    pictures = []
+    pictures: list[npt.NDArray[np.uint8]] = []
     for number in range(views):
         how = "lean it by 20 to 40 degrees, another way and place each time, into every corner"
         prompt = "lay the board flat on the plate" if number == 0 else how
@@ -70,7 +70,7 @@ def read_pictures(folder: Path) -> list[npt.NDArray[np.uint8]]:
     paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in {".png", ".jpg", ".tif"})
     if not paths:
         raise InputError("--images", "", str(folder), "contains no .png, .jpg or .tif")
-    pictures = []
+    pictures: list[npt.NDArray[np.uint8]] = []
     for path in paths:
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if picture is None:

@@ -226,7 +226,9 @@ class ClockStands(ExampleArm):
 
 def without_tilt(self: ExampleArm, path: Any) -> tuple[Any]:
     """Lift the limit of a turn."""
-    self._guard._limits = self._guard._limits.model_copy(update={"tilt_deg": 180.0})
+    limits = self._guard._limits
+    assert limits is not None
+    self._guard._limits = limits.model_copy(update={"tilt_deg": 180.0})
     return (path,)
 
 

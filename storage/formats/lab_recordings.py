@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +162,7 @@ def with_run(trial: ForeignTrial, stem: str, run: Path | None) -> ForeignTrial:
     unknown += [f"clock of {name}" for name in forces]
     return replace(
         trial, about=about, frames=frames, frame_px=size, unknown=tuple(unknown),
-        cameras={**trial.cameras, **{name: read for name, (read, _) in cameras.items()}},
+        cameras={**trial.cameras, **{n: read for n, (read, _) in cameras.items() if read}},
         streams={**trial.streams, **forces}, resolution_us={**trial.resolution_us, **resolution},
         notes=lambda: (*trial.notes(), *dict.fromkeys(notes)),
     )  # fmt: skip
@@ -210,7 +210,7 @@ def _video_streams(run: Path, stem: str, notes: list[str]) -> dict[str, Camera]:
             continue
         name = FRAMES_KIND if not found else re.sub(r"[^a-z0-9]+", "_", camera.lower()).strip("_")
         size = (first.shape[1], first.shape[0])
-        found[name] = (lambda video=video, times=times: _frames(video, times, notes)), size
+        found[name] = partial(_frames, video, times, notes), size
     return found
 
 

@@ -23,7 +23,6 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, safe_name
 from sliplab.storage.formats.aedat4 import LINE, read_aedat4, salvage_aedat4
 from sliplab.storage.formats.dsec import (
-    SIGNATURE,
     is_lab_hdf5,
     read_dsec,
     read_lab_hdf5,
@@ -75,6 +74,7 @@ from sliplab.storage.formats.ros_bags import (
 )
 from sliplab.storage.formats.unread import unread
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.superblock import SIGNATURE
 
 Reader = Callable[[Path, str], ForeignTrial]
 READERS: dict[str, tuple[tuple[str, ...], Reader]] = {

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.storage.formats.dsec import SIGNATURE
 from sliplab.storage.formats.foreign import read_head
+from sliplab.storage.trials.superblock import SIGNATURE
 
 _AEDAT = re.compile(rb"#!AER-DAT(\d+\.\d+)")
 _READ_AEDAT = b"4.0"
