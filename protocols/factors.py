@@ -146,6 +146,7 @@ def _list_units(schema: dict[str, Any]) -> None:
     schema["enum"] = [*all_symbols(), None]
 
 
+_PLAIN = re.compile(rf"\s*{_DIGITS}\s*")
 _WITH_UNIT = re.compile(r"\s*[+-]?[\d.].*[A-Za-z%]\d?\s*")
 
 
@@ -165,7 +166,7 @@ def in_canonical_unit(level: Any, symbol: object) -> Any:
     unit = find_unit(symbol) if isinstance(symbol, str) else None
     if unit is None:
         return level
-    if isinstance(level, str) and _WITH_UNIT.fullmatch(level):
+    if isinstance(level, str) and _WITH_UNIT.fullmatch(level) and not _PLAIN.fullmatch(level):
         return parse(level, canonical_of(unit))
     try:
         return level if unit.factor == 1 else to_decimal(level) * unit.factor

@@ -227,6 +227,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
         return node
 
 
+_MISSING = "is missing"
 _LEFT_OUT = object()
 """In place of a value that cannot be read."""
 
@@ -505,7 +506,7 @@ def validate(
         *((fault, _as_written(document, fault)) for fault in found),
         *((fault, fault.value) for fault in checked),
     ):
-        if not any(_at_or_around(each.key, key) for key in unread):
+        if not any(_due_to(each, key) for key in unread):
             by_key.setdefault(each.key, InputError(path, each.key, value, str(each)))
     if by_key:
         raise InputError.joined(by_key.values())
@@ -517,8 +518,11 @@ def _as_written(document: Document, fault: KeyedError) -> object:
     return fault.value if fault.value is None else document.written.get(fault.key) or fault.value
 
 
-def _at_or_around(key: str, unread: str) -> bool:
-    """Return whether a fault at `key` may come from the value at `unread`, which was left out."""
+def _due_to(fault: KeyedError, unread: str) -> bool:
+    """Return whether a fault may come from the value at `unread`, which was left out."""
+    key, merged = fault.key, unread.removesuffix("<<")
+    if merged != unread and str(fault) == _MISSING:
+        return key.startswith(merged)  # it may be among the merged keys
     return f"{unread}.".startswith(f"{key}.") or f"{unread}[".startswith(f"{key}[")
 
 
@@ -623,7 +627,7 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
         hint = (f" (holds {foreign})" if foreign else "") + hint
         return KeyedError(key, value, f"unknown key{hint}{known}")
     if kind == "missing":
-        return KeyedError(key, None, "is missing")
+        return KeyedError(key, None, _MISSING)
     if kind == "value_error":
         return KeyedError(key, value, str(context["error"]))
     if kind in {"union_tag_invalid", "union_tag_not_found"}:

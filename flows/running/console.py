@@ -46,7 +46,7 @@ steps of other kinds, counted by the same bar, changed the estimate from minutes
 WIDTH = 120
 """Columns of a table where there is no terminal: in a file, a pipe or a log."""
 
-_FEWEST = 16
+_FEWEST = 12
 """Width to which columns are folded inside a word, outside of a terminal."""
 
 _FOLDED = 30
@@ -159,9 +159,8 @@ def _print(
     table: Table, columns: Sequence[str], cells: Sequence[Sequence[str]], spare: int = 0
 ) -> None:
     by_column = list(zip(columns, *cells, strict=True))
-    widths, gap = _layout(by_column, results.width, spare)
-    if table.show_header and not results.is_terminal:
-        _fold_words(widths, gap, max(results.width, WIDTH))
+    outside = table.show_header and not results.is_terminal
+    widths, gap = _layout(by_column, results.width, spare, outside)
     table.title_justify, table.padding = "left", (0, 1 if gap == 3 else 0, 0, 1)
     table.width = _table_width(widths, gap)
     for column, width in zip(columns, widths, strict=False):
@@ -177,12 +176,15 @@ def _print(
     results.print(lines, end="", markup=False, soft_wrap=True)
 
 
-def _layout(by_column: Sequence[Sequence[str]], room: int, spare: int) -> tuple[list[int], int]:
+def _layout(
+    by_column: Sequence[Sequence[str]], room: int, spare: int, fold_words: bool
+) -> tuple[list[int], int]:
     """Choose the width of each column that is shown, and of the gap between two.
 
     Args:
         room: of the whole table; a table whose words do not fit is wider.
         spare: how many of the last columns may be left out to make it fit.
+        fold_words: whether words are folded where they do not fit `WIDTH`.
     """
     widths, gap = [max(map(cell_len, cells)) for cells in by_column], 3
     words = [
@@ -194,6 +196,11 @@ def _layout(by_column: Sequence[Sequence[str]], room: int, spare: int) -> tuple[
         spare -= 1
     if _table_width(words, gap) > room:
         gap = 2
+    if fold_words and _table_width(words, gap) > max(room, WIDTH):
+        for column in reversed(range(len(words))):  # ids and paths come first in a row
+            over = max(_table_width(words, gap) - max(room, WIDTH), 0)
+            words[column] -= min(over, max(words[column] - _FEWEST, 0))
+        return words, gap
     if _table_width(words, gap) > room:
         return [
             min(pair) for pair in zip(widths, (max(_FOLDED, w) for w in words), strict=True)
@@ -202,17 +209,6 @@ def _layout(by_column: Sequence[Sequence[str]], room: int, spare: int) -> tuple[
         foldable = [number for number, width in enumerate(widths) if width > words[number]]
         widths[max(foldable, key=widths.__getitem__)] -= 1
     return widths, gap
-
-
-def _fold_words(widths: list[int], gap: int, room: int) -> None:
-    """Narrow the widest columns until a table fits, though words are folded: few ones if possible.
-
-    Args:
-        widths: of the columns; changed in place.
-    """
-    for column in sorted(range(len(widths)), key=widths.__getitem__, reverse=True):
-        over = _table_width(widths, gap) - room
-        widths[column] -= min(max(over, 0), max(widths[column] - _FEWEST, 0))
 
 
 def _table_width(widths: Sequence[int], gap: int) -> int:

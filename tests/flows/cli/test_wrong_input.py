@@ -212,13 +212,16 @@ PROTOCOLS: dict[str, tuple[str, str, str, str]] = {
 
 
 def refused(*arguments: object) -> str:
-    """The one message of a command that refuses its input."""
+    """The first message of a command that refuses its input; others are of the same file."""
     done = here(*arguments)
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
+    line, *more = done.stderr.splitlines()
     assert line.startswith("error: ")
-    assert not re.search(r"[\x00-\x1f\x7f-\x9f]|Decimal\(|datetime", line)
+    file = line.removeprefix("error: ").partition(": ")[0]
+    assert [each for each in more if not each.startswith(f"{file}: ")] == []
+    for each in (line, *more):
+        assert not re.search(r"[\x00-\x1f\x7f-\x9f]|Decimal\(|datetime", each)
     return line
 
 
