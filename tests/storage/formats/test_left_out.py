@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -568,3 +569,11 @@ def test_names_that_no_file_system_has_are_changed(name: str) -> None:
     safe_name(made)
     assert made.lower() not in {"con", "trial."}
     assert not made.endswith(".")
+
+
+@pytest.mark.parametrize("kind", [(), ("raw",)])
+def test_a_pipe_is_no_recording(tmp_path: Path, kind: tuple[str, ...]) -> None:
+    os.mkfifo(tmp_path / "a.raw")
+    done = here("import", *kind, tmp_path / "a.raw", "--store", tmp_path / "s", "--name", "x")
+    assert done.returncode == 2
+    assert "a.raw: is neither a file nor a folder" in done.stderr
