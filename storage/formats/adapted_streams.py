@@ -33,6 +33,7 @@ from sliplab.storage.formats.numpy_files import MAGIC, array_of
 from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
 from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
 from sliplab.storage.formats.tables import read_columns, times_ns
+from sliplab.storage.formats.time_order import is_unordered
 from sliplab.storage.streams import (
     F64,
     I64,
@@ -218,7 +219,8 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
         if "p" in found:
             p[:] = np.isin(found["p"], positive) if positive else found["p"] > 0
             p[np.isnan(found["p"])] = UNKNOWN
-        if len(t_us) and np.any(t_us[1:] < t_us[:-1]):
+        valid = t_us >= 0
+        if is_unordered(t_us[valid], p[valid] > 0):
             order = np.argsort(t_us, kind="stable")
             t_us, x, y, p = t_us[order], x[order], y[order], p[order]
         for first in range(0, len(t_us), _BLOCK_EVENTS):

@@ -28,7 +28,9 @@ from sliplab.storage.formats.foreign import (
     read_head,
     resolution_us,
     rounded_us,
+    some_rows,
 )
+from sliplab.storage.formats.time_order import is_unordered
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, EventChunk
 from sliplab.storage.trials.hdf5_reader import FileContent, RowFile, Rows
@@ -189,13 +191,22 @@ def _lab_events(
 ) -> tuple[I64, I64, Any, I64, float]:
     """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
     xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
-    positive = np.asarray(ps) > 0  # 0 and 1, or -1 and 1
-    return _pixels(xs), _pixels(ys), positive, rounded_us(ts, 1e6), resolution_us(ts, 1e6)
+    return _pixels(xs), _pixels(ys), _polarities(ps), rounded_us(ts, 1e6), resolution_us(ts, 1e6)
+
+
+def _polarities(values: Any) -> Any:
+    """Return polarities: 1 and 255 are ON, 0 and -1 OFF, others unknown (2)."""
+    found = np.asarray(values)
+    if found.dtype.kind == "b":
+        return found
+    return np.select([np.isin(found, (1, 255)), np.isin(found, (0, -1))], [1, 0], 2)
 
 
 def _sorted(x: I64, y: I64, p: Any, t_us: I64, resolution: float) -> EventChunk:
-    order = np.argsort(t_us, kind="stable")
-    return event_chunk(x[order], y[order], p[order], t_us[order], resolution)
+    chunk = event_chunk(x, y, p, t_us, resolution)
+    if not is_unordered(chunk.t_us, chunk.p > 0):
+        return chunk
+    return some_rows(chunk, np.argsort(chunk.t_us, kind="stable"))
 
 
 def _lab_trial(
@@ -289,29 +300,18 @@ def _resolution(
     """Return columns and rows of the camera, by the attribute `sensor_resolution`.
 
     The lab writes columns first, other programs that share its layout rows first. Sensors are wider
-    than high, so the larger number is the columns, unless the events fit only the other way.
-
-    Raises:
-        FormatError: the events fit neither way.
+    than high, so the larger number is the columns, unless more events fit the other way.
     """
     if stated is None or len(stated) < 2 or min(stated[:2]) <= 0:
         return None
     long, short = max(stated[:2]), min(stated[:2])
-    columns, rows = (_end(of[key], count) for key in ("xs", "ys"))
-    for size in ((long, short), (short, long)):
-        if columns <= size[0] and rows <= size[1]:
-            return size
-    raise FormatError(
-        f"holds events up to column {columns - 1} and row {rows - 1}, outside of its "
-        f"sensor_resolution {stated[0]} x {stated[1]}"
-    )
-
-
-def _end(column: Rows, count: int) -> int:
-    """Return one more than the largest pixel of the first `count` rows of a column."""
-    starts = range(0, count, PIECE)
-    pieces = (_pixels(column.read(low, min(low + PIECE, count))) for low in starts)
-    return max((int(piece.max()) + 1 for piece in pieces), default=0)
+    sizes = ((long, short), (short, long))
+    outside = [0, 0]
+    for low in range(0, count, PIECE):
+        x, y = (_pixels(of[key].read(low, min(low + PIECE, count))) for key in ("xs", "ys"))
+        for which, (columns, rows) in enumerate(sizes):
+            outside[which] += int(((x >= columns) | (y >= rows)).sum())
+    return sizes[int(outside[1] < outside[0])]
 
 
 def _same_length(columns: Mapping[str, Sized]) -> None:

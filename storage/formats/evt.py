@@ -7,9 +7,9 @@ time is sent alone and grows until it begins again at 0. It may step back a litt
 lower part, because events come from several sources; a high part that falls further is a fault. An
 event has the time of the words before it, whatever times passed without an event, as in the maker's
 own decoders. One that is earlier than the event before it is raised to that time, and counted; so
-is one of DAT. Events before the first high part have no time, and are dropped, as
-the maker says for EVT 2.0; the row and the base of a vector, which EVT 3.0 sends alone, count from
-the first word on.
+is one of DAT that is earlier by no more than a high part may step back. Events before the first
+high part have no time, and are dropped, as the maker says for EVT 2.0; the row and the base of a
+vector, which EVT 3.0 sends alone, count from the first word on.
 """
 
 from __future__ import annotations
@@ -53,6 +53,9 @@ _HIGHS_3, _HIGHS_2 = 1 << 12, 1 << 28
 _BACK = 10
 """Values by which a high part may step back."""
 
+_BACK_US = _BACK << 12
+"""Step back up to which an event of DAT is raised; one by more is a fault, and left as it is."""
+
 Decode = Callable[..., tuple[int, int]]
 
 
@@ -64,6 +67,7 @@ class Encoding:
         dtype: of its words, little-endian. decode: see `decode_evt3`.
         type_bit: the lowest of the four bits with a word's type; None if all words are events.
         most_px: columns and rows that its words can tell.
+        high_us: one of its high parts, us; 0 if it has none.
     """
 
     name: str
@@ -71,6 +75,26 @@ class Encoding:
     decode: Decode
     type_bit: int | None
     most_px: int
+    high_us: int = 0
+
+    def after_fault(self, word: int, state: I64) -> tuple[int, int]:
+        """Make a state ready to continue after a fault; return words and events to leave out.
+
+        Where a high part fell the clock restarted: the events behind it run back in time.
+        """
+        if state[FAULT] == FELL:
+            state[HIGH_US] += (state[GOT] - state[HAD]) * self.high_us
+            state[HIGH], state[LOW] = state[GOT], 0
+            state[NOW] = state[EDGE_US] = state[HIGH_US]
+            return 1, 0
+        kind = None if self.type_bit is None else word >> self.type_bit
+        if self.dtype == "<u2" and kind in (_VECT_12, _VECT_8):
+            size = 12 if kind == _VECT_12 else 8
+            state[BASE] += size
+            return 1, (word & (1 << size) - 1).bit_count()
+        if self.dtype == "<u8" and kind is not None:
+            return 1, (word & 0xFFFFFFFF).bit_count()
+        return 1, 1
 
     def has_edges(self, words: npt.NDArray[Any]) -> bool:
         """Return whether one of the words is an edge of a trigger input."""
@@ -407,11 +431,12 @@ def _mend(x, y, t, state, width, height):  # type: ignore[no-untyped-def]
                 return i
             turned_us += 1 << 32
             state[HIGH_US] += 1 << 32
-        t[i] = now = _raised(t[i] + turned_us, now, state)
+        found = t[i] + turned_us
+        t[i] = now = found if now - found > _BACK_US else _raised(found, now, state)
     return len(t)
 
 
-EVT2 = Encoding("EVT 2.0", "<u4", decode_evt2, 28, 1 << 11)
-EVT21 = Encoding("EVT 2.1", "<u8", decode_evt21, 60, 1 << 11)
-EVT3 = Encoding("EVT 3.0", "<u2", decode_evt3, 12, 1 << 11)
+EVT2 = Encoding("EVT 2.0", "<u4", decode_evt2, 28, 1 << 11, 64)
+EVT21 = Encoding("EVT 2.1", "<u8", decode_evt21, 60, 1 << 11, 64)
+EVT3 = Encoding("EVT 3.0", "<u2", decode_evt3, 12, 1 << 11, 4096)
 DAT = Encoding("DAT", "<u8", decode_dat, None, 1 << 14)

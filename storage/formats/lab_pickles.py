@@ -31,9 +31,10 @@ from sliplab.storage.formats.pickles import parse_pickle, read_bounded
 from sliplab.storage.streams import EventChunk
 
 _FILE = re.compile(
-    r"(?P<stem>.+?)(?P<events>_events)?_(?P<polarity>on|off)(?P<ending>\.(?:pickle|pkl|npy))?"
+    r"(?P<stem>.+?)(?P<events>_events)?_(?P<polarity>on|off)(?P<ending>\.(?:pickle|pkl|npy))?",
+    re.IGNORECASE,
 )
-_STREAM = re.compile(r"(?P<stem>.+?)_events_stream(?:\.(?:h5|hdf5))?")
+_STREAM = re.compile(r"(?P<stem>.+?)_events_stream(?:\.(?:h5|hdf5))?", re.IGNORECASE)
 _PART = re.compile(
     r"d(?P<depth>[0-9.]+)_s(?P<speed>[0-9.]+)_dir_(?P<direction>[A-Za-z0-9-]+)_r(?P<repetition>\d{1,6})"
 )
@@ -81,7 +82,7 @@ def pairs(files: list[Path]) -> list[Pair]:
         elif (match := _FILE.fullmatch(path.name)) is not None and (
             match["events"] or match["ending"] or _is_pickle(path)
         ):
-            what = match["polarity"]
+            what = match["polarity"].lower()
         else:
             continue
         parts = found.setdefault(match["stem"], {})
@@ -101,7 +102,7 @@ def unnamed(files: list[Path]) -> list[Pair]:
     return [
         Pair(path.stem, path, None, doubtful=True)
         for path in files
-        if path.suffix in {".pickle", ".pkl"}
+        if path.suffix.lower() in {".pickle", ".pkl"}
         and _is_pickle(path)
         and not path.name.startswith("timestamps_")
     ]

@@ -37,9 +37,11 @@ from sliplab.storage.formats.evt import (
     new_state,
     raised_warning,
 )
+from sliplab.storage.formats.foreign import OUTSIDE as EVENTS_OUTSIDE
 from sliplab.storage.formats.foreign import (
     RISING,
     Damage,
+    ForeignChunk,
     ForeignTrial,
     FormatError,
     Triggers,
@@ -68,6 +70,8 @@ _FALLING = 2
 _CHUNK = 1 << 16
 """Events of a chunk."""
 _EDGES = 1 << 10
+_WORDS_A_FAULT = 1000
+"""Words for each one that cannot be right and is left out; a file with more of them is damaged."""
 _BLOCK = 1 << 18
 """Bytes that are read at once."""
 
@@ -311,6 +315,9 @@ def _decoded(
     Args:
         state: before the first word, a new one by default; changed.
 
+    Up to one in 1,000 words may be wrong: a pixel outside of the camera, and what it would add, is
+    left out; times may run back where a high part fell.
+
     Raises:
         DamagedWord: after what stands before it was yielded.
     """
@@ -320,6 +327,8 @@ def _decoded(
     state = new_state(header.t0_us, *header.bits) if state is None else state
     edges = np.empty((_EDGES, 3), np.int64)
     chunk, filled = _empty(), 0
+    most_faults = (header.end - header.begin) // item // _WORDS_A_FAULT
+    faults: list[DamagedWord] = []
     for place, words in _blocks(path, header):
         at = 0
         while at < len(words):
@@ -333,7 +342,14 @@ def _decoded(
                 chunk, filled, state[EDGES] = _empty(), 0, 0
             if fault:
                 where = f"{width} x {height} pixels {'in its header' if header.size else 'of all'}"
-                raise DamagedWord(place + at * item, _reason(state, where))
+                faults.append(DamagedWord(place + at * item, _reason(state, where)))
+                if len(faults) > most_faults or fault not in {FELL, OUTSIDE}:
+                    raise faults[0]
+                words_out, events_out = header.encoding.after_fault(int(words[at]), state)
+                at += words_out
+                if events_out:
+                    out = {EVENTS_OUTSIDE: events_out}
+                    yield _left_out(out), edges[:0].copy()
     yield _part(chunk, filled), edges[: state[EDGES]].copy()
 
 
@@ -371,6 +387,11 @@ def _empty() -> EventChunk:
         np.empty(_CHUNK, np.uint8),
         np.empty(_CHUNK, np.int64),
     )
+
+
+def _left_out(events: dict[str, int]) -> ForeignChunk:
+    none = _part(_empty(), 0)
+    return ForeignChunk(none.x, none.y, none.p, none.t_us, events)
 
 
 def _part(chunk: EventChunk, count: int) -> EventChunk:

@@ -409,8 +409,10 @@ def _files(path: Path) -> list[Path]:
             for file in folder.iterdir()
             if (file.is_file() or is_bag_folder(file)) and not file.is_symlink()
         )
-    elif path.exists():
+    elif path.is_dir() or path.is_file():
         found = [path]
+    elif path.exists():
+        raise InputError(path, "", None, "is neither a file nor a folder")
     else:
         raise InputError(path, "", None, "no such file or folder")
     return found

@@ -17,11 +17,8 @@ from sliplab.storage.formats.evt import (
     EVT3,
     FAULT,
     FELL,
-    GOT,
     HAD,
     HIGH,
-    HIGH_US,
-    LOW,
     NOW,
     ROOM,
     ROW,
@@ -148,13 +145,10 @@ class EventDecoder:
             at, self._lost, state[ROW] = int(highs[0]), False, _NO_ROW
         while at < len(words):
             at, filled = EVT3.decode(words, at, filled, state, width, height, x, y, p, times, edges)
-            if state[FAULT] == PLACE:
-                outside += state[HAD] != _NO_ROW
-                at += 1
-            elif state[FAULT] == FELL:  # the clock restarted: the import takes the longer part
-                state[HIGH_US] += (state[GOT] - state[HAD]) * _LOWS
-                state[HIGH], state[LOW], state[NOW] = state[GOT], 0, state[HIGH_US]
-                at += 1
+            if state[FAULT] in {PLACE, FELL}:  # after a restart the import takes the longer part
+                words_out, events_out = EVT3.after_fault(int(words[at]), state)
+                outside += events_out if state[HAD] != _NO_ROW else 0
+                at += words_out
             elif state[FAULT]:
                 raise FormatError("holds events at a time that is out of range")
         if self._offset_us is None and state[HIGH] >= 0:

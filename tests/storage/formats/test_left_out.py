@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -170,6 +171,106 @@ def test_one_event_before_the_clock_costs_neither_file_nor_folder(tmp_path: Path
     assert [len(one.events()) for one in store.campaign("theirs").recordings()] == [2, 2, 2]
     (item,) = result["left_out"]
     assert (item["trial"], item["left_out"]) == ("d3_s0.5_dir_up_r1", {NO_TIME: 1})
+
+
+def _lab(path: Path, t: Any, **changed: Any) -> None:
+    """As the lab's own program writes it: seconds, of a camera of 40 x 30 pixels."""
+    rng = np.random.default_rng(1)
+    columns = {"xs": rng.integers(0, 40, len(t)), "ys": rng.integers(0, 30, len(t))}
+    columns |= {"ps": rng.integers(0, 2, len(t)), "ts": t} | changed
+    with h5py.File(path, "w") as file:
+        for name, values in columns.items():
+            file[f"events/{name}"] = np.asarray(values)
+        file.attrs["sensor_resolution"] = np.array([40, 30])
+
+
+@pytest.mark.parametrize("table", [False, True])
+@pytest.mark.parametrize("fault", ["stale at the start", "stale at the end", "restart", "future"])
+def test_lab_files_and_tables_leave_events_that_run_back_out(
+    tmp_path: Path, fault: str, table: bool
+) -> None:
+    right = 100 + np.arange(COUNT) / 100
+    t, count = {
+        "stale at the start": (np.r_[right[:20] + 1000, right], 20),
+        "stale at the end": (np.r_[right, right[:20] - 90], 20),
+        "restart": (np.r_[right, right[:300]], 300),
+        "future": (np.r_[right[:9], 1e6, right[9:]], 1),
+    }[fault]
+    if table:
+        x, p = np.arange(len(t)) % 40, np.arange(len(t)) % 2
+        lines = [
+            "t,x,y,p",
+            *(f"{a!r},{b},{b % 30},{c}" for a, b, c in zip(t.tolist(), x, p, strict=True)),
+        ]
+        (tmp_path / "theirs").mkdir()
+        (tmp_path / "theirs" / "a.csv").write_text("\n".join(lines))
+        events = {"format": "csv", "columns": {key: key for key in "txyp"}, "unit": "s"}
+        streams = {"events": {**events, "size_px": [40, 30]}}
+        adapter = tmp_path / "theirs.yaml"
+        adapter.write_text(json.dumps({
+            "adapter": 1, "name": "theirs", "experiment": "classes", "trials": {"files": "*.csv"},
+            "streams": streams, "labels": {"class": "slip"},
+        }))  # fmt: skip
+        done = here("import", "--adapter", adapter, tmp_path / "theirs", "--store", tmp_path / "s")
+        assert done.returncode == 0, done.stderr
+        (found,) = Store.open(tmp_path / "s").campaign("theirs").recordings()
+    else:
+        _lab(tmp_path / "a.h5", t)
+        found = _one(tmp_path / "s", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, np.rint(right * 1e6))
+    assert _dropped(found) == {BACK: count}
+
+
+@pytest.mark.parametrize("order", ["polarity", "packets", "pixel"])
+def test_lab_files_in_another_order_are_sorted(tmp_path: Path, order: str) -> None:
+    right = np.arange(COUNT) / 100
+    p = np.arange(COUNT) % 2
+    rows = {
+        "polarity": np.argsort(p, kind="stable"),
+        "packets": np.arange(COUNT).reshape(-1, 5)[:, ::-1].ravel(),
+        "pixel": np.random.default_rng(2).permutation(COUNT),
+    }[order]
+    _lab(tmp_path / "a.h5", right[rows], ps=p[rows])
+    found = _one(tmp_path / "s", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().t_us, np.rint(right * 1e6))
+    np.testing.assert_array_equal(found.events().p, p)
+    assert _dropped(found) == {}
+
+
+def test_a_few_events_outside_of_the_stated_resolution_are_left_out(tmp_path: Path) -> None:
+    x = np.arange(COUNT) % 40
+    x[[3, 70]] = 41, 4000
+    _lab(tmp_path / "a.h5", np.arange(COUNT) / 100, xs=x)
+    found = _one(tmp_path / "s", tmp_path / "a.h5")
+    assert found.record.geometry.event_px == (40, 30)
+    assert (len(found.events()), _dropped(found)) == (COUNT - 2, {OUTSIDE: 2})
+
+
+@pytest.mark.parametrize(("off", "on"), [(0, 1), (-1, 1), (0, 255)])
+def test_polarities_of_lab_files_are_read(tmp_path: Path, off: int, on: int) -> None:
+    p = np.where(np.arange(COUNT) % 3, on, off)
+    p[7] = 9
+    _lab(tmp_path / "a.h5", np.arange(COUNT) / 100, ps=p)
+    found = _one(tmp_path / "s", tmp_path / "a.h5")
+    np.testing.assert_array_equal(found.events().p, np.delete(p, 7) == on)
+    assert _dropped(found) == {"events with an unknown polarity": 1}
+
+
+def test_lab_files_of_unknown_polarities_are_refused(tmp_path: Path) -> None:
+    _lab(tmp_path / "a.h5", np.arange(COUNT) / 100, ps=1 + np.arange(COUNT) % 2)
+    done = here("import", tmp_path / "a.h5", "--store", tmp_path / "s", "--name", "x")
+    assert done.returncode == 2
+    assert "holds 250 events with an unknown polarity" in done.stderr
+
+
+@pytest.mark.usefixtures("small")
+def test_names_of_the_labs_files_in_capitals_are_one_recording(tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()
+    _lab(tmp_path / "x" / "A_EVENTS_STREAM.H5", np.arange(COUNT) / 100)
+    for polarity in ("ON", "OFF"):
+        cells = lab_cells(SMALL, {(1, 1): [5.0]})
+        (tmp_path / "x" / f"A_EVENTS_{polarity}.PKL").write_bytes(pickle.dumps(cells))
+    assert [trial.name for trial in trials_in(tmp_path / "x", kind_of(tmp_path / "x"))] == ["A"]
 
 
 def _folder(folder: Path) -> None:
@@ -468,3 +569,11 @@ def test_names_that_no_file_system_has_are_changed(name: str) -> None:
     safe_name(made)
     assert made.lower() not in {"con", "trial."}
     assert not made.endswith(".")
+
+
+@pytest.mark.parametrize("kind", [(), ("raw",)])
+def test_a_pipe_is_no_recording(tmp_path: Path, kind: tuple[str, ...]) -> None:
+    os.mkfifo(tmp_path / "a.raw")
+    done = here("import", *kind, tmp_path / "a.raw", "--store", tmp_path / "s", "--name", "x")
+    assert done.returncode == 2
+    assert "a.raw: is neither a file nor a folder" in done.stderr

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sliplab.storage.formats import prophesee
 from sliplab.storage.formats.evt import LAST_TURN_US, ROOM
-from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError
+from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError, left_out_of
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.prophesee import read_header, read_prophesee, salvage_prophesee
 from sliplab.storage.formats.recognition import trials_in
@@ -82,7 +82,12 @@ def listed(trial: ForeignTrial) -> list[Row]:
         if chunk is None:
             break
         found.append(chunk)
-    whole = EventChunk.joined(found)
+    return listed_of(found)
+
+
+def listed_of(chunks: list[EventChunk]) -> list[Row]:
+    """Events as (time, column, row, polarity)."""
+    whole = EventChunk.joined(chunks)
     assert [vars(whole)[name].dtype for name in ("x", "y", "p", "t_us")] == ["u2", "u2", "u1", "i8"]
     return list(zip(*(c.tolist() for c in (whole.t_us, whole.x, whole.y, whole.p)), strict=True))
 
@@ -201,7 +206,9 @@ def test_blocks_chunks_and_edges_may_end_anywhere(
          [(1 << 34) + 1]),
         ("dat", dat(((1 << 32) - 5, 1, 1, 1), (3, 1, 1, 1), ((1 << 32) - 5, 1, 1, 1)),
          [(1 << 32) - 5, (1 << 32) + 3, (2 << 32) - 5]),
-        ("dat", dat((1 << 31, 1, 1, 1), (0, 1, 1, 1)), [1 << 31, 1 << 31]),  # not by more than half
+        ("dat", dat((40_960, 1, 1, 1), (0, 1, 1, 1)), [40_960, 40_960]),
+        ("dat", dat((40_961, 1, 1, 1), (0, 1, 1, 1)), [40_961, 0]),  # the import leaves one out
+        ("dat", dat((1 << 31, 1, 1, 1), (0, 1, 1, 1)), [1 << 31, 0]),  # not by more than half
     ],
 )  # fmt: skip
 def test_the_time_goes_on_where_its_bits_begin_anew(
@@ -325,6 +332,50 @@ def test_every_event_has_the_time_of_the_words_before_it(
         made.append((kind, value))
     found = [row[0] for row in events(write(tmp_path, "evt3", evt3(*made)))]
     assert found == np.maximum.accumulate(times).tolist() if times else found == []
+
+
+def _timed(form: str, times: Any, x: Any) -> bytes:
+    """An event at each time, us, and column, in row 0."""
+    pairs = list(zip(times.tolist(), x.tolist(), strict=True))
+    if form == "evt2":
+        return evt2(*(w for t, a in pairs for w in (high(t >> 6), cd(1, t & 63, a, 0))))
+    if form == "evt21":
+        words = (w for t, a in pairs for w in ((high(t >> 6), 0), (cd(1, t & 63, a, 0), 1)))
+        return evt21(*words)
+    if form == "dat":
+        return dat(*((t, a, 0, 1) for t, a in pairs))
+    each = ((HIGH, t >> 12, LOW, t & 0xFFF, ADDR_X, a) for t, a in pairs)
+    return evt3(*(pair for w in each for pair in (w[:2], w[2:4], w[4:])))
+
+
+@pytest.mark.parametrize("form", ["evt2", "evt21", "evt3", "dat"])
+@pytest.mark.parametrize("fault", ["stale at the start", "stale at the end", "a pixel"])
+def test_a_wrong_word_of_1000_costs_its_events_alone(tmp_path: Path, form: str, fault: str) -> None:
+    right = 200_000 + np.arange(3000) * 100
+    times, x = right, np.arange(3000) % 640
+    dropped = {"events whose times run back": 20}
+    if fault == "stale at the start":
+        times, x = np.r_[right[:20] + 3_000_000, right], np.r_[x[:20], x]
+    elif fault == "stale at the end":
+        times, x = np.r_[right, right[:20] - 100_000], np.r_[x, x[:20]]
+    else:
+        x[7], right = 640, np.delete(right, 7)
+        dropped = {"events outside of the sensor": 1}
+    path = write(tmp_path, form, _timed(form, times, x))
+    store = Store.create(tmp_path / "s")
+    import_trials(store, "theirs", trials_in(path, "raw"), path, "raw")
+    (found,) = store.campaign("theirs").recordings()
+    np.testing.assert_array_equal(found.events().t_us, right)
+    assert found.record.imported is not None
+    assert found.record.imported.dropped == dropped
+
+
+def test_a_vector_that_is_left_out_moves_the_base_on(tmp_path: Path) -> None:
+    words = [(HIGH, 0), *[(ADDR_X, 1)] * 1000, (BASE_X, 634), (VECT_12, 0xFFF), (BASE_X, 630)]
+    words += [(ADDR_Y, 480), (VECT_8, 3), (ADDR_Y, 7), (VECT_8, 2), *[(ADDR_X, 1)] * 2000]
+    chunks = list(read_prophesee(write(tmp_path, "evt3", evt3(*words)), "a").events())
+    assert sum(sum(left_out_of(chunk).values()) for chunk in chunks) == 14
+    assert [row[1:3] for row in listed_of(chunks) if row[1] != 1] == [(639, 7)]
 
 
 FAULTS: dict[str, tuple[str, bytes, int, str]] = {
@@ -706,8 +757,8 @@ def words2(draw: st.DrawFn) -> bytes:
 
 
 def words_dat() -> st.SearchStrategy[bytes]:
-    """Any times, also such as fall."""
-    near = st.integers(0, 20) | st.integers((1 << 32) - 20, (1 << 32) - 1) | st.integers(0, 1 << 31)
+    """Any times, also such as fall by so little that they are raised, or begin anew."""
+    near = st.integers(0, 20) | st.integers((1 << 32) - 20, (1 << 32) - 1) | st.integers(0, 40_000)
     row = st.tuples(near, st.integers(0, 2047), st.integers(0, 2047), st.integers(0, 15))
     return st.lists(row, max_size=60).map(lambda rows: dat(*rows))
 
@@ -741,7 +792,8 @@ def test_any_bytes_give_events_up_to_a_damage(tmp_path: Path, form: str, data: b
     path = write(tmp_path, form, data)
     saved = salvage_prophesee(path, "a")
     found = listed(saved)
-    assert [row[0] for row in found] == sorted(row[0] for row in found)
+    if form != "dat":
+        assert [row[0] for row in found] == sorted(row[0] for row in found)
     assert all(x < 640 and y < 480 and p < 2 for _, x, y, p in found)
     if saved.lost is not None:
         assert saved.lost.at_byte + saved.lost.unread_bytes == path.stat().st_size
