@@ -17,6 +17,9 @@ from sliplab.flows.running.process import exhausted, run_in_child, too_few_threa
 
 def main() -> None:
     """Run the command line; ends the process with its exit code."""
+    own = getattr(sys.modules["__main__"], "main", None) is main  # not called by another program
+    if own:
+        _end_on_signals()
     if reason := too_few_threads() or run_in_child():
         sys.exit(_fail(reason, 1))
     try:
@@ -32,13 +35,25 @@ def main() -> None:
         code = _fail("interrupted", 130)
     except (ImportError, MemoryError, OSError, SystemError) as error:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
-    if getattr(sys.modules["__main__"], "main", None) is main:  # not called by another program
+    if own:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: os._exit(code))  # all has been said
     orchestration = sys.modules.get("sliplab.flows.running.orchestration")
     if orchestration is not None and not orchestration.close():
         os._exit(code)
     sys.exit(code)
+
+
+def _end_on_signals() -> None:
+    """End the program at once on a signal while it has not begun, or has said all it had to say."""
+
+    def end(*_: object) -> None:
+        stopping = sys.modules.get("sliplab.flows.running.stopping")
+        os._exit(130 if stopping and stopping.requested() else _fail("interrupted", 130))
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup
+            signal.signal(number, end)
 
 
 def _run() -> int:
