@@ -10,6 +10,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from contextlib import suppress
 
 from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads
@@ -49,7 +50,8 @@ def _end_on_signals() -> None:
 
     def end(*_: object) -> None:
         stopping = sys.modules.get("sliplab.flows.running.stopping")
-        os._exit(130 if stopping and stopping.requested() else _fail("interrupted", 130))
+        requested = getattr(stopping, "requested", None)  # it may just be imported
+        os._exit(130 if requested and requested() else _fail("interrupted", 130))
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup
@@ -68,12 +70,23 @@ def _run() -> int:
 
             code = app(standalone_mode=False)
             if code == console.INTERRUPTED:
-                return errors.interruption().report()
+                return _interrupted()
             return code if isinstance(code, int) else console.DONE
         except KeyboardInterrupt:
-            return errors.interruption().report()
+            return _interrupted()
         except Exception as error:
             return _explain(error)
+
+
+def _interrupted() -> int:
+    """Say that the user stopped the program; further signals meanwhile say the same."""
+    from sliplab.flows.cli import errors
+    from sliplab.flows.running import stopping
+
+    if threading.current_thread() is threading.main_thread():
+        for number in stopping.SIGNALS:
+            signal.signal(number, signal.SIG_IGN)  # until `stopping.signals` ends
+    return errors.interruption().report()
 
 
 def _explain(error: Exception) -> int:
@@ -83,7 +96,7 @@ def _explain(error: Exception) -> int:
     from sliplab.protocols.errors import InputError
 
     if stopping.requested() and not (isinstance(error, InputError) or errors.is_arm_fault(error)):
-        return errors.interruption().report()
+        return _interrupted()
     return errors.failure(error).report()
 
 
