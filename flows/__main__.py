@@ -70,23 +70,23 @@ def _run() -> int:
 
             code = app(standalone_mode=False)
             if code == console.INTERRUPTED:
-                return _interrupted()
+                _ignore_signals()
+                return errors.interruption().report()
             return code if isinstance(code, int) else console.DONE
         except KeyboardInterrupt:
-            return _interrupted()
+            _ignore_signals()
+            return errors.interruption().report()
         except Exception as error:
             return _explain(error)
 
 
-def _interrupted() -> int:
-    """Say that the user stopped the program; further signals meanwhile say the same."""
-    from sliplab.flows.cli import errors
+def _ignore_signals() -> None:
+    """Ignore signals until `stopping.signals` ends: that the user stopped it is being said."""
     from sliplab.flows.running import stopping
 
     if threading.current_thread() is threading.main_thread():
         for number in stopping.SIGNALS:
-            signal.signal(number, signal.SIG_IGN)  # until `stopping.signals` ends
-    return errors.interruption().report()
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _explain(error: Exception) -> int:
@@ -96,7 +96,8 @@ def _explain(error: Exception) -> int:
     from sliplab.protocols.errors import InputError
 
     if stopping.requested() and not (isinstance(error, InputError) or errors.is_arm_fault(error)):
-        return _interrupted()
+        _ignore_signals()
+        return errors.interruption().report()
     return errors.failure(error).report()
 
 
