@@ -43,7 +43,7 @@ from sliplab.storage.trials.checksums import (
     to_fetch,
 )
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import INFO, Campaign, Store
 
 ORIGIN = "origin.json"
 """In a store that was pulled: its URL."""
@@ -219,13 +219,14 @@ class _Pull:
         if isinstance(about, RemoteError):
             self.done.problems.append(str(about))
             return
+        if self.follows:  # first: a campaign without notes is the store's own
+            make_folder(_note(self.campaign.folder.parents[1], name, "").parent)
         try:
             self._describe(about)
         except (_Differs, RemoteError) as error:
             self.done.problems.append(str(error))
             return
         if self.follows:
-            make_folder(_note(self.campaign.folder.parents[1], name, "").parent)
             found = read_manifests(self.remote, name, "withdrawn")
             self.marked = {take for take, mark in found.items() if isinstance(mark, Manifest)}
         for trial, known in pushed.items():
@@ -302,7 +303,8 @@ class _Pull:
         if CHECKSUMS in files:
             (folder / CHECKSUMS).unlink(missing_ok=True)
             sync_folder(folder)
-        for name in sorted(files, key=lambda name: name == CHECKSUMS):
+        # a campaign that has no description yet has not begun
+        for name in sorted(files, key=lambda name: (name == CHECKSUMS, name == INFO)):
             write_bytes(folder / name, files[name])
             self._count(len(files[name]))
 

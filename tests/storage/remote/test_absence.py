@@ -15,7 +15,7 @@ from sliplab.storage.remote.push import push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.control import again
 from sliplab.storage.trials.store import Campaign, Store
-from sliplab.storage.trials.verify import verify
+from sliplab.storage.trials.verify import DAMAGED, verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
 
@@ -330,3 +330,24 @@ def test_pull_overwrites_neither_own_campaign_nor_own_session(
 def test_pull_of_a_campaign_that_is_not_listed_is_a_problem(remote: Remote, tmp_path: Path) -> None:
     done = pull(remote, tmp_path / "back", campaigns=["cc"])
     assert "campaign 'cc' is not listed" in done.problems[0]
+
+
+@pytest.mark.parametrize("files", range(1, 7))
+def test_pull_interrupted_in_a_description_is_no_damage_and_follows_later(
+    files: int, lab: Campaign, remote: Remote, tmp_path: Path
+) -> None:
+    left = [files]
+
+    def interrupt(size: int) -> None:
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    place = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        pull(remote, place, on_bytes=interrupt)
+    assert [item for item in verify(Store.open(place)) if item.kind == DAMAGED] == []
+    assert pull(remote, place).problems == []
+    again(lab, [TRIALS[0]], BY)
+    push(store_of(lab), remote)
+    assert (pull(remote, place).withdrawn, verify(Store.open(place))) == (1, [])
