@@ -10,6 +10,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from contextlib import suppress
 
 from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads
@@ -17,6 +18,9 @@ from sliplab.flows.running.process import exhausted, run_in_child, too_few_threa
 
 def main() -> None:
     """Run the command line; ends the process with its exit code."""
+    own = getattr(sys.modules["__main__"], "main", None) is main  # not called by another program
+    if own:
+        _end_on_signals()
     if reason := too_few_threads() or run_in_child():
         sys.exit(_fail(reason, 1))
     try:
@@ -32,13 +36,26 @@ def main() -> None:
         code = _fail("interrupted", 130)
     except (ImportError, MemoryError, OSError, SystemError) as error:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
-    if getattr(sys.modules["__main__"], "main", None) is main:  # not called by another program
+    if own:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: os._exit(code))  # all has been said
     orchestration = sys.modules.get("sliplab.flows.running.orchestration")
     if orchestration is not None and not orchestration.close():
         os._exit(code)
     sys.exit(code)
+
+
+def _end_on_signals() -> None:
+    """End the program at once on a signal while it has not begun, or has said all it had to say."""
+
+    def end(*_: object) -> None:
+        stopping = sys.modules.get("sliplab.flows.running.stopping")
+        requested = getattr(stopping, "requested", None)  # it may just be imported
+        os._exit(130 if requested and requested() else _fail("interrupted", 130))
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup
+            signal.signal(number, end)
 
 
 def _run() -> int:
@@ -53,12 +70,23 @@ def _run() -> int:
 
             code = app(standalone_mode=False)
             if code == console.INTERRUPTED:
+                _ignore_signals()
                 return errors.interruption().report()
             return code if isinstance(code, int) else console.DONE
         except KeyboardInterrupt:
+            _ignore_signals()
             return errors.interruption().report()
         except Exception as error:
             return _explain(error)
+
+
+def _ignore_signals() -> None:
+    """Ignore signals until `stopping.signals` ends: that the user stopped it is being said."""
+    from sliplab.flows.running import stopping
+
+    if threading.current_thread() is threading.main_thread():
+        for number in stopping.SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _explain(error: Exception) -> int:
@@ -68,6 +96,7 @@ def _explain(error: Exception) -> int:
     from sliplab.protocols.errors import InputError
 
     if stopping.requested() and not (isinstance(error, InputError) or errors.is_arm_fault(error)):
+        _ignore_signals()
         return errors.interruption().report()
     return errors.failure(error).report()
 

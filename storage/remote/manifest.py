@@ -58,6 +58,8 @@ ALLOWED: Mapping[Kind, frozenset[str]] = {
 _BENCH = re.compile(r"bench/\d{4,8}\.json")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _MOST_FILES = 10_000
+_SUMS_BYTES = 1 << 16
+"""Limit of a trial's checksums."""
 
 
 @dataclass(frozen=True)
@@ -198,20 +200,38 @@ def listing_problem(
     """
     if about is None and trials:
         return f"{remote.where(manifest_key('about', campaign))}: is missing"
-    if trials or read_manifests(remote, campaign, "withdrawn"):
+    if trials:
         return None
     listed = [about, *read_manifests(remote, campaign, "quarantine").values()]
     known = {
         item.sha256 for found in listed if isinstance(found, Manifest)
         for item in found.files.values()
     }  # fmt: skip
-    if remote.sizes(objects_folder(campaign)).keys() <= known:
+    sizes = remote.sizes(objects_folder(campaign))
+    unknown = {sha: size for sha, size in sizes.items() if sha not in known}
+    marked = read_manifests(remote, campaign, "withdrawn")
+    if not unknown or (marked and _takes(remote, campaign, unknown) <= marked.keys()):
         return None
     return (
         f"{remote.url}/campaigns/{campaign}/trials: is empty or missing, although files of trials "
         "are there: a push has not ended, or the folder cannot be read at the moment; try again, "
         "and if it stays so, push the store again"
     )
+
+
+def _takes(remote: Remote, campaign: str, sizes: Mapping[str, int]) -> set[str]:
+    """Return the takes whose checksums are among some objects of a campaign."""
+    folder = objects_folder(campaign)
+    small = [f"{folder}/{sha}" for sha, size in sizes.items() if size <= _SUMS_BYTES]
+    takes = set()
+    for data in remote.read_many(small).values():
+        try:
+            sums = json.loads(b"" if isinstance(data, RemoteError) else data)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(sums, dict) and all(map(Checksum.parse, sums.values())) and DATA in sums:
+            takes.add(hash_data(sums))
+    return takes
 
 
 def campaign_manifest(campaign: Campaign) -> Manifest:

@@ -43,13 +43,15 @@ from sliplab.storage.trials.checksums import (
     to_fetch,
 )
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import INFO, Campaign, Store
 
 ORIGIN = "origin.json"
 """In a store that was pulled: its URL."""
 PULLED = "pulled"
 """Folder of a store that was pulled: for each of its campaigns a folder that has, by trial, the
 take that came from the URL. What is not in it is the store's own."""
+LACKS_NOTES = "lacks_notes"
+"""Key of `ORIGIN`: an older version pulled the store, and not all of that is noted yet."""
 BIG = frozenset({DATA, FRAMES})
 """Files of a trial that a mirror fetches when they are first read."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
@@ -86,6 +88,11 @@ def origin_of(folder: Path) -> str | None:
         return str(read_json(folder / ORIGIN)["url"])
     except (OSError, ValueError, KeyError):
         return None
+
+
+def _lacks_notes(folder: Path) -> bool:
+    """Return whether notes of what an older version pulled are incomplete."""
+    return bool(read_json(folder / ORIGIN).get(LACKS_NOTES))
 
 
 def _note(store: Path, campaign: str, trial: str) -> Path:
@@ -151,8 +158,10 @@ def pull(
             write_json(folder / ORIGIN, {"url": remote.url})
         follows = origin_of(folder) == remote.url
         notes = inside(folder / PULLED, folder)
-        older = follows and not fresh and not notes.is_dir()
-        pulled = {path.name for path in notes.iterdir()} if notes.is_dir() else set()
+        older = follows and not fresh and (not notes.is_dir() or _lacks_notes(folder))
+        pulled = {path.name for path in notes.glob("*/")}
+        if older:  # until a pull of all of it has ended, whatever ends this one
+            write_json(folder / ORIGIN, {"url": remote.url, LACKS_NOTES: True})
         if follows:
             make_folder(notes)
         wanted = {*listed, *pulled} if campaigns is None else set(campaigns)
@@ -171,6 +180,8 @@ def pull(
             ours = campaign.begun and name not in pulled and not older
             one = _Pull(remote, campaign, follows and not ours, older, small, done, on_bytes)
             one.run(quarantine, on_trial)
+        if older and campaigns is None:
+            write_json(folder / ORIGIN, {"url": remote.url})
     return done
 
 
@@ -185,6 +196,7 @@ class _Pull:
     Attributes:
         follows: the campaign was pulled from this remote, and is changed as the remote is.
         older: by a version that did not note which trials; those that agree count as pulled.
+        marked: takes that are marked as withdrawn at the URL.
     """
 
     remote: Remote
@@ -194,6 +206,7 @@ class _Pull:
     small: bool
     done: PullResult
     on_bytes: OnBytes | None
+    marked: Set[str] = frozenset()
 
     def run(self, quarantine: bool, on_trial: Callable[[str], None] | None) -> None:
         name = self.campaign.name
@@ -206,13 +219,16 @@ class _Pull:
         if isinstance(about, RemoteError):
             self.done.problems.append(str(about))
             return
+        if self.follows:  # first: a campaign without notes is the store's own
+            make_folder(_note(self.campaign.folder.parents[1], name, "").parent)
         try:
             self._describe(about)
         except (_Differs, RemoteError) as error:
             self.done.problems.append(str(error))
             return
         if self.follows:
-            make_folder(_note(self.campaign.folder.parents[1], name, "").parent)
+            found = read_manifests(self.remote, name, "withdrawn")
+            self.marked = {take for take, mark in found.items() if isinstance(mark, Manifest)}
         for trial, known in pushed.items():
             self.done.trials += 1
             try:
@@ -240,13 +256,12 @@ class _Pull:
 
     def _withdraw(self, unlisted: Set[str]) -> None:
         """Quarantine trials that were pulled and are marked as withdrawn; keep all others."""
-        marked = read_manifests(self.remote, self.campaign.name, "withdrawn")
         lost = []
         for trial in sorted(unlisted):
             path = self.campaign.folder / "trials" / trial
-            if not _from_there(path):
+            if not self._from_there(path):
                 continue
-            if not isinstance(marked.get(take_of(path)), Manifest):
+            if take_of(path) not in self.marked:
                 lost.append(trial)
                 continue
             self.campaign.quarantine(path, f"withdrawn: is no longer at {self.remote.url}")
@@ -288,7 +303,8 @@ class _Pull:
         if CHECKSUMS in files:
             (folder / CHECKSUMS).unlink(missing_ok=True)
             sync_folder(folder)
-        for name in sorted(files, key=lambda name: name == CHECKSUMS):
+        # a campaign that has no description yet has not begun
+        for name in sorted(files, key=lambda name: (name == CHECKSUMS, name == INFO)):
             write_bytes(folder / name, files[name])
             self._count(len(files[name]))
 
@@ -311,7 +327,7 @@ class _Pull:
                 self._complete(target, manifest)
                 self.done.there += 1
                 return
-            if cause is None and not (self.follows and _from_there(target)):
+            if cause is None and not (self.follows and self._from_there(target)):
                 raise _Differs(
                     f"{target}: is another attempt than that at {self.remote.url}; pull into "
                     "another store"
@@ -354,16 +370,17 @@ class _Pull:
             except RemoteError as error:
                 self.done.problems.append(str(error))
 
+    def _from_there(self, target: Path) -> bool:
+        """Return whether a trial was pulled; that of a mirror shows it itself, of any version."""
+        if was_pulled(target) or (target / ELSEWHERE).is_file():
+            return True
+        return self.older and take_of(target) in self.marked
+
     def _count(self, size: int) -> None:
         self.done.files += 1
         self.done.bytes += size
         if self.on_bytes is not None:
             self.on_bytes(size)
-
-
-def _from_there(target: Path) -> bool:
-    """Return whether a trial was pulled; that of a mirror shows it itself, of any version."""
-    return was_pulled(target) or (target / ELSEWHERE).is_file()
 
 
 def _big(name: str) -> bool:

@@ -25,6 +25,7 @@ from sliplab.storage.remote.manifest import (
     trial_manifest,
 )
 from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError, RemoteMissing
+from sliplab.storage.remote.pull import was_pulled
 from sliplab.storage.trials.checksums import Checksum
 from sliplab.storage.trials.store import AGAIN, INFO, Campaign, Store
 
@@ -145,15 +146,22 @@ class _Push:
         self.sizes = self.remote.sizes(objects_folder(name))
         theirs = self._manifests("trials")
         self._send(about, self.campaign.folder, self._manifests("about").get(""))
+        marked = self._manifests("withdrawn").keys()
         ours = set()
         for recording in self.campaign.recordings():
             trial = recording.folder.name
-            ours.add(trial)
             self.done.trials += 1
-            self._push_trial(trial, theirs.get(trial))
+            if trial not in theirs and self._is_withdrawn_elsewhere(recording.folder, marked):
+                self._problem(
+                    f"{trial}: was pulled, and is withdrawn there since; `sliplab pull` sets it "
+                    "aside here"
+                )
+            else:
+                ours.add(trial)
+                self._push_trial(trial, theirs.get(trial))
             if on_trial is not None:
                 on_trial(trial)
-        self._mark_withdrawn(ours)
+        self._mark_withdrawn(ours, marked)
         for trial, pushed in theirs.items():
             if trial not in ours and pushed.take in self._takes(trial, AGAIN):
                 self.remote.remove(pushed.key)
@@ -183,11 +191,20 @@ class _Push:
             else:
                 self.done.replaced += 1
 
-    def _mark_withdrawn(self, ours: Set[str]) -> None:
-        """Mark each take that a person wants again: other stores withdraw marked takes only."""
-        marked = self._manifests("withdrawn")
+    @staticmethod
+    def _is_withdrawn_elsewhere(trial: Path, marked: Set[str]) -> bool:
+        """Return whether a trial was pulled, and its take is marked by another store."""
+        return bool(marked) and was_pulled(trial) and take_of(trial) in marked
+
+    def _mark_withdrawn(self, ours: Set[str], marked: Set[str]) -> None:
+        """Mark each take that a person wants again: other stores withdraw marked takes only.
+
+        A take that is wanted after all loses its mark.
+        """
         current = {take_of(self.campaign.folder / "trials" / trial) for trial in ours}
-        for take in sorted(self._takes(None, AGAIN) - current - marked.keys()):
+        for take in sorted(current & marked):
+            self.remote.remove(manifest_key("withdrawn", self.campaign.name, take))
+        for take in sorted(self._takes(None, AGAIN) - current - marked):
             mark = Manifest("withdrawn", self.campaign.name, take, {}, take)
             self.remote.put(mark.key, mark.dump())
 

@@ -142,3 +142,50 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
                 with suppress(ProcessLookupError):
                     signal.pidfd_send_signal(worker, signal.SIGKILL)
                 os.close(worker)
+
+
+AT_AN_EDGE = """
+import os, signal, sys
+import sliplab.flows.__main__ as program
+from sliplab.flows.__main__ import main
+
+place, number = sys.argv.pop(1), int(sys.argv.pop(1))
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == place:
+            os.kill(os.getpid(), number)
+
+run = program._run
+
+def ending():
+    code = run()
+    os.kill(os.getpid(), number)
+    return code
+
+sys.meta_path.insert(0, Finder())
+if place == "end":
+    program._run = ending
+main()
+"""
+
+
+@pytest.mark.usefixtures("terminal")
+@pytest.mark.parametrize("number", stopping.SIGNALS)
+@pytest.mark.parametrize(
+    "place",
+    ["sliplab.flows.running.console", "sliplab.storage.process", "sliplab.flows.cli.app", "end"],
+)
+def test_signal_before_or_after_the_work_is_said_in_one_line(
+    place: str, number: signal.Signals, tmp_path: Path
+) -> None:
+    script = tmp_path / "program.py"
+    script.write_text(AT_AN_EDGE)
+    done = subprocess.run(
+        [sys.executable, str(script), place, str(int(number)), "--version"],
+        capture_output=True, text=True, timeout=60, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert done.returncode == 130, done.stderr
+    assert done.stderr.startswith("interrupted")
+    assert len(done.stderr.splitlines()) == 1

@@ -15,7 +15,7 @@ from sliplab.storage.remote.push import push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.control import again
 from sliplab.storage.trials.store import Campaign, Store
-from sliplab.storage.trials.verify import verify
+from sliplab.storage.trials.verify import DAMAGED, verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
 
@@ -89,10 +89,15 @@ def test_pull_leaves_own_trial_of_a_name_that_is_pushed_later(
     assert tree(back.folder, "trials") == before
 
 
+@pytest.mark.parametrize("marks", [0, 1])
 @pytest.mark.parametrize("gone", ["trials", "", "about.json", "../../campaigns"])
 def test_pull_from_missing_folder_changes_nothing(
-    gone: str, remote: Remote, back: Campaign, tmp_path: Path
+    gone: str, marks: int, lab: Campaign, remote: Remote, back: Campaign, tmp_path: Path
 ) -> None:
+    for trial in range(marks):  # what was withdrawn before does not explain what is missing now
+        again(lab, [TRIALS[trial]], BY)
+        push(store_of(lab), remote)
+        pull(remote, tmp_path / "back")
     before = tree(tmp_path / "back", "campaigns")
     folder = (tmp_path / "shared/campaigns/c" / gone).resolve()
     folder.rename(tmp_path / "unplugged")
@@ -106,7 +111,17 @@ def test_pull_from_missing_folder_changes_nothing(
     assert tree(tmp_path / "back", "campaigns") == before
     (tmp_path / "unplugged").rename(folder)
     done = pull(remote, tmp_path / "back")
-    assert (done.there, done.withdrawn, done.problems) == (3, 0, [])
+    assert (done.there, done.withdrawn, done.problems) == (3 - marks, 0, [])
+
+
+def test_pull_where_all_was_withdrawn_is_no_problem(
+    lab: Campaign, remote: Remote, back: Campaign, tmp_path: Path
+) -> None:
+    again(lab, TRIALS, BY)
+    push(store_of(lab), remote)
+    assert (pull(remote, tmp_path / "back").withdrawn, back.committed()) == (3, set())
+    assert pull(remote, tmp_path / "fresh").problems == []
+    assert verify_remote(remote) == (0, [])
 
 
 def _problems(remote: Remote) -> list[str]:
@@ -171,6 +186,81 @@ def test_store_pulled_by_older_version_follows(
     done = pull(remote, tmp_path / "back")
     assert (done.withdrawn, done.replaced, done.problems) == (1, 1, [])
     assert back.committed() == {*TRIALS[1:], "depth=9mm,r=1"}
+
+
+def test_store_pulled_by_older_version_follows_what_was_withdrawn_before(
+    lab: Campaign, remote: Remote, back: Campaign, tmp_path: Path
+) -> None:
+    """The mark of its take says where a trial comes from that is not listed any more."""
+    shutil.rmtree(tmp_path / "back" / PULLED)
+    again(lab, TRIALS[:2], BY)
+    commit(lab, TRIALS[1], attempt=1)
+    push(store_of(lab), remote)
+    done = pull(remote, tmp_path / "back")
+    assert (done.withdrawn, done.replaced, done.problems) == (1, 1, [])
+
+
+@pytest.mark.parametrize("how", ["interrupted", "one campaign"])
+def test_store_pulled_by_older_version_follows_after_part_of_a_pull(
+    how: str, lab: Campaign, remote: Remote, tmp_path: Path
+) -> None:
+    other = store_of(lab).campaign("d")
+    other.update({"name": "d", "simulated": True}, "protocol: 1\n", "rig: 1\n")
+    commit(other, TRIALS[0], campaign="d")
+    push(store_of(lab), remote)
+    pull(remote, tmp_path / "back")
+    shutil.rmtree(tmp_path / "back" / PULLED)
+
+    def interrupt(trial: str) -> None:
+        raise KeyboardInterrupt
+
+    if how == "interrupted":
+        with pytest.raises(KeyboardInterrupt):
+            pull(remote, tmp_path / "back", on_trial=interrupt)
+    else:
+        pull(remote, tmp_path / "back", campaigns=["c"])
+    assert pull(remote, tmp_path / "back").problems == []
+    for where in (lab, other):
+        again(where, [TRIALS[0]], BY)
+    again(lab, [TRIALS[1]], BY)
+    commit(lab, TRIALS[1], attempt=1)
+    push(store_of(lab), remote)
+    done = pull(remote, tmp_path / "back")
+    assert (done.withdrawn, done.replaced, done.problems) == (2, 1, [])
+
+
+def test_push_does_not_bring_back_what_another_store_withdrew(
+    lab: Campaign, remote: Remote, back: Campaign, tmp_path: Path
+) -> None:
+    again(lab, [TRIALS[0]], BY)
+    push(store_of(lab), remote)
+    done = push(store_of(back), remote)
+    assert (done.pushed, done.there) == (0, 2)
+    assert len(done.problems) == 1
+    assert f"{TRIALS[0]}: was pulled, and is withdrawn there since" in done.problems[0]
+    assert pull(remote, tmp_path / "back").withdrawn == 1
+    assert push(store_of(back), remote).problems == []
+
+
+def test_push_of_a_trial_that_is_wanted_after_all_removes_its_mark(
+    lab: Campaign, remote: Remote, back: Campaign, tmp_path: Path
+) -> None:
+    again(lab, [TRIALS[0]], BY)
+    push(store_of(lab), remote)
+    aside = lab.folder / "quarantine" / lab.quarantined()[0]["folder"]
+    aside.rename(lab.folder / "trials" / TRIALS[0])
+    assert push(store_of(lab), remote).pushed == 1
+    assert read_manifests(remote, "c", "withdrawn") == {}
+    (tmp_path / "shared" / manifest_key("trials", "c", TRIALS[0])).unlink()
+    done = pull(remote, tmp_path / "back")
+    assert (done.withdrawn, len(done.problems)) == (0, 1)
+
+
+def test_file_of_another_program_among_the_notes_is_no_campaign(
+    remote: Remote, back: Campaign, tmp_path: Path
+) -> None:
+    (tmp_path / "back" / PULLED / ".DS_Store").write_text("x")
+    assert pull(remote, tmp_path / "back").problems == []
 
 
 def test_mirror_of_older_version_follows(
@@ -240,3 +330,24 @@ def test_pull_overwrites_neither_own_campaign_nor_own_session(
 def test_pull_of_a_campaign_that_is_not_listed_is_a_problem(remote: Remote, tmp_path: Path) -> None:
     done = pull(remote, tmp_path / "back", campaigns=["cc"])
     assert "campaign 'cc' is not listed" in done.problems[0]
+
+
+@pytest.mark.parametrize("files", range(1, 7))
+def test_pull_interrupted_in_a_description_is_no_damage_and_follows_later(
+    files: int, lab: Campaign, remote: Remote, tmp_path: Path
+) -> None:
+    left = [files]
+
+    def interrupt(size: int) -> None:
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    place = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        pull(remote, place, on_bytes=interrupt)
+    assert [item for item in verify(Store.open(place)) if item.kind == DAMAGED] == []
+    assert pull(remote, place).problems == []
+    again(lab, [TRIALS[0]], BY)
+    push(store_of(lab), remote)
+    assert (pull(remote, place).withdrawn, verify(Store.open(place))) == (1, [])

@@ -6,6 +6,7 @@ case, and ``clean`` or the error of each way to read the trial, then the problem
 
 from __future__ import annotations
 
+import io
 import json
 import resource
 import shutil
@@ -76,6 +77,21 @@ def unknown_filter(file: Any) -> None:
     data.write_direct_chunk((0,), bytes(2000))
 
 
+def packed(values: Any, filters: Any, mask: int = 0, rows: int = 1 << 24) -> Change:
+    """Times in one chunk of many rows, which unpacks to some values only."""
+
+    def change(file: Any) -> None:
+        one = h5py.File(io.BytesIO(), "w")
+        few = np.asarray(values, np.uint32)
+        data = one.create_dataset("t", data=few, chunks=few.shape, **filters)
+        stored = few.tobytes() if mask else data.id.read_direct_chunk((0,))[1]
+        del file["events/t"]
+        made = file.create_dataset("events/t", (rows,), "u4", chunks=(rows,), **filters)
+        made.id.write_direct_chunk((0,), stored, mask)
+
+    return change
+
+
 def index(values: Any) -> Change:
     """Another index of the same type."""
     return replaced("ms_to_idx", data=np.asarray(values, np.int64))
@@ -133,6 +149,21 @@ SHAPES: dict[str, Change] = {
     "a compression of nothing": replaced(
         "events/t", shape=(1 << 33,), dtype="u4", chunks=(1 << 20,), **hdf5plugin.Zstd()
     ),
+    **{
+        f"a short chunk, {name}": packed(np.zeros(200), filters)
+        for name, filters in {
+            "gzip": {"compression": "gzip"},
+            "gzip with a sum": {"compression": "gzip", "shuffle": True, "fletcher32": True},
+            "gzip in zstd": {"compression": "gzip", **hdf5plugin.Zstd()},
+            "lzf": {"compression": 32000, "compression_opts": (4, 261, 800)},
+            "zstd": hdf5plugin.Zstd(),
+            "lz4": hdf5plugin.LZ4(),
+            "blosc": hdf5plugin.Blosc(),
+            "bitshuffle": hdf5plugin.Bitshuffle(nelems=64),
+        }.items()
+    },
+    "a short chunk that is not packed": packed(np.zeros(200), hdf5plugin.Zstd(), mask=1),
+    "an offset beyond all times": replaced("t_offset", data=np.uint64((1 << 64) - 1)),
     "an index that ends beyond": index([0, HUGE, HUGE, HUGE]),
     "an index that runs backwards": index(np.arange(100)[::-1] * 10),
     "a negative index": index([-HUGE, -5, -1, -1]),

@@ -6,8 +6,10 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import h5py
+import hdf5plugin
 import numpy as np
 import pytest
 
@@ -18,6 +20,23 @@ from sliplab.storage.trials.verify import verify_trial
 from tests.conftest import ROOT
 from tests.storage.trials.foreign_hdf5 import LOOKS, SHAPES, changed, committed, look
 
+PACKED: list[dict[str, Any]] = [
+    {},
+    {"compression": "gzip"},
+    {"compression": "gzip", "shuffle": True, "fletcher32": True},
+    {"fletcher32": True},
+    {"shuffle": True},
+    {"compression": "lzf"},
+    {"scaleoffset": 0},
+    dict(hdf5plugin.Zstd()),
+    dict(hdf5plugin.LZ4()),
+    dict(hdf5plugin.Blosc()),
+    dict(hdf5plugin.Blosc2()),
+    dict(hdf5plugin.BZip2()),
+    dict(hdf5plugin.Bitshuffle()),
+    dict(hdf5plugin.Bitshuffle(cname="zstd")),
+    dict(hdf5plugin.Bitshuffle(cname="none")),
+]
 Found = dict[str, tuple[list[str], list[str]]]
 
 
@@ -78,4 +97,15 @@ def test_attribute_of_many_integers_names_file_and_key(tmp_path: Path) -> None:
     rows = RowFile(tmp_path / "a.h5")
     with pytest.raises(StoreError, match=r"a\.h5: .*'n'"):
         rows.attribute("n", 0)
+    rows.close()
+
+
+@pytest.mark.parametrize("filters", PACKED, ids=str)
+def test_column_packed_in_any_way_is_read(filters: dict[str, Any], tmp_path: Path) -> None:
+    values = np.arange(3000, dtype="u4").reshape(1000, 3)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("t", data=values, chunks=(300, 2), **filters)
+    rows = RowFile(tmp_path / "a.h5")
+    assert (rows.rows("t").read() == values).all()
+    assert (rows.rows("t").read(599, 950) == values[599:950]).all()
     rows.close()
