@@ -188,14 +188,17 @@ def _stop_moving(bench: ArmBench) -> None:
 
 @RULES.add(
     "protective stop",
-    "a path that a protective stop ends is reported as ended, not finished; stop returns, and no "
-    "path starts until a person has cleared it",
+    "a path that a protective stop ends is reported as ended, not finished, and as no other "
+    "stop; stop returns, and no path starts until a person has cleared it",
 )
 def _protective(bench: ArmBench) -> None:
     bench.connect()
     bench.start_long()
     bench.inject(Kind.PROTECTIVE_STOP)
     _check_aborted(bench)
+    state = bench.state()  # one that only loses its connection is lost
+    if state.healthy or state is ArmState.EMERGENCY_STOP:
+        raise Seen(f"in a protective stop its state was {state}")
     for _ in range(2):
         bench.stop()
     bench.until(lambda: not bench.moving(), bench.bounds.call_s)

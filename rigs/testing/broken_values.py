@@ -241,6 +241,11 @@ def ready(state: ArmState) -> ArmState:
     return ArmState.READY if state is ArmState.MOVING else state
 
 
+def swapped_stops(state: ArmState) -> ArmState:
+    """Take a protective stop for an emergency stop."""
+    return ArmState.EMERGENCY_STOP if state is ArmState.PROTECTIVE_STOP else state
+
+
 SPEED, CALLS, POSES, HOST = "speed and length", "calls while moving", "poses", "host times"
 TURN, TILT, WRAPS = "orientation", "limits of turn and depth", "counter wraps"
 ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
@@ -259,6 +264,10 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
     "ReadyWhileMoving": (
         reports(ExampleArm, ready, "state"), (CALLS,), "its state was ArmState.READY",
+    ),
+    "StopsSwapped": (
+        reports(ExampleArm, swapped_stops, "state"), ("protective stop",),
+        "its state was ArmState.EMERGENCY_STOP",
     ),
     "ProgressWaits": (ProgressWaits, (CALLS,), "had not returned before the arm was at rest"),
     "StopDoesNotWait": (StopDoesNotWait, ("stop while moving",), "still moving when the call"),
@@ -282,6 +291,12 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
             ExampleArm, lambda c: PoseChunk(*(v[-1:] for v in vars(c).values())), "read_poses"
         ),
         (POSES,), "returned 1 samples of 0.000 s",
+    ),
+    "LosesLastSample": (
+        reports(
+            ExampleArm, lambda c: PoseChunk(*(v[:-1] for v in vars(c).values())), "read_poses"
+        ),
+        (POSES,), "each read loses some",
     ),
     "HostTimeIsZero": (
         reports(ExampleArm, at_host(lambda: 0), "read_poses"), (HOST,), "host_ns was 0, received",
@@ -596,6 +611,14 @@ class OpensOnConnect(ExampleGripper):
         self.move(self.range.opening_mm[1], self.range.speed_mm_s[1], self.range.force_n[0])
 
 
+class StopOpens(ExampleGripper):
+    """Stop opens the fingers."""
+
+    def stop(self) -> None:
+        """Stop."""
+        self.move(self.range.opening_mm[1], self.range.speed_mm_s[1], self.range.force_n[0])
+
+
 def percent(self: ExampleGripper, line: str) -> tuple[str]:
     """Send the force of a move in percent of the largest one."""
     word, *values = line.split()
@@ -623,6 +646,7 @@ GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     ),
     "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
     "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it said"),
+    "StopOpens": (StopOpens, ("stop of the fingers",), "the fingers opened to 80 mm after"),
     "OpensOnConnect": (OpensOnConnect, ("fingers stay",), "the fingers went from"),
 }  # fmt: skip
 
