@@ -27,6 +27,8 @@ STEP_MM, STEP_DEG = 1.0, 1.0
 """Largest step of a pose within no time: noise."""
 AHEAD_NS = 1_000_000_000
 """Largest lead that a stamp may gain over the host's clock since the last one."""
+MOST_DROPPED = 3
+"""Poses in a row that are not believed, after which none is, whether or not they agree."""
 BURST_NS = 50_000_000
 """Largest time by which packets that arrive in a burst may seem too close to each other."""
 
@@ -35,14 +37,14 @@ Stamped = tuple[int, int, tuple[Pose, ...]]
 
 
 class PoseJumpError(RuntimeError):
-    """Poses that the arm cannot have reached, or times that cannot have passed, twice in a row."""
+    """Poses that the arm cannot have reached, or times that cannot have passed, in a row."""
 
 
 class PoseCheck:
     """Holds each pose against the last one: how far the arm can have come, how much time can pass.
 
     A single pose beyond that is an invalid packet, to be dropped. A second one that continues it
-    shows that the arm or its clock did jump.
+    shows that the arm or its clock did jump; `MOST_DROPPED` in a row show that nothing is known.
 
     Args:
         limit_mm_s: limit of the speed of a path.
@@ -56,6 +58,7 @@ class PoseCheck:
         self._fastest_mm_s = max(2 * limit_mm_s, FASTEST_MM_S)
         self._last: Stamped | None = None
         self._held: Stamped | None = None
+        self._row = 0
         self.active = True
         self.dropped = 0
 
@@ -68,15 +71,17 @@ class PoseCheck:
             poses: places of one or more points, in the same order each time.
 
         Raises:
-            PoseJumpError: the second poses in a row that are not.
+            PoseJumpError: the second ones in a row that are not, or the third if these differ.
         """
         new = t_ns, host_ns, poses
         why = self._jump(self._last, new) if self.active else None
         if why is None:
-            self._last, self._held = new, None
+            self._last, self._held, self._row = new, None, 0
             return True
         self.dropped += 1
-        if self._held is not None and self._jump(self._held, new) is None:
+        self._row += 1
+        continues = self._held is not None and self._jump(self._held, new) is None
+        if continues or self._row == MOST_DROPPED:
             raise PoseJumpError(why)
         self._held = new
         return False
