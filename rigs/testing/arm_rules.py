@@ -41,7 +41,11 @@ def _declaration(bench: ArmBench) -> None:
         raise Seen("the arm moved when it was connected")
 
 
-@RULES.add("path", "a path is followed to its end, and each segment has its start and its end")
+@RULES.add(
+    "path",
+    "a path is followed to its end, and each segment has its start and its end, those of one path "
+    "alone",
+)
 def _path(bench: ArmBench) -> None:
     bench.connect()
     before_ns = bench.now_ns()
@@ -53,6 +57,10 @@ def _path(bench: ArmBench) -> None:
         raise Seen(f"{len(progress.finished)} of {len(path)} segments were reported finished")
     after_ns = bench.now_ns()
     _check_spans(progress.finished, before_ns, after_ns)
+    bench.start(bench.to(SHORT_MM))
+    progress = bench.end(2 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
+    if len(progress.finished) != 1:
+        raise Seen(f"{len(progress.finished)} segments of the next path, of one, were finished")
 
 
 @RULES.add(

@@ -148,6 +148,16 @@ class CutsCorners(ExampleArm):
         run.finished[:] = run.finished * len(whole)
 
 
+class KeepsFinished(ExampleArm):
+    """Segments of the path before count as finished, too."""
+
+    def start(self, path: Any) -> None:
+        """Begin to follow a path."""
+        before = self._run.finished
+        super().start(path)
+        self._run.finished[:0] = before
+
+
 class DoneTooEarly(ExampleArm):
     """The path counts as done shortly before its end."""
 
@@ -262,6 +272,7 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleArm, host_spans, "progress"), (SPEED,), "segment 1 was reported to begin",
     ),
     "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
+    "KeepsFinished": (KeepsFinished, ("path",), "3 segments of the next path, of one"),
     "ReadyWhileMoving": (
         reports(ExampleArm, ready, "state"), (CALLS,), "its state was ArmState.READY",
     ),
@@ -368,6 +379,22 @@ class EventsTwice(ExampleEvents):
         return EventChunk.joined([last, found]) if last is not None and len(found) else found
 
 
+class OldPulses(ExampleEvents):
+    """Start keeps the pulses that were not read."""
+
+    old: Any = None
+
+    def start(self) -> None:
+        """Start streaming."""
+        self.old = super().read_pulses()
+        super().start()
+
+    def read_pulses(self) -> Any:
+        """Sync pulses since the last call."""
+        found, old, self.old = super().read_pulses(), self.old, None
+        return found if old is None else replace(found, t_ns=np.append(old.t_ns, found.t_ns))
+
+
 class SizeSwapped(ExampleEvents):
     """Columns are taken for rows."""
 
@@ -427,6 +454,18 @@ class ZeroHides(ExampleForce):
         return scaled(force_n=self.share, torque_nm=self.share)(super().read())
 
 
+class ZeroOnce(ExampleForce):
+    """Only the first zero counts."""
+
+    zeroed = False
+
+    def zero(self) -> None:
+        """Take the present load for zero."""
+        if not self.zeroed:
+            super().zero()
+        self.zeroed = True
+
+
 class KeepsTicking(ExampleSync):
     """Stop drops what comes, and the box ticks on."""
 
@@ -481,6 +520,7 @@ EVENTS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleEvents, us("t_ns"), "read_pulses"), DATA, "pulses up to",
     ),
     "StopDrops": (StopDrops, ("read after stop",), "could not be read after it"),
+    "OldPulses": (OldPulses, ("fresh start",), "began with pulses of the first one"),
     "ReadWaits": (ReadWaits, ("read at once",), "read took"),
 }  # fmt: skip
 FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
@@ -523,6 +563,7 @@ FORCE: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "ForceCounterWraps": (
         _read(ExampleForce, wrapped("t_ns", 1_000_000)), (WRAPS,), "came after",
     ),
+    "ZeroOnce": (ZeroOnce, ("zero",), "was not zero after a second zero"),
     "ZeroHides": (ZeroHides, ("zero",), "its change was not read"),
 }  # fmt: skip
 BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
