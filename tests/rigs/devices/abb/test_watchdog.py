@@ -7,8 +7,8 @@ import re
 import pytest
 
 from sliplab.rigs.devices.abb.fake import WATCH_S
-from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.abb.rws import WebRefused
+from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.abb.watchdog import BEAT, BEAT_S, ECHO, LIMIT, Watchdog
 from tests.conftest import ROOT
 
