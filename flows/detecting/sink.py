@@ -42,7 +42,7 @@ class Timeouts:
     """Longest times on the rig's clock, ns.
 
     Attributes:
-        stream_ns: without newer data of the camera.
+        stream_ns: without newer data of the camera, and of their delay.
         decision_ns: from events to the decision on them; None for any.
     """
 
@@ -129,7 +129,6 @@ class DetectSink(NullSink):
         if len(chunk):
             self.events += len(chunk)
             self._note_life("events", int(chunk.t_us.max()) * 1000, here_ns)
-            self._camera.observe(int(chunk.t_us.max()), here_ns)
         self._report(self._decided(lambda: self.detector.push(chunk)), here_ns, began_ns)
 
     def add_event_pulses(self, chunk: PulseChunk) -> None:
@@ -150,8 +149,6 @@ class DetectSink(NullSink):
                 f"event camera: neither events nor pulses for {silent_ns / 1e6:.0f} ms, and "
                 f"at most {self._timeouts.stream_ns / 1e6:g} ms are allowed (reflex.stream_timeout)"
             )
-        if len(chunk):
-            self._camera.observe(int(chunk.t_ns.max()) // 1000, here_ns)
         now_us = self._camera.camera_us(here_ns)
         if now_us is not None:
             # the first time that is known begins the windows; from then on events may be late
@@ -161,9 +158,18 @@ class DetectSink(NullSink):
         self._every_poll()
 
     def _note_life(self, stream: str, newest_ns: int, here_ns: int) -> None:
-        """Note that data of the camera came, where they are newer than those before."""
-        if newest_ns > self._newest_ns[stream]:
-            self._newest_ns[stream], self._alive_ns = newest_ns, here_ns
+        """Note that data of the camera came, where they are newer than those before, and in time.
+
+        Data that come later and later are no news, though each is newer than the last.
+        """
+        self._camera.observe(newest_ns // 1000, here_ns)
+        if newest_ns <= self._newest_ns[stream]:
+            return
+        self._newest_ns[stream] = newest_ns
+        soonest_ns = self._camera.host_ns(newest_ns // 1000)
+        assert soonest_ns is not None
+        if self._timeouts is None or here_ns - soonest_ns <= self._timeouts.stream_ns:
+            self._alive_ns = here_ns
 
     def _decided(self, work: Callable[[], list[Decision]]) -> list[Decision]:
         """Return the decisions of `work`; a failing detector is a lost sense while `guarded`."""

@@ -30,6 +30,8 @@ BLIND_MM = 1.0
 RIM_MM_PER_DEG = 0.2
 """Motion of the skin's rim (a radius of some 11 mm) in a turn on the spot."""
 DEVICE = "force sensor"
+_DRIFT = 5e-4
+"""Largest difference of the rates of two clocks, as a share."""
 _OUTWARD_MM = 0.01
 """Depth by which a motion goes outwards: there contact may end, and an ideal sensor reads zero."""
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -50,9 +52,10 @@ class ForceWatch:
     """A force sensor that is read for its limit; it streams from now on.
 
     A force that is not finite is a fault. Where a decision hangs on the readings (there is a limit,
-    or a press ends at a force) so is a sensor without a newer sample for `SILENT_S`, and one whose
-    forces stay exactly the same while the arm moves `BLIND_MM` in contact, and not outwards. Clear
-    of the plate an ideal simulated sensor is constant; in contact none is.
+    or a press ends at a force) so is a sensor without a newer sample for `SILENT_S`; a sample that
+    was on its way for longer than the fastest one by as much is no news. So are forces that stay
+    exactly the same while the arm moves `BLIND_MM` in contact, and not outwards. Clear of the
+    plate an ideal simulated sensor is constant; in contact none is.
 
     Args:
         limit_n: largest force on the plate, in any direction; None for no limit.
@@ -93,6 +96,8 @@ class ForceWatch:
         self._normal_n: _F64 = np.empty(0)
         self._first_n: _F64 | None = None
         self._last: _F64 | None = None
+        self._fresh_ns: int | None = None
+        self._soonest_ns = np.inf
         self._changed_at: tuple[Pose, float] | None = None
         self._sensor.start()
 
@@ -124,10 +129,9 @@ class ForceWatch:
             self._keep(chunk, forces[:, 2])
             self._check_limit(forces)
         if self.needed:
-            newest = int(self._t_ns[-1]) if len(self._t_ns) else None
-            silent_s = self._stall.waited_s((newest,))
+            silent_s = self._stall.waited_s((self._fresh_ns,))
             if silent_s > self._silent_s:
-                why = "no sample came" if newest is None else "no newer sample came"
+                why = "no sample came" if self._fresh_ns is None else "no newer sample came"
                 raise _unusable(f"{why} for {silent_s:.2f} s")
         return chunk
 
@@ -213,6 +217,13 @@ class ForceWatch:
         newer = t_ns > np.maximum.accumulate(np.concatenate([floor, t_ns[:-1]]))
         if not newer.all():
             t_ns, host_ns, normal_n = t_ns[newer], host_ns[newer], normal_n[newer]
+        if len(t_ns):
+            on_way_ns = host_ns - t_ns
+            passed_ns = int(t_ns[-1] - self._t_ns[-1]) if len(self._t_ns) else 0
+            soonest_ns = self._soonest_ns + _DRIFT * passed_ns
+            self._soonest_ns = min(soonest_ns, float(on_way_ns.min()))
+            if on_way_ns[-1] - self._soonest_ns <= 1e9 * self._silent_s:
+                self._fresh_ns = int(t_ns[-1])
         t_ns = np.concatenate([self._t_ns, t_ns])
         first = int(np.searchsorted(t_ns, t_ns[-1] - _LINE_NS, side="right"))
         kept = slice(max(min(first, len(t_ns) - _FEWEST), 0), None)

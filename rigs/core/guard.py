@@ -19,6 +19,8 @@ from sliplab.rigs.core.pose import angle_deg
 _EPS = 1e-6
 MEASURED_MM = 0.2
 """Largest distance of a measured pose beyond a limit: repeatability and noise of arms."""
+MEASURED_DEG = 1.0
+"""Largest measured turn of the tool beyond its limit."""
 
 
 class GuardError(RigError):
@@ -173,23 +175,35 @@ class Guard:
             at = segment.to
 
     def check_measured(
-        self, pose: Pose, begin: Pose, plate: PlateFrame, closed_mm: float = 0.0
+        self,
+        pose: Pose,
+        begin: Pose,
+        plate: PlateFrame,
+        closed_mm: float = 0.0,
+        when: str = "on its way",
     ) -> None:
-        """Check a pose that was measured on the way of a path, within `MEASURED_MM`.
+        """Check a pose that was measured, within `MEASURED_MM` and `MEASURED_DEG`.
 
         Args:
             begin: pose at which the path began, which may be outside; the path may not go farther.
+            when: what the arm is doing, for the error.
 
         Raises:
-            GuardError: the pose is outside.
+            GuardError: the pose is outside, or turned too far.
         """
+        where = f"the arm was stopped {when}, where its pose shows"
         before: list[_Place] | None = None
         for number, place in enumerate(self._places(pose, plate, closed_mm)):
             if place.excess <= MEASURED_MM:
                 continue
             before = before or list(self._places(begin, plate, closed_mm))
             if not place.excess <= max(before[number].excess, 0.0) + MEASURED_MM:
-                raise place.fault("the arm was stopped on its way, where its pose shows")
+                raise place.fault(where)
+        if self._limits is None or pose.rotvec_deg == begin.rotvec_deg:
+            return
+        turn, most = angle_deg(begin, pose), self._limits.tilt_deg
+        if not turn <= most + MEASURED_DEG:
+            raise TiltError("turn of the tool", turn, most, "deg", where)
 
     def check_depth(self, depth_mm: float, what: str) -> None:
         """Check a measured depth in contact, in the rig's frame, that fingers would lead to.

@@ -13,6 +13,7 @@ clear drops what it holds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -93,6 +94,12 @@ class Reflex:
     speed_mm_s: float = 1.0
     force_n: float = 0.0
     hold_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if a number is not finite."""
+        for name in ("deepest_mm", "deeper_mm", "speed_mm_s", "force_n", "hold_s"):
+            if not math.isfinite(value := getattr(self, name)):
+                raise ValueError(f"{name} of a reflex is {value}, which is no number")
 
 
 @dataclass(frozen=True)

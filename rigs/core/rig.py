@@ -173,6 +173,8 @@ class Rig:
     """Forces while they are watched, whether or not they are recorded."""
     _motion: MotionWatch | None = field(default=None, init=False)
     """The arm's motion while it is watched."""
+    _resting: Pose | None = field(default=None, init=False)
+    """The end of the last motion, while the arm rests; None outside a program."""
     _noise: NoiseWatch | None = field(default=None, init=False)
     """The event camera's noise while the arm approaches the plate."""
     _zeroed: bool = field(default=False, init=False)
@@ -394,10 +396,11 @@ class Rig:
         try:
             yield
         finally:
-            self._motion = None
+            self._motion, self._resting = None, segment.to
 
     def _send(self, segment: Segment, begin: Pose) -> None:
         """Check a segment, and send it: the one place from which the arm receives its motion."""
+        self._resting = None
         self.guard.check_segment(begin, segment, self.plate_frame, self._closed_mm)
         self.arm.start([segment])
         self._motion = MotionWatch(
@@ -430,6 +433,7 @@ class Rig:
         with self.safely(home):
             out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
             self.move(Move("home", home, out_mm_s), self.position(), None)
+            self._open_fingers()
             if self._often:
                 self._zero_forces()
             for _ in range(times):
@@ -511,8 +515,12 @@ class Rig:
 
     def _approach_until_touch(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
+        seconds = _seconds(2 * search_mm, speed_mm_s)
         with self.moving(Segment(self.plate_frame.pose(target), speed_mm_s)):
+            deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
             while not self.arm.progress().done:
+                if self.clock.now_ns() > deadline:
+                    raise ArmFault("arm", "did not finish touching off in time")
                 self.wait(POLL_S)
                 depth = self.position().depth_mm
                 if rate.touched(self.central_events(), depth, self.clock.now_ns()):
@@ -594,7 +602,7 @@ class Rig:
             StopRequested: as `wait`; the arm is still moving then, and `safely` stops it.
             ArmFault: the arm stopped, or did not finish in time.
         """
-        seconds = at.distance_mm(step.to) / step.speed_mm_s
+        seconds = _seconds(at.distance_mm(step.to), step.speed_mm_s)
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         return self._follow(segment, seconds, step.phase, sink)[:2]
 
@@ -607,6 +615,8 @@ class Rig:
         """
         if self.force is None:
             raise RigError("force sensor", f"this rig has none to press to {force_n:g} N")
+        if not force_n > 0:
+            raise RigError("force sensor", f"{force_n:g} N is no force to press to")
         forces = self._forces or self._watch_forces()
         forces.needed = True
         arm, goes_on_s = self.arm, 0.0
@@ -618,7 +628,7 @@ class Rig:
         def left_s() -> float:
             return forces.seconds_to(force_n, self.clock.now_ns()) - goes_on_s
 
-        seconds = at.distance_mm(step.to) / step.speed_mm_s
+        seconds = _seconds(at.distance_mm(step.to), step.speed_mm_s)
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         start, end, stopped = self._follow(segment, seconds, step.phase, None, left_s)
         forces.needed = self.force_limit_n is not None
@@ -632,7 +642,7 @@ class Rig:
 
     def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Turn about the plate's normal on the spot; as `move`."""
-        seconds = abs(step.to.twist_deg - at.twist_deg) / step.speed_deg_s
+        seconds = _seconds(abs(step.to.twist_deg - at.twist_deg), step.speed_deg_s)
         bound_mm_s = self.at_most(RETRACT_SPEED_MM_S)
         segment = Segment(self.plate_frame.pose(step.to), bound_mm_s, step.speed_deg_s)
         return self._follow(segment, seconds, step.phase, sink)[:2]
@@ -709,8 +719,9 @@ class Rig:
                 raise StopRequested
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
-        """Let time pass; forces and the moving arm's pose are looked at after it, and meanwhile."""
-        if self._forces is None and self._motion is None:
+        """Let time pass; forces and the arm's pose are looked at after it, and meanwhile."""
+        resting = self._resting if self._often else None
+        if self._forces is None and self._motion is None and resting is None:
             self.clock.wait(seconds)
             return
         most_s = force_watch.POLL_S if self._often else seconds
@@ -723,6 +734,10 @@ class Rig:
                     sink.add_stream(FORCE, forces)
             if self._motion is not None:
                 self._look(self._motion)
+            elif resting is not None:  # no motion was sent, but another program may send one
+                self.guard.check_measured(
+                    self.pose(), resting, self.plate_frame, self._closed_mm, "at rest"
+                )
 
     def _look(self, motion: MotionWatch) -> None:
         """Hold the moving arm's pose against its motion, its limits and the forces."""
@@ -824,20 +839,19 @@ class Rig:
             self._twisted = False
         out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
         self.move(Move("home", home, out_mm_s), self.position(), None)
-        if self.gripper is not None:
-            self._open_fingers(self.gripper)
         self.begin_clear(seed, nuisances)
         for device in self.further:
             device.prepare()
 
     def begin_clear(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
-        """Let the simulation draw its random values, and zero the force sensor.
+        """Open the fingers, let the simulation draw its random values, zero the force sensor.
 
         The sensor is clear of the plate. Forces are watched from now on, where they have a limit.
 
         Raises:
-            RigError: the force sensor is at fault.
+            RigError: gripper or force sensor is at fault.
         """
+        self._open_fingers()
         if self.force is not None and self.force_limit_n is not None:
             forces = self._forces or self._watch_forces()
             while not forces.fresh:  # or the sensor is silent, which it raises
@@ -858,8 +872,10 @@ class Rig:
         if self._often:
             self._watch_forces()
 
-    def _open_fingers(self, gripper: Gripper) -> None:
-        """Move the fingers to the opening with which a trial begins, and wait for it."""
+    def _open_fingers(self) -> None:
+        """Move a gripper's fingers to the opening with which a trial begins, and wait for it."""
+        if (gripper := self.gripper) is None:
+            return
         opening_mm, allowed = self.grip_opening_mm, gripper.range
         state = check_state(allowed, gripper.state())
         if state.moving or not self._is_open(gripper, state, opening_mm):
@@ -925,7 +941,7 @@ class Rig:
         try:
             yield
         except BaseException as error:
-            self._forces, self._reading = None, ()
+            self._forces, self._resting, self._reading = None, None, ()
             fault: RigError | None = None
             try:
                 fault = self._stop_arm()
@@ -947,6 +963,7 @@ class Rig:
             if uncaught and isinstance(error, RigError):
                 raise self._with_plate_warning(error) from error
             raise
+        self._resting = None
         with suppress(Exception):  # the motion is over
             self._end_watch()
 
@@ -1026,6 +1043,13 @@ class Rig:
             if not _of_sensor(fault):
                 raise
             self._forces = None
+
+
+def _seconds(way: float, speed: float) -> float:
+    """Return the time that a way takes; infinite at a speed that is none, which is never sent."""
+    if way == 0.0:
+        return 0.0
+    return way / speed if 0.0 < speed < math.inf else math.inf
 
 
 def _of_sensor(error: BaseException) -> bool:

@@ -66,18 +66,22 @@ class NoiseWatch:
         rate = len(chunk) / QUIET_S
         self._longest_s = max(self.SILENT_S, self.EXPECTED / rate) if rate else np.inf
         self._stall = StallTimer(now_ns)
+        self._now_ns, self._soonest_ns = now_ns, np.inf
         self._newest_us: int | None = None
         self.check(chunk)
 
     def check(self, chunk: EventChunk) -> None:
-        """Hold the events since the last call against the noise.
+        """Hold the events since the last call against the noise; late ones are no news.
 
         Raises:
-            RigError: no newer event has come for too long.
+            RigError: no newer event has come in time for too long.
         """
         newest_us = int(chunk.t_us.max()) if len(chunk) else None
         if newest_us is not None and (self._newest_us is None or newest_us > self._newest_us):
-            self._newest_us = newest_us
+            on_way_ns = self._now_ns() - 1000 * newest_us
+            self._soonest_ns = min(self._soonest_ns, on_way_ns)
+            if on_way_ns - self._soonest_ns <= 1e9 * self._longest_s:
+                self._newest_us = newest_us
         silent_s = self._stall.waited_s((self._newest_us,))
         if silent_s > self._longest_s:
             raise RigError(

@@ -41,7 +41,11 @@ def _declaration(bench: ArmBench) -> None:
         raise Seen("the arm moved when it was connected")
 
 
-@RULES.add("path", "a path is followed to its end, and each segment has its start and its end")
+@RULES.add(
+    "path",
+    "a path is followed to its end, and each segment has its start and its end, those of one path "
+    "alone",
+)
 def _path(bench: ArmBench) -> None:
     bench.connect()
     before_ns = bench.now_ns()
@@ -53,6 +57,10 @@ def _path(bench: ArmBench) -> None:
         raise Seen(f"{len(progress.finished)} of {len(path)} segments were reported finished")
     after_ns = bench.now_ns()
     _check_spans(progress.finished, before_ns, after_ns)
+    bench.start(bench.to(SHORT_MM))
+    progress = bench.end(2 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
+    if len(progress.finished) != 1:
+        raise Seen(f"{len(progress.finished)} segments of the next path, of one, were finished")
 
 
 @RULES.add(
@@ -188,14 +196,17 @@ def _stop_moving(bench: ArmBench) -> None:
 
 @RULES.add(
     "protective stop",
-    "a path that a protective stop ends is reported as ended, not finished; stop returns, and no "
-    "path starts until a person has cleared it",
+    "a path that a protective stop ends is reported as ended, not finished, and as no other "
+    "stop; stop returns, and no path starts until a person has cleared it",
 )
 def _protective(bench: ArmBench) -> None:
     bench.connect()
     bench.start_long()
     bench.inject(Kind.PROTECTIVE_STOP)
     _check_aborted(bench)
+    state = bench.state()  # one that only loses its connection is lost
+    if state.healthy or state is ArmState.EMERGENCY_STOP:
+        raise Seen(f"in a protective stop its state was {state}")
     for _ in range(2):
         bench.stop()
     bench.until(lambda: not bench.moving(), bench.bounds.call_s)

@@ -148,6 +148,16 @@ class CutsCorners(ExampleArm):
         run.finished[:] = run.finished * len(whole)
 
 
+class KeepsFinished(ExampleArm):
+    """Segments of the path before count as finished, too."""
+
+    def start(self, path: Any) -> None:
+        """Begin to follow a path."""
+        before = self._run.finished
+        super().start(path)
+        self._run.finished[:0] = before
+
+
 class DoneTooEarly(ExampleArm):
     """The path counts as done shortly before its end."""
 
@@ -243,6 +253,11 @@ def ready(state: ArmState) -> ArmState:
     return ArmState.READY if state is ArmState.MOVING else state
 
 
+def swapped_stops(state: ArmState) -> ArmState:
+    """Take a protective stop for an emergency stop."""
+    return ArmState.EMERGENCY_STOP if state is ArmState.PROTECTIVE_STOP else state
+
+
 SPEED, CALLS, POSES, HOST = "speed and length", "calls while moving", "poses", "host times"
 TURN, TILT, WRAPS = "orientation", "limits of turn and depth", "counter wraps"
 ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
@@ -259,8 +274,13 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleArm, host_spans, "progress"), (SPEED,), "segment 1 was reported to begin",
     ),
     "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
+    "KeepsFinished": (KeepsFinished, ("path",), "3 segments of the next path, of one"),
     "ReadyWhileMoving": (
         reports(ExampleArm, ready, "state"), (CALLS,), "its state was ArmState.READY",
+    ),
+    "StopsSwapped": (
+        reports(ExampleArm, swapped_stops, "state"), ("protective stop",),
+        "its state was ArmState.EMERGENCY_STOP",
     ),
     "ProgressWaits": (ProgressWaits, (CALLS,), "had not returned before the arm was at rest"),
     "StopDoesNotWait": (StopDoesNotWait, ("stop while moving",), "still moving when the call"),
@@ -284,6 +304,12 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
             ExampleArm, lambda c: PoseChunk(*(v[-1:] for v in vars(c).values())), "read_poses"
         ),
         (POSES,), "returned 1 samples of 0.000 s",
+    ),
+    "LosesLastSample": (
+        reports(
+            ExampleArm, lambda c: PoseChunk(*(v[:-1] for v in vars(c).values())), "read_poses"
+        ),
+        (POSES,), "each read loses some",
     ),
     "HostTimeIsZero": (
         reports(ExampleArm, at_host(lambda: 0), "read_poses"), (HOST,), "host_ns was 0, received",
@@ -355,6 +381,22 @@ class EventsTwice(ExampleEvents):
         return EventChunk.joined([last, found]) if last is not None and len(found) else found
 
 
+class OldPulses(ExampleEvents):
+    """Start keeps the pulses that were not read."""
+
+    old: Any = None
+
+    def start(self) -> None:
+        """Start streaming."""
+        self.old = super().read_pulses()
+        super().start()
+
+    def read_pulses(self) -> Any:
+        """Sync pulses since the last call."""
+        found, old, self.old = super().read_pulses(), self.old, None
+        return found if old is None else replace(found, t_ns=np.append(old.t_ns, found.t_ns))
+
+
 class SizeSwapped(ExampleEvents):
     """Columns are taken for rows."""
 
@@ -414,6 +456,18 @@ class ZeroHides(ExampleForce):
         return scaled(force_n=self.share, torque_nm=self.share)(super().read())
 
 
+class ZeroOnce(ExampleForce):
+    """Only the first zero counts."""
+
+    zeroed = False
+
+    def zero(self) -> None:
+        """Take the present load for zero."""
+        if not self.zeroed:
+            super().zero()
+        self.zeroed = True
+
+
 class KeepsTicking(ExampleSync):
     """Stop drops what comes, and the box ticks on."""
 
@@ -468,6 +522,7 @@ EVENTS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleEvents, us("t_ns"), "read_pulses"), DATA, "pulses up to",
     ),
     "StopDrops": (StopDrops, ("read after stop",), "could not be read after it"),
+    "OldPulses": (OldPulses, ("fresh start",), "began with pulses of the first one"),
     "ReadWaits": (ReadWaits, ("read at once",), "read took"),
 }  # fmt: skip
 FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
@@ -510,6 +565,7 @@ FORCE: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "ForceCounterWraps": (
         _read(ExampleForce, wrapped("t_ns", 1_000_000)), (WRAPS,), "came after",
     ),
+    "ZeroOnce": (ZeroOnce, ("zero",), "was not zero after a second zero"),
     "ZeroHides": (ZeroHides, ("zero",), "its change was not read"),
 }  # fmt: skip
 BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
@@ -598,6 +654,14 @@ class OpensOnConnect(ExampleGripper):
         self.move(self.range.opening_mm[1], self.range.speed_mm_s[1], self.range.force_n[0])
 
 
+class StopOpens(ExampleGripper):
+    """Stop opens the fingers."""
+
+    def stop(self) -> None:
+        """Stop."""
+        self.move(self.range.opening_mm[1], self.range.speed_mm_s[1], self.range.force_n[0])
+
+
 def percent(self: ExampleGripper, line: str) -> tuple[str]:
     """Send the force of a move in percent of the largest one."""
     word, *values = line.split()
@@ -625,6 +689,7 @@ GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     ),
     "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
     "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it said"),
+    "StopOpens": (StopOpens, ("stop of the fingers",), "the fingers opened to 80 mm after"),
     "OpensOnConnect": (OpensOnConnect, ("fingers stay",), "the fingers went from"),
 }  # fmt: skip
 

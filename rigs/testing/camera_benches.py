@@ -86,6 +86,11 @@ class EventBench(StreamBench):
         if found != self.fed_pulses:
             raise Seen(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
 
+    def check_fresh(self, mark: int) -> None:
+        """Raise Seen if a pulse came from before a time, us."""
+        if min(self.pulses) < mark * 1000:
+            raise Seen("the second run began with pulses of the first one")
+
     def forget(self) -> None:
         """Forget what was fed and what came."""
         super().forget()

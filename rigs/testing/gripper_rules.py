@@ -147,7 +147,10 @@ def _range(bench: GripperBench) -> None:
         raise Seen("the fingers moved all the same")
 
 
-@RULES.add("stop of the fingers", "stop returns in any state, and the fingers stand soon after")
+@RULES.add(
+    "stop of the fingers",
+    "stop returns in any state, and the fingers stand soon after, where they were",
+)
 def _stop(bench: GripperBench) -> None:
     bench.connect()
     bench.call("stop before a move", bench.device.stop)
@@ -155,12 +158,15 @@ def _stop(bench: GripperBench) -> None:
     bench.wait(QUIET_S)
     for _ in range(2):
         bench.call("stop", bench.device.stop)
+    (stopped_mm,) = bench.true_mm(time.monotonic_ns())
     if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
         raise Seen("state said moving after the stop")
     if not bench.until(lambda: not bench.fingers.moving(time.monotonic_ns()), bench.bounds.call_s):
         raise Seen("the fingers moved on")
     if abs(bench.fingers.target_mm - (bench.opening_mm - CLOSED_MM)) < 1.0:
         raise Seen("the fingers went to the end of their move")
+    if bench.fingers.target_mm > stopped_mm + bench.range.step_mm + EPS_MM:
+        raise Seen(f"the fingers opened to {bench.fingers.target_mm:g} mm after the stop")
 
 
 @RULES.add("stall", "fingers that an object stops are reported as stalled, not as moving")

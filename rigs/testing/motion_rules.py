@@ -54,6 +54,9 @@ STAMP_S = 0.05
 """Largest error of a pose's time, s."""
 AT_ONCE_S = 0.25
 """Longest duration of a call that does not wait for a motion, s."""
+FEWEST_STEPS, LOST_SHARE = 10, 1.5
+"""Steps of time that are compared within and between reads, and how much longer the latter are
+where samples are lost."""
 WATCH_S, PAUSE_S = 1.0, 0.4
 PULSES, ROUNDS = 4, 5
 EDGE_S = 0.03
@@ -528,6 +531,17 @@ def _check_samples(bench: ArmBench, report: Report) -> None:
                 )
     if not count:
         raise Seen("read_poses returned no pose during a path")
+    within = np.concatenate([np.diff(chunk.t_ns) for chunk in report.chunks])
+    between = np.array(
+        [int(new.t_ns[0] - old.t_ns[-1]) for old, new in itertools.pairwise(report.chunks)]
+    )
+    if min(len(within), len(between)) < FEWEST_STEPS:
+        return
+    if np.median(between) > LOST_SHARE * np.median(within):
+        raise Seen(
+            f"samples read together are {np.median(within) / 1e6:g} ms apart, those of two reads "
+            f"{np.median(between) / 1e6:g} ms: each read loses some"
+        )
 
 
 def _check_wrap(bench: ArmBench, wrap_s: float) -> None:

@@ -123,6 +123,9 @@ class StreamBench(Bench):
 
     # -- data ------------------------------------------------------------------------------
 
+    def check_fresh(self, mark: int) -> None:
+        """Raise Seen if something besides the chunks came from before a time."""
+
     def gather(self) -> list[int]:
         """Feed and read some batches; return all times that came.
 

@@ -157,11 +157,13 @@ def _fresh(bench: StreamBench) -> None:
     bench.wait(QUIET_S)
     mark = bench.mark()
     bench.stop()
-    bench.came.clear()
+    bench.forget()
     bench.start()
     for time in bench.gather():
         if mark is not None and time < mark:
             raise Seen("the second run began with data of the first one")
+    if mark is not None:
+        bench.check_fresh(mark)
 
 
 @RULES.add(
@@ -401,19 +403,26 @@ def _camera_clock(bench: FrameBench) -> None:
 
 
 @FORCE_RULES.add(
-    "zero", "after zero the present load is read as zero, and a change of it in full, in N and N m"
+    "zero",
+    "after zero the present load is read as zero, and a change of it in full, in N and N m; each "
+    "time",
 )
 def _zero(bench: ForceBench | ArmForceBench) -> None:
     bench.steady = True
     bench.connect()
     bench.start()
     bench.gather()
-    bench.call("zero", bench.device.zero)
-    for load, what in ((LOAD, "the load was not zero"), (2.0 * LOAD, "its change was not read")):
+    for load, zero, what in (
+        (LOAD, LOAD, "the load was not zero"),
+        (2.0 * LOAD, LOAD, "its change was not read"),
+        (2.0 * LOAD, 2.0 * LOAD, "the load was not zero after a second zero"),
+    ):
         bench.load = load
+        if (load == zero).all():
+            bench.call("zero", bench.device.zero)
         last: list[float] = []
 
-        def read(due: Any = load - LOAD, last: list[float] = last) -> bool:
+        def read(due: Any = load - zero, last: list[float] = last) -> bool:
             bench.feed()
             bench.came.clear()
             bench.read()

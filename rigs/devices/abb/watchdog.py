@@ -44,7 +44,8 @@ class Watchdog:
     def begin(self, web: WebServices) -> None:
         """Start the heartbeat, and check that the controller's task is active.
 
-        Takes at most 4 requests and `ECHO_S`.
+        Takes at most 5 requests and `ECHO_S`. An echo that was there before is none: signals
+        keep their values when a task has ended.
 
         Args:
             web: another session, so that these requests do not delay the heartbeat.
@@ -53,13 +54,14 @@ class Watchdog:
             WebRefused: the controller has no such task, or it is not running.
             WebError: no answer.
         """
+        before = web.read_signal(ECHO)
         first = self._beat()
         self._begun = self._beating = True
         if not self._thread.is_alive():
             self._thread.start()
         web.write_signal(LIMIT, self._limit_s)
         deadline = time.monotonic() + ECHO_S
-        while not (web.read_signal(ECHO) - first) % _WRAP < _WRAP / 2:  # NaN, too
+        while (echo := web.read_signal(ECHO)) == before or not (echo - first) % _WRAP < _WRAP / 2:
             if time.monotonic() > deadline:
                 raise WebRefused(f"{ECHO} does not follow {BEAT}: the task is not running")
 

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,38 @@ def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(
     assert rig.arm.progress().done
     assert rig.position().depth_mm == pytest.approx(2.4, abs=0.01)  # not moved clear
     assert -3.5 < rig.position().x_mm < 3.4
+
+
+def test_a_stream_that_lags_more_and_more_leads_to_the_safe_state(
+    model: Path, protocol: Path, tmp_path: Path
+) -> None:
+    """What was read arrives at half the rate: all data are newer, and later, than the last."""
+    ages_ms = [0.0]
+
+    def slowed(read: Callable[[], Any], rig: Rig) -> Callable[[], Any]:
+        waiting: list[tuple[int, Any]] = []
+        reads = count()
+
+        def lagging() -> Any:
+            now_ns, new = rig.clock.now_ns(), read()
+            waiting.append((now_ns, new))
+            if rig.position().x_mm <= -2.0:
+                return waiting.pop(0)[1]
+            if next(reads) % 2:
+                return type(new)(*(column[:0] for column in vars(new).values()))
+            ages_ms.append((now_ns - waiting[0][0]) / 1e6)
+            return waiting.pop(0)[1]
+
+        return lagging
+
+    def disturb(rig: Rig) -> None:
+        rig.events.read = slowed(rig.events.read, rig)  # type: ignore[method-assign]
+        rig.events.read_pulses = slowed(rig.events.read_pulses, rig)  # type: ignore[method-assign]
+
+    error, rig = safe_state(gripping(model, protocol, tmp_path), quiet, disturb)
+    assert "neither events nor pulses" in error.cause
+    assert max(ages_ms) < 2 * STREAM_MS + 100.0
+    assert rig.position().depth_mm > 2.0
 
 
 def test_a_camera_that_fails_leads_to_the_safe_state(

@@ -76,3 +76,13 @@ def test_turn_is_the_angle_between_two_rotations(
     one: tuple[float, float, float], other: tuple[float, float, float]
 ) -> None:
     assert _turn_deg(one, other) == pytest.approx(angle_deg(at(0, one), at(0, other)), abs=1e-6)
+
+
+def test_third_jump_in_a_row_is_a_fault_wherever_it_leads() -> None:
+    """Poses from a buffer that holds anything never agree, and are no life either."""
+    check = PoseCheck()
+    assert check.believes(0, 0, at(0.0))
+    assert not check.believes(2 * MS, 2 * MS, at(900.0))
+    assert not check.believes(4 * MS, 4 * MS, at(-900.0))
+    with pytest.raises(PoseJumpError, match="jumped by 900"):
+        check.believes(6 * MS, 6 * MS, at(900.0))

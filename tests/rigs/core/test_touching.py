@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sliplab.rigs.core.touching import MarkerTouch, RateTouch, count_central
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.touching import MarkerTouch, NoiseWatch, RateTouch, count_central
 from sliplab.storage.streams import EventChunk
 
 Floats = NDArray[np.float64]
@@ -166,3 +167,28 @@ def test_only_events_near_the_centre_count() -> None:
     chunk = EventChunk(x, y, np.ones(5, np.uint8), np.arange(5, dtype=np.int64))
     assert count_central(chunk, (640, 480), None) == 2
     assert count_central(chunk, (640, 480), (100.0, 100.0)) == 1
+
+
+@pytest.mark.parametrize(("rate", "seconds"), [(1.0, 60.0), (0.9999, 60.0), (0.5, 0.7)])
+def test_noise_that_lags_more_and_more_is_no_noise(rate: float, seconds: float) -> None:
+    """Each event is newer than the one before; by the last one the arm is already deeper."""
+    now_ns = [0]
+
+    def noise(until_s: float) -> EventChunk:
+        t_us = np.arange(int(1e6 * (until_s - 0.5)), int(1e6 * until_s), 2000)
+        return EventChunk(*(np.zeros(len(t_us), kind) for kind in (np.uint16, np.uint16, np.uint8)),
+                          t_us)  # fmt: skip
+
+    watch = NoiseWatch(noise(0.0), lambda: now_ns[0], may_be_silent=False)
+    polls = np.arange(0.01, seconds, 0.01)
+
+    def run() -> None:
+        for now_s in polls:
+            now_ns[0] = round(now_s * 1e9)
+            watch.check(noise(rate * now_s))
+
+    if rate > 0.9:
+        run()
+    else:
+        with pytest.raises(RigError, match=r"no newer event for 0\.2\d s"):
+            run()

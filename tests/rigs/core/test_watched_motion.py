@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.arm_settings import Limits
 from sliplab.rigs.core.capabilities import ArmFault, GripperState, Pose, RigError, Segment
 from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
-from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, WorkspaceError
+from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
+from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
@@ -338,6 +340,32 @@ def test_sensor_that_dies_in_mid_slide_stops_the_arm(
     assert rig.position().depth_mm < 0.0  # a dead sensor does not keep the arm in contact
 
 
+def test_force_samples_that_lag_more_and_more_stop_the_arm() -> None:
+    """Each sample is newer than the one before, and later than that on its way."""
+    rig = make_rig(limit_n=30.0)
+    sensor = rig.force
+    assert sensor is not None
+    read, waiting, ages_s = sensor.read, [], [0.0]
+
+    def slow() -> WrenchChunk:
+        new, now_ns = read(), rig.clock.now_ns()
+        rows = [*waiting, *zip(*vars(new).values(), strict=True)]
+        sent, waiting[:] = rows[: (len(new) + 1) // 2], rows[(len(new) + 1) // 2 :]
+        if not sent:
+            return new
+        t_ns, host_ns, force_n, torque_nm = map(np.array, zip(*sent, strict=True))
+        ages_s.append((now_ns - int(host_ns[-1])) * 1e-9)
+        return WrenchChunk(t_ns, np.full_like(host_ns, now_ns), force_n, torque_nm)
+
+    sensor.read = slow  # type: ignore[method-assign]
+    start = sensor.start
+    sensor.start = lambda: (waiting.clear(), start())[1]  # type: ignore[method-assign, func-returns-value]
+    with pytest.raises(RigError, match=r"force sensor: no newer sample came for 0\.\d+ s"):
+        trial(rig)
+    assert max(ages_s) < 2 * SILENT_S + 0.2
+    assert rig.position().depth_mm < 0.0
+
+
 @pytest.mark.parametrize("how", ["nan", "empty", "frozen", "zeros"])
 def test_sensor_without_a_limit_is_held_where_a_press_ends_by_it(how: str) -> None:
     rig = make_rig(limit_n=None)
@@ -510,6 +538,36 @@ def replace_limits(rig: Rig, **change: float) -> Any:
     return replace(limits, **change)
 
 
+@pytest.mark.parametrize("way", [(0, 0, 1), (1, 0, 0)])
+def test_arm_that_leaves_the_limits_at_rest_is_stopped(way: Any) -> None:
+    """Another program or a person moves it in a hold, in which no motion was commanded."""
+    rig = plain_rig()
+    rig.simulation = None
+    watcher = Watcher()
+    watcher.step = lambda phase, acting: drifting(rig, way, 20.0) if phase == "hold" else None  # type: ignore[method-assign, assignment]
+    deepest = depths(rig)
+    program = Program(HOME, (PROGRAM.steps[0], Dwell("hold", 5.0), PROGRAM.steps[-1]))
+    with pytest.raises(RigError, match=r"stopped at rest, where its pose shows: .* its limit"):
+        run_watched(rig, program, watcher, 1, 100, None)
+    assert max(deepest) < 6.0
+
+
+def test_tool_that_turns_on_its_way_beyond_the_limit_stops_the_arm() -> None:
+    rig = plain_rig()
+    rig.guard = Guard(Limits(low_mm=(200, -99, 200), high_mm=(499, 99, 400), tilt_deg=10))
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    began = rig.clock.now_ns()
+
+    def lie(pose: Pose) -> Pose:
+        return Pose(
+            pose.xyz_mm, turned_about_z(pose.rotvec_deg, (rig.clock.now_ns() - began) / 5e7)
+        )
+
+    with_arm(rig, lie)
+    with pytest.raises(TiltError, match=r"turn of the tool 1\d(\.\d+)? deg is beyond its limit 10"):
+        rig.move(Move("slide", Position(9.0, 0.0, -2.0), 1.0), HOME)
+
+
 # -- limits before anything is sent ------------------------------------------------------------
 
 
@@ -521,6 +579,9 @@ def replace_limits(rig: Rig, **change: float) -> Any:
         (Position(11.0, -11.0, -2.0), 2.0, WorkspaceError),
         (DEEP, 101.0, SpeedError),
         (DEEP, float("nan"), RigError),
+        (DEEP, float("inf"), RigError),
+        (DEEP, 0.0, SpeedError),
+        (DEEP, -2.0, SpeedError),
         (Position(0.0, float("nan"), 1.0), 2.0, RigError),
     ],
 )
@@ -544,6 +605,57 @@ def test_turn_beyond_the_rigs_limits_is_sent_to_no_driver(rate: float) -> None:
     with pytest.raises(RigError, match=r"turns at|sensor's rim at 1000 deg/s"), rig.moving(segment):
         pass
     assert arm.started == []
+
+
+@pytest.mark.parametrize("rate", [0.0, -5.0, float("nan"), float("inf")])
+def test_twist_at_no_speed_is_sent_to_no_driver(rate: float) -> None:
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    arm = with_arm(rig)
+    with pytest.raises(RigError, match=r"arm: segment 1 of 1 turns at"):
+        rig.twist(Twist("twist", replace(HOME, twist_deg=10.0), rate), HOME)
+    assert arm.started == []
+
+
+@pytest.mark.parametrize("force_n", [0.0, -1.0, float("nan")])
+def test_press_to_a_force_that_is_none_is_sent_to_no_driver(force_n: float) -> None:
+    rig = make_rig()
+    rig.begin_trial(HOME, 1)
+    arm = with_arm(rig)
+    with pytest.raises(RigError, match=r"force sensor: .*press to"):
+        rig.take_step(0, Move("press", DEEP, 2.0, until_force_n=force_n), HOME, None)
+    assert arm.started == []
+
+
+def test_reflex_without_numbers_is_refused() -> None:
+    for name in ("deepest_mm", "deeper_mm", "speed_mm_s", "force_n", "hold_s"):
+        with pytest.raises(ValueError, match=name):
+            replace(Reflex("press", 3.0, 0.5), **{name: float("nan")})
+
+
+def test_touching_off_by_an_arm_that_never_arrives_ends() -> None:
+    """Its measured pose scatters, so that it is never the same."""
+    rig = deaf(plain_rig())
+    looks = iter(range(1, 100_000))
+    rig.should_stop = lambda: next(looks) > 20_000
+    arm = with_arm(rig)
+    start, progress = rig.arm.start, rig.arm.progress
+    stood: list[Pose] = []
+
+    def begin(path: Any) -> None:
+        if path[0].speed_mm_s == 1.0:
+            stood.append(arm._arm.pose())
+            x, y, z = stood[0].xyz_mm
+            noise = np.random.default_rng(1)
+            arm._lie = lambda _: Pose((x + noise.normal(0, 1e-3), y, z), stood[0].rotvec_deg)
+            arm.progress = lambda: replace(progress(), done=False)  # type: ignore[attr-defined]
+            arm.stop = lambda: arm.__dict__.pop("progress", None)  # type: ignore[attr-defined]
+        else:
+            start(path)
+
+    rig.arm.start = begin  # type: ignore[method-assign]
+    with pytest.raises(ArmFault, match="did not finish touching off in time"):
+        rig.touch_off(1.0, 2.4, 1)
 
 
 def test_limits_of_the_arm_are_held_for_a_driver_that_holds_none() -> None:
@@ -637,6 +749,32 @@ def test_fingers_close_no_deeper_than_the_rigs_limit() -> None:
     for wrong in ((float("nan"), 20.0, 50.0), (39.0, 1e6, 50.0), (39.0, 20.0, float("nan"))):
         with pytest.raises(RigError, match=r"gripper: .* is out of its range"):
             rig.move_fingers(*wrong)
+
+
+@pytest.mark.parametrize(
+    "motion", [warm_up, touching_off, taught_touch, circles], ids=lambda motion: motion.__name__
+)
+def test_fingers_are_opened_before_any_contact(motion: Callable[[Rig], None]) -> None:
+    """A gripper that was closed by hand holds the sensor deeper than the arm's depth shows."""
+    rig = make_rig("mock-gripper", None)
+    gripper = rig.gripper
+    assert gripper is not None
+    gripper.move(rig.grip_opening_mm - 9.0, 20.0, 50.0)
+    while gripper.state().moving:
+        rig.clock.wait(0.05)
+    openings, pose = [], rig.arm.pose
+
+    def noted() -> Pose:
+        here = pose()
+        if rig.plate_frame.position(here.xyz_mm).depth_mm > -0.5:
+            openings.append(gripper.state().opening_mm)
+        return here
+
+    rig.arm.pose = noted  # type: ignore[method-assign]
+    with suppress(RigError):  # a deaf rig finds no plate
+        motion(rig)
+    assert openings
+    assert min(openings) == pytest.approx(rig.grip_opening_mm, abs=0.1)
 
 
 @pytest.mark.parametrize(

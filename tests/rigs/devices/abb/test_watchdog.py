@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from sliplab.rigs.devices.abb.fake import WATCH_S
+from sliplab.rigs.devices.abb.rws import WebRefused
 from sliplab.rigs.devices.abb.settings import AbbSettings
-from sliplab.rigs.devices.abb.watchdog import BEAT, BEAT_S, ECHO, LIMIT
+from sliplab.rigs.devices.abb.watchdog import BEAT, BEAT_S, ECHO, LIMIT, Watchdog
 from tests.conftest import ROOT
 
 RAPID = ROOT / "docs" / "rapid"
+AHEAD = range(-4500, 5000, 500)
 MODULE = (RAPID / "sliplab_watchdog.mod").read_text()
 
 
@@ -39,3 +43,37 @@ def test_the_stand_in_has_the_cycle_of_the_module_and_beats_fit_into_every_limit
     assert float(found[1]) == WATCH_S
     shortest = AbbSettings.model_json_schema()["properties"]["watchdog_s"]["anyOf"][0]["minimum"]
     assert shortest > BEAT_S + WATCH_S
+
+
+class Signals:
+    """Analog signals of a controller whose watchdog task has ended; they keep their values."""
+
+    def __init__(self, echo: float) -> None:
+        self.values = {BEAT: 0.0, ECHO: echo, LIMIT: 0.0}
+
+    def read_signal(self, name: str) -> float:
+        return self.values[name]
+
+    def write_signal(self, name: str, value: float) -> None:
+        self.values[name] = value
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@pytest.mark.parametrize("ahead", [*AHEAD, float("nan")])
+def test_echo_of_a_task_that_has_ended_is_no_echo(
+    ahead: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sliplab.rigs.devices.abb.watchdog.ECHO_S", 0.02)
+    settings = AbbSettings.model_validate(
+        {"host": "127.0.0.1", "limits": {"low_mm": [0, 0, 0], "high_mm": [9, 9, 9]}}
+    )
+    watchdog = Watchdog(settings, 2.0)
+    controller = Signals((watchdog._count + ahead) % 10_000)
+    watchdog._web = controller  # type: ignore[assignment]
+    try:
+        with pytest.raises(WebRefused, match="the task is not running"):
+            watchdog.begin(controller)  # type: ignore[arg-type]
+    finally:
+        watchdog.close(watch=False)
