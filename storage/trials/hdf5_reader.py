@@ -11,8 +11,9 @@ import io
 import math
 import os
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
+from itertools import product, repeat
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ from sliplab.storage.trials.hdf5_writer import (
     Array,
     Kind,
 )
+from sliplab.storage.trials.packed_chunks import Filter, unpacked_bytes
 from sliplab.storage.trials.superblock import HEAD_BYTES, closed
 
 MOST_STREAMS = 64
@@ -55,6 +57,7 @@ _MOST_TEXT = 128
 _NUMBERS, _ATTRIBUTES = "biuf", "biufS"
 """Kinds of type of a column and of an attribute, as numpy names them."""
 _HDF5_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
+_LATEST_US = 1 << 60
 _LARGE = 1 << 26
 """Bytes that a column may claim without having them in the file."""
 _CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
@@ -277,7 +280,9 @@ class RowFile:
         chunk = kept.get_chunk() if kept.get_layout() == h5py.h5d.CHUNKED else ()
         if max(_LARGE, 2 * stated) < data.dtype.itemsize * math.prod(chunk):
             raise NotOurs(f"{self.path}: {name} is stored in pieces of {chunk} for {data.shape}")
-        return Rows(data, f"{self.path}: {name}")
+        filters = [kept.get_filter(number) for number in range(kept.get_nfilters())]
+        packing = [(kind, options) for kind, _, options, _ in filters]
+        return Rows(data, f"{self.path}: {name}", chunk, packing)
 
     def _place(self, name: str) -> bytes:
         """Return the full path of something in the file itself.
@@ -375,13 +380,21 @@ def _kind_of(name: str) -> Kind | None:
 class Rows:
     """One column: a dataset whose first axis is read in ranges.
 
+    Args:
+        chunk: values in each direction that are stored together; empty if it is stored in a row.
+        filters: what its chunks are packed with.
+
     Attributes:
         shape: all of it, rows first; () for a single value.
         dtype: of its values.
     """
 
-    def __init__(self, data: Any, name: str) -> None:
+    def __init__(
+        self, data: Any, name: str, chunk: tuple[int, ...] = (), filters: Sequence[Filter] = ()
+    ) -> None:
         self._data, self._name = data, name
+        self._chunk = chunk if filters else ()
+        self._filters, self._fine = filters, set[tuple[int, ...]]()
         self.shape: tuple[int, ...] = data.shape
         self.dtype = data.dtype
 
@@ -427,6 +440,7 @@ class Rows:
             values = np.empty(self.shape, self.dtype)
             if values.size:
                 with _faults(self._name):
+                    self._check_chunks(0, len(values) if self.shape else 0)
                     self._data.read(_room(values), h5py.h5s.ALL, values)
             return values
         high = min(len(self) if high is None else high, len(self))
@@ -439,9 +453,32 @@ class Rows:
         """Fill `values` from row `low` on."""
         if values.size:
             with _faults(self._name):
+                self._check_chunks(low, low + len(values))
                 place = self._data.get_space()
                 place.select_hyperslab((low, *(0 for _ in self.shape[1:])), values.shape)
                 self._data.read(_room(values), place, values)
+
+    def _check_chunks(self, low: int, high: int) -> None:
+        """Check once that each chunk with some of the rows is as long as it has to be.
+
+        Raises:
+            NotOurs: HDF5 would read beyond it.
+        """
+        if not self._chunk:
+            return
+        step = self._chunk[0]
+        others = map(range, repeat(0), self.shape[1:], self._chunk[1:])
+        full = self.dtype.itemsize * math.prod(self._chunk)
+        for at in product(range(low // step * step, high, step), *others):
+            if at in self._fine:
+                continue
+            if self._data.get_chunk_info_by_coord(at).byte_offset is not None:
+                found = unpacked_bytes(self._filters, *self._data.read_direct_chunk(at), full)
+                if found is not None and found < full:
+                    raise NotOurs(
+                        f"{self._name} has a chunk of {found} bytes, not {full}, at row {at[0]}"
+                    )
+            self._fine.add(at)
 
     def added(self, low: int, high: int, amount: int) -> I64:
         """Read rows low to high of a column of integers, as int64, with `amount` added to each.
@@ -496,6 +533,8 @@ class StreamReader:
                 )
             self._index_cut = found == INDEX_CUT_FORMAT
             self.t_offset_us = int(self._rows(OFFSET).read())
+            if abs(self.t_offset_us) > _LATEST_US:
+                raise NotOurs(f"{path}: {OFFSET} = {self.t_offset_us}: is no time in us")
         except BaseException:
             self._file.close()
             raise
