@@ -103,7 +103,7 @@ class Samples(StrictModel):
     that was recorded before."""
 
 
-HeldOut = Annotated[str, WithJsonSchema({"type": ["string", "number"]})]
+HeldOut = Annotated[str, WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}]})]
 """A level; a number without a unit is in its factor's, see `protocols.model`."""
 
 

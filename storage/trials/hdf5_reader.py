@@ -473,7 +473,8 @@ class Rows:
             if at in self._fine:
                 continue
             if self._data.get_chunk_info_by_coord(at).byte_offset is not None:
-                found = unpacked_bytes(self._filters, *self._data.read_direct_chunk(at), full)
+                mask, data = self._data.read_direct_chunk(at)
+                found = unpacked_bytes(self._filters, mask, data, full)
                 if found is not None and found < full:
                     raise NotOurs(
                         f"{self._name} has a chunk of {found} bytes, not {full}, at row {at[0]}"
