@@ -197,10 +197,10 @@ def _layout(
     if _table_width(words, gap) > room:
         gap = 2
     if fold_words and _table_width(words, gap) > max(room, WIDTH):
-        for column in reversed(range(len(words))):  # ids and paths come first in a row
-            over = max(_table_width(words, gap) - max(room, WIDTH), 0)
-            words[column] -= min(over, max(words[column] - _FEWEST, 0))
-        return words, gap
+        for column in reversed(range(len(widths))):  # ids and paths come first in a row
+            over = max(_table_width(widths, gap) - max(room, WIDTH), 0)
+            widths[column] -= min(over, max(widths[column] - _FEWEST, 0))
+        return widths, gap
     if _table_width(words, gap) > room:
         return [
             min(pair) for pair in zip(widths, (max(_FOLDED, w) for w in words), strict=True)
