@@ -107,17 +107,19 @@ def test_a_newer_store_is_refused_by_name(tmp_path: Path) -> None:
 def test_a_newer_trial_is_refused_by_name(tmp_path: Path) -> None:
     store = old(tmp_path / "s")
     campaign_ = store.campaign("c")
-    folder = commit(campaign_, "n", format=99)
+    commit(campaign_, "n", format=99)
     with pytest.raises(StoreError, match=r"record.json: format = 99: was written by a newer"):
         _ = campaign_.recording("n").record
     assert [p.what for p in verify(store) if p.trial == "n"] == [
         "was written by a newer version (format 99)"
     ]
+    folder = commit(campaign_, "m")
+    (folder / "data.h5").chmod(0o644)
     with h5py.File(folder / "data.h5", "r+") as file:
         file.attrs["format"] = 99
     write_sums(folder, ("data.h5", "record.json", "frames.mkv"))
     with pytest.raises(StoreError, match=r"data.h5: format = 99: was written by a newer"):
-        campaign_.recording("n").open()
+        campaign_.recording("m").open()
 
 
 def test_a_migration_names_what_it_cannot_bring_forward(tmp_path: Path) -> None:
