@@ -60,7 +60,9 @@ class Watch:
 
     def _inside(self, event: str, arguments: tuple[Any, ...]) -> bool:
         """Files of its own."""
-        if not event.startswith(("os.re", "os.mkdir", "os.rmdir", "os.link", "shutil.")):
+        if not event.startswith(
+            ("os.re", "os.mkdir", "os.rmdir", "os.link", "os.chmod", "shutil.")
+        ):
             return False
         paths = [item for item in arguments[:2] if isinstance(item, str | bytes | os.PathLike)]
         return all(os.path.abspath(os.fsdecode(p)).startswith(self.box) for p in paths)
