@@ -131,3 +131,11 @@ def test_several_faults_of_yaml_text_are_reported_at_once() -> None:
     with pytest.raises(InputError) as caught:
         parse_yaml("a: *x\nb: !t y\nc: 1\nc: 2\nd: 2026-02-30\n", "f.yaml")
     assert [each.key for each in caught.value.faults] == ["a", "b", "c", "d"]
+
+
+def test_unreadable_item_of_a_list_in_an_extending_rig_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: mock\nname: mine\ncameras: [events, *a]\nlimits: {depht: 3 mm}\n")
+    with pytest.raises(InputError) as caught:
+        load_rig_file(path)
+    assert {each.key for each in caught.value.faults} == {"cameras[1]", "limits.depht"}
