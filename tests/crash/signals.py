@@ -23,22 +23,21 @@ from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
-from tests.conftest import ROOT
 from tests.crash.campaign import NAME, collect, hashes, run_request, wrong, wrong_at_the_end
 from tests.crash.process import live
 
 SOFT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PHASES = ("campaign", "trial", "motion")
 MODULES = {
-    str(ROOT / name)
+    f"sliplab.{name}"
     for name in (
-        "flows/collecting/session.py", "flows/planning/run_request.py", "storage/files.py",
-        "storage/trials/checksums.py", "storage/trials/control.py", "storage/trials/store.py",
-        "storage/trials/frame_writer.py", "storage/trials/hdf5_writer.py", "storage/trials/lock.py",
-        "storage/trials/recovery.py", "storage/trials/writer.py",
+        "flows.collecting.session", "flows.planning.run_request", "storage.files",
+        "storage.trials.checksums", "storage.trials.control", "storage.trials.store",
+        "storage.trials.frame_writer", "storage.trials.hdf5_writer", "storage.trials.lock",
+        "storage.trials.recovery", "storage.trials.writer",
     )
 }  # fmt: skip
-"""Files whose lines are counted."""
+"""Modules whose lines are counted."""
 MORE = {1: 0.5, 2: 0.3, 10: 0.2}
 """Number of signals, with its probability."""
 MOST_LIVES = 3000
@@ -93,7 +92,7 @@ class Tracer:
     def _trace_stack(self, frame: FrameType | None) -> None:
         sys.settrace(self._trace)
         while frame is not None:
-            if frame.f_code.co_filename in MODULES:
+            if frame.f_globals.get("__name__") in MODULES:
                 frame.f_trace = self._trace
             frame = frame.f_back
 
@@ -103,7 +102,7 @@ class Tracer:
             self._trace_stack(frame)
 
     def _trace(self, frame: FrameType, event: str, argument: object) -> Callable[..., Any] | None:
-        if frame.f_code.co_filename not in MODULES:
+        if frame.f_globals.get("__name__") not in MODULES:
             return None
         if event == "line":
             self._line()
@@ -207,7 +206,10 @@ def _count_lines(folder: Path, store: Path, work: Callable[[], None]) -> dict[st
     end = live(count)
     if end.code:
         raise RuntimeError(f"the undisturbed collection failed: {end.said}")
-    return {name: int(number) for name, number in map(str.split, counts.read_text().splitlines())}
+    lines = {name: int(number) for name, number in map(str.split, counts.read_text().splitlines())}
+    if missing := [name for name, number in lines.items() if not number]:
+        raise RuntimeError(f"no line was counted in {missing}: MODULES names other files than ran")
+    return lines
 
 
 def _plan(rng: random.Random, lengths: dict[str, int], trials: int) -> Plan:
