@@ -17,6 +17,8 @@ from typing import Any
 LONGEST_S = 120.0
 """Longest import of a package, s; PyTorch takes up to 20 s on a busy machine."""
 
+_SIGNAL = signal.SIGRTMAX
+
 
 class PluginError(RuntimeError):
     """Code of another package that cannot be imported or called; the text says why, in one line."""
@@ -32,7 +34,7 @@ def foreign_code() -> Iterator[None]:
         ModuleNotFoundError: a module is missing; the caller knows whether that is an extra.
     """
     try:
-        with _alarm(LONGEST_S):
+        with _time_limit(LONGEST_S):
             yield
     except ModuleNotFoundError:
         raise
@@ -51,8 +53,6 @@ def import_foreign(place: str) -> Any:
     """
     module, _, attribute = place.partition(":")
     try:
-        if module.startswith("sliplab."):  # no other package's code
-            return getattr(import_module(module), attribute)
         with foreign_code():
             return getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
@@ -60,19 +60,34 @@ def import_foreign(place: str) -> Any:
 
 
 @contextmanager
-def _alarm(seconds: float) -> Iterator[None]:
-    """Raise TimeoutError in the block after some time; only in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
+def _time_limit(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError in the block after some time; only in the main thread.
+
+    A real-time signal interrupts a call that waits. SIGALRM is not free: the library of Basler
+    cameras sets its own handler for it, which Python does not know and would not restore.
+    """
+    main = threading.main_thread()
+    if threading.current_thread() is not main:
         yield
         return
 
     def ring(number: int, frame: FrameType | None) -> None:
         raise TimeoutError(f"it was not done after {seconds:g} s")
 
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again: code may swallow the first one
+    done = threading.Event()
+
+    def watch() -> None:
+        wait = seconds
+        while not done.wait(wait):
+            signal.pthread_kill(main.ident or 0, _SIGNAL)
+            wait = 1.0  # again: code may swallow the first error
+
+    before = signal.signal(_SIGNAL, ring)
+    watcher = threading.Thread(target=watch, name="limit of an import", daemon=True)
+    watcher.start()
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        done.set()
+        watcher.join()
+        signal.signal(_SIGNAL, before)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -34,12 +37,12 @@ def test_package_that_fails_exits_or_hangs_on_import_is_one_error(
     monkeypatch.setattr(plugins, "LONGEST_S", 0.2 if "while" in text else 60.0)
     name = f"lab_{tmp_path.name.replace('-', '_').replace('[', '_')}"
     (tmp_path / f"{name}.py").write_text(text)
-    before = signal.getsignal(signal.SIGALRM)
+    before = signal.getsignal(plugins._SIGNAL)
     with pytest.raises(PluginError, match=said) as caught:
         import_foreign(f"{name}:DRIVER")
     assert "\n" not in str(caught.value)
-    assert signal.getsignal(signal.SIGALRM) is before
-    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(plugins._SIGNAL) is before
+    assert all(thread.name != "limit of an import" for thread in threading.enumerate())
 
 
 def test_package_that_imports_gives_its_attribute(
@@ -57,3 +60,14 @@ def test_interrupt_during_an_import_is_passed_on(
     (tmp_path / "lab_stopped.py").write_text("raise KeyboardInterrupt")
     with pytest.raises(KeyboardInterrupt):
         import_foreign("lab_stopped:DRIVER")
+
+
+def test_handler_that_a_library_has_set_for_alarms_stays() -> None:
+    code = (
+        "import ctypes, os, signal\n"
+        "from sliplab.protocols.plugins import import_foreign\n"
+        "ctypes.CDLL(None).signal(int(signal.SIGALRM), ctypes.c_void_p(1))  # ignored\n"
+        "import_foreign('json:loads')\n"
+        "os.kill(os.getpid(), signal.SIGALRM)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
