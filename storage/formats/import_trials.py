@@ -90,6 +90,8 @@ _LEAST_SHARE = 0.01
 """Share of the rows that must be in order of time."""
 _MOST_RATE, _FEW = 1e8, 100
 """Events a second that no camera sends; of fewer events the rate says nothing."""
+_MOST_ALIKE = 1000
+"""Events for each distinct time, in the mean, from which on times carry too little information."""
 SampleT = TypeVar("SampleT", bound=PoseChunk | WrenchChunk | ScalarChunk)
 _UNKNOWN = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
 
@@ -289,11 +291,14 @@ class _Content:
                 "order"
             )
 
-    def check_times(self, stream: str, ends: tuple[int, int] | None, resolution: float) -> None:
+    def check_times(
+        self, stream: str, ends: tuple[int, int] | None, resolution: float, distinct: int = 0
+    ) -> None:
         """Check that the times of a stream carry information.
 
         Args:
             ends: first and last time, ns. resolution: of their type, us.
+            distinct: number of different times of events.
         """
         rows, what = self.rows[stream], _rows_of(stream)
         if ends is None or rows < 2:
@@ -314,6 +319,11 @@ class _Content:
                     "events_rate", rate, _MOST_RATE,
                     f"{rate:,.3g} events a second are more than a camera sends; are the times in "
                     "another unit?",
+                )  # fmt: skip
+            elif rows >= _MOST_ALIKE * distinct:
+                self._fail(
+                    "events_distinct_times", float(distinct), rows / _MOST_ALIKE,
+                    f"{rows:,} events have {distinct:,} different times; were the times rounded?",
                 )  # fmt: skip
 
     def check_images(self, stream: str, alike: int) -> None:
@@ -451,7 +461,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
     """
     first_us = last_us = None
     gap_us = gap_end_us = 0
-    done, resolution = 0, 0.0
+    done, distinct, resolution = 0, 1, 0.0
     content.left_out.update(trial.left_out)
     for chunk in _events(trial, content):
         if isinstance(chunk, ForeignChunk):
@@ -464,6 +474,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
             continue
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
         steps = np.diff(chunk.t_us, prepend=first_us if last_us is None else last_us)
+        distinct += int(np.count_nonzero(steps))
         widest = int(steps.argmax())
         if int(steps[widest]) > gap_us:
             gap_us, gap_end_us = int(steps[widest]), int(chunk.t_us[widest])
@@ -483,7 +494,8 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
         content.check_times(FRAMES_KIND, times, trial.resolution_us.get(FRAMES_KIND, 0.0))
     events = None if first_us is None or last_us is None else (first_us, last_us)
     if events is not None:
-        content.check_times(EVENTS_KIND, (events[0] * 1000, events[1] * 1000), resolution)
+        ends = events[0] * 1000, events[1] * 1000
+        content.check_times(EVENTS_KIND, ends, resolution, distinct)
     content.warnings += _gap_warnings(gap_us, gap_end_us)
     return Seen(events, times)
 

@@ -147,7 +147,7 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
             whole.
 
     Raises:
-        InputError: it does not exist, a file is damaged, two have one name, or faery is missing.
+        InputError: it does not exist, a file is damaged, or faery is missing.
         ModuleNotFoundError: the extra `publish` is missing, for MCAP files.
     """
     if kind in DATA_SETS:
@@ -160,19 +160,28 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
         manifest = _read_manifest(path)
     if manifest is not None:
         for item in manifest["trials"]:
-            file = path / item["file"]
+            file, fault = path / item["file"], None
+            of = kind
             if file.is_symlink() or not file.is_file():
-                raise InputError(file, "", None, "is missing or not a regular file")
-            of = (_kind(file) or "") if kind == MIXED else kind
-            if of not in READERS:
-                raise InputError(file, "", None, f"is of no known format ({', '.join(READERS)})")
+                fault = "is missing or not a regular file"
+            elif (of := (_kind(file) or "") if kind == MIXED else kind) not in READERS:
+                fault = f"is of no known format ({', '.join(READERS)})"
+            if fault is not None:
+                yield broken(item["trial"], item["file"], InputError(file, "", None, fault))
+                continue
             found = _read(of, file, item["trial"], salvage)
             yield _as_exported(found, item, manifest["simulated"])
         return
     wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)
-    _check_names(path, wanted)
+    _check_libraries(wanted)
     run = run_folder(path)
+    files: dict[str, list[str]] = {}
+    for name, _, file in wanted:
+        files.setdefault(name, []).append(file.name if isinstance(file, Path) else str(file))
+    yield from (_several(path, name, files[name]) for name in files if len(files[name]) > 1)
     for name, of, file in wanted:
+        if len(files[name]) > 1:
+            continue
         stem = file.stem if isinstance(file, Pair) else _stem(file)
         if isinstance(file, Pair):
             found = _read_lab(of, file, name, salvage)
@@ -293,24 +302,26 @@ def _of_kind(path: Path, kind: str) -> list[Wanted]:
     return _named([*recordings, *((pair.stem, kind, pair) for pair in lab)])
 
 
-def _check_names(path: Path, wanted: list[Wanted]) -> None:
-    """Check that no two files have the name of one trial, and that their libraries are there.
-
-    Two files of one name are mostly one recording in two formats, which must not count twice.
-    """
-    seen: dict[str, Path | Pair] = {}
-    for name, kind, file in wanted:
-        if (other := seen.setdefault(name, file)) is not file:
-            one, two = (item.name if isinstance(item, Path) else item for item in (other, file))
-            raise InputError(
-                path, "", None,
-                f"holds two files for the trial {name}: {one} and {two}; keep one of them, rename "
-                "one, or import one format alone: sliplab import KIND PATH",
-            )  # fmt: skip
+def _check_libraries(wanted: list[Wanted]) -> None:
+    """Check that the libraries for these files are installed."""
+    for _, kind, file in wanted:
         if kind == "es" and isinstance(file, Path):
             check_faery(file)
         if isinstance(file, Path) and (needed := _needs(kind, file)) is not None:
             raise ModuleNotFoundError(f"No module named {needed!r}", name=needed)
+
+
+def _several(path: Path, name: str, files: Sequence[str]) -> ForeignTrial:
+    """Return a trial that several files are named after, of which none is imported.
+
+    They are mostly one recording in two formats, which must not count twice.
+    """
+    error = InputError(
+        path, "", None,
+        f"holds {len(files)} files for the trial {name}: {', '.join(files)}; keep one of them, "
+        "rename the others, or import one format alone: sliplab import KIND PATH",
+    )  # fmt: skip
+    return broken(name, ", ".join(files), error)
 
 
 def _needs(kind: str, file: Path) -> str | None:

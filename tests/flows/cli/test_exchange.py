@@ -203,7 +203,7 @@ def test_mutated_headers_give_one_message_and_leave_nothing(
         (("import", "bad.h5", "--store", "s", "--name", "a"), "is not an HDF5 file"),
         (("import", "bad.aedat4", "--store", "s", "--name", "../a"), "--name"),
         (("import", "word", "bad.aedat4", "--store", "s", "--name", "a"), "must be one of"),
-        (("import", ".", "--store", "s", "--name", "a"), "holds two files for the trial bad"),
+        (("import", ".", "--store", "s", "--name", "a"), "holds 2 files for the trial bad"),
         (("export", "ours", "nothing", "--output", "o"), "is no campaign"),
         (("export", "ours", "c", "--output", "o", "--format", "word"), "must be one of"),
         (("export", "ours", "c", "--labels", "--output", "o.xls"), "must end in"),

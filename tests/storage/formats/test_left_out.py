@@ -474,6 +474,24 @@ def test_times_in_another_unit_fail_their_gate(tmp_path: Path) -> None:
     assert set(found.record.quality.gates) == {"events_rate"}
 
 
+@pytest.mark.parametrize(
+    ("times", "gates"), [(2, {"events_distinct_times"}), (5, {"events_distinct_times"}), (6, set())]
+)
+def test_a_few_times_for_thousands_of_events_fail_their_gate(
+    tmp_path: Path, times: int, gates: set[str]
+) -> None:
+    count = 5000
+    lab_hdf5(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        for name in ("xs", "ys", "ps"):
+            values = np.resize(file[f"events/{name}"][:], count)
+            del file[f"events/{name}"]
+            file[f"events/{name}"] = values
+        del file["events/ts"]
+        file["events/ts"] = np.arange(count) * times // count * 128.0
+    assert set(_one(tmp_path / "store", tmp_path / "a.h5").record.quality.gates) == gates
+
+
 @pytest.mark.parametrize(("same", "gates"), [(True, {"frames_change"}), (False, set())])
 def test_frames_that_never_change_fail_their_gate(
     tmp_path: Path, same: bool, gates: set[str]

@@ -345,17 +345,29 @@ def test_a_folder_of_several_formats_is_sorted(tmp_path: Path) -> None:
     assert "b.aedat4" not in others
 
 
-def test_two_formats_of_one_name_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_two_formats_of_one_name_are_left_out_and_the_rest_is_imported(tmp_path: Path) -> None:
     """They are mostly one recording, which must not count twice."""
     folder = tmp_path / "theirs"
     folder.mkdir()
     _aedat4(folder / "a.aedat4", _events([3, 4]))
     for name in ("b.aedat4", "b.h5"):
         (lab_hdf5 if name == "b.h5" else lambda path: _aedat4(path, _events([3])))(folder / name)
-    with pytest.raises(InputError, match=r"two files for the trial b: b\.aedat4 and b\.h5; .*KIND"):
+    done = here("import", folder, "--store", tmp_path / "store", "--name", "theirs")
+    assert done.returncode == 1
+    assert "holds 2 files for the trial b: b.aedat4, b.h5; " in " ".join(done.stderr.split())
+    campaign = Store.open(tmp_path / "store").campaign("theirs")
+    assert [one.trial_id for one in campaign.recordings()] == ["a"]
+    assert [one.trial_id for one in _import(tmp_path / "s", folder, "aedat4")] == ["a", "b"]
+
+
+def test_two_files_of_one_name_and_nothing_else_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    _aedat4(folder / "b.aedat4", _events([3]))
+    lab_hdf5(folder / "b.h5")
+    with pytest.raises(InputError, match=r"2 files for the trial b: b\.aedat4, b\.h5; .*KIND"):
         _import(tmp_path / "store", folder)
     assert Store.open(tmp_path / "store").campaigns() == []
-    assert [one.trial_id for one in _import(tmp_path / "store", folder, "aedat4")] == ["a", "b"]
 
 
 def test_a_missing_library_is_said_before_anything_is_written(
