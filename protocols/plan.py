@@ -335,7 +335,12 @@ def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -
         InputError: anything wrong, with file, key, value and what would be right.
     """
     path = path if stored else protocol_path(path)
-    document = parse_leniently(read_text(path, "protocol"), path)
+    return parse_plan(read_text(path, "protocol"), path, enable, stored=stored)
+
+
+def parse_plan(text: str, path: Path, enable: Iterable[str] = (), *, stored: bool = False) -> Plan:
+    """Expand a protocol that was read from `path`; arguments and errors as of `load_plan`."""
+    document = parse_leniently(text, path)
     try:
         protocol = validate(Protocol, document, path, None if stored else _check)
         return make_plan(protocol, str(path), enable)

@@ -144,19 +144,25 @@ def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
         return file.read(most)
 
 
-@uninterrupted
 def write_new_json(path: Path, data: Any) -> bool:
-    """Write JSON, complete and flushed, under a name that is free.
-
-    Returns:
-        False if the name was taken; nothing was changed then.
+    """Write JSON under a name that is free, as `write_new_bytes`.
 
     Raises:
         ValueError: as `write_json`.
     """
+    return write_new_bytes(path, _utf_8(json_text(data)))
+
+
+@uninterrupted
+def write_new_bytes(path: Path, data: bytes) -> bool:
+    """Write a file, complete and flushed, under a name that is free.
+
+    Returns:
+        False if the name was taken; nothing was changed then.
+    """
     temporary = temporary_path(path, f".{threading.get_ident()}")
     try:
-        write_json_aside(temporary, data)
+        _write_aside(temporary, data)
         try:
             os.link(temporary, path)
         except FileExistsError:
@@ -311,8 +317,12 @@ def write_json_aside(path: Path, data: Any) -> None:
     Raises:
         ValueError: as `write_json`.
     """
+    _write_aside(path, _utf_8(json_text(data)))
+
+
+def _write_aside(path: Path, data: bytes) -> None:
     with path.open("wb") as handle:
-        handle.write(_utf_8(json_text(data)))
+        handle.write(data)
         handle.flush()
         os.fsync(handle.fileno())
 

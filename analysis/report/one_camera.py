@@ -33,6 +33,7 @@ from sliplab.analysis.report.page import (
     percent,
     render_page,
 )
+from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.analysis.report.sources import VERSION, report_key
 from sliplab.analysis.report.summary import (
     label_sources,
@@ -111,7 +112,8 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
     if is_evaluated(store, campaigns):
         inputs.append([report_key(store, campaigns)])
     plans = [[item.planned.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
-    return make_key("report, one camera", VERSION, [inputs, plans, *claims_key(campaigns)], None)
+    besides = [*claims_key(campaigns), *registration_key(store, campaigns)]
+    return make_key("report, one camera", VERSION, [inputs, plans, *besides], None)
 
 
 def one_camera_summary(
@@ -284,6 +286,7 @@ def one_camera_sections(
     sections: list[Content | None] = [
         left_out_section(summary),
         collected_section(campaigns, summary),
+        registration_section(store, campaigns),
         claims_section(campaigns, simulated=simulated),
         quality_section(campaigns, summary.references, simulated=simulated),
     ]

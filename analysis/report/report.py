@@ -38,6 +38,7 @@ from sliplab.analysis.report.programs import (
     skin_section,
     tradeoff_section,
 )
+from sliplab.analysis.report.registration import registration_section
 from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.sources import Sources
 from sliplab.analysis.report.trial import Example, choose_example, output_section, trial_section
@@ -155,6 +156,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         paper_section(summary),
         holdout,
         collected_section(campaigns, summary),
+        registration_section(store, list(campaigns)),
         claims_section(campaigns, simulated=simulated),
         quality_section(campaigns, summary.references, simulated=simulated),
         trial,

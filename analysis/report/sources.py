@@ -18,6 +18,7 @@ from sliplab.analysis.networks.models import training_settings
 from sliplab.analysis.report.claims import claims_key
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
 from sliplab.analysis.report.programs import read_programs
+from sliplab.analysis.report.registration import registration_key
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import (
     Evaluation,
@@ -99,6 +100,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
         # commands in the page name the store's folder
         str(store.folder.resolve()),
         *claims_key(campaigns),
+        *registration_key(store, campaigns),
     ]
     return make_key(STEP, VERSION, inputs, None)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
@@ -38,11 +37,8 @@ from sliplab.storage.schema.summary import (
 )
 from sliplab.storage.schema.sweeps import HoldoutResult
 from sliplab.storage.streams import Json
+from sliplab.storage.versions import FIGURES, installed_versions
 
-_PACKAGES = (
-    "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",
-    "opencv-contrib-python-headless", "scikit-learn",
-)  # fmt: skip
 Slips = Mapping[tuple[str, str], References]
 """Slips of trials by each onset, by campaign and trial."""
 _WINDOWS = (
@@ -54,7 +50,7 @@ _WINDOWS = (
 
 def package_versions() -> dict[str, str]:
     """Return the versions of the packages that figures depend on."""
-    return {name: version(name) for name in _PACKAGES}
+    return installed_versions(FIGURES)
 
 
 def protocol_hashes(campaigns: Sequence[Collected]) -> dict[str, Hashes]:

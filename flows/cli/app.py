@@ -16,6 +16,7 @@ from sliplab.flows.cli import (
     power,
     publish,
     reflex,
+    register,
     review,
     rigs,
     schema,
@@ -58,6 +59,7 @@ def options(
 
 for part in (
     collect.app,
+    register.app,
     power.app,
     steps.app,
     sweeps.app,

@@ -121,6 +121,7 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Collect the missing trials. Ctrl-C stops the arm; run the same command to resume."""
+    from sliplab.flows.planning.register import registration_line
     from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
     from sliplab.flows.running import orchestration
     from sliplab.storage.trials.store import Store
@@ -137,6 +138,7 @@ def collect(
     )
     for warning in run_request.plan.warnings():
         console.say(f"note: {warning}")
+    console.say(registration_line(Store(store).campaign(run_request.campaign), run_request.plan))
     check_disk([run_request])
     prepare_store(store)
     if run_request.due_trials(Store(store).campaign(run_request.campaign)):

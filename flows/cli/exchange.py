@@ -140,6 +140,8 @@ def export(
     from sliplab.storage.formats.export_trials import SUFFIXES, export_trials, label_table
     from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import write_table
+    from sliplab.storage.trials.registration import copy_registrations
+    from sliplab.storage.trials.store import REGISTRATIONS
 
     opened = open_store(store)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
@@ -181,6 +183,7 @@ def export(
             lambda trial: bar.advance(1, trial),
             stream,
         )
+    copy_registrations(campaign, output / REGISTRATIONS / campaign.name)
     if not as_json:
         result = {key: value for key, value in result.items() if key != "files"}
     finish(result, f"exported to {output}", as_json)

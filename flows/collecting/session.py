@@ -17,7 +17,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
-from importlib.metadata import version
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.claims import ClaimWatch
@@ -35,7 +34,7 @@ from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
-from sliplab.storage.files import sweep_temporary
+from sliplab.storage.files import sha256, sweep_temporary
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.trial import (
     Geometry,
@@ -50,11 +49,12 @@ from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.recovery import recover
+from sliplab.storage.trials.registration import registration_files
 from sliplab.storage.trials.store import Campaign, SessionRecord, Store
 from sliplab.storage.trials.writer import TrialWriter
+from sliplab.storage.versions import RECORDING, installed_versions
 
 interruptible(Rig.run_trial)
-_PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         ):
             rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
-            campaign.add_bench_record(_session_record(run_request))
+            campaign.add_bench_record(_session_record(run_request, campaign))
             collector = TrialCollector(
                 run_request.plan, run_request.rig, rig, campaign, run_request.metadata.operator
             )
@@ -155,11 +155,11 @@ def clean_up(store: Store) -> None:
                 sweep_temporary(path)
 
 
-def _session_record(run_request: RunRequest) -> SessionRecord:
+def _session_record(run_request: RunRequest, campaign: Campaign) -> SessionRecord:
     """Return the metadata of one session at the rig, as the store keeps it."""
     began = datetime.now(UTC)
     skin, metadata = run_request.rig.skin, run_request.metadata
-    return {
+    record: SessionRecord = {
         "began": began.isoformat(timespec="seconds"),
         "operator": metadata.operator,
         "temperature_c": metadata.temperature_c,
@@ -172,6 +172,11 @@ def _session_record(run_request: RunRequest) -> SessionRecord:
         "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
         "simulated": run_request.rig.simulated,
     }
+    if registered := registration_files(campaign):
+        record["registration"] = sha256(registered[-1])
+    if run_request.claims == "overrule":
+        record["no_stopping"] = True
+    return record
 
 
 @dataclass
@@ -462,7 +467,7 @@ def _installed() -> Json:
     return {
         "system": platform.platform(),
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in _PACKAGES},
+        "versions": installed_versions(RECORDING),
     }
 
 

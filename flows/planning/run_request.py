@@ -6,10 +6,9 @@ key by key. Nothing here needs Prefect, so a wrong input is answered at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Literal, TypedDict
 
 from sliplab.flows.planning.campaign_trials import (
     ExcludedTrial,
@@ -19,7 +18,7 @@ from sliplab.flows.planning.campaign_trials import (
 from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
-from sliplab.protocols.shown import shown
+from sliplab.protocols.differences import comparable_collection, format_differences
 from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
@@ -29,8 +28,6 @@ from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
 
 Claims = Literal["use", "overrule", "ignore"]
 """`overrule`: they are looked at and do not end the campaign."""
-MOST_CHANGES = 12
-_MISSING = object()
 
 
 @dataclass(frozen=True)
@@ -169,14 +166,14 @@ def make_request(
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
     run_request = RunRequest(
         plan, rig_file, rig_text, store, name, enable, metadata, most, until,
-        claims=claims, judging_model=None if claims == "ignore" else _judging_model(plan),
+        claims=claims, judging_model=None if claims == "ignore" else judging_model(plan),
     )  # fmt: skip
     if begun:
         _check_same(run_request, begun)
     return run_request
 
 
-def _judging_model(plan: Plan) -> Path | None:
+def judging_model(plan: Plan) -> Path | None:
     """Return the file of the network that the claims of a plan are judged by.
 
     Raises:
@@ -232,13 +229,7 @@ def _changed(run_request: RunRequest, campaign: Campaign) -> str:
         begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()), stored=True)
     except InputError:
         return ""
-    old, new = begun.collection_data, run_request.plan.collection_data
-    for data, enabled in ((old, begun.enabled), (new, run_request.plan.enabled)):
-        # however they were written
-        for name, factor in (*data["factors"].items(), *data.get("context", {}).items()):
-            for key in ("values", "range", "optional"):
-                factor.pop(key)
-            factor["levels"] = [str(level) for level in enabled[name]]
+    old, new = comparable_collection(begun), comparable_collection(run_request.plan)
     changes = format_differences(old, new, "collection")
     return f" What changed:{changes}" if changes else ""
 
@@ -249,39 +240,6 @@ def _rig_changed(run_request: RunRequest, campaign: Campaign) -> str:
     new = parse_yaml(run_request.rig_text, "rig file")
     changes = format_differences(without_secrets(old), without_secrets(new))
     return f" What changed:{changes}" if changes else ""
-
-
-def differences(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield key, old and new value of everything that differs, in the order of the keys."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in [*old, *(name for name in new if name not in old)]:
-            inner = f"{key}.{name}" if key else str(name)
-            yield from differences(old.get(name, _MISSING), new.get(name, _MISSING), inner)
-    elif isinstance(old, list) and isinstance(new, list) and _of_mappings(old, new):
-        for index in range(max(len(old), len(new))):
-            before, after = (part[index] if index < len(part) else _MISSING for part in (old, new))
-            yield from differences(before, after, f"{key}[{index}]")
-    elif old != new:
-        yield key, _shown_value(old, key), _shown_value(new, key)
-
-
-def format_differences(old: Any, new: Any, key: str = "") -> str:
-    """Format differences, one a line, indented, at most `MOST_CHANGES`; empty if there are none."""
-    found = list(differences(old, new, key))
-    lines = [f"\n  {name}: {before} -> {after}" for name, before, after in found[:MOST_CHANGES]]
-    if len(found) > MOST_CHANGES:
-        lines.append(f"\n  and {len(found) - MOST_CHANGES} more")
-    return "".join(lines)
-
-
-def _of_mappings(*lists: list[Any]) -> bool:
-    return any(isinstance(item, dict) for part in lists for item in part)
-
-
-def _shown_value(value: Any, key: str) -> str:
-    if value is _MISSING:
-        return "not there"
-    return "null" if value is None else shown(value, key)
 
 
 def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:

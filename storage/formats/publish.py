@@ -33,7 +33,16 @@ from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import CHECKSUMS, DATA, PROVENANCE
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, STORE, SYNC, Campaign
+from sliplab.storage.trials.registration import copy_registrations
+from sliplab.storage.trials.store import (
+    INFO,
+    PROTOCOL,
+    REGISTRATIONS,
+    RIG,
+    STORE,
+    SYNC,
+    Campaign,
+)
 
 CROISSANT, RO_CRATE, CARD, SUMS = (
     "croissant.json", "ro-crate-metadata.json", "README.md", "checksums.sha256"
@@ -110,6 +119,7 @@ def _copy_campaign(campaign: Campaign, folder: Path) -> None:
     for name in (INFO, PROTOCOL, RIG, CHECKSUMS):
         if (campaign.folder / name).is_file():
             shutil.copyfile(campaign.folder / name, target / name)
+    copy_registrations(campaign, target / REGISTRATIONS)
 
 
 def _copy_trial(

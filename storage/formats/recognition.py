@@ -74,6 +74,7 @@ from sliplab.storage.formats.ros_bags import (
 )
 from sliplab.storage.formats.unread import unread
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import REGISTRATIONS
 from sliplab.storage.trials.superblock import SIGNATURE
 
 Reader = Callable[[Path, str], ForeignTrial]
@@ -222,6 +223,7 @@ def skipped_in(path: Path, kind: str) -> list[Skipped]:
     manifest = _read_manifest(path) if kind != LAB_PICKLES else None
     taken: set[str | None] = {EXPORT_MANIFEST}
     if manifest is not None:
+        taken.add(REGISTRATIONS)
         taken |= {item["file"] for item in manifest["trials"]}
         other = f"is not in {EXPORT_MANIFEST}"
     else:

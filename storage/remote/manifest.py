@@ -2,7 +2,8 @@
 
     URL/sliplab.json                         version of this layout
     URL/campaigns/NAME/objects/SHA256        files by their content, written once, never changed
-    URL/campaigns/NAME/about.json            manifest of campaign.json, protocol, rig file, bench
+    URL/campaigns/NAME/about.json            manifest of campaign.json, protocol, rig file, bench,
+                                             registrations
     URL/campaigns/NAME/trials/ID.json        manifest of a committed trial, written after its files
     URL/campaigns/NAME/quarantine/ID.N.json  manifest of a quarantined folder, where asked for
     URL/campaigns/NAME/withdrawn/TAKE.json   mark: the recording TAKE of a trial is not wanted any
@@ -39,7 +40,16 @@ from sliplab.storage.trials.checksums import (
     read_sums,
 )
 from sliplab.storage.trials.control import SKIPPED
-from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError
+from sliplab.storage.trials.registration import FILE
+from sliplab.storage.trials.store import (
+    CAUSE,
+    INFO,
+    PROTOCOL,
+    REGISTRATIONS,
+    RIG,
+    Campaign,
+    StoreError,
+)
 
 Kind = Literal["about", "trials", "quarantine", "withdrawn"]
 FORMAT = 1
@@ -55,7 +65,7 @@ ALLOWED: Mapping[Kind, frozenset[str]] = {
     "quarantine": NEEDED["trials"] | {FRAMES, CAUSE, SPOOL},
     "withdrawn": frozenset(),
 }
-_BENCH = re.compile(r"bench/\d{4,8}\.json")
+_NUMBERED = re.compile(rf"bench/\d{{4,8}}\.json|{REGISTRATIONS}/{FILE.pattern}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _MOST_FILES = 10_000
 _SUMS_BYTES = 1 << 16
@@ -146,7 +156,7 @@ def _allowed(path: str, kind: Kind) -> bool:
     """Return whether a file of this name may be in a manifest of a kind."""
     further = is_stream_file(path)
     if kind == "about":
-        further = _BENCH.fullmatch(path) is not None
+        further = _NUMBERED.fullmatch(path) is not None
     return path in ALLOWED[kind] or (further and kind != "withdrawn")
 
 
@@ -245,8 +255,9 @@ def campaign_manifest(campaign: Campaign) -> Manifest:
     files = {name: sums[name] for name in (PROTOCOL, RIG, INFO)}
     more = [CHECKSUMS]
     more += [name for name in (SKIPPED, CHOICES, STOPPING) if (folder / name).exists()]
-    bench = sorted(f"bench/{path.name}" for path in (folder / "bench").glob("*.json"))
-    more += filter(_BENCH.fullmatch, bench)
+    for below in ("bench", REGISTRATIONS):
+        found = sorted(f"{below}/{path.name}" for path in (folder / below).glob("*"))
+        more += filter(_NUMBERED.fullmatch, found)
     return Manifest("about", campaign.name, "", files | _measured(folder, more))
 
 

@@ -43,7 +43,7 @@ from sliplab.storage.trials.checksums import (
     to_fetch,
 )
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import INFO, Campaign, Store
+from sliplab.storage.trials.store import INFO, REGISTRATIONS, Campaign, Store
 
 ORIGIN = "origin.json"
 """In a store that was pulled: its URL."""
@@ -279,8 +279,9 @@ class _Pull:
         for name in _FOLDERS:
             make_folder(self.campaign.inside(folder / name))
         lacks = [name for name, known in about.files.items() if known.problem(folder / name)]
-        for name in [name for name in lacks if name.startswith("bench/") and self.follows]:
-            if (folder / name).exists():  # records of sessions are never changed: it is our own
+        numbered = tuple(f"{below}/" for below in ("bench", REGISTRATIONS))
+        for name in [name for name in lacks if name.startswith(numbered) and self.follows]:
+            if (folder / name).exists():  # such a file is never changed: it is our own
                 self.done.problems.append(
                     f"{folder / name}: differs from that at {self.remote.url}, and is left as it is"
                 )
@@ -305,6 +306,7 @@ class _Pull:
             sync_folder(folder)
         # a campaign that has no description yet has not begun
         for name in sorted(files, key=lambda name: (name == CHECKSUMS, name == INFO)):
+            make_folder(self.campaign.inside(folder / name).parent)
             write_bytes(folder / name, files[name])
             self._count(len(files[name]))
 

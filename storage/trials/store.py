@@ -6,6 +6,7 @@
     STORE/campaigns/NAME/incoming/ID/    the trial being written
     STORE/campaigns/NAME/quarantine/     attempts that are no trials, each with its cause
     STORE/campaigns/NAME/bench/          who stood at the rig, one file a session
+    STORE/campaigns/NAME/registrations/  what was registered before the first trial, one file a time
     STORE/campaigns/NAME/skipped.json    trials that a person skipped (`storage.trials.control`)
     STORE/control/                       requests of people (`storage.trials.control`)
     STORE/review/                        decisions about labels (`storage.trials.review`)
@@ -53,6 +54,8 @@ SYNC = "sync"
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
+REGISTRATIONS = "registrations"
+"""Folder of a campaign's registrations (`storage.trials.registration`)."""
 IMPORTED: Final = "imported"
 """Key of a campaign's description: where its trials come from, if they were imported."""
 ADAPTER = "adapter"
@@ -120,7 +123,12 @@ class QuarantineEntry(TypedDict):
 
 
 class SessionRecord(TypedDict):
-    """Operator, devices and versions of one session."""
+    """Operator, devices and versions of one session.
+
+    Attributes:
+        registration: SHA-256 of the campaign's last registration, if there was one.
+        no_stopping: the protocol's claims were not to end the campaign.
+    """
 
     began: str
     operator: str
@@ -133,6 +141,8 @@ class SessionRecord(TypedDict):
     calibration: Json
     skin_age_days: int | None
     simulated: bool
+    registration: NotRequired[str]
+    no_stopping: NotRequired[bool]
 
 
 @dataclass(frozen=True)
@@ -173,7 +183,7 @@ class Campaign:
     @property
     def begun(self) -> bool:
         """True once something was collected into it, or could have been."""
-        return (self.folder / INFO).exists() or any(self._folders("trials"))
+        return (self.folder / INFO).exists() or any(self.folders("trials"))
 
     @property
     def protocol_file(self) -> Path:
@@ -211,7 +221,7 @@ class Campaign:
 
     def damaged(self) -> dict[str, str]:
         """Return folders among the committed trials that are incomplete, and why."""
-        found = {path.name: incomplete(path) for path in self._folders("trials")}
+        found = {path.name: incomplete(path) for path in self.folders("trials")}
         return {name: cause for name, cause in found.items() if cause is not None}
 
     def recordings(self) -> Iterator[Recording]:
@@ -262,19 +272,19 @@ class Campaign:
         Returns:
             The number of folders that went to quarantine.
         """
-        for folder in (self.folder, self.folder / "bench"):
+        for folder in (self.folder, self.folder / "bench", self.folder / REGISTRATIONS):
             sweep_temporary(folder)
-        left = dict.fromkeys(self._folders("incoming"), "interrupted")
+        left = dict.fromkeys(self.folders("incoming"), "interrupted")
         for name, cause in self.damaged().items():
             left[self.folder / "trials" / name] = f"damaged: {cause}"
-        moving = [path for path in self._folders("trials") if (path / CAUSE).exists()]
+        moving = [path for path in self.folders("trials") if (path / CAUSE).exists()]
         left |= dict.fromkeys(moving, "interrupted")
         for path, cause in left.items():
             if known_cause(path) is None:
                 self.quarantine(path, cause)
             else:  # a killed program was about to move it
                 self._move_to_quarantine(path)
-        for path in self._folders("quarantine"):
+        for path in self.folders("quarantine"):
             sweep_temporary(path)
         return len(left)
 
@@ -302,7 +312,7 @@ class Campaign:
     def quarantined(self) -> list[QuarantineEntry]:
         """Return cause, trial and folder of everything in quarantine."""
         causes: list[QuarantineEntry] = []
-        for path in self._folders("quarantine"):
+        for path in self.folders("quarantine"):
             known = {"cause": "unknown", **(known_cause(path) or {})}
             trial_id = path.name.rpartition(".")[0]
             entry = {**known, "trial": trial_id, "folder": path.name}
@@ -347,7 +357,8 @@ class Campaign:
         """Return the path of a trial's clocks that were fitted again, if there are any."""
         return self.sync_folder / f"{trial_id}.json"
 
-    def _folders(self, name: str) -> Iterator[Path]:
+    def folders(self, name: str) -> Iterator[Path]:
+        """Yield the folders in one of the campaign's own, by name; links are left out."""
         folder = self.folder / name
         if folder.is_dir():
             for path in sorted(folder.iterdir()):
@@ -355,7 +366,7 @@ class Campaign:
                     yield path
 
     def _complete(self) -> Iterator[Path]:
-        return (path for path in self._folders("trials") if incomplete(path) is None)
+        return (path for path in self.folders("trials") if incomplete(path) is None)
 
     def inside(self, path: Path) -> Path:
         """Return `path`; raise `StoreError` if a link on the way leads out of the store."""

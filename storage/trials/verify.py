@@ -38,11 +38,13 @@ from sliplab.storage.trials.checksums import (
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import COLUMNS, INDEX, STREAM_GROUP, TIMING, TRACKS
 from sliplab.storage.trials.lock import STORE_LOCK, current_holder
+from sliplab.storage.trials.registration import registration_files, registration_problems
 from sliplab.storage.trials.store import (
     CAUSE,
     IMPORTED,
     INFO,
     PROTOCOL,
+    REGISTRATIONS,
     RIG,
     Campaign,
     Store,
@@ -230,6 +232,8 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
 
     folder, found = campaign.folder, []
     if not campaign.begun:
+        if registration_files(campaign):  # before its first trial
+            return _registered(campaign)
         return [problem(folder, "is a campaign without any trial yet", UNFINISHED)]
     for name in _FOLDERS:
         if (folder / name).is_symlink() or not (folder / name).is_dir():
@@ -256,11 +260,21 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
             continue
         if name in sums and (wrong := sums[name].problem(path)) is not None:
             found.append(problem(path, f"{wrong}; `sliplab collect` writes it again"))
+    found += _registered(campaign)
     return found + [
         Problem(item.path, item.what, item.kind, campaign.name)
         for place in (folder, folder / "bench")
         for item in _temporary(place, campaign.name)
     ]
+
+
+def _registered(campaign: Campaign) -> list[Problem]:
+    """Check a campaign's registrations."""
+    found = [
+        Problem(str(path), what, DAMAGED, campaign.name)
+        for path, what in registration_problems(campaign)
+    ]
+    return found + _temporary(campaign.folder / REGISTRATIONS, campaign.name)
 
 
 def _temporary(folder: Path, campaign: str) -> list[Problem]:

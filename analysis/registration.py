@@ -1,0 +1,253 @@
+"""Deviations of a campaign from its first registration, found in the store alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.protocols.claims import Claim
+from sliplab.protocols.differences import comparable_collection, differences
+from sliplab.protocols.hashing import hash_text
+from sliplab.protocols.plan import Plan, parse_plan
+from sliplab.protocols.yaml_file import parse_yaml, read_text, without_secrets
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json
+from sliplab.storage.schema.claims import STOPPING, StoppingRecord
+from sliplab.storage.schema.registration import Registration
+from sliplab.storage.schema.trial import Provenance
+from sliplab.storage.trials.control import skipped
+from sliplab.storage.trials.store import AGAIN, RIG, QuarantineEntry
+from sliplab.storage.versions import FIGURES, installed_versions
+
+_NONE = "–"
+
+
+class Deviation(NamedTuple):
+    """One difference between a registration and its campaign, as text."""
+
+    what: str
+    registered: str
+    found: str
+
+
+def registered_plan(registration: Registration, path: Path) -> Plan:
+    """Expand the registered protocol. Raises InputError where this version cannot read it."""
+    protocol = registration.protocol
+    return parse_plan(protocol.text, path, protocol.enabled, stored=True)
+
+
+def protocol_deviations(
+    registration: Registration, path: Path, plan: Plan, text: str
+) -> Iterator[Deviation]:
+    """Yield what another protocol has that the registered one has not, and the reverse.
+
+    Args:
+        path: of the registration; text: of the other protocol, its template written out.
+    """
+    hashes = [f"SHA-256 {hash_text(each)}" for each in (registration.protocol.text, text)]
+    if hashes[0] != hashes[1]:
+        yield Deviation("text of the protocol", *hashes)
+    before = registered_plan(registration, path)
+    was, now = comparable_collection(before), comparable_collection(plan)
+    was.pop("stopping", None)
+    stopping = now.pop("stopping", None)
+    for change in differences(was, now, "collection"):
+        yield Deviation(*change)
+    yield from _claim_deviations(before, plan)
+    limits = [_without_claims(each) for each in (registration.stopping, stopping)]
+    for key, *values in differences(*limits, "collection.stopping"):
+        name = "error level of claims: " if key.endswith(".error") else ""
+        yield Deviation(name + key, *values)
+    analysis = plan.protocol.analysis.model_dump(mode="json")
+    for change in differences(registration.analysis, analysis, "analysis"):
+        yield Deviation(*change)
+
+
+def _without_claims(stopping: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {key: value for key, value in (stopping or {}).items() if key != "claims"}
+
+
+def _claim_deviations(before: Plan, plan: Plan) -> Iterator[Deviation]:
+    """Yield claims that were removed, changed or added."""
+    removed, added = ([*_claims(each)] for each in (before, plan))
+    for claim in [each for each in removed if each in added]:
+        removed.remove(claim)
+        added.remove(claim)
+    for claim in removed:
+        subject = (claim.figure, claim.of, claim.between)
+        other = next((it for it in added if (it.figure, it.of, it.between) == subject), None)
+        if other is None:
+            yield Deviation("claim removed", _claim_text(claim, before), _NONE)
+        else:
+            added.remove(other)
+            yield Deviation("claim changed", _claim_text(claim, before), _claim_text(other, plan))
+    for claim in added:
+        yield Deviation("claim added", _NONE, _claim_text(claim, plan))
+
+
+def _claims(plan: Plan) -> tuple[Claim, ...]:
+    stopping = plan.protocol.collection.stopping
+    return () if stopping is None else stopping.claims
+
+
+def _claim_text(claim: Claim, plan: Plan) -> str:
+    return claim.text(plan.protocol.collection.all_factors)
+
+
+def campaign_deviations(
+    item: Collected, registration: Registration, path: Path
+) -> Iterator[Deviation]:
+    """Yield every difference of a campaign from a registration, in the order of the work.
+
+    Raises:
+        InputError: the registered protocol cannot be read by this version.
+        StoreError: a record that is needed is damaged.
+    """
+    text = read_text(item.campaign.protocol_file, "protocol")
+    yield from protocol_deviations(registration, path, item.plan, text)
+    enabled = tuple(item.info.get("enabled", ()))
+    if enabled != registration.protocol.enabled:
+        yield _changed("enabled levels", registration.protocol.enabled, enabled)
+    yield from _rig_deviations(item, registration)
+    yield from _trial_deviations(item, registration, registered_plan(registration, path))
+    yield from _attempt_deviations(item)
+    yield from _stopping_deviations(item, registration)
+    yield from _version_deviations(item, registration)
+
+
+def _changed(what: str, old: Iterable[str], new: Iterable[str]) -> Deviation:
+    return Deviation(what, ", ".join(old) or _NONE, ", ".join(new) or _NONE)
+
+
+def _rig_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
+    rig = registration.rig
+    if rig is None or rig.sha256 == item.info.get("rig_hash"):
+        return
+    yield Deviation(
+        "rig file", f"{rig.name}, SHA-256 {rig.sha256}",
+        f"{item.info.get('rig')}, SHA-256 {item.info.get('rig_hash')}",
+    )  # fmt: skip
+    texts = (rig.text, read_text(item.campaign.folder / RIG, "rig file"))
+    for change in differences(*(without_secrets(parse_yaml(text, RIG)) for text in texts), "rig"):
+        yield Deviation(*change)
+
+
+def _trial_deviations(
+    item: Collected, registration: Registration, plan: Plan
+) -> Iterator[Deviation]:
+    """Yield trials that were taken before, are missing, or were not registered."""
+    began = datetime.fromisoformat(registration.registered)
+    early = [
+        trial.id for trial, recording in item.trials
+        if (when := item.campaign.provenance(recording).started) is not None
+        and datetime.fromisoformat(when) < began
+    ]  # fmt: skip
+    taken = registration.taken
+    if early or taken.committed or taken.attempts:
+        found = f"registered {registration.after}"
+        if early:
+            found += f"; {_listed(early, 'trials')} began before that time"
+        yield Deviation("trials taken before the registration", _NONE, found)
+    planned, committed = {trial.id for trial in plan}, item.campaign.committed()
+    more = sorted(committed - planned)
+    if more:
+        yield Deviation(
+            "more trials than registered", f"{len(planned)} trials", _listed(more, "others")
+        )
+    missing = len(planned - committed)
+    if missing:
+        ended = _verdict(item) in ("settled", "most")
+        yield Deviation(
+            "fewer trials than registered", f"{len(planned)} trials",
+            f"{len(planned) - missing}"
+            + ("; the campaign was ended by its claims" if ended else ""),
+        )  # fmt: skip
+
+
+def _listed(names: Sequence[str], what: str) -> str:
+    return f"{len(names)} {what}: {'; '.join(names)}"
+
+
+def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
+    """Yield trials that were skipped, set aside or retaken, each with its cause."""
+    for trial, by in sorted(skipped(item.campaign).items()):
+        yield Deviation("trial skipped", _NONE, f"{trial}: {_by(by)}")
+    kinds: dict[str, list[QuarantineEntry]] = {}
+    for entry in item.campaign.quarantined():
+        kinds.setdefault(str(entry["cause"]).partition(":")[0], []).append(entry)
+    for kind, entries in sorted(kinds.items()):
+        if kind == AGAIN:
+            for entry in entries:
+                by = _by(entry.get("asked", {}))
+                yield Deviation("trial retaken on request", _NONE, f"{entry['trial']}: {by}")
+        else:
+            counts = Counter(entry["trial"] for entry in entries)
+            names = [f"{name} ({n} times)" if n > 1 else name for name, n in counts.items()]
+            what = "failed a gate" if kind == "gate" else f"quarantined: {kind}"
+            yield Deviation(f"attempts {what}", _NONE, _listed(names, "trials"))
+    committed = item.campaign.committed()
+    retakes = item.plan.protocol.collection.gates.retakes
+    failed = item.campaign.failed_attempts()
+    aside = [name for name, n in failed.items() if n > retakes and name not in committed]
+    if aside:
+        yield Deviation("trials set aside", _NONE, _listed(aside, "trials"))
+
+
+def _by(by: Mapping[str, Any]) -> str:
+    """Return who asked for something, when and why."""
+    why = f" ({by['why']})" if by.get("why") else ""
+    return f"by {by.get('who') or 'unknown'}, {by.get('when') or 'at an unknown time'}{why}"
+
+
+def _record(item: Collected) -> StoppingRecord | None:
+    try:
+        return StoppingRecord.load(item.campaign.folder / STOPPING)
+    except FileNotFoundError:
+        return None
+
+
+def _verdict(item: Collected) -> str:
+    record = _record(item)
+    return "" if record is None else record.verdict
+
+
+def _stopping_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
+    """Yield sessions that overruled the claims, and another network that judged them."""
+    sessions = []
+    for file in sorted((item.campaign.folder / "bench").glob("*.json")):
+        try:
+            session = read_json(file)
+        except (OSError, ValueError) as error:
+            raise StoreError(str(error)) from None
+        if session.get("no_stopping"):
+            sessions.append(str(session.get("began")))
+    if sessions or _verdict(item) == "overruled":
+        when = f"; sessions of {', '.join(sessions)}" if sessions else ""
+        yield Deviation("stopping overruled", _NONE, f"collected with --no-stopping{when}")
+    record = _record(item)
+    if record is not None and record.model != registration.judging_model:
+        hashes = (
+            f"SHA-256 {it}" if it else _NONE for it in (registration.judging_model, record.model)
+        )
+        yield Deviation("network that judges the claims", *hashes)
+
+
+def _version_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
+    """Yield packages of another version than registered, in trials and in this report."""
+    found: dict[str, Counter[str]] = {}
+    for _, recording in item.trials:
+        provenance: Provenance = item.campaign.provenance(recording)
+        for name, version in provenance.versions.items():
+            found.setdefault(name, Counter())[version] += 1
+    here = installed_versions(FIGURES)
+    for name, registered in sorted(registration.versions.items()):
+        others = {version: n for version, n in found.get(name, {}).items() if version != registered}
+        words = [f"{version} in {n} trials" for version, n in sorted(others.items())]
+        if here.get(name, registered) != registered:
+            words.append(f"{here[name]} in this report")
+        if words:
+            yield Deviation(f"version of {name}", registered, "; ".join(words))
