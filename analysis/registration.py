@@ -34,6 +34,11 @@ class Deviation(NamedTuple):
     found: str
 
 
+def _hash(sha256: str | None) -> str:
+    """Return the first digits of a hash, which tell two files apart."""
+    return f"SHA-256 {sha256[:16]}" if sha256 else _NONE
+
+
 def registered_plan(registration: Registration, path: Path) -> Plan:
     """Expand the registered protocol. Raises InputError where this version cannot read it."""
     protocol = registration.protocol
@@ -48,7 +53,7 @@ def protocol_deviations(
     Args:
         path: of the registration; text: of the other protocol, its template written out.
     """
-    hashes = [f"SHA-256 {hash_text(each)}" for each in (registration.protocol.text, text)]
+    hashes = [_hash(hash_text(each)) for each in (registration.protocol.text, text)]
     if hashes[0] != hashes[1]:
         yield Deviation("text of the protocol", *hashes)
     before = registered_plan(registration, path)
@@ -128,8 +133,8 @@ def _rig_deviations(item: Collected, registration: Registration) -> Iterator[Dev
     if rig is None or rig.sha256 == item.info.get("rig_hash"):
         return
     yield Deviation(
-        "rig file", f"{rig.name}, SHA-256 {rig.sha256}",
-        f"{item.info.get('rig')}, SHA-256 {item.info.get('rig_hash')}",
+        "rig file", f"{rig.name}, {_hash(rig.sha256)}",
+        f"{item.info.get('rig')}, {_hash(item.info.get('rig_hash'))}",
     )  # fmt: skip
     texts = (rig.text, read_text(item.campaign.folder / RIG, "rig file"))
     for change in differences(*(without_secrets(parse_yaml(text, RIG)) for text in texts), "rig"):
@@ -230,10 +235,8 @@ def _stopping_deviations(item: Collected, registration: Registration) -> Iterato
         yield Deviation("stopping overruled", _NONE, f"collected with --no-stopping{when}")
     record = _record(item)
     if record is not None and record.model != registration.judging_model:
-        hashes = (
-            f"SHA-256 {it}" if it else _NONE for it in (registration.judging_model, record.model)
-        )
-        yield Deviation("network that judges the claims", *hashes)
+        models = (registration.judging_model, record.model)
+        yield Deviation("network that judges the claims", *map(_hash, models))
 
 
 def _version_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:

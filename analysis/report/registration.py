@@ -78,7 +78,7 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
     try:
         for path, each in registrations(item.campaign):
             stamped = ", ".join(stamp.name for stamp in stamps(path)) or "–"
-            files.append([path.name, each.registered, each.after, sha256(path), stamped])
+            files.append([path.name, each.registered[:19], each.after, stamped, sha256(path)])
             if not after:
                 after, rig = each.after, each.rig is not None
                 found += campaign_deviations(item, each, path)
@@ -88,7 +88,7 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
         found.append(Deviation("a file cannot be read", "–", str(error)))
     return Registered(
         item.name, after, rig,
-        Table(("file", "registered (UTC)", "when", "SHA-256", "stamps"), files),
+        Table(("file", "registered (UTC)", "when", "stamps", "SHA-256 of the file"), files),
         Table(("deviation", "registered", "found"), found),
     )  # fmt: skip
 

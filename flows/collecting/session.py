@@ -174,7 +174,7 @@ def _session_record(run_request: RunRequest, campaign: Campaign) -> SessionRecor
     }
     if registered := registration_files(campaign):
         record["registration"] = sha256(registered[-1])
-    if run_request.claims == "overrule":
+    if run_request.has_claims and run_request.claims == "overrule":
         record["no_stopping"] = True
     return record
 
