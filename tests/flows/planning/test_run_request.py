@@ -8,35 +8,13 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.flows.planning.run_request import (
-    MOST_CHANGES,
-    describe_campaign,
-    differences,
-    format_differences,
-    make_request,
-)
+from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.trial_files import commit
-
-
-def test_differences_name_key_old_and_new() -> None:
-    old = {"a": 1, "b": [{"c": 1}, {"c": 2}], "d": [1, 2], "e": {"f": 1}, "g": None}
-    new = {"a": 1, "b": [{"c": 1}, {"c": 3}, {"c": 4}], "d": [1, 3], "h": {"i": 1}, "g": 2}
-    assert list(differences(old, new)) == [
-        ("b[1].c", "2", "3"),
-        ("b[2]", "not there", "{c: 4}"),
-        ("d", "[1, 2]", "[1, 3]"),
-        ("e", "{f: 1}", "not there"),
-        ("g", "null", "2"),
-        ("h", "not there", "{i: 1}"),
-    ]
-    assert format_differences(old, old) == ""
-    many = {str(number): number for number in range(MOST_CHANGES + 3)}
-    assert format_differences(many, {}).endswith("\n  and 3 more")
 
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
@@ -137,13 +115,4 @@ def test_a_changed_rig_and_levels_that_are_gone_are_said(tmp_path: Path) -> None
     assert (
         "collection.factors.direction.levels: [0, 60, 120, 180, 240, 300] -> "
         "[0, 60, 120, 180, 240]" in message
-    )
-
-
-def test_a_changed_secret_is_masked() -> None:
-    old, new = ({"arm": {"password": word, "port": 1}} for word in ("hunter2", "hunter3"))
-    assert format_differences(old, new) == "\n  arm.password: **** -> ****"
-    assert (
-        format_differences({}, {"arm": new["arm"]})
-        == "\n  arm: not there -> {password: ****, port: 1}"
     )
