@@ -16,7 +16,6 @@ from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.trial_files import commit
 
-
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 

@@ -74,9 +74,7 @@ def test_later_registration_is_numbered_and_chained(tmp_path: Path) -> None:
     assert verify(Store.open(tmp_path / "store")) == []
 
 
-def test_taken_number_is_never_overwritten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_taken_number_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     where = campaign(tmp_path / "store")
     (first,) = registered(where)
     before = first.read_bytes()
