@@ -17,7 +17,7 @@ from sliplab.protocols.yaml_file import parse_yaml, read_text, without_secrets
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.claims import STOPPING, StoppingRecord
-from sliplab.storage.schema.registration import Registration
+from sliplab.storage.schema.registration import Registration, plural
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import AGAIN, RIG, QuarantineEntry
@@ -155,13 +155,13 @@ def _trial_deviations(
     if early or taken.committed or taken.attempts:
         found = f"registered {registration.after}"
         if early:
-            found += f"; {_listed(early, 'trials')} began before that time"
+            found += f"; {_listed(early, 'trial')} began before that time"
         yield Deviation("trials taken before the registration", _NONE, found)
     planned, committed = {trial.id for trial in plan}, item.campaign.committed()
     more = sorted(committed - planned)
     if more:
         yield Deviation(
-            "more trials than registered", f"{len(planned)} trials", _listed(more, "others")
+            "more trials than registered", f"{len(planned)} trials", _listed(more, "other")
         )
     missing = len(planned - committed)
     if missing:
@@ -174,7 +174,7 @@ def _trial_deviations(
 
 
 def _listed(names: Sequence[str], what: str) -> str:
-    return f"{len(names)} {what}: {'; '.join(names)}"
+    return f"{plural(len(names), what)}: {'; '.join(names)}"
 
 
 def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
@@ -193,13 +193,13 @@ def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
             counts = Counter(entry["trial"] for entry in entries)
             names = [f"{name} ({n} times)" if n > 1 else name for name, n in counts.items()]
             what = "failed a gate" if kind == "gate" else f"quarantined: {kind}"
-            yield Deviation(f"attempts {what}", _NONE, _listed(names, "trials"))
+            yield Deviation(f"attempts {what}", _NONE, _listed(names, "trial"))
     committed = item.campaign.committed()
     retakes = item.plan.protocol.collection.gates.retakes
     failed = item.campaign.failed_attempts()
     aside = [name for name, n in failed.items() if n > retakes and name not in committed]
     if aside:
-        yield Deviation("trials set aside", _NONE, _listed(aside, "trials"))
+        yield Deviation("trials set aside", _NONE, _listed(aside, "trial"))
 
 
 def _by(by: Mapping[str, Any]) -> str:
@@ -249,7 +249,7 @@ def _version_deviations(item: Collected, registration: Registration) -> Iterator
     here = installed_versions(FIGURES)
     for name, registered in sorted(registration.versions.items()):
         others = {version: n for version, n in found.get(name, {}).items() if version != registered}
-        words = [f"{version} in {n} trials" for version, n in sorted(others.items())]
+        words = [f"{version} in {plural(n, 'trial')}" for version, n in sorted(others.items())]
         if here.get(name, registered) != registered:
             words.append(f"{here[name]} in this report")
         if words:

@@ -7,6 +7,11 @@ from typing import Any
 from sliplab.storage.schema.document import Document, Int, Part
 
 
+def plural(count: int, noun: str) -> str:
+    """Return a count with its noun."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 class RegisteredProtocol(Part):
     """The protocol as it was registered."""
 
@@ -71,5 +76,5 @@ class Registration(Document):
         taken = self.taken
         if not taken.committed and not taken.attempts:
             return "before the first trial"
-        more = f" and {taken.attempts} other attempts" if taken.attempts else ""
-        return f"after {taken.committed} trials{more}"
+        more = f" and {plural(taken.attempts, 'other attempt')}" if taken.attempts else ""
+        return f"after {plural(taken.committed, 'trial')}{more}"

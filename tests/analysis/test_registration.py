@@ -197,7 +197,7 @@ def test_trials_outside_the_registered_plan_and_missing_ones_are_counted(
     (more, *_) = sorted({*ids(protocol, tmp_path)} - {*registered})
     take(where, [*registered[:3], more])
     by_name = {each.what: each for each in found(where)}
-    assert by_name["more trials than registered"].found == f"1 others: {more}"
+    assert by_name["more trials than registered"].found == f"1 other: {more}"
     fewer = by_name["fewer trials than registered"]
     assert (fewer.registered, fewer.found) == ("36 trials", "3")
 
@@ -222,7 +222,7 @@ def test_earlier_trials_and_attempts_are_listed(tmp_path: Path, protocol: Json) 
     take(where, [three])
     early = named(where)["trials taken before the registration"]
     assert early.found == (
-        f"registered after 1 trials and 1 other attempts; 1 trials: {one} began before that time"
+        f"registered after 1 trial and 1 other attempt; 1 trial: {one} began before that time"
     )
 
 
@@ -254,9 +254,10 @@ def test_skipped_retaken_and_excluded_trials_are_listed(tmp_path: Path, protocol
     listed = named(where)
     assert listed["trial skipped"].found == f"{two}: by Ada, 2026-01-01 (the skin was wet)"
     assert listed["trial retaken on request"].found.startswith(f"{one}: by Ada")
-    assert listed["attempts failed a gate"].found == f"2 trials: {three} (5 times); {four}"
-    assert listed["attempts quarantined: interrupted"].found == f"1 trials: {four}"
-    assert listed["trials set aside"].found == f"1 trials: {three}"
+    gates = "; ".join(sorted([f"{three} (5 times)", four]))
+    assert listed["attempts failed a gate"].found == f"2 trials: {gates}"
+    assert listed["attempts quarantined: interrupted"].found == f"1 trial: {four}"
+    assert listed["trials set aside"].found == f"1 trial: {three}"
 
 
 def test_overruled_stopping_is_listed_even_if_the_record_has_changed(
