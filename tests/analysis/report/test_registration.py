@@ -1,0 +1,87 @@
+"""Registrations in a report: options of the evaluation that took the place of the protocol's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.analysis.campaigns import collected
+from sliplab.analysis.report.page import render_section
+from sliplab.analysis.report.registration import registration_key, registration_section
+from sliplab.flows.planning.register import register
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.trials.store import Store
+from tests.flows.older import older_store
+
+
+def deviations(store: Store) -> dict[str, tuple[str, str]]:
+    """Registered and found by name, but for versions: the store is an older one's."""
+    section = registration_section(store, collected(store))
+    assert section is not None
+    (campaign,) = section.campaigns
+    assert campaign.after == "after 4 trials"
+    return {
+        what: (registered, found)
+        for what, registered, found in campaign.deviations.rows
+        if not what.startswith("version of ")
+    }
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store with an evaluation, registered as it is."""
+    found = Store.open(older_store(tmp_path / "store"))
+    register(found.campaign("small").protocol_file, found.folder, campaign="small")
+    return found
+
+
+def evaluated(store: Store, **changes: Any) -> None:
+    """Change the evaluation as options do."""
+    path = store.folder / "derived" / "evaluation" / "evaluation.json"
+    data = read_json(path)
+    detection = changes.pop("detection", {})
+    data["detection"]["small"] |= detection
+    write_json(path, data | changes)
+
+
+def test_evaluation_by_the_protocol_is_no_deviation(store: Store) -> None:
+    assert [*deviations(store)] == ["trials taken before the registration"]
+
+
+@pytest.mark.parametrize(
+    ("detection", "found"),
+    [({"margin": 5.0}, "smoothing 4, margin 5"), ({"smoothing": 2}, "smoothing 2, margin 8")],
+)
+def test_given_margin_or_smoothing_is_a_deviation(
+    store: Store, detection: dict[str, Any], found: str
+) -> None:
+    before = registration_key(store, collected(store))
+    evaluated(store, detection=detection)
+    listed = deviations(store)["evaluate --smoothing, --margin"]
+    assert listed == ("smoothing 4, margin 8", found)
+    assert registration_key(store, collected(store)) != before
+
+
+def test_choice_by_the_protocol_is_no_deviation(store: Store) -> None:
+    evaluated(store, detection={"margin": 5.0, "choose": "validation"})
+    assert "evaluate --smoothing, --margin" not in deviations(store)
+
+
+def test_review_decisions_are_a_deviation(store: Store) -> None:
+    evaluated(store, reviewed={"accepted": 3, "corrected": 1})
+    listed = deviations(store)["evaluate --reviewed"]
+    assert listed[1] == "review decisions are applied: 3 accepted, 1 corrected"
+
+
+def test_section_escapes_what_it_shows(store: Store) -> None:
+    campaign = store.campaign("small")
+    text = campaign.protocol_file.read_text()
+    campaign.update(campaign.info, f"{text}# <script>\n", "")
+    section = registration_section(store, collected(store))
+    assert section is not None
+    title, page = render_section(section, simulated=True)
+    assert title == "Registration, and deviations from it"
+    assert "text of the protocol" in page
+    assert "<script>" not in page
