@@ -63,8 +63,8 @@ def protocol_deviations(
     for change in differences(was, now, "collection"):
         yield Deviation(*change)
     yield from _claim_deviations(before, plan)
-    limits = [_without_claims(each) for each in (registration.stopping, stopping)]
-    for key, *values in differences(*limits, "collection.stopping"):
+    old, new = (_without_claims(each) for each in (registration.stopping, stopping))
+    for key, *values in differences(old, new, "collection.stopping"):
         name = "error level of claims: " if key.endswith(".error") else ""
         yield Deviation(name + key, *values)
     analysis = plan.protocol.analysis.model_dump(mode="json")
@@ -137,7 +137,8 @@ def _rig_deviations(item: Collected, registration: Registration) -> Iterator[Dev
         f"{item.info.get('rig')}, {_hash(item.info.get('rig_hash'))}",
     )  # fmt: skip
     texts = (rig.text, read_text(item.campaign.folder / RIG, "rig file"))
-    for change in differences(*(without_secrets(parse_yaml(text, RIG)) for text in texts), "rig"):
+    old, new = (without_secrets(parse_yaml(text, RIG)) for text in texts)
+    for change in differences(old, new, "rig"):
         yield Deviation(*change)
 
 
@@ -187,8 +188,8 @@ def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
     for kind, entries in sorted(kinds.items()):
         if kind == AGAIN:
             for entry in entries:
-                by = _by(entry.get("asked", {}))
-                yield Deviation("trial retaken on request", _NONE, f"{entry['trial']}: {by}")
+                found = f"{entry['trial']}: {_by(entry.get('asked', {}))}"
+                yield Deviation("trial retaken on request", _NONE, found)
         else:
             counts = Counter(entry["trial"] for entry in entries)
             names = [f"{name} ({n} times)" if n > 1 else name for name, n in counts.items()]

@@ -121,8 +121,8 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Collect the missing trials. Ctrl-C stops the arm; run the same command to resume."""
-    from sliplab.flows.planning.register import registration_line
     from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
+    from sliplab.flows.register import registration_line
     from sliplab.flows.running import orchestration
     from sliplab.storage.trials.store import Store
 

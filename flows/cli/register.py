@@ -49,7 +49,7 @@ def register(
     if stamp is not None:
         _attach(protocol, store, campaign, stamp, as_json)
         return
-    from sliplab.flows.planning.register import register as run
+    from sliplab.flows.register import register as run
     from sliplab.storage.files import sha256
     from sliplab.storage.trials.registration import registrations
 

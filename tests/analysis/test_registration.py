@@ -12,7 +12,7 @@ import yaml
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.registration import Deviation, campaign_deviations
-from sliplab.flows.planning.register import register
+from sliplab.flows.register import register
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
 from sliplab.storage.files import json_text, read_json, write_json

@@ -10,7 +10,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.registration import registration_key, registration_section
-from sliplab.flows.planning.register import register
+from sliplab.flows.register import register
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.store import Store
 from tests.flows.older import older_store
