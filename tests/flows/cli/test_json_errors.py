@@ -27,6 +27,7 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     # command: arguments, and the file, key and value that its error names; ROOM is a folder
     "plan": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
     "check": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
+    "register": (("ROOM/nowhere", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
     "collect": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
     **dict.fromkeys(
         (
