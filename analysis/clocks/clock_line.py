@@ -45,8 +45,7 @@ _PIECES = 4
 """
 _BEND = 2.0
 """A clock is straight where pieces explain less of the squares than this for each knot that joins
-them (Akaike 1974): of straight clocks 11 % get four pieces. A knot that stays hidden is expected to
-be as large."""
+them (Akaike 1974): of straight clocks 11 % get four pieces."""
 _MOVED_KNOTS = 4
 """Up to this number of knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
@@ -412,23 +411,20 @@ def _judged(
 ) -> ClockLine:  # fmt: skip
     """The line with its uncertainty; `at` are the knots whose places were fitted to the pulses."""
     inner, n = residuals[inside], knots.size
-    piece, share = places_of(x[inside], knots)
-    none = np.zeros(inner.size)
-    matrix = _held(normal_equations(piece, share, none, none, np.inf, np.inf, n)[0])
-    variance = float((_influence(inner, sigma) ** 2).mean())
-    variance *= inner.size / max(1, inner.size - n - at.size)
-    covariance = variance * np.linalg.inv(matrix)
-    if hidden is None:
+    if hidden is not None:
+        ends, away = hidden.covariance, hidden.bend
+    else:
+        piece, share = places_of(x[inside], knots)
+        none = np.zeros(inner.size)
+        matrix = _held(normal_equations(piece, share, none, none, np.inf, np.inf, n)[0])
+        variance = float((_influence(inner, sigma) ** 2).mean())
+        variance *= inner.size / max(1, inner.size - n - at.size)
         ends = _with_places(matrix, piece, share, np.searchsorted(knots, at)) * variance
         away = np.zeros(ends.shape[0])
-    else:
-        ends, away = hidden.covariance, hidden.bend
     count = ends.shape[0]
     root = np.zeros((count + 1, count + 1))
     root[1:, 0] = away
-    root[1:, 1:] = np.linalg.cholesky(
-        ends + (1e-12 * ends.trace() / count + 1e-6) * np.eye(count)
-    )
+    root[1:, 1:] = np.linalg.cholesky(ends + (1e-12 * ends.trace() / count + 1e-6) * np.eye(count))
     # between knots the error is no larger than at one of them
     largest = largest_sizes(_draws(count), root)
     band = float(np.partition(largest, int(0.95 * _DRAWS))[int(0.95 * _DRAWS)])
@@ -442,6 +438,7 @@ def _judged(
         to_change[here, here], to_change[here, here + 2] = 1 / run[:-1], 1 / run[1:]
         to_change[here, here + 1] = -1 / run[:-1] - 1 / run[1:]
         changed = np.abs(to_change @ values)
+        covariance = variance * np.linalg.inv(matrix)
         chance = np.sqrt(np.einsum("ij,jk,ik->i", to_change, covariance, to_change))
         spans, longest = 0.5 * (run[:-1] + run[1:]), np.maximum(run[:-1], run[1:])
         faster = np.maximum(changed - chance - bend_per_ns * spans, 0.0) * longest / 2
@@ -476,24 +473,36 @@ class _Hidden:
 def _hidden(
     x: Floats, knots: Floats, residuals: Floats, inside: Bools, sigma: float
 ) -> _Hidden | None:
-    """Judge the residuals of a straight line for a bend at one of some knots; None if there is one.
+    """Judge the residuals of a straight line for bends at even knots; None if there are some.
 
-    A bend that may be there has mean 0 and `_BEND` times the variance with which the pulses show it
-    (the g-prior of Zellner 1986); what they show of it makes the rest.
+    Which bends are hidden is judged for pieces of half the length: a bend near an end lies within
+    the first. Each bend has mean 0 and the variance with which the pulses show it; its posterior is
+    half of what they show, and half of that variance (the g-prior of Zellner 1986 with g = 1).
     """
     x, apparent = x[inside], _influence(residuals[inside], sigma)
-    piece, share = places_of(x, knots)
+    coarse, ends = _halved(knots.size)
+    finer = np.linspace(knots[0], knots[-1], coarse.shape[0])
+    piece, share = places_of(x, finer)
     none = np.zeros(x.size)
-    matrix, right = normal_equations(piece, share, apparent, none, np.inf, np.inf, knots.size)
+    matrix, right = normal_equations(piece, share, apparent, none, np.inf, np.inf, finer.size)
     variance = float((apparent**2).mean()) * x.size / max(1, x.size - 2)
-    bent = np.linalg.inv(_held(matrix))
-    bend = bent @ right
-    if float(right @ bend) > _BEND * variance * (knots.size - 2):
+    found = coarse.T @ right
+    if float(found @ np.linalg.solve(_held(coarse.T @ matrix @ coarse), found)) > (
+        _BEND * variance * (knots.size - 2)
+    ):
         return None
-    line = np.stack([np.ones(knots.size), (knots - knots[0]) / (knots[-1] - knots[0])], axis=1)
-    straight = line @ np.linalg.inv(line.T @ matrix @ line) @ line.T
-    part = _BEND / (1 + _BEND)
-    return _Hidden(part * bend, variance * (straight + part * (bent - straight)))
+    straight = ends @ np.linalg.inv(ends.T @ matrix @ ends) @ ends.T
+    bent = np.linalg.inv(_held(matrix))
+    return _Hidden(0.5 * bent @ right, 0.5 * variance * (straight + bent))
+
+
+@lru_cache(maxsize=4)
+def _halved(n: int) -> tuple[Floats, Floats]:
+    """Return what makes values at n even knots, or at both ends, values at 2 n - 1 of them."""
+    finer = np.linspace(0.0, 1.0, 2 * n - 1)
+    knots = np.linspace(0.0, 1.0, n)
+    hats = np.stack([np.interp(finer, knots, hat) for hat in np.eye(n)], axis=1)
+    return hats, np.stack([1.0 - finer, finer], axis=1)
 
 
 def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Floats:
@@ -540,4 +549,4 @@ def _locked(residuals: Floats, resolution: float) -> float:
 def _draws(n: int) -> Floats:
     """Return 1 and n normal numbers, the same at every call, (draws, 1 + n)."""
     normal = np.random.default_rng(n).standard_normal((_DRAWS, n))
-    return np.column_stack((np.ones(_DRAWS), normal))
+    return np.asfortranarray(np.column_stack((np.ones(_DRAWS), normal)))
