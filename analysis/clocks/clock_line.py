@@ -204,7 +204,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         finer = knots if locked else _cut(x[inside], knots)
         if knots.size == 2 < finer.size:
             values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _EXACTLY)
-            hidden = _hidden(x, finer, residuals, inside, sigma)
+            hidden = _hidden(x, finer.size - 1, residuals, inside, sigma)
         if hidden is None:
             values, knots = np.interp(finer, knots, values), finer
             values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _EXACTLY)
@@ -471,38 +471,39 @@ class _Hidden:
 
 
 def _hidden(
-    x: Floats, knots: Floats, residuals: Floats, inside: Bools, sigma: float
+    x: Floats, pieces: int, residuals: Floats, inside: Bools, sigma: float
 ) -> _Hidden | None:
-    """Judge the residuals of a straight line for bends at even knots; None if there are some.
+    """Judge the residuals of a straight line for bends between pieces; None if there are some.
 
-    Which bends are hidden is judged for pieces of half the length: a bend near an end lies within
-    the first. Each bend has mean 0 and the variance with which the pulses show it; its posterior is
-    half of what they show, and half of that variance (the g-prior of Zellner 1986 with g = 1).
+    Pieces have equally many pulses, so a stretch without any is in none. Which bends are hidden is
+    judged for halves of them: a bend near an end lies within the first. Each bend has mean 0 and
+    the variance with which the pulses show it; its posterior is half of what they show, and half of
+    that variance (the g-prior of Zellner 1986 with g = 1).
     """
     x, apparent = x[inside], _influence(residuals[inside], sigma)
-    coarse, ends = _halved(knots.size)
-    finer = np.linspace(knots[0], knots[-1], coarse.shape[0])
+    finer = x[np.linspace(0, x.size - 1, 2 * pieces + 1).astype(np.int64)]
     piece, share = places_of(x, finer)
     none = np.zeros(x.size)
     matrix, right = normal_equations(piece, share, apparent, none, np.inf, np.inf, finer.size)
     variance = float((apparent**2).mean()) * x.size / max(1, x.size - 2)
-    found = coarse.T @ right
-    if float(found @ np.linalg.solve(_held(coarse.T @ matrix @ coarse), found)) > (
-        _BEND * variance * (knots.size - 2)
+    hats = _between(finer[::2], finer)
+    found = hats.T @ right
+    if float(found @ np.linalg.solve(_held(hats.T @ matrix @ hats), found)) > (
+        _BEND * variance * (pieces - 1)
     ):
         return None
+    ends = _between(finer[[0, -1]], finer)
     straight = ends @ np.linalg.inv(ends.T @ matrix @ ends) @ ends.T
     bent = np.linalg.inv(_held(matrix))
     return _Hidden(0.5 * bent @ right, 0.5 * variance * (straight + bent))
 
 
-@lru_cache(maxsize=4)
-def _halved(n: int) -> tuple[Floats, Floats]:
-    """Return what makes values at n even knots, or at both ends, values at 2 n - 1 of them."""
-    finer = np.linspace(0.0, 1.0, 2 * n - 1)
-    knots = np.linspace(0.0, 1.0, n)
-    hats = np.stack([np.interp(finer, knots, hat) for hat in np.eye(n)], axis=1)
-    return hats, np.stack([1.0 - finer, finer], axis=1)
+def _between(knots: Floats, x: Floats) -> Floats:
+    """Return what makes values at x of values at knots, (x, knots)."""
+    piece, share = places_of(x, knots)
+    result, row = np.zeros((x.size, knots.size)), np.arange(x.size)
+    result[row, piece], result[row, piece + 1] = 1.0 - share, share
+    return result
 
 
 def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Floats:

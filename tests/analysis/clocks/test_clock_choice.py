@@ -25,7 +25,8 @@ BEND_PER_NS = BEND_PPM_S * 1e-15
 def pulse_times(rng: np.random.Generator, count: int) -> Floats:
     """Return times of pulses on half of the ticks, ns from the middle one."""
     ticks = np.sort(rng.permutation(2 * count)[:count])
-    return (ticks - ticks[count // 2]) * 1e7
+    times: Floats = (ticks - ticks[count // 2]) * 1e7
+    return times
 
 
 def line_of(x: Floats, y: Floats, resolution_ns: float = 0.0) -> ClockLine:
@@ -158,14 +159,13 @@ def test_what_a_straight_line_hides_is_that_of_the_whole_linear_model() -> None:
     rng = np.random.default_rng(12)
     x = pulse_times(rng, 400)
     t = (x - x[0]) / (x[-1] - x[0])
-    knots = np.linspace(x[0], x[-1], 5)
     noise = rng.normal(0, 1.0, 400)
     residuals = noise - np.polyval(np.polyfit(t, noise, 1), t)
     every = np.ones(400, np.bool_)
     # so wide that no pulse is clipped
-    found = _hidden(x, knots, residuals, every, 100.0)
+    found = _hidden(x, 4, residuals, every, 100.0)
     assert found is not None
-    places = np.linspace(0, 1, 9)
+    places = t[np.linspace(0, 399, 9).astype(np.int64)]
     design, at_knots = (
         np.stack([np.ones(at.size), at, *(np.maximum(at - k, 0) for k in places[1:-1])], axis=1)
         for at in (t, places)
@@ -181,7 +181,22 @@ def test_what_a_straight_line_hides_is_that_of_the_whole_linear_model() -> None:
     expected = variance * at_knots @ covariance @ at_knots.T
     assert found.covariance == pytest.approx(expected, rel=1e-6)
     # a bend that is plain to see is none that hides
-    assert _hidden(x, knots, residuals + 5 * t**2, every, 100.0) is None
+    assert _hidden(x, 4, residuals + 5 * t**2, every, 100.0) is None
+
+
+@pytest.mark.parametrize("lost", [(0.1, 0.35), (0.4, 0.7), (0.62, 0.95)])
+def test_a_straight_clock_is_known_where_a_stretch_of_pulses_was_lost(
+    lost: tuple[float, float],
+) -> None:
+    rng = np.random.default_rng(31)
+    for _ in range(20):
+        x = pulse_times(rng, 600)
+        share = np.arange(600) / 600
+        x = x[(share < lost[0]) | (share > lost[1])]
+        line = line_of(x, 1e-5 * x + rng.normal(0, JITTER_NS, x.size))
+        away = np.abs(line.values - 1e-5 * line.knots).max()
+        assert away <= 3 * line.uncertainty
+        assert line.uncertainty < 3 * JITTER_NS
 
 
 def test_pulses_left_out_at_an_end_turn_a_straight_line_only_beyond_chance() -> None:
