@@ -46,6 +46,8 @@ _PIECES = 4
 _BEND = 2.0
 """A clock is straight where pieces explain less of the squares than this for each knot that joins
 them (Akaike 1974): of straight clocks 11 % get four pieces."""
+_HIDDEN = 0.8
+"""Variance of a bend that a straight line hides, in that with which the pulses show it."""
 _MOVED_KNOTS = 4
 """Up to this number of knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
@@ -477,8 +479,7 @@ def _hidden(
 
     Pieces have equally many pulses, so a stretch without any is in none. Which bends are hidden is
     judged for halves of them: a bend near an end lies within the first. Each bend has mean 0 and
-    the variance with which the pulses show it; its posterior is half of what they show, and half of
-    that variance (the g-prior of Zellner 1986 with g = 1).
+    `_HIDDEN` times the variance with which the pulses show it (the g-prior of Zellner 1986).
     """
     x, apparent = x[inside], _influence(residuals[inside], sigma)
     finer = x[np.linspace(0, x.size - 1, 2 * pieces + 1).astype(np.int64)]
@@ -495,7 +496,9 @@ def _hidden(
     ends = _between(finer[[0, -1]], finer)
     straight = ends @ np.linalg.inv(ends.T @ matrix @ ends) @ ends.T
     bent = np.linalg.inv(_held(matrix))
-    return _Hidden(0.5 * bent @ right, 0.5 * variance * (straight + bent))
+    part = _HIDDEN / (1.0 + _HIDDEN)
+    covariance = variance * (straight + part * (bent - straight))
+    return _Hidden(part * bent @ right, covariance)
 
 
 def _between(knots: Floats, x: Floats) -> Floats:

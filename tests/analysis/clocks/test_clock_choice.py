@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from benchmarks.clocks import DRIFT_PPM, Train, make_train
-from sliplab.analysis.clocks.clock_line import ClockLine, _hidden, fit_line
+from sliplab.analysis.clocks.clock_line import _HIDDEN, ClockLine, _hidden, fit_line
 from sliplab.analysis.clocks.clocks import BEND_PPM_S, ClockRefused, fit_clock
 
 Floats = NDArray[np.float64]
@@ -174,7 +174,7 @@ def test_what_a_straight_line_hides_is_that_of_the_whole_linear_model() -> None:
     free = bends - line @ np.linalg.lstsq(line, bends, rcond=None)[0]
     variance = (residuals**2).mean() * 400 / 398
     prior = np.zeros((9, 9))
-    prior[2:, 2:] = free.T @ free
+    prior[2:, 2:] = free.T @ free / _HIDDEN
     covariance = np.linalg.inv(design.T @ design + prior)
     mean = covariance @ design.T @ residuals
     assert found.bend == pytest.approx(at_knots @ mean, rel=1e-6, abs=1e-9)
