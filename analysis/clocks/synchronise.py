@@ -42,7 +42,7 @@ from sliplab.storage.trials.recording import Recording
 
 I64 = npt.NDArray[np.int64]
 
-VERSION = 5
+VERSION = 6
 """Version of the fit; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
