@@ -7,7 +7,7 @@ from pathlib import Path
 from sliplab.analysis.bench.registry import SHIPPED as _SHIPPED
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_text
-from sliplab.storage.schema.bench import BenchDetector, BenchResult, MedianLatency
+from sliplab.storage.schema.bench import AlarmRate, BenchDetector, BenchResult, MedianLatency
 
 SHIPPED = tuple(_SHIPPED)
 PLOT = "bench.svg"
@@ -34,15 +34,13 @@ def rows(found: BenchResult) -> list[list[str]]:
 def _row(row: BenchDetector) -> list[str]:
     test = row.table.test
     alarms = test.false_alarms
-    nuisance = sum(it.false_alarms.alarms for it in row.nuisances.values())
-    hours = sum(it.false_alarms.hours for it in row.nuisances.values())
     return [
         row.name,
         _median(test.latency_ms),
         _median(test.latency_paper_ms),
         f"{test.missed}/{test.slides} ({test.early})",
-        f"{alarms.value:.1f} ({alarms.low:.1f} to {alarms.high:.1f})",
-        f"{nuisance / hours:.0f}/h" if hours else "–",
+        _rate(alarms, 1),
+        "–" if row.disturbed is None else _rate(row.disturbed, 0),
         "–" if row.accuracy is None else f"{100 * row.accuracy:.1f}",
         "–" if row.operations is None else f"{row.operations:,.0f}",
         "–" if row.memory_bytes is None else f"{row.memory_bytes:,}",
@@ -56,6 +54,14 @@ def _median(found: MedianLatency) -> str:
         return "–"
     low, high = ("–" if it is None else f"{it:.0f}" for it in (found.low, found.high))
     return f"{found.value:.0f} ({low} to {high})"
+
+
+def _rate(found: AlarmRate, digits: int) -> str:
+    """Return a rate with its interval; alone where so few worlds bound nothing."""
+    value = f"{found.value:.{digits}f}"
+    if found.low is None or found.high is None:
+        return value
+    return f"{value} ({found.low:.{digits}f} to {found.high:.{digits}f})"
 
 
 def write_plot(path: Path, found: BenchResult) -> None:

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from sliplab.analysis.detectors.detectors import Evidence, Predictions, Smoothing
 from sliplab.analysis.detectors.latency import TrueSlip
-from sliplab.analysis.metrics.intervals import poisson_interval
 from sliplab.analysis.stress import (
     ALL,
     Outcome,
@@ -78,13 +76,6 @@ def test_what_lies_before_an_alarm_is_forgotten() -> None:
 )
 def test_an_alarm_is_false_a_detection_or_too_late(at_ns: list[int], expected: Outcome) -> None:
     assert outcome(np.array(at_ns, np.int64), SLIP, TOLERANCE) == expected
-
-
-def test_counts_have_garwoods_interval() -> None:
-    for count in (0, 1, 7, 300):
-        low, high = poisson_interval(count)
-        assert high == pytest.approx(chi2.ppf(0.975, 2 * count + 2) / 2)
-        assert low == pytest.approx(chi2.ppf(0.025, 2 * count) / 2 if count else 0.0)
 
 
 def trial(nuisance: str = "none", strength: float = 100.0, hold_s: int = 10) -> StressTrial:
