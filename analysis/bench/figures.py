@@ -18,15 +18,16 @@ from sliplab.analysis.bench.alarms import (
     outcome,
 )
 from sliplab.analysis.bench.interface import NO_LABEL
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.metrics.intervals import median_interval, rate_interval
+from sliplab.analysis.metrics.intervals import median_interval
 from sliplab.storage.schema.bench import (
-    AlarmRate,
     BenchDetector,
     BenchPoint,
     BenchScores,
     MedianLatency,
 )
+from sliplab.storage.schema.evaluation import AlarmRate
 
 RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Asked false alarms an hour; the first one is the table's."""
@@ -111,9 +112,7 @@ def _alarm_rate(scenes: Sequence[Judged], outcomes: Sequence[Outcome]) -> AlarmR
     _, world = np.unique(_worlds(scenes), return_inverse=True)
     counts = np.bincount(world, [found.false for found in outcomes])
     times = np.bincount(world, [hours_without_slip([scene]) for scene in scenes])
-    low, high = rate_interval(counts, times) or (None, None)
-    alarms, hours = sum(found.false for found in outcomes), hours_without_slip(scenes)
-    return AlarmRate(alarms=alarms, hours=hours, value=alarms / hours, low=low, high=high)
+    return alarm_rate(counts, times)
 
 
 def accuracy(scenes: Sequence[Judged], length_us: int = 30_000) -> float | None:

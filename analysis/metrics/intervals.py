@@ -57,26 +57,29 @@ STATISTICS: Mapping[str, Callable[..., Any]] = {
 """Statistics by name; each over an axis, trials without a value left out."""
 
 
-def interval(values: Values, statistic: str = "mean") -> Span | None:
+def interval(values: Values, statistic: str = "mean", least: float = -np.inf) -> Span | None:
     """The interval of a statistic over trials: Student's of a mean, by ranks of another.
 
     Args:
-        values: (n,), one a trial.
+        values: (n,), one a trial; infinite ones have ranks and no mean.
         statistic: a name of `STATISTICS`.
+        least: the smallest value that there can be: no interval reaches below it.
 
     Returns:
         None where so few trials bound nothing: below 2, of a median 6, of a 95th percentile 72; and
         of a mean where all values are equal, so that nothing is known of their spread.
 
     Raises:
-        ValueError: a value that is not finite.
+        ValueError: NaN, or an infinite value in a mean.
     """
-    there = _checked(values)
-    if not np.isfinite(there).all():
+    there = _checked(values, infinite=statistic != "mean")
+    if np.isnan(there).any():
         raise ValueError("values must be finite")
     if statistic != "mean":
-        return _by_ranks(np.sort(there), _SHARES[statistic])
-    return mean_interval(there, np.ones(len(there)))
+        span = _by_ranks(np.sort(there), _SHARES[statistic])
+    else:
+        span = mean_interval(there, np.ones(len(there)))
+    return None if span is None else (max(span[0], least), max(span[1], least))
 
 
 def mean_interval(sums: Values, sizes: Values) -> Span | None:
@@ -178,9 +181,9 @@ def rate_interval(
 def _sum_variance(
     counts: FloatArray, exposures: FloatArray, strata: Sequence[Hashable] | None
 ) -> tuple[float, float]:
-    """Variance of a sum of counts within strata, and its degrees of freedom; 0 and 1 of single ones.
+    """Variance of a sum of counts within strata, and its degrees of freedom.
 
-    Counts may have unequal exposures.
+    Exposures may be unequal. Without two clusters of a stratum it is 0, and the freedom 1.
     """
     names = list(strata) if strata is not None else [None] * len(counts)
     seen = Counter(names)
@@ -250,21 +253,22 @@ def difference(
     Of means it is Welch's, or Student's over pairs; medians and percentiles are drawn again.
 
     Args:
-        first, second: (n,) and (m,), one value a trial; NaN where a trial has none.
+        first, second: (n,) and (m,), one value a trial; NaN where a trial has none. Infinite ones
+            have ranks and no mean.
         paired: they are of the same trials in the same order.
 
     Returns:
         None where either has too few values: 2 for a mean, 12 for a median, 72 for the 95th
-        percentile.
+        percentile; and where it is infinite.
 
     Raises:
-        ValueError: an infinite value, or paired sets of different lengths.
+        ValueError: an infinite value in a mean, or paired sets of different lengths.
     """
-    a, b = _checked(first), _checked(second)
+    a, b = (_checked(part, infinite=statistic != "mean") for part in (first, second))
     if paired and len(a) != len(b):
         raise ValueError(f"{len(a)} and {len(b)} values are no pairs")
     fewest = _FEWEST_DRAWN.get(statistic, _FEWEST)
-    if min(np.isfinite(a).sum(), np.isfinite(b).sum()) < fewest:
+    if min((~np.isnan(a)).sum(), (~np.isnan(b)).sum()) < fewest:
         return None
     if statistic == "mean":
         return _mean_difference(a, b, paired=paired)
@@ -274,7 +278,11 @@ def difference(
     with warnings.catch_warnings():  # a draw may hold only trials without a value
         warnings.simplefilter("ignore", RuntimeWarning)
         found = measure(a[of_a], axis=1) - measure(b[of_b], axis=1)
-    low, high = np.quantile(found[np.isfinite(found)], _QUANTILES)
+    found = found[~np.isnan(found)]
+    if not np.isfinite(found).all():  # between two values a quantile of infinite ones is none
+        low, high = np.quantile(found, _QUANTILES, method="inverted_cdf")
+        return (float(low), float(high)) if np.isfinite([low, high]).all() else None
+    low, high = np.quantile(found, _QUANTILES)
     return float(low), float(high)
 
 
@@ -391,8 +399,8 @@ def _at_rank(rank: float, ordered: FloatArray) -> float:
     return float(ordered[place] + part * (ordered[place + 1] - ordered[place]))
 
 
-def _checked(values: Values) -> FloatArray:
+def _checked(values: Values, *, infinite: bool = False) -> FloatArray:
     there = np.asarray(values, np.float64)
-    if there.ndim != 1 or np.isinf(there).any():
+    if there.ndim != 1 or (not infinite and np.isinf(there).any()):
         raise ValueError("values must be (n,), none of them infinite")
     return there

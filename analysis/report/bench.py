@@ -7,7 +7,8 @@ from pathlib import Path
 from sliplab.analysis.bench.registry import SHIPPED as _SHIPPED
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_text
-from sliplab.storage.schema.bench import AlarmRate, BenchDetector, BenchResult, MedianLatency
+from sliplab.storage.schema.bench import BenchDetector, BenchResult, MedianLatency
+from sliplab.storage.schema.evaluation import AlarmRate
 
 SHIPPED = tuple(_SHIPPED)
 PLOT = "bench.svg"

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
-from sliplab.analysis.report.page import Content, Table, number, percent
+from sliplab.analysis.report.page import Content, Table, percent, with_interval
 from sliplab.storage.schema.evaluation import LatencyByOnset, Share
 from sliplab.storage.schema.summary import (
     Holdout,
     HoldoutWindows,
     Kinematic,
-    Span,
     TrialIntervals,
 )
 from sliplab.storage.schema.sweeps import HoldoutResult
@@ -25,8 +25,15 @@ _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
 
 def holdout_part(found: HoldoutResult) -> Holdout:
     """Return the part of the summary: all but single trials and dates, with intervals."""
-    return Holdout(
+    scored = [row.latency for row in found.rows if row.latency is not None]
+    figures = {
         **dict(found.kinematic),
+        # results of older versions have medians without missed and late detections
+        "latency_ms": summarise_latency(scored),
+        "lead_ms": summarise_lead(scored),
+    }
+    return Holdout(
+        **figures,
         protocol_seed=found.protocol_seed,
         skin_seed=found.skin_seed,
         model=found.model,
@@ -83,9 +90,12 @@ def _rows(
     for kind, latency in (("incipient", latencies.incipient), ("gross", latencies.gross)):
         known = intervals.of(f"latency_{kind}_ms")
         for statistic in ("median", "mean"):
-            value = number(getattr(latency, statistic), 0, "ms")
-            said = _with(value, getattr(known, statistic), 0, "ms")
-            rows.append([f"{kind} latency, {statistic}", said, f"{latency.n} trials"])
+            value, span = getattr(latency, statistic), getattr(known, statistic)
+            all_of = latency.n
+            if statistic == "median":  # missed and late ones are in it
+                all_of += latency.missed + latency.late
+            said = with_interval(value, span, 0, "ms")
+            rows.append([f"{kind} latency, {statistic}", said, f"{all_of} trials"])
         counts = {word: getattr(latency, name) for name, word in _OUT.items()}
         all_of = latency.n + sum(counts.values())
         for word, count in counts.items():
@@ -95,7 +105,7 @@ def _rows(
     return rows
 
 
-def _with(value: str, span: Span | Sequence[float], digits: int, unit: str) -> str:
+def _with(value: str, span: Sequence[float] | None, digits: int, unit: str) -> str:
     if span is None:
         return value
     return f"{value} ({span[0]:.{digits}f} to {span[1]:.{digits}f} {unit})"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sliplab.analysis.report.figures import stress as figures
-from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
-from sliplab.analysis.stress import ALL
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page, with_interval
+from sliplab.analysis.stress import ALL, RULE
 from sliplab.storage.schema.evaluation import Rate
-from sliplab.storage.schema.stress import StressDetector, StressFigures, StressRecord
+from sliplab.storage.schema.stress import HourlyRate, StressDetector, StressFigures, StressRecord
 
 COLUMNS = (
     "detector", "clean trials (95 %)", "false alarms an hour (95 %)", "missed slips",
@@ -70,10 +70,21 @@ def _accuracies(
     record: StressRecord, names: Sequence[str], networks: Sequence[str]
 ) -> list[list[str]]:
     found = {(it.network, it.nuisance): it.strict for it in record.accuracy if it.strength is None}
-    return [
+    rows = [
         [name, *(_span(found.get((network, name))) for network in networks)]
         for name in [ALL, *names]
     ]
+    rules: dict[str, StressDetector] = {}  # the first of a network is its rule
+    for it in record.detectors:
+        if it.rule.startswith(RULE):
+            rules.setdefault(it.network, it)
+    for name, title in (("none", "false alarms/h, quiet"), (ALL, "false alarms/h, all trials")):
+        cells = [
+            _hourly(of(rules[it], name).per_hour) if it in rules and name in [ALL, *names] else "–"
+            for it in networks
+        ]
+        rows.append([title, *cells])
+    return rows
 
 
 def _span(rate: Rate | None) -> str:
@@ -83,5 +94,7 @@ def _span(rate: Rate | None) -> str:
     return f"{percent(rate.value)} ({low} to {high})"
 
 
-def _hourly(rate: Rate) -> str:
-    return f"{rate.value:.1f} ({rate.low:.1f} to {rate.high:.1f})"
+def _hourly(rate: HourlyRate) -> str:
+    if rate.low is None or rate.high is None:
+        return number(rate.value, 1)
+    return with_interval(rate.value, (rate.low, rate.high), 1)

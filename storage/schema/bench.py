@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+from sliplab.storage.schema.evaluation import AlarmRate
 
 
 class MedianLatency(Part):
@@ -12,20 +13,6 @@ class MedianLatency(Part):
     """
 
     value: Number | None
-    low: Number | None
-    high: Number | None
-
-
-class AlarmRate(Part):
-    """False alarms an hour without slip, with its 95 % interval over worlds.
-
-    Attributes:
-        low, high: None with one world.
-    """
-
-    alarms: Int
-    hours: Number
-    value: Number
     low: Number | None
     high: Number | None
 

@@ -292,7 +292,8 @@ class TrialScore(Part):
 class LatencyFigures(Part):
     """A latency or lead over trials, ms, of the detections that count.
 
-    n, missed, late and false_early add up to the trials.
+    n, missed, late and false_early add up to the trials. In the median missed and late ones count,
+    too: as infinitely late, and as no lead at all. It is null where it is one of these.
     """
 
     mean: Number | None
@@ -414,6 +415,19 @@ class Rate(Part):
     value: Number
     low: Number
     high: Number
+
+
+class AlarmRate(Part):
+    """False alarms an hour without slip, with its 95 % interval over trials or worlds."""
+
+    alarms: Int
+    hours: Number
+    value: Number
+    low: Number | None
+    """Null with one trial or world."""
+    high: Number | None
+    clusters: Int = 0
+    """Trials or worlds that the interval is over; 0 in older results."""
 
 
 class OnsetFigures(Part):

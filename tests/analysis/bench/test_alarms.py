@@ -92,7 +92,7 @@ def test_scenes_of_a_world_are_one_in_intervals() -> None:
     ]
     found = scores(slides, 1)
     assert (found.slides, found.worlds) == (60, 6)
-    assert (found.latency_ms.low, found.latency_ms.high) == pytest.approx((200.0, 500.0))
+    assert (found.latency_ms.low, found.latency_ms.high) == pytest.approx((100.0, 600.0))
     alone = scores([replace(one, world="") for one in slides], 1)
     assert alone.worlds == 60
     assert alone.latency_ms.high is not None

@@ -1,0 +1,28 @@
+"""Rates of false alarms, by the hour in which nothing slips."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.metrics.intervals import rate_interval
+from sliplab.storage.schema.evaluation import AlarmRate
+
+
+def alarm_rate(
+    alarms: npt.ArrayLike, hours: npt.ArrayLike, strata: Sequence[Hashable] | None = None
+) -> AlarmRate:
+    """Return a rate with its interval, over trials or worlds.
+
+    Args:
+        alarms, hours: (n,), of each trial or world; there are some hours.
+        strata: as of `rate_interval`.
+    """
+    counts, times = np.asarray(alarms, np.float64), np.asarray(hours, np.float64)
+    low, high = rate_interval(counts, times, strata) or (None, None)
+    total, time = round(float(counts.sum())), float(times.sum())
+    return AlarmRate(
+        alarms=total, hours=time, value=total / time, low=low, high=high, clusters=len(counts)
+    )
