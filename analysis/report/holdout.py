@@ -10,6 +10,7 @@ from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
 from sliplab.analysis.report.page import Content, Table, percent, with_interval
+from sliplab.analysis.report.seeds import seed_words
 from sliplab.storage.schema.evaluation import LatencyByOnset, Share
 from sliplab.storage.schema.summary import (
     Holdout,
@@ -55,12 +56,14 @@ class HoldoutSection(Content):
 
     Attributes:
         command: that measures it; file: which has the dates.
+        seeds: that were trained on the store.
     """
 
     template: ClassVar[str] = "holdout.html"
     holdout: Holdout | None
     command: str
     file: str
+    seeds: str
     table: Table | None
 
 
@@ -69,12 +72,12 @@ def holdout_section(
 ) -> HoldoutSection:
     """Compare hold-out and test trials."""
     if holdout is None:
-        return HoldoutSection(None, command, file, None)
+        return HoldoutSection(None, command, file, "", None)
     windows = {"strict": kinematic.interval, "argmax": kinematic.window_intervals["accuracy"]}
     test = _rows(windows, kinematic.latency_ms, kinematic.intervals)
     rows = [[*mine, *theirs[1:]] for mine, theirs in zip(holdout_rows(holdout), test, strict=True)]
     columns = (COLUMNS[0], "hold-out (95 %)", "n", "test trials (95 %)", "n")
-    return HoldoutSection(holdout, command, file, Table(columns, rows))
+    return HoldoutSection(holdout, command, file, seed_words(kinematic.seeds), Table(columns, rows))
 
 
 def _rows(

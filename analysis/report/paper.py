@@ -14,6 +14,7 @@ from sliplab.analysis.report.alarms import DISTURBED, QUIET, rate_words
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Table, number, percent
 from sliplab.analysis.report.published import PAPER
+from sliplab.analysis.report.seeds import seed_words
 from sliplab.storage.schema.evaluation import AlarmRate, Share
 from sliplab.storage.schema.summary import Experiment, Network, NetworkWindows, Paper, Span, Summary
 
@@ -42,7 +43,7 @@ class PaperSection(Content):
     """Return every published figure with this report's.
 
     Attributes:
-        seeds, spread: how many were trained here, and the range of their strict accuracy.
+        seeds: that were trained here, with the range of their strict accuracy.
         networks: others on the same trials: title, network and its margins.
     """
 
@@ -52,8 +53,7 @@ class PaperSection(Content):
     rows: Table
     counts: Table
     differences: Table
-    seeds: int
-    spread: str
+    seeds: str
 
 
 def paper_section(summary: Summary) -> PaperSection | None:
@@ -68,7 +68,6 @@ def paper_section(summary: Summary) -> PaperSection | None:
         for of in networks.values()
     ]
     same = list(zip(*each, strict=True))
-    strict = summary.kinematic.seeds.spread["strict"]
     differences = [[it.setting, it.paper, it.here, it.source] for it in summary.paper.differences]
     return PaperSection(
         summary.paper,
@@ -81,8 +80,7 @@ def paper_section(summary: Summary) -> PaperSection | None:
               [[of[0].name, of[0].paper, *(row.text for row in of)] for of in same]),
         Table(["figure", *networks], [[of[0].name, *(row.count for row in of)] for of in same]),
         Table(("setting", "paper", "here", "the paper's value is"), [*differences, _SCANNED]),
-        len(summary.kinematic.seeds.each),
-        f"{percent(strict.min)} to {percent(strict.max)}",
+        seed_words(summary.kinematic.seeds),
     )  # fmt: skip
 
 

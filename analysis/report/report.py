@@ -37,6 +37,7 @@ from sliplab.analysis.report.programs import (
     skin_section,
     tradeoff_section,
 )
+from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.sources import Sources
 from sliplab.analysis.report.tiles import slip_tiles
@@ -131,7 +132,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
     if collected_here:
         skins = skin_section(
             programs.get("generalisation"), command(store, "generalisation"),
-            kinematic.accuracy.strict, simulated=simulated,
+            kinematic.accuracy.strict, seed_words(kinematic.seeds), simulated=simulated,
         )  # fmt: skip
     if simulated and collected_here:
         how = command(store, "holdout")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sliplab.analysis.report.alarms import COMMAND, DISTURBED, QUIET, rate_words
 from sliplab.analysis.report.latency import smallest_lead
 from sliplab.analysis.report.page import Number, number, percent
+from sliplab.analysis.report.seeds import seed_words
 from sliplab.storage.schema.summary import Experiment, Kinematic, OneCameraSummary, Summary
 
 _BODIES = {"kinematic": "the slide", "gravity": "the plate", "disturbance": "the plate"}
@@ -46,11 +47,7 @@ def slip_tiles(summary: Summary | OneCameraSummary, note: str = "") -> list[Numb
 
 
 def _accuracy(kinematic: Kinematic) -> Number:
-    strict = kinematic.seeds.spread["strict"]
-    seeds = "one network, another seed would differ"
-    if len(kinematic.seeds.each) > 1:
-        low, high = percent(strict.min).removesuffix(" %"), percent(strict.max)
-        seeds = f"{len(kinematic.seeds.each)} seeds {low} to {high}"
+    seeds = seed_words(kinematic.seeds)
     return Number(
         "window accuracy",
         percent(kinematic.accuracy.strict),
