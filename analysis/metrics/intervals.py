@@ -279,6 +279,8 @@ def difference(
         warnings.simplefilter("ignore", RuntimeWarning)
         found = measure(a[of_a], axis=1) - measure(b[of_b], axis=1)
     found = found[~np.isnan(found)]
+    if not len(found):
+        return None
     if not np.isfinite(found).all():  # between two values a quantile of infinite ones is none
         low, high = np.quantile(found, _QUANTILES, method="inverted_cdf")
         return (float(low), float(high)) if np.isfinite([low, high]).all() else None

@@ -304,3 +304,23 @@ def test_interval_of_a_median_of_ties_holds_it(rows: list[tuple[float, int]]) ->
     middle = np.sort(values)[(len(values) - 1) // 2]
     if span is not None:
         assert span[0] <= middle <= span[1]
+
+
+def test_difference_of_medians_counts_infinite_values() -> None:
+    lost = np.r_[LATE[:150], np.full(30, np.inf)]
+    found = difference(lost, LATE, "median", paired=True)
+    assert found is not None
+    assert found[0] > 0, "as many slow ones as were lost"
+    assert difference(np.r_[LATE[:80], np.full(100, np.inf)], LATE, "median") is None
+    with pytest.raises(ValueError, match="infinite"):
+        difference(lost, LATE)
+
+
+@pytest.mark.parametrize("statistic", ["mean", "median"])
+def test_interval_stops_at_the_least_that_can_be(statistic: str) -> None:
+    values = [1.0, 2.0, 2.5, 3.0, 4.0, 90.0]
+    free = interval([value - 30 for value in values], statistic)
+    assert free is not None
+    assert free[0] < 0
+    bounded = interval([value - 30 for value in values], statistic, least=0.0)
+    assert bounded == (0.0, max(free[1], 0.0))
