@@ -10,6 +10,19 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.intervals import rate_interval
 from sliplab.storage.schema.evaluation import AlarmRate
 
+ENOUGH = 24
+"""Trials or worlds from which on intervals of rates hold, whatever the rates (`rate_interval`)."""
+
+
+def few_words(clusters: int) -> str:
+    """Return a warning where so few trials or worlds cannot bound a rate surely; else nothing."""
+    if clusters >= ENOUGH:
+        return ""
+    return (
+        f"below {ENOUGH} trials or worlds, here {clusters}, such an interval is too narrow where a "
+        "few of them have most alarms"
+    )
+
 
 def alarm_rate(
     alarms: npt.ArrayLike, hours: npt.ArrayLike, strata: Sequence[Hashable] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.metrics.alarm_rates import alarm_rate
+from sliplab.analysis.metrics.alarm_rates import alarm_rate, few_words
 from sliplab.analysis.report.page import number, with_interval
 from sliplab.analysis.stress import ALL, RULE
 from sliplab.analysis.windows.dataset import recorded_span
@@ -97,6 +97,8 @@ def alarm_words(found: dict[str, AlarmRate]) -> str:
             f"{rate_words(quiet)} in quiet holding ({quiet.alarms} in {quiet.hours:.3f} h of "
             f"{quiet.clusters} trials), "
         )
+        if few := few_words(quiet.clusters):
+            text = text.removesuffix("), ") + f"; {few}), "
     if disturbed is None:
         return text + f"not measured under nuisances ({COMMAND})"
     text += f"{rate_words(disturbed)} under nuisances"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sliplab.analysis.bench.registry import SHIPPED as _SHIPPED
+from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.schema.bench import BenchDetector, BenchResult, MedianLatency
@@ -25,6 +26,19 @@ IMAGES = "images"
 def title(found: BenchResult) -> str:
     """Return the table's title."""
     return f"bench {found.version}, {found.size}, seed {found.seed} (simulated)"
+
+
+def interval_note(found: BenchResult) -> str:
+    """Return what the intervals of the table are over, and where they may be too narrow."""
+    tests = [row.table.test for row in found.detectors]
+    rates = [row.disturbed for row in found.detectors if row.disturbed is not None]
+    disturbed = [rate.clusters for rate in rates if rate.clusters]
+    worlds = max(it.worlds for it in tests)
+    text = f"Intervals are 95 %, over {worlds} test worlds"
+    if disturbed:
+        text += f" and {max(disturbed)} with nuisances"
+    few = few_words(min([worlds, *disturbed]))
+    return f"{text}; {few}." if few else f"{text}."
 
 
 def rows(found: BenchResult) -> list[list[str]]:
@@ -97,7 +111,7 @@ def write_leaderboard(page: Path, found: BenchResult) -> None:
         f"`{command} --seed {found.seed}`, scenes of version {found.version}, **simulated**: "
         f"{found.scenes['train']} training, {found.scenes['validation']} validation and "
         f"{found.scenes['test']} test scenes, {hours['validation']:.2f} and {hours['test']:.2f} "
-        "hours without slip.",
+        f"hours without slip. {interval_note(found)}",
         "",
         *_markdown([row[:COSTS] for row in every]),
         "",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.analysis.report.figures import stress as figures
 from sliplab.analysis.report.page import Figure, Table, number, percent, render_page, with_interval
 from sliplab.analysis.stress import ALL, RULE
@@ -58,6 +59,7 @@ def render(record: StressRecord) -> str:
         detectors=Table(COLUMNS, [cells(name, of(it, ALL)) for name, it in titled]),
         clean=Figure(figures.clean_trials(titled, names, simulated=simulated)),
         best=titled[0][0],
+        few=few_words(min(of(best, name).trials for name in names)),
         by_nuisance=Table(
             ("nuisance", *COLUMNS[1:]), [cells(name, of(best, name)) for name in names]
         ),
