@@ -97,8 +97,8 @@ def _rows(
             all_of = latency.n
             if statistic == "median":  # missed and late ones are in it
                 all_of += latency.missed + latency.late
-            said = with_interval(value, span, 0, "ms")
-            rows.append([f"{kind} latency, {statistic}", said, f"{all_of} trials"])
+            text = with_interval(value, span, 0, "ms")
+            rows.append([f"{kind} latency, {statistic}", text, f"{all_of} trials"])
         counts = {word: getattr(latency, name) for name, word in _OUT.items()}
         all_of = latency.n + sum(counts.values())
         for word, count in counts.items():

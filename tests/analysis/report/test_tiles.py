@@ -1,4 +1,4 @@
-"""Headline numbers: gross slip, smallest leads, false alarms and seeds stand in them."""
+"""Headline numbers: gross slip, smallest leads, false alarms and seeds."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_tiles_name_trials_gross_detections_and_the_cost_of_accuracy() -> None:
     )
 
 
-def test_smallest_lead_is_one_trials_and_has_the_next_and_the_presets_beside_it() -> None:
+def test_smallest_lead_names_the_next_one_and_the_presets() -> None:
     said = smallest_lead(summary(QUIET, seeds(0.9)), "gravity")
     assert said == (
         "71 ms, in one trial of 4 (the next 560 ms, half above 586 ms); the paper preset 611 ms"
