@@ -181,9 +181,10 @@ def rate_interval(
 def _sum_variance(
     counts: FloatArray, exposures: FloatArray, strata: Sequence[Hashable] | None
 ) -> tuple[float, float]:
-    """Variance of a sum of counts within strata, and its degrees of freedom.
+    """Variance of a sum of counts within strata, and its degrees of freedom, 1 if there are none.
 
-    Exposures may be unequal. Without two clusters of a stratum it is 0, and the freedom 1.
+    Exposures may be unequal. A cluster that is compared with none has the variance of a Poisson
+    count.
     """
     names = list(strata) if strata is not None else [None] * len(counts)
     seen = Counter(names)
@@ -191,17 +192,18 @@ def _sum_variance(
     of: dict[Hashable, list[int]] = {}
     for place, name in enumerate(joined):
         of.setdefault(name, []).append(place)
-    parts = []
+    parts, alone = [], 0.0
     for places in of.values():
         n = len(places)
-        if n < _FEWEST:
-            continue
         here, time = counts[places], exposures[places]
+        if n < _FEWEST:
+            alone += float(here.sum())
+            continue
         apart = here - time * float(here.sum()) / float(time.sum())
         parts.append((n / (n - 1) * float((apart**2).sum()), n - 1))
     variance = sum(part for part, _ in parts)
     squares = sum(part**2 / freedom for part, freedom in parts)
-    return variance, variance**2 / squares if squares else 1.0
+    return variance + alone, variance**2 / squares if squares else 1.0
 
 
 def median_interval(values: Values, clusters: Sequence[Hashable]) -> Span | None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.metrics.alarm_rates import alarm_rate, few_words
+from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms
+from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.analysis.report.page import number, with_interval
 from sliplab.analysis.stress import ALL, RULE
-from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.storage.schema.evaluation import AlarmRate, TrialScore
 from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.streams import Json
@@ -17,7 +17,6 @@ COMMAND = "sliplab stress"
 OWN = "own"
 """Title of the store's own network in `stress.json`."""
 QUIET, UNDISTURBED, DISTURBED = "quiet", "none", "nuisances"
-_NS_PER_HOUR = 3.6e12
 
 
 def false_alarms(
@@ -27,35 +26,10 @@ def false_alarms(
     network: str,
 ) -> dict[str, Json]:
     """Return all rates of a network that are known, as plain data; see `NetworkWindows`."""
-    quiet = quiet_alarms(campaigns, rows)
+    quiet = quiet_alarms(item_trials(campaigns, rows))
     found = {} if quiet is None else {QUIET: quiet}
     found |= stress_alarms(record, network)
     return {name: rate.to_json() for name, rate in found.items()}
-
-
-def quiet_alarms(campaigns: Sequence[Collected], rows: Iterable[TrialScore]) -> AlarmRate | None:
-    """Return false early detections of slides by the hour before slip; None without such trials.
-
-    A trial has one detection: its time ends with a false one, else with the onset of its label.
-
-    Args:
-        rows: of the evaluation.
-    """
-    known = {(row.campaign, row.trial): row for row in rows}
-    alarms, hours = [], []
-    for item in campaigns:
-        if item.experiment != "kinematic":
-            continue
-        for trial, recording in item.of_split("test"):
-            row = known.get((item.name, trial.id))
-            if row is None or row.latency is None:
-                continue
-            false = row.latency.false_early_incipient
-            end_ns = row.detected_incipient_ns if false else row.incipient_ns
-            if end_ns is not None and (time := end_ns - recorded_span(recording)[0]) > 0:
-                alarms.append(int(false))
-                hours.append(time / _NS_PER_HOUR)
-    return alarm_rate(alarms, hours) if hours else None
 
 
 def stress_alarms(record: StressRecord | None, network: str) -> dict[str, AlarmRate]:

@@ -8,10 +8,11 @@ from typing import ClassVar
 
 from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.analysis.report.alarms import QUIET, rate_words
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
 from sliplab.analysis.report.page import Content, Table, percent, with_interval
 from sliplab.analysis.report.seeds import seed_words
-from sliplab.storage.schema.evaluation import LatencyByOnset, Share
+from sliplab.storage.schema.evaluation import AlarmRate, LatencyByOnset, Share
 from sliplab.storage.schema.summary import (
     Holdout,
     HoldoutWindows,
@@ -40,6 +41,7 @@ def holdout_part(found: HoldoutResult) -> Holdout:
         model=found.model,
         versions=tuple(each.version for each in found.evaluations),
         windows=HoldoutWindows.model_validate(found.windows.to_json()),
+        false_alarms=found.false_alarms,
         intervals=trial_intervals([trial_outcome(row) for row in found.rows]),
     )
 
@@ -47,7 +49,7 @@ def holdout_part(found: HoldoutResult) -> Holdout:
 def holdout_rows(holdout: Holdout) -> list[list[str]]:
     """Return figures of the hold-out campaign as rows of `COLUMNS`."""
     windows = {"strict": holdout.windows.strict, "argmax": holdout.windows.argmax}
-    return _rows(windows, holdout.latency_ms, holdout.intervals)
+    return _rows(windows, holdout.false_alarms, holdout.latency_ms, holdout.intervals)
 
 
 @dataclass(frozen=True)
@@ -74,14 +76,18 @@ def holdout_section(
     if holdout is None:
         return HoldoutSection(None, command, file, "", None)
     windows = {"strict": kinematic.interval, "argmax": kinematic.window_intervals["accuracy"]}
-    test = _rows(windows, kinematic.latency_ms, kinematic.intervals)
+    quiet = kinematic.false_alarms.get(QUIET)
+    test = _rows(windows, quiet, kinematic.latency_ms, kinematic.intervals)
     rows = [[*mine, *theirs[1:]] for mine, theirs in zip(holdout_rows(holdout), test, strict=True)]
     columns = (COLUMNS[0], "hold-out (95 %)", "n", "test trials (95 %)", "n")
     return HoldoutSection(holdout, command, file, seed_words(kinematic.seeds), Table(columns, rows))
 
 
 def _rows(
-    windows: Mapping[str, Share], latencies: LatencyByOnset, intervals: TrialIntervals
+    windows: Mapping[str, Share],
+    quiet: AlarmRate | None,
+    latencies: LatencyByOnset,
+    intervals: TrialIntervals,
 ) -> list[list[str]]:
     rows = []
     titles = {"strict": "windows right, strict", "argmax": "windows right, ties shared"}
@@ -90,6 +96,8 @@ def _rows(
         span = None if row.low is None or row.high is None else (100 * row.low, 100 * row.high)
         n = f"{row.trials} trials, {row.n} windows"
         rows.append([title, _with(percent(row.share), span, 1, "%"), n])
+    held = "–" if quiet is None else f"{quiet.clusters} trials, {quiet.hours:.3f} h"
+    rows.append(["false alarms an hour, quiet holding", rate_words(quiet), held])
     for kind, latency in (("incipient", latencies.incipient), ("gross", latencies.gross)):
         known = intervals.of(f"latency_{kind}_ms")
         for statistic in ("median", "mean"):

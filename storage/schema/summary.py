@@ -261,6 +261,8 @@ class Holdout(Part):
     skin_seed: Int
     model: str
     versions: tuple[str, ...]
+    false_alarms: AlarmRate | None = None
+    """In quiet holding."""
     windows: HoldoutWindows
     latency_ms: LatencyByOnset
     lead_ms: LeadFigures

@@ -324,3 +324,11 @@ def test_interval_stops_at_the_least_that_can_be(statistic: str) -> None:
     assert free[0] < 0
     bounded = interval([value - 30 for value in values], statistic, least=0.0)
     assert bounded == (0.0, max(free[1], 0.0))
+
+
+def test_cluster_of_a_stratum_alone_has_the_variance_of_its_count() -> None:
+    """Five alike in one condition, and one in another: Poisson's interval, no narrower."""
+    found = rate_interval([4.0] * 5 + [40.0], [0.1] * 6, ["a"] * 5 + ["b"])
+    assert found is not None
+    assert found[1] == pytest.approx(stats.chi2.ppf(0.975, 122) / 2 / 0.6)
+    assert found[0] == pytest.approx(stats.chi2.ppf(0.025, 120) / 2 / 0.6)
