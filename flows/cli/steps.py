@@ -160,7 +160,8 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
         sure = f" ({interval.low:.1%} to {interval.high:.1%} over {interval.trials} trials)"
     differ = "" if result["same_as_sinabs"] else "; a few counts may differ from Sinabs'"
     shown: dict[str, str | int] = {
-        "windows": f"{accuracy.n} of {interval.trials} trials", "engine": f"{result['engine']}{differ}",
+        "windows": f"{accuracy.n} of {interval.trials} trials",
+        "engine": f"{result['engine']}{differ}",
     }  # fmt: skip
     if accuracy.n:
         shown |= {
