@@ -18,6 +18,7 @@ from typing import Any, TypedDict
 import numpy as np
 
 from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.metrics.intervals import interval
 from sliplab.storage.schema.evaluation import (
     LatencyByOnset,
     LatencyFigures,
@@ -176,6 +177,21 @@ def median_with_lost(there: Sequence[float] | Any, lost: int, lost_ms: float) ->
     every = np.concatenate([np.asarray(there, np.float64), np.full(lost, lost_ms)])
     median = float(np.median(every)) if len(every) else np.inf
     return median if np.isfinite(median) else None
+
+
+def median_span(
+    there: Sequence[float], lost: int, lost_ms: float, least: float = -np.inf
+) -> tuple[float | None, float | None] | None:
+    """Return the interval of that median, an end None where it is infinite; None without one.
+
+    Args:
+        least: the smallest value that there can be.
+    """
+    span = interval([*there, *([lost_ms] * lost)], "median", least)
+    if span is None or not np.isfinite(span).any():
+        return None
+    low, high = (float(end) if np.isfinite(end) else None for end in span)
+    return low, high
 
 
 class Statistics(TypedDict):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.detectors.latency import median_span
 from sliplab.analysis.metrics.intervals import interval
 from sliplab.analysis.report.page import Content, Table, number
 from sliplab.protocols.settings import Detection
@@ -112,10 +113,8 @@ def trial_intervals(
         there = times(trials, name)
         least = max(LEAST[name], -early_ms)
         spans: dict[str, Span] = {kind: interval(there, kind, least) for kind in ("mean", "p95")}
-        every = [*there, *(lost_ms(name) for row in trials if is_lost(row, name))]
-        median = interval(every, "median", least)
-        ends = [value if math.isfinite(value) else None for value in median or ()]
-        spans["median"] = None if all(end is None for end in ends) else (ends[0], ends[1])
+        lost = sum(is_lost(row, name) for row in trials)
+        spans["median"] = median_span(there, lost, lost_ms(name), least)
         found[name] = TimeIntervals(n=len(there), **spans)
     return TrialIntervals(**found)
 

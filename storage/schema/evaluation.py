@@ -438,9 +438,10 @@ class OnsetFigures(Part):
     lacking: Int
     """Trials without; they are in no other figure."""
     latency_ms: LatencyByOnset
-    median_incipient_ms: tuple[Number, Number] | None
-    """95 % interval of the median incipient latency; null where so few trials bound nothing."""
-    median_gross_ms: tuple[Number, Number] | None
+    median_incipient_ms: tuple[Number | None, Number | None] | None
+    """95 % interval of the median incipient latency; null where so few trials bound nothing, an end
+    where it is infinite."""
+    median_gross_ms: tuple[Number | None, Number | None] | None
     false_early_rate: Rate | None
     """Of incipient detections; null without trials."""
     early_by_paper: Int
