@@ -19,12 +19,15 @@ import numpy.typing as npt
 
 from sliplab.analysis.bench.alarms import ALARM_US
 from sliplab.analysis.detectors.detectors import Detector, Predictions, first_above
-from sliplab.analysis.detectors.latency import TrueSlip
-from sliplab.analysis.metrics.intervals import exact_interval, poisson_interval
+from sliplab.analysis.detectors.latency import TrueSlip, median_with_lost
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
+from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.storage.schema.evaluation import Rate
-from sliplab.storage.schema.stress import StressDetector, StressFigures
+from sliplab.storage.schema.stress import HourlyRate, StressDetector, StressFigures
 
 ALL = "all"
+RULE = "rule, "
+"""Beginning of the name of a network's rule of detection among the detectors."""
 
 
 @dataclass(frozen=True)
@@ -85,29 +88,32 @@ def figures(
     nuisance: str, strength: float | None, trials: Sequence[tuple[StressTrial, Outcome]]
 ) -> StressFigures:
     """Summarise a detector's outcomes."""
-    hours = sum((t.slip.incipient_ns - t.begin_ns) for t, _ in trials) / 3.6e12
-    false = sum(it.false_alarms for _, it in trials)
+    per_hour = alarm_rate(
+        [it.false_alarms for _, it in trials],
+        [(t.slip.incipient_ns - t.begin_ns) / 3.6e12 for t, _ in trials],
+        [(t.nuisance, t.strength) for t, _ in trials],
+    )
     clean = sum(it.false_alarms == 0 and it.detected_ns is not None for _, it in trials)
-    low, high = poisson_interval(false)
     of_clean = exact_interval(clean, len(trials))
-    caught = [(t, it.detected_ns) for t, it in trials if it.detected_ns is not None]
-    true = [(ns - t.true_ns) / 1e6 for t, ns in caught if t.true_ns is not None]
+    known = [(t.true_ns, it.detected_ns) for t, it in trials if t.true_ns is not None]
     return StressFigures(
         nuisance=nuisance,
         strength=strength,
         trials=len(trials),
-        hold_h=hours,
-        false_alarms=false,
-        per_hour=Rate(value=false / hours, low=low / hours, high=high / hours),
+        hold_h=per_hour.hours,
+        false_alarms=per_hour.alarms,
+        per_hour=HourlyRate(value=per_hour.value, low=per_hour.low, high=per_hour.high),
         clean=Rate(value=clean / len(trials), low=of_clean[0], high=of_clean[1]),
         missed=sum(it.detected_ns is None for _, it in trials),
-        latency_ms=_median([(ns - t.slip.incipient_ns) / 1e6 for t, ns in caught]),
-        latency_true_ms=_median(true),
+        latency_ms=_median([(t.slip.incipient_ns, it.detected_ns) for t, it in trials]),
+        latency_true_ms=_median(known),
     )
 
 
-def _median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if values else None
+def _median(found: Sequence[tuple[int, int | None]]) -> float | None:
+    """Return the median from onsets to detections, ms; None where half of them are missed."""
+    there = [(ns - onset_ns) / 1e6 for onset_ns, ns in found if ns is not None]
+    return median_with_lost(there, len(found) - len(there), np.inf)
 
 
 def groups(

@@ -10,6 +10,7 @@ from prefect import flow
 from sliplab.analysis.campaigns import Collected, need_slip
 from sliplab.analysis.evaluation import networks
 from sliplab.analysis.evaluation.networks import Engines, Judgement, network_of
+from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms, summaries
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.trial_work import KeepTrials, Make, TrialWork
 from sliplab.flows.label import report_states
@@ -20,6 +21,7 @@ from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
 from sliplab.storage.schema.evaluation import (
     Accuracy,
+    AlarmRate,
     LatencyByOnset,
     LeadFigures,
     OtherEvaluation,
@@ -50,6 +52,7 @@ class NetworkScores(StepResult):
         same_as_sinabs: the engine gives the counts of Sinabs.
         margin: of the rule, in spikes, by campaign.
         accuracy, interval: of the sample windows.
+        false_alarms: an hour of quiet holding; None without slides.
         latency_ms: of the slides; lead_ms: of the other experiments, by name.
     """
 
@@ -60,6 +63,7 @@ class NetworkScores(StepResult):
     margin: dict[str, float]
     accuracy: Accuracy
     interval: Share
+    false_alarms: AlarmRate | None
     latency_ms: LatencyByOnset
     lead_ms: dict[str, LeadFigures]
 
@@ -95,7 +99,8 @@ def judge_model(
         )
     done = _judge(judgement, cluster)
     found = Derived.of(store, networks.STEP).load(network.name, OtherEvaluation)
-    kinematic = found.experiments["kinematic"]
+    experiments = summaries(found.trials)
+    kinematic = experiments["kinematic"]
     return {
         "step": "evaluate",
         "done": int(done),
@@ -107,11 +112,10 @@ def judge_model(
         "margin": {name: rule.margin for name, rule in judgement.rules.items()},
         "accuracy": found.windows.accuracy,
         "interval": found.windows.interval,
+        "false_alarms": quiet_alarms(item_trials(campaigns, found.trials)),
         "latency_ms": kinematic.latency_ms,
         "lead_ms": {
-            name: scores.lead_ms
-            for name, scores in found.experiments.items()
-            if name != "kinematic"
+            name: scores.lead_ms for name, scores in experiments.items() if name != "kinematic"
         },
         **report_states(labels, campaigns),
     }

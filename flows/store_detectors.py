@@ -21,6 +21,7 @@ from sliplab.analysis.networks.models import (
     training_settings,
     wanted_models,
 )
+from sliplab.analysis.stress import RULE
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
@@ -78,7 +79,7 @@ def _others(store: Store, campaigns: list[Collected]) -> Iterator[Model]:
 def _with_rule(rule: Detection) -> Tuned:
     """The protocol's rule as a detector: its level is the margin, which is enough."""
     level = float(np.nextafter(rule.margin, -np.inf))
-    return Tuned(f"rule, {rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
+    return Tuned(f"{RULE}{rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
 
 
 @dataclass(frozen=True)

@@ -202,5 +202,6 @@ def _accuracy(
         if found.share is not None and found.low is not None and found.high is not None:
             strict = Rate(value=found.share, low=found.low, high=found.high)
         yield StressAccuracy(
-            network=title, nuisance=name, strength=strength, windows=int(there.sum()), strict=strict
-        )
+            network=title, nuisance=name, strength=strength, windows=int(there.sum()),
+            trials=found.trials, strict=strict,
+        )  # fmt: skip

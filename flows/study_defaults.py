@@ -11,6 +11,8 @@ PILOT = ("pilot", "pilot_gravity")
 EXTRA = ("disturbance=125",)
 LABELS_CHECKED = 60
 """Trials whose labels by tracks a study checks with video."""
+NETWORKS = 3
+"""Networks, each of another seed, from which on a study knows by how much seeds differ."""
 HELD_OUT = 144
 """Trials that choose nothing: half of the conditions of the kinematic grid, each once."""
 

@@ -23,10 +23,11 @@ US_PER_HOUR = 3_600_000_000
 
 @dataclass(frozen=True)
 class Judged:
-    """Evidence on a scene with the truth."""
+    """Evidence on a scene with the truth, and the scene's world, empty if it shares none."""
 
     evidence: Evidence
     slip: Slip
+    world: str = ""
 
 
 @dataclass(frozen=True)

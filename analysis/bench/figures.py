@@ -18,21 +18,19 @@ from sliplab.analysis.bench.alarms import (
     outcome,
 )
 from sliplab.analysis.bench.interface import NO_LABEL
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.metrics.intervals import interval, poisson_interval
+from sliplab.analysis.metrics.intervals import median_interval
 from sliplab.storage.schema.bench import (
-    AlarmRate,
     BenchDetector,
     BenchPoint,
     BenchScores,
     MedianLatency,
 )
+from sliplab.storage.schema.evaluation import AlarmRate
 
 RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Asked false alarms an hour; the first one is the table's."""
-_MISSED_MS = 1e12
-"""Stands for an infinite latency in ranks."""
-_LONGEST_MS = 1e7
 
 
 @dataclass(frozen=True)
@@ -74,38 +72,47 @@ def tested(scenes: Sequence[Judged], levels: Sequence[Level]) -> tuple[BenchPoin
 def scores(scenes: Sequence[Judged], level: float) -> BenchScores:
     """Return the scores of scenes at a level."""
     outcomes = [outcome(scene, level) for scene in scenes]
+    worlds = _worlds(scenes)
     return BenchScores(
         slides=len(outcomes),
-        latency_ms=_median(outcomes, [it.slip.physical_us for it in outcomes]),
-        latency_paper_ms=_median(outcomes, [it.slip.paper_us for it in outcomes]),
+        worlds=len(set(worlds)),
+        latency_ms=_median(outcomes, [it.slip.physical_us for it in outcomes], worlds),
+        latency_paper_ms=_median(outcomes, [it.slip.paper_us for it in outcomes], worlds),
         missed=sum(it.detected_us is None for it in outcomes),
         early=sum(it.early for it in outcomes),
-        false_alarms=alarm_rate(sum(it.false for it in outcomes), hours_without_slip(scenes)),
+        false_alarms=_alarm_rate(scenes, outcomes),
     )
 
 
-def _median(outcomes: Sequence[Outcome], onsets_us: Sequence[int]) -> MedianLatency:
+def _worlds(scenes: Sequence[Judged]) -> list[str]:
+    """Return the world of each scene; one that shares none has its place as a name."""
+    return [scene.world or f"scene {place}" for place, scene in enumerate(scenes)]
+
+
+def _median(
+    outcomes: Sequence[Outcome], onsets_us: Sequence[int], worlds: Sequence[str]
+) -> MedianLatency:
     late = np.array(
         [
-            _MISSED_MS if it.detected_us is None else (it.detected_us - onset_us) / 1e3
+            np.inf if it.detected_us is None else (it.detected_us - onset_us) / 1e3
             for it, onset_us in zip(outcomes, onsets_us, strict=True)
         ]
     )
-    low, high = interval(late, "median") or (None, None)
+    low, high = median_interval(late, worlds) or (None, None)
     value = float(np.median(late)) if len(late) else None
     return MedianLatency(value=_finite(value), low=_finite(low), high=_finite(high))
 
 
 def _finite(value: float | None) -> float | None:
-    return value if value is not None and value < _LONGEST_MS else None
+    return value if value is not None and np.isfinite(value) else None
 
 
-def alarm_rate(alarms: int, hours: float) -> AlarmRate:
-    """Return a Poisson rate with its exact interval."""
-    low, high = poisson_interval(alarms)
-    return AlarmRate(
-        alarms=alarms, hours=hours, value=alarms / hours, low=low / hours, high=high / hours
-    )
+def _alarm_rate(scenes: Sequence[Judged], outcomes: Sequence[Outcome]) -> AlarmRate:
+    """Return the rate of false alarms with its interval over worlds."""
+    _, world = np.unique(_worlds(scenes), return_inverse=True)
+    counts = np.bincount(world, [found.false for found in outcomes])
+    times = np.bincount(world, [hours_without_slip([scene]) for scene in scenes])
+    return alarm_rate(counts, times)
 
 
 def accuracy(scenes: Sequence[Judged], length_us: int = 30_000) -> float | None:
@@ -137,7 +144,8 @@ def ranked(rows: Sequence[BenchDetector]) -> list[BenchDetector]:
     def key(row: BenchDetector) -> tuple[bool, bool, float, int, float, str]:
         point = row.table
         latency = point.test.latency_ms.value
-        broken = point.test.false_alarms.low > point.asked
+        low = point.test.false_alarms.low
+        broken = low is not None and low > point.asked
         return (
             latency is None,
             latency is not None and broken,
@@ -153,3 +161,9 @@ def ranked(rows: Sequence[BenchDetector]) -> list[BenchDetector]:
 def nuisance_scores(scenes: Mapping[str, Sequence[Judged]], level: float) -> dict[str, BenchScores]:
     """Return the scores at a level by nuisance."""
     return {name: scores(found, level) for name, found in scenes.items()}
+
+
+def disturbed_rate(scenes: Mapping[str, Sequence[Judged]], level: float) -> AlarmRate | None:
+    """Return false alarms in all scenes with nuisances at a level; None without such scenes."""
+    every = [scene for found in scenes.values() for scene in found]
+    return _alarm_rate(every, [outcome(scene, level) for scene in every]) if every else None

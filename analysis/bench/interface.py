@@ -47,6 +47,7 @@ class Scene:
         events: of the whole scene, from time 0 on.
         width, height: the sensor's pixels.
         end_us: end of the recording.
+        world: simulated rig that it shares with other scenes; empty if with none.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Scene:
     height: int
     end_us: int
     slip: Slip
+    world: str = ""
 
 
 @dataclass(frozen=True)

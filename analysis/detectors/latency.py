@@ -18,13 +18,14 @@ from typing import Any, TypedDict
 import numpy as np
 
 from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.metrics.intervals import interval
 from sliplab.storage.schema.evaluation import (
     LatencyByOnset,
     LatencyFigures,
     LeadFigures,
     TrialLatency,
 )
-from sliplab.storage.schema.label import Kind, TrialLabel
+from sliplab.storage.schema.label import KINDS, Kind, TrialLabel
 
 NEVER = int(np.iinfo(np.int64).max)
 """The time of what was not detected, where times are held in an array."""
@@ -123,23 +124,27 @@ def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> Trial
 
 
 def summarise_latency(trials: Sequence[TrialLatency]) -> LatencyByOnset:
-    """Latency over trials, of either onset."""
-    return LatencyByOnset(
-        incipient=LatencyFigures(
-            **_describe([t.latency_incipient_ms for t in trials]),
-            **_not_counted(trials, "incipient"),
-        ),
-        gross=LatencyFigures(
-            **_describe([t.latency_gross_ms for t in trials]),
-            **_not_counted(trials, "gross"),
-        ),
-    )
+    """Latency over trials, of either onset; a missed or late one is infinite in the median."""
+    counts = {kind: _not_counted(trials, kind) for kind in KINDS}
+    values = {
+        "incipient": [t.latency_incipient_ms for t in trials],
+        "gross": [t.latency_gross_ms for t in trials],
+    }
+    found = {
+        kind: LatencyFigures(**_describe(values[kind], of["missed"] + of["late"], np.inf), **of)
+        for kind, of in counts.items()
+    }
+    return LatencyByOnset(**found)
 
 
 def summarise_lead(trials: Sequence[TrialLatency]) -> LeadFigures:
-    """Lead over trials; missed, late and false early ones are those of the incipient detection."""
-    found = _describe([t.lead_ms for t in trials])
-    return LeadFigures(**found, detected_first=found["n"], **_not_counted(trials, "incipient"))
+    """Lead over trials; missed, late and false early ones are those of the incipient detection.
+
+    A missed or late one is no lead at all, below all others, in the median.
+    """
+    of = _not_counted(trials, "incipient")
+    found = _describe([t.lead_ms for t in trials], of["missed"] + of["late"], -np.inf)
+    return LeadFigures(**found, detected_first=found["n"], **of)
 
 
 def _not_counted(trials: Sequence[TrialLatency], kind: Kind) -> dict[str, int]:
@@ -167,6 +172,28 @@ def _ms(difference_ns: int) -> float:
     return int(difference_ns) / 1e6
 
 
+def median_with_lost(there: Sequence[float] | Any, lost: int, lost_ms: float) -> float | None:
+    """Return the median of values and of `lost` infinite ones; None if it is infinite."""
+    every = np.concatenate([np.asarray(there, np.float64), np.full(lost, lost_ms)])
+    median = float(np.median(every)) if len(every) else np.inf
+    return median if np.isfinite(median) else None
+
+
+def median_span(
+    there: Sequence[float], lost: int, lost_ms: float, least: float = -np.inf
+) -> tuple[float | None, float | None] | None:
+    """Return the interval of that median, an end None where it is infinite; None without one.
+
+    Args:
+        least: the smallest value that there can be.
+    """
+    span = interval([*there, *([lost_ms] * lost)], "median", least)
+    if span is None or not np.isfinite(span).any():
+        return None
+    low, high = (float(end) if np.isfinite(end) else None for end in span)
+    return low, high
+
+
 class Statistics(TypedDict):
     """Statistics of n values; None where one cannot be computed."""
 
@@ -179,11 +206,14 @@ class Statistics(TypedDict):
     n: int
 
 
-def _describe(values: Sequence[float | None]) -> Statistics:
+def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> Statistics:
     """Statistics of the values that are there; None where one cannot be computed.
 
     ``std`` is the sample standard deviation (divisor n - 1), so it needs two values; percentiles
     interpolate linearly between order statistics.
+
+    Args:
+        lost: missed or late detections, which count in the median. lost_ms: as what, infinite.
     """
     there = np.array([v for v in values if v is not None], np.float64)
     n = len(there)
@@ -192,7 +222,7 @@ def _describe(values: Sequence[float | None]) -> Statistics:
     return {
         "mean": float(there.mean()),
         "std": float(there.std(ddof=1)) if n > 1 else None,
-        "median": float(np.median(there)),
+        "median": median_with_lost(there, lost, lost_ms),
         "p95": float(np.percentile(there, 95)),
         "min": float(there.min()),
         "max": float(there.max()),

@@ -18,19 +18,20 @@ import numpy as np
 from sliplab.analysis.detectors.latency import (
     TrueSlip,
     is_false_early,
+    median_span,
     score_trial,
     slip_of,
     summarise_latency,
 )
 from sliplab.analysis.detectors.smoothing_rule import Found
 from sliplab.analysis.labels.label_errors import true_onset_ns
-from sliplab.analysis.metrics.intervals import exact_interval, interval
+from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import OnsetFigures, Rate, TrialLatency, TrialScore
-from sliplab.storage.schema.label import KINDS, RuleOnsets, TrialLabel
+from sliplab.storage.schema.label import KINDS, Kind, RuleOnsets, TrialLabel
 from sliplab.storage.trials.recording import Recording
 
-VERSION = 1
+VERSION = 2
 Name = Literal["paper", "change_point", "true"]
 NAMES: tuple[Name, ...] = ("paper", "change_point", "true")
 """`true`: the tips' physical start of sliding, of simulated trials alone."""
@@ -156,8 +157,8 @@ def _figures(decisions: Sequence[Decided], name: Name) -> OnsetFigures:
         trials=len(there),
         lacking=len(decisions) - len(there),
         latency_ms=summarise_latency(scored),
-        median_incipient_ms=_median_span([trial.latency_incipient_ms for trial in scored]),
-        median_gross_ms=_median_span([trial.latency_gross_ms for trial in scored]),
+        median_incipient_ms=_median_span(scored, "incipient"),
+        median_gross_ms=_median_span(scored, "gross"),
         false_early_rate=Rate(value=early / len(scored), low=low, high=high) if scored else None,
         early_by_paper=len(by_paper),
         not_before=sum(by_paper),
@@ -166,5 +167,9 @@ def _figures(decisions: Sequence[Decided], name: Name) -> OnsetFigures:
     )
 
 
-def _median_span(values: Sequence[float | None]) -> tuple[float, float] | None:
-    return interval([value for value in values if value is not None], "median")
+def _median_span(
+    scored: Sequence[TrialLatency], kind: Kind
+) -> tuple[float | None, float | None] | None:
+    values = [getattr(trial, f"latency_{kind}_ms") for trial in scored]
+    lost = sum(trial.uncounted[2 if kind == "incipient" else 3] for trial in scored)
+    return median_span([value for value in values if value is not None], lost, np.inf)

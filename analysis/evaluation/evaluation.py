@@ -68,7 +68,7 @@ class Job:
 
 STEP = "evaluation"
 VERSION = 4
-BY_SEED_VERSION = 1
+BY_SEED_VERSION = 2
 NAME = "evaluation"
 FORMAT = (VERSION, WINDOWS_VERSION)
 """Stands in an evaluation, so that who reads it knows that its keys are those of today."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.models import rules_of
 from sliplab.analysis.networks.quantised import Quantised, chip_run, quantised_net
@@ -30,6 +31,7 @@ from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import (
+    AlarmRate,
     ExperimentScores,
     SeedTimes,
     TrialLatency,
@@ -114,6 +116,37 @@ def summaries(
 def _scored(rows: Sequence[TrialScore], experiment: str) -> list[TrialLatency]:
     """Return the latencies of an experiment's trials that have both onsets."""
     return [row.latency for row in rows if row.experiment == experiment and row.latency is not None]
+
+
+def item_trials(
+    campaigns: Sequence[Collected], rows: Iterable[TrialScore]
+) -> Iterator[tuple[TrialScore, Recording]]:
+    """Yield rows of an evaluation with their recordings, of those test trials that are there."""
+    known = {(row.campaign, row.trial): row for row in rows}
+    for item in campaigns:
+        for trial, recording in item.of_split("test"):
+            if (item.name, trial.id) in known:
+                yield known[item.name, trial.id], recording
+
+
+def quiet_alarms(trials: Iterable[tuple[TrialScore, Recording]]) -> AlarmRate | None:
+    """Return false early detections of slides by the hour before slip; None without such trials.
+
+    A trial has one detection: its time ends with a false one, else with the onset of its label.
+
+    Args:
+        trials: rows of `score_row` with their recordings; other experiments are left out.
+    """
+    alarms, hours = [], []
+    for row, recording in trials:
+        if row.experiment != "kinematic" or row.latency is None:
+            continue
+        false = row.latency.false_early_incipient
+        end_ns = row.detected_incipient_ns if false else row.incipient_ns
+        if end_ns is not None and (time := end_ns - dataset.recorded_span(recording)[0]) > 0:
+            alarms.append(int(false))
+            hours.append(time / 3.6e12)
+    return alarm_rate(alarms, hours) if hours else None
 
 
 def latencies(

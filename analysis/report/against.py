@@ -24,6 +24,7 @@ from sliplab.analysis.metrics.intervals import (
     share_difference,
 )
 from sliplab.analysis.report.figures.intervals import differences
+from sliplab.analysis.report.outcomes import is_lost, lost_ms
 from sliplab.analysis.report.page import Figure, Number, Table, render_page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
@@ -274,9 +275,13 @@ def _of_trials(here: Summary, there: Summary, experiment: str) -> list[Change]:
             value = getattr(row, key)
             return math.nan if value is None else float(value)
 
+        def with_lost(row: TrialOutcome, key: str = key) -> float:
+            return lost_ms(key) if is_lost(row, key) else time(row, key)
+
         for statistic, word in _STATISTICS.items():
             name = f"{experiment}: {title}, {word}{who}"
-            found += _measured(name, "ms", rows, time, statistic, same)
+            value = with_lost if statistic == "median" else time
+            found += _measured(name, "ms", rows, value, statistic, same)
     for entry, outcome, title in _SHARES:
 
         def hit(row: TrialOutcome, entry: str = entry, outcome: str = outcome) -> float:
@@ -333,6 +338,8 @@ def _measured(
         return []
     measure: Callable[..., npt.NDArray[np.float64]] = STATISTICS[statistic]
     ours, theirs = float(measure(a, axis=0)), float(measure(b, axis=0))
+    if not math.isfinite(ours) or not math.isfinite(theirs):
+        return []
     span = difference(a, b, statistic, paired=same)
     return [Change.of(name, unit, ours, theirs, span, "same trials" if same else "trials")]
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from sliplab.analysis.bench.registry import SHIPPED as _SHIPPED
+from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.schema.bench import BenchDetector, BenchResult, MedianLatency
+from sliplab.storage.schema.evaluation import AlarmRate
 
 SHIPPED = tuple(_SHIPPED)
 PLOT = "bench.svg"
@@ -26,6 +28,19 @@ def title(found: BenchResult) -> str:
     return f"bench {found.version}, {found.size}, seed {found.seed} (simulated)"
 
 
+def interval_note(found: BenchResult) -> str:
+    """Return what the intervals of the table are over, and where they may be too narrow."""
+    tests = [row.table.test for row in found.detectors]
+    rates = [row.disturbed for row in found.detectors if row.disturbed is not None]
+    disturbed = [rate.clusters for rate in rates if rate.clusters]
+    worlds = max(it.worlds for it in tests)
+    text = f"Intervals are 95 %, over {worlds} test worlds"
+    if disturbed:
+        text += f" and {max(disturbed)} with nuisances"
+    few = few_words(min([worlds, *disturbed]))
+    return f"{text}; {few}." if few else f"{text}."
+
+
 def rows(found: BenchResult) -> list[list[str]]:
     """Return a row of text for each detector, the best first; see `COLUMNS`."""
     return [_row(row) for row in found.detectors]
@@ -34,15 +49,13 @@ def rows(found: BenchResult) -> list[list[str]]:
 def _row(row: BenchDetector) -> list[str]:
     test = row.table.test
     alarms = test.false_alarms
-    nuisance = sum(it.false_alarms.alarms for it in row.nuisances.values())
-    hours = sum(it.false_alarms.hours for it in row.nuisances.values())
     return [
         row.name,
         _median(test.latency_ms),
         _median(test.latency_paper_ms),
         f"{test.missed}/{test.slides} ({test.early})",
-        f"{alarms.value:.1f} ({alarms.low:.1f} to {alarms.high:.1f})",
-        f"{nuisance / hours:.0f}/h" if hours else "–",
+        _rate(alarms, 1),
+        "–" if row.disturbed is None else _rate(row.disturbed, 0),
         "–" if row.accuracy is None else f"{100 * row.accuracy:.1f}",
         "–" if row.operations is None else f"{row.operations:,.0f}",
         "–" if row.memory_bytes is None else f"{row.memory_bytes:,}",
@@ -56,6 +69,14 @@ def _median(found: MedianLatency) -> str:
         return "–"
     low, high = ("–" if it is None else f"{it:.0f}" for it in (found.low, found.high))
     return f"{found.value:.0f} ({low} to {high})"
+
+
+def _rate(found: AlarmRate, digits: int) -> str:
+    """Return a rate with its interval; alone where so few worlds bound nothing."""
+    value = f"{found.value:.{digits}f}"
+    if found.low is None or found.high is None:
+        return value
+    return f"{value} ({found.low:.{digits}f} to {found.high:.{digits}f})"
 
 
 def write_plot(path: Path, found: BenchResult) -> None:
@@ -90,7 +111,7 @@ def write_leaderboard(page: Path, found: BenchResult) -> None:
         f"`{command} --seed {found.seed}`, scenes of version {found.version}, **simulated**: "
         f"{found.scenes['train']} training, {found.scenes['validation']} validation and "
         f"{found.scenes['test']} test scenes, {hours['validation']:.2f} and {hours['test']:.2f} "
-        "hours without slip.",
+        f"hours without slip. {interval_note(found)}",
         "",
         *_markdown([row[:COSTS] for row in every]),
         "",

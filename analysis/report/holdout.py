@@ -6,15 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.analysis.report.alarms import QUIET, rate_words
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
-from sliplab.analysis.report.page import Content, Table, number, percent
-from sliplab.storage.schema.evaluation import LatencyByOnset, Share
+from sliplab.analysis.report.page import Content, Table, percent, with_interval
+from sliplab.analysis.report.seeds import seed_words
+from sliplab.storage.schema.evaluation import AlarmRate, LatencyByOnset, Share
 from sliplab.storage.schema.summary import (
     Holdout,
     HoldoutWindows,
     Kinematic,
-    Span,
     TrialIntervals,
 )
 from sliplab.storage.schema.sweeps import HoldoutResult
@@ -25,13 +27,21 @@ _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
 
 def holdout_part(found: HoldoutResult) -> Holdout:
     """Return the part of the summary: all but single trials and dates, with intervals."""
-    return Holdout(
+    scored = [row.latency for row in found.rows if row.latency is not None]
+    figures = {
         **dict(found.kinematic),
+        # results of older versions have medians without missed and late detections
+        "latency_ms": summarise_latency(scored),
+        "lead_ms": summarise_lead(scored),
+    }
+    return Holdout(
+        **figures,
         protocol_seed=found.protocol_seed,
         skin_seed=found.skin_seed,
         model=found.model,
         versions=tuple(each.version for each in found.evaluations),
         windows=HoldoutWindows.model_validate(found.windows.to_json()),
+        false_alarms=found.false_alarms,
         intervals=trial_intervals([trial_outcome(row) for row in found.rows]),
     )
 
@@ -39,7 +49,7 @@ def holdout_part(found: HoldoutResult) -> Holdout:
 def holdout_rows(holdout: Holdout) -> list[list[str]]:
     """Return figures of the hold-out campaign as rows of `COLUMNS`."""
     windows = {"strict": holdout.windows.strict, "argmax": holdout.windows.argmax}
-    return _rows(windows, holdout.latency_ms, holdout.intervals)
+    return _rows(windows, holdout.false_alarms, holdout.latency_ms, holdout.intervals)
 
 
 @dataclass(frozen=True)
@@ -48,12 +58,14 @@ class HoldoutSection(Content):
 
     Attributes:
         command: that measures it; file: which has the dates.
+        seeds: that were trained on the store.
     """
 
     template: ClassVar[str] = "holdout.html"
     holdout: Holdout | None
     command: str
     file: str
+    seeds: str
     table: Table | None
 
 
@@ -62,16 +74,20 @@ def holdout_section(
 ) -> HoldoutSection:
     """Compare hold-out and test trials."""
     if holdout is None:
-        return HoldoutSection(None, command, file, None)
+        return HoldoutSection(None, command, file, "", None)
     windows = {"strict": kinematic.interval, "argmax": kinematic.window_intervals["accuracy"]}
-    test = _rows(windows, kinematic.latency_ms, kinematic.intervals)
+    quiet = kinematic.false_alarms.get(QUIET)
+    test = _rows(windows, quiet, kinematic.latency_ms, kinematic.intervals)
     rows = [[*mine, *theirs[1:]] for mine, theirs in zip(holdout_rows(holdout), test, strict=True)]
     columns = (COLUMNS[0], "hold-out (95 %)", "n", "test trials (95 %)", "n")
-    return HoldoutSection(holdout, command, file, Table(columns, rows))
+    return HoldoutSection(holdout, command, file, seed_words(kinematic.seeds), Table(columns, rows))
 
 
 def _rows(
-    windows: Mapping[str, Share], latencies: LatencyByOnset, intervals: TrialIntervals
+    windows: Mapping[str, Share],
+    quiet: AlarmRate | None,
+    latencies: LatencyByOnset,
+    intervals: TrialIntervals,
 ) -> list[list[str]]:
     rows = []
     titles = {"strict": "windows right, strict", "argmax": "windows right, ties shared"}
@@ -80,12 +96,17 @@ def _rows(
         span = None if row.low is None or row.high is None else (100 * row.low, 100 * row.high)
         n = f"{row.trials} trials, {row.n} windows"
         rows.append([title, _with(percent(row.share), span, 1, "%"), n])
+    held = "–" if quiet is None else f"{quiet.clusters} trials, {quiet.hours:.3f} h"
+    rows.append(["false alarms an hour, quiet holding", rate_words(quiet), held])
     for kind, latency in (("incipient", latencies.incipient), ("gross", latencies.gross)):
         known = intervals.of(f"latency_{kind}_ms")
         for statistic in ("median", "mean"):
-            value = number(getattr(latency, statistic), 0, "ms")
-            said = _with(value, getattr(known, statistic), 0, "ms")
-            rows.append([f"{kind} latency, {statistic}", said, f"{latency.n} trials"])
+            value, span = getattr(latency, statistic), getattr(known, statistic)
+            all_of = latency.n
+            if statistic == "median":  # missed and late ones are in it
+                all_of += latency.missed + latency.late
+            text = with_interval(value, span, 0, "ms")
+            rows.append([f"{kind} latency, {statistic}", text, f"{all_of} trials"])
         counts = {word: getattr(latency, name) for name, word in _OUT.items()}
         all_of = latency.n + sum(counts.values())
         for word, count in counts.items():
@@ -95,7 +116,7 @@ def _rows(
     return rows
 
 
-def _with(value: str, span: Span | Sequence[float], digits: int, unit: str) -> str:
+def _with(value: str, span: Sequence[float] | None, digits: int, unit: str) -> str:
     if span is None:
         return value
     return f"{value} ({span[0]:.{digits}f} to {span[1]:.{digits}f} {unit})"

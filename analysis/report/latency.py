@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
@@ -11,15 +12,14 @@ from sliplab.analysis.metrics.intervals import difference, exact_interval, inter
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.figures.intervals import Panel, by_condition
 from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
-from sliplab.analysis.report.outcomes import OUTCOMES, TIMES, WORDS, Conditions, times
-from sliplab.analysis.report.page import Content, Figure, Table, number, percent
+from sliplab.analysis.report.outcomes import LEAST, OUTCOMES, TIMES, WORDS, Conditions, times
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent, with_interval
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
 from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.summary import (
     Accounts,
     Experiment,
     OneCameraSummary,
-    Span,
     Summary,
     TrialOutcome,
 )
@@ -64,6 +64,7 @@ class LatencySection(Content):
     Attributes:
         title: of the section.
         by: the factors by which the figures have rows.
+        smallest: lead, as text with what it is among.
         late: onset, number and range in ms of detections after their event.
         choices: how smoothing and margin were chosen.
         trends: by time, as text.
@@ -73,6 +74,7 @@ class LatencySection(Content):
     template: ClassVar[str] = "latency.html"
     experiment: str
     numbers: Experiment
+    smallest: str
     paper: Mapping[str, Published]
     paper_std_ms: float
     by: Sequence[str]
@@ -90,7 +92,7 @@ class LatencySection(Content):
     @property
     def lead_mean(self) -> str:
         """Mean lead with its interval."""
-        return _with(self.numbers.lead_ms.mean, self.numbers.intervals.lead_ms.mean, 0)
+        return with_interval(self.numbers.lead_ms.mean, self.numbers.intervals.lead_ms.mean, 0)
 
     @property
     def others(self) -> list[tuple[int, str]]:
@@ -129,7 +131,8 @@ def latency_section(
     shown = TIMES[1:3] if kinematic else TIMES
     kinds = ("incipient", "gross") if kinematic else ("incipient", "gross", "lead")
     return LatencySection(
-        experiment, numbers, PAPER, DISTURBANCE_LEAD_STD_MS, by, late,
+        experiment, numbers, smallest_lead(summary, experiment), PAPER, DISTURBANCE_LEAD_STD_MS,
+        by, late,
         sorted({choice_note(rule) for rule in rules} - {""}),
         {NAMES[name]: trends for name in shown if (trends := _trends(found, name))},
         clocks.latency_note(summary.sync, summary.labels), clocks.figure_note(summary.sync),
@@ -138,6 +141,30 @@ def latency_section(
         [] if kinematic else [_by_level(found, factor) for factor in found.varied()],
         _by_seed(numbers, kinds),
     )  # fmt: skip
+
+
+def smallest_lead(summary: Summary | OneCameraSummary, experiment: str) -> str:
+    """Return the smallest lead as text, with the next one, and that of other networks and seeds.
+
+    It is one trial's, and the figure that changes most with another network or other trials.
+    """
+    mine = [row for row in summary.trials if row.experiment == experiment]
+    leads = sorted(times(mine, "lead_ms"))
+    if not leads:
+        return number(None)
+    text = f"{leads[0]:.0f} ms, in one trial of {len(leads)}"
+    if len(leads) > 1:
+        text += f" (the next {leads[1]:.0f} ms, half above {median(leads):.0f} ms)"
+    numbers: Experiment = getattr(summary, experiment)
+    others = [(f"seed {it.seed}", it.lead_ms.min) for it in numbers.by_seed if not it.chosen]
+    if isinstance(summary, Summary):
+        others += [
+            (f"the {of.preset} preset" if of.preset else of.title,
+             getattr(of, experiment).lead_ms.min)
+            for of in summary.networks.values()
+        ]  # fmt: skip
+    known = [f"{name} {least:.0f} ms" for name, least in others if least is not None]
+    return "; ".join([text, *known])
 
 
 def choice_note(chosen_by: str) -> str:
@@ -190,7 +217,7 @@ def _draw(
         published = None if value is None else (value, said)
         values = {row: times(found, time) for row, found in groups.items()}
         notes = {row: _lacking(found, time) for row, found in groups.items()}
-        panels.append(Panel(label, values, colour, zero, published, notes))
+        panels.append(Panel(label, values, colour, zero, published, notes, LEAST[time]))
     svg = by_condition(list(groups), panels, simulated=simulated, breaks=breaks)
     trials = [(row, trial) for row, found in groups.items() for trial in found]
     data: dict[str, list[object]] = {
@@ -232,7 +259,10 @@ def _by_level(found: Conditions, factor: str) -> Table:
     for text in found.factors[factor]:
         there = found.at(**{factor: text})
         known = [times(there, name) for name in TIMES]
-        means = [_with(sum(of) / len(of) if of else None, interval(of), 0) for of in known]
+        means = [
+            with_interval(sum(of) / len(of) if of else None, interval(of, least=LEAST[name]), 0)
+            for name, of in zip(TIMES, known, strict=True)
+        ]
         rows.append([text, str(len(there)), *means])
     columns = [factor, "trials", *(f"{NAMES[name]} (ms)" for name in TIMES)]
     return Table(columns, rows, "Means with 95 % intervals over trials.")
@@ -247,7 +277,7 @@ def _statistics(numbers: Experiment, kinds: Sequence[str]) -> Table:
             name, found = f"{kind} latency", getattr(numbers.latency_ms, kind)
             spans = numbers.intervals.of(f"latency_{kind}_ms")
         cells = [
-            _with(getattr(found, key), getattr(spans, key))
+            with_interval(getattr(found, key), getattr(spans, key))
             if key in ("mean", "median", "p95")
             else number(getattr(found, key))
             for key in STATISTICS
@@ -282,10 +312,3 @@ def _accounts(experiment: str, accounts: Accounts) -> Table:
         cells.append(f"{count}{shares}")
     columns = ("trials", "planned for the test", *(WORDS[name] for name in OUTCOMES))
     return Table(columns, [[experiment, str(accounts.planned), *cells]])
-
-
-def _with(value: float | None, span: Span, digits: int = 1) -> str:
-    """Return a value with its interval."""
-    if value is None or span is None:
-        return number(value, digits)
-    return f"{value:.{digits}f} ({span[0]:.{digits}f} to {span[1]:.{digits}f})"

@@ -13,6 +13,7 @@ from sliplab.analysis.evaluation.windows import window_intervals
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import marker_net
 from sliplab.analysis.networks.marker_net import MarkerNet
+from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.latency import latency_section
 from sliplab.analysis.report.outcomes import failure_section
 from sliplab.analysis.report.page import Content, Figure, Table, percent
@@ -90,6 +91,7 @@ class MarkerNetworkSection(Content):
     classifier: MarkerClassifier
     accuracy: Accuracy
     interval: Share
+    alarms: str
     seeds: Seeds
     rules: Sequence[str]
     confusion: Figure
@@ -115,7 +117,8 @@ def _network_section(
     history = [asdict(epoch) for epoch in net.history]
     own = [percent(value) for value in (accuracy.argmax, accuracy.strict, accuracy.margin)]
     return MarkerNetworkSection(
-        summary.classifier, accuracy, kinematic.interval, kinematic.seeds,
+        summary.classifier, accuracy, kinematic.interval,
+        alarm_words(kinematic.false_alarms), kinematic.seeds,
         sorted({
             f"{_frames(rule.smoothing)} leads by {rule.margin:g} points"
             for rule in summary.detection.values()

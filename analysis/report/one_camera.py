@@ -30,7 +30,6 @@ from sliplab.analysis.report.page import (
     Number,
     Table,
     number,
-    percent,
     render_page,
 )
 from sliplab.analysis.report.registration import registration_key, registration_section
@@ -43,6 +42,7 @@ from sliplab.analysis.report.summary import (
     quality_part,
     sync_part,
 )
+from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.storage.schema.summary import Labels, MotionRate, OneCameraSummary, StepLeftOut
 from sliplab.storage.trials.derived import make_key
@@ -193,27 +193,7 @@ def headline(summary: OneCameraSummary) -> list[Number]:
         found.append(
             Number("labelled by both rules", str(both.gross.n), "trials with a known gross onset")
         )
-    if (kinematic := summary.kinematic) is not None:
-        accuracy, latency = kinematic.accuracy, kinematic.latency_ms.incipient
-        found += [
-            Number("window accuracy", percent(accuracy.strict), f"strict, n = {accuracy.n}"),
-            Number(
-                "incipient latency",
-                number(latency.median, 0, "ms"),
-                f"median of {latency.n}; {latency.missed} missed, {latency.late} late, "
-                f"{latency.false_early} false early",
-            ),
-        ]
-    if summary.gravity is not None and summary.gravity.trials:
-        lead = summary.gravity.lead_ms
-        found.append(
-            Number(
-                "gravity lead",
-                number(lead.median, 0, "ms"),
-                f"median; smallest {number(lead.min, 0, 'ms')}, n = {lead.n}, "
-                f"{lead.missed} missed, {lead.late} late",
-            )
-        )
+    found += slip_tiles(summary)
     for name, rate in (summary.event_rates or {}).items():
         found.append(
             Number(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sliplab.analysis.report.detectors import titled
-from sliplab.analysis.report.page import Content, Table, number, percent
-from sliplab.storage.schema.evaluation import LatencyFigures, OnsetFigures
+from sliplab.analysis.report.page import Content, Table, number, percent, with_interval
+from sliplab.storage.schema.evaluation import OnsetFigures
 from sliplab.storage.schema.summary import Summary
 
 WORDS = {
@@ -94,14 +94,9 @@ def _cells(name: str, figures: OnsetFigures) -> list[str]:
     return [
         WORDS[name],
         f"{figures.trials} ({figures.lacking})",
-        _median(incipient, figures.median_incipient_ms),
+        with_interval(incipient.median, figures.median_incipient_ms, 0),
         early,
         f"{incipient.missed}, {incipient.late}",
         "–" if name == "paper" else of_paper,
         f"{number(gross.median, 0)}; {gross.false_early}, {gross.missed}, {gross.late}",
     ]
-
-
-def _median(found: LatencyFigures, span: tuple[float, float] | None) -> str:
-    text = number(found.median, 0)
-    return text if span is None else f"{text} ({span[0]:.0f} to {span[1]:.0f})"

@@ -17,12 +17,15 @@ from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.detectors.latency import median_span
 from sliplab.analysis.metrics.intervals import interval
 from sliplab.analysis.report.page import Content, Table, number
+from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import TrialLatency, TrialScore
 from sliplab.storage.schema.summary import (
     Accounts,
     Outcome,
+    Span,
     TimeIntervals,
     TrialIntervals,
     TrialOutcome,
@@ -40,6 +43,8 @@ WORDS = {
 }
 TIMES = ("duration_ms", "latency_incipient_ms", "latency_gross_ms", "lead_ms")
 """Times of a trial."""
+LEAST = {name: 0.0 if name in ("duration_ms", "lead_ms") else -math.inf for name in TIMES}
+"""The least that each can be, ms; latencies reach below zero by the tolerance."""
 
 
 def trial_outcome(row: TrialScore) -> TrialOutcome:
@@ -91,14 +96,39 @@ def account(
     return Accounts(planned=counts.total(), **{name: counts[name] for name in OUTCOMES})
 
 
-def trial_intervals(trials: Sequence[TrialOutcome]) -> TrialIntervals:
-    """Return the interval of each time's mean, median and 95th percentile over trials."""
+def trial_intervals(
+    trials: Sequence[TrialOutcome], rules: Iterable[Detection] = ()
+) -> TrialIntervals:
+    """Return the interval of each time's mean, median and 95th percentile over trials.
+
+    In medians missed and late detections count, see `LatencyFigures`. No interval reaches below
+    what can be: leads and lengths are not negative, and latencies not earlier than the tolerance.
+
+    Args:
+        rules: of detection, with the tolerance of early detections.
+    """
+    early_ms = max((rule.false_early_ms for rule in rules), default=math.inf)
     found = {}
     for name in TIMES:
         there = times(trials, name)
-        spans = {kind: interval(there, kind) for kind in ("mean", "median", "p95")}
+        least = max(LEAST[name], -early_ms)
+        spans: dict[str, Span] = {kind: interval(there, kind, least) for kind in ("mean", "p95")}
+        lost = sum(is_lost(row, name) for row in trials)
+        spans["median"] = median_span(there, lost, lost_ms(name), least)
         found[name] = TimeIntervals(n=len(there), **spans)
     return TrialIntervals(**found)
+
+
+def is_lost(row: TrialOutcome, name: str) -> bool:
+    """Return whether the detection behind one of `TIMES` was missed or late."""
+    if name == "duration_ms":
+        return False
+    return (row.gross if name == "latency_gross_ms" else row.outcome) in ("missed", "late")
+
+
+def lost_ms(name: str) -> float:
+    """Return as what a lost detection counts in a median: infinitely late, or no lead at all."""
+    return -math.inf if name == "lead_ms" else math.inf
 
 
 def times(trials: Iterable[TrialOutcome], name: str) -> list[float]:

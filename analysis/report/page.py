@@ -169,6 +169,20 @@ def number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
+def with_interval(
+    value: float | None,
+    span: tuple[float | None, float | None] | None,
+    digits: int = 1,
+    unit: str = "",
+) -> str:
+    """Return a value with its 95 % interval; an end that is None is infinite."""
+    text = number(value, digits)
+    if span is not None:
+        low, high = (number(end, digits) if end is not None else "∞" for end in span)
+        text = f"{text} ({low} to {high})"
+    return f"{text} {unit}".rstrip()
+
+
 def percent(value: float | None, digits: int = 1) -> str:
     """Return a share as a percentage."""
     return "–" if value is None else f"{100 * value:.{digits}f} %"

@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from sliplab.analysis.report.alarms import DISTURBED, QUIET, rate_words
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Table, number, percent
 from sliplab.analysis.report.published import PAPER
-from sliplab.storage.schema.evaluation import Share
+from sliplab.analysis.report.seeds import seed_words
+from sliplab.storage.schema.evaluation import AlarmRate, Share
 from sliplab.storage.schema.summary import Experiment, Network, NetworkWindows, Paper, Span, Summary
 
 _SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "published"]
@@ -41,6 +43,7 @@ class PaperSection(Content):
     """Return every published figure with this report's.
 
     Attributes:
+        seeds: that were trained here, with the range of their strict accuracy.
         networks: others on the same trials: title, network and its margins.
     """
 
@@ -50,6 +53,7 @@ class PaperSection(Content):
     rows: Table
     counts: Table
     differences: Table
+    seeds: str
 
 
 def paper_section(summary: Summary) -> PaperSection | None:
@@ -76,6 +80,7 @@ def paper_section(summary: Summary) -> PaperSection | None:
               [[of[0].name, of[0].paper, *(row.text for row in of)] for of in same]),
         Table(["figure", *networks], [[of[0].name, *(row.count for row in of)] for of in same]),
         Table(("setting", "paper", "here", "the paper's value is"), [*differences, _SCANNED]),
+        seed_words(summary.kinematic.seeds),
     )  # fmt: skip
 
 
@@ -104,7 +109,18 @@ def _windows(kinematic: NetworkWindows) -> list[Row]:
             Row(f"incipient {name}", PAPER[f"incipient_{name}"].text, percent(value),
                 _percents(row), _count(row))
         )  # fmt: skip
-    return [*rows, _confused(kinematic.confusion)]
+    return [*rows, *_alarms(kinematic.false_alarms), _confused(kinematic.confusion)]
+
+
+def _alarms(found: dict[str, AlarmRate]) -> list[Row]:
+    """Return false alarms an hour, quiet and under nuisances, which the accuracy costs."""
+    names = {QUIET: "false alarms an hour, quiet holding", DISTURBED: "the same, under nuisances"}
+    rows = []
+    for name, title in names.items():
+        rate = found.get(name)
+        count = "–" if rate is None else f"{rate.clusters} trials, {rate.hours:.3f} h"
+        rows.append(Row(title, "–", rate_words(rate), count=count))
+    return rows
 
 
 def _percents(row: Share | None) -> str:
@@ -114,7 +130,7 @@ def _percents(row: Share | None) -> str:
 
 
 def _count(row: Share | None) -> str:
-    return "–" if row is None else f"{row.n} windows, {row.trials} trials"
+    return "–" if row is None else f"{row.trials} trials ({row.n} windows)"
 
 
 def _confused(confusion: Sequence[Sequence[int]]) -> Row:
@@ -161,4 +177,6 @@ def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) 
 
 
 def _ms(span: Span) -> str:
-    return "–" if span is None else f"{span[0]:.0f} to {span[1]:.0f} ms"
+    if span is None or span[0] is None or span[1] is None:
+        return "–"
+    return f"{span[0]:.0f} to {span[1]:.0f} ms"

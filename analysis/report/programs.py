@@ -34,6 +34,7 @@ FILES = {
     "generalisation": "derived/generalisation/results.json",
     "guesses": "derived/guesses/results.json",
     "holdout": "holdout/results.json",
+    "stress": "stress/stress.json",
     "scene": "derived/tradeoff/tradeoff.json",
     "labels": "derived/tradeoff/labels.json",
     "labels_truth": "derived/tradeoff/labels_truth.json",
@@ -45,6 +46,7 @@ COMMANDS = {
     "generalisation": "sliplab generalise {store}",
     "guesses": "sliplab guesses {store}",
     "holdout": "sliplab holdout {store}",
+    "stress": "sliplab stress {store}",
     "scene": "sliplab tradeoff --scene PROTOCOL --out {folder}",
     "labels": "python -m benchmarks labels --json > {file}",
     "labels_truth": "python -m benchmarks labels_truth --json > {file}",
@@ -111,15 +113,16 @@ class SkinSection(Content):
     command: str
     figure: Figure | None = None
     table: Table | None = None
+    seeds: str = ""
 
 
 def skin_section(
-    found: Json | None, command: str, strict: float | None, *, simulated: bool
+    found: Json | None, command: str, strict: float | None, seeds: str = "", *, simulated: bool
 ) -> SkinSection:
     """Show the results of `sliplab generalise`.
 
     Args:
-        strict: accuracy of the network on its own skin.
+        strict: accuracy of the network on its own skin. seeds: that were trained there, in words.
 
     Raises:
         StoreError: they are of another shape.
@@ -146,7 +149,7 @@ def skin_section(
         svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
         figure = Figure(svg, name="skins", data=share_data(drawn))
     columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
-    return SkinSection(command, figure, Table(columns, rows))
+    return SkinSection(command, figure, Table(columns, rows), seeds)
 
 
 @dataclass(frozen=True)

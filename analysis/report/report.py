@@ -28,7 +28,6 @@ from sliplab.analysis.report.page import (
     Number,
     Table,
     number,
-    percent,
     render_page,
 )
 from sliplab.analysis.report.paper import paper_section
@@ -39,8 +38,10 @@ from sliplab.analysis.report.programs import (
     tradeoff_section,
 )
 from sliplab.analysis.report.registration import registration_section
+from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.sources import Sources
+from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.report.trial import Example, choose_example, output_section, trial_section
 from sliplab.storage.schema.summary import SeedsUsed, Summary
 
@@ -99,27 +100,14 @@ def render(sources: Sources, summary: Summary, sections: Sequence[Content]) -> s
 
 def headline(summary: Summary) -> list[Number]:
     """Return the numbers on top of the page."""
-    accuracy, quality = summary.kinematic.accuracy, summary.quality
-    latency, lead = summary.kinematic.latency_ms.incipient, summary.gravity.lead_ms
+    quality = summary.quality
     uncertain, device = clocks.worst_clock(summary.sync)
     note = clocks.short_note(summary.sync, summary.labels)
     if any(rule.choose == "test" for rule in summary.detection.values()):
         note += "; smoothing and margin chosen on test trials"
     return [
         Number("trials committed", str(quality.committed), f"of {quality.planned} planned"),
-        Number("window accuracy", percent(accuracy.strict), f"strict, n = {accuracy.n}"),
-        Number(
-            "incipient latency",
-            number(latency.median, 0, "ms"),
-            f"median of {latency.n}; {latency.missed} missed, {latency.late} late, "
-            f"{latency.false_early} false early; {note}",
-        ),
-        Number(
-            "gravity lead",
-            number(lead.median, 0, "ms"),
-            f"median; smallest {number(lead.min, 0, 'ms')}, n = {lead.n}, "
-            f"{lead.missed} missed, {lead.late} late; {note}",
-        ),
+        *slip_tiles(summary, f"; {note}"),
         Number("clock uncertainty", uncertain, f"worst trial, {device}"),
     ]
 
@@ -145,7 +133,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
     if collected_here:
         skins = skin_section(
             programs.get("generalisation"), command(store, "generalisation"),
-            kinematic.accuracy.strict, simulated=simulated,
+            kinematic.accuracy.strict, seed_words(kinematic.seeds), simulated=simulated,
         )  # fmt: skip
     if simulated and collected_here:
         how = command(store, "holdout")

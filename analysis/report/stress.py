@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.analysis.report.figures import stress as figures
-from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
-from sliplab.analysis.stress import ALL
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page, with_interval
+from sliplab.analysis.stress import ALL, RULE
 from sliplab.storage.schema.evaluation import Rate
-from sliplab.storage.schema.stress import StressDetector, StressFigures, StressRecord
+from sliplab.storage.schema.stress import HourlyRate, StressDetector, StressFigures, StressRecord
 
 COLUMNS = (
     "detector", "clean trials (95 %)", "false alarms an hour (95 %)", "missed slips",
@@ -58,6 +59,7 @@ def render(record: StressRecord) -> str:
         detectors=Table(COLUMNS, [cells(name, of(it, ALL)) for name, it in titled]),
         clean=Figure(figures.clean_trials(titled, names, simulated=simulated)),
         best=titled[0][0],
+        few=few_words(min(of(best, name).trials for name in names)),
         by_nuisance=Table(
             ("nuisance", *COLUMNS[1:]), [cells(name, of(best, name)) for name in names]
         ),
@@ -70,10 +72,21 @@ def _accuracies(
     record: StressRecord, names: Sequence[str], networks: Sequence[str]
 ) -> list[list[str]]:
     found = {(it.network, it.nuisance): it.strict for it in record.accuracy if it.strength is None}
-    return [
+    rows = [
         [name, *(_span(found.get((network, name))) for network in networks)]
         for name in [ALL, *names]
     ]
+    rules: dict[str, StressDetector] = {}  # the first of a network is its rule
+    for it in record.detectors:
+        if it.rule.startswith(RULE):
+            rules.setdefault(it.network, it)
+    for name, title in (("none", "false alarms/h, quiet"), (ALL, "false alarms/h, all trials")):
+        cells = [
+            _hourly(of(rules[it], name).per_hour) if it in rules and name in [ALL, *names] else "–"
+            for it in networks
+        ]
+        rows.append([title, *cells])
+    return rows
 
 
 def _span(rate: Rate | None) -> str:
@@ -83,5 +96,7 @@ def _span(rate: Rate | None) -> str:
     return f"{percent(rate.value)} ({low} to {high})"
 
 
-def _hourly(rate: Rate) -> str:
-    return f"{rate.value:.1f} ({rate.low:.1f} to {rate.high:.1f})"
+def _hourly(rate: HourlyRate) -> str:
+    if rate.low is None or rate.high is None:
+        return number(rate.value, 1)
+    return with_interval(rate.value, (rate.low, rate.high), 1)

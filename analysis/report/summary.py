@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.detectors.onset_references import (
     References,
     decisions_of,
     judge_by_reference,
 )
+from sliplab.analysis.report.alarms import OWN, false_alarms
 from sliplab.analysis.report.campaign import references_of
 from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
@@ -26,6 +28,7 @@ from sliplab.storage.schema.evaluation import (
     TrainedBaseline,
     WindowIntervals,
 )
+from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.schema.summary import (
     Difference,
     Hashes,
@@ -70,9 +73,13 @@ def make_summary(sources: Sources) -> Summary:
         StoreError: another program's result is of another shape.
     """
     campaigns, evaluation = sources.campaigns, sources.evaluation
+    stress = None
+    if "stress" in sources.programs:
+        stress = parse_program("stress", StressRecord, sources.programs["stress"])
     judged = judged_part(
-        campaigns, evaluation, sources.window_intervals, sources.baselines, sources.references
-    )
+        campaigns, evaluation, sources.window_intervals, sources.baselines, sources.references,
+        stress,
+    )  # fmt: skip
     holdout = None
     if "holdout" in sources.programs:
         kept = parse_program("holdout", HoldoutResult, sources.programs["holdout"])
@@ -81,7 +88,7 @@ def make_summary(sources: Sources) -> Summary:
         "simulated": sources.store.simulated,
         **judged,
         "networks": {
-            name: _network(campaigns, of, sources.references)
+            name: _network(campaigns, of, sources.references, stress)
             for name, of in sources.networks.items()
         },
         "paper": _paper(sources.settings, campaigns),
@@ -123,6 +130,7 @@ def judged_part(
     spans: WindowIntervals | None,
     baselines: Mapping[str, TrainedBaseline],
     references: Slips,
+    stress: StressRecord | None = None,
 ) -> dict[str, Any]:
     """Return `kinematic`, `gravity`, `disturbance` and `trials` of an evaluation."""
     judged = _judged(campaigns, evaluation, references)
@@ -131,6 +139,7 @@ def judged_part(
         **{name: windows[name] for name in _WINDOWS},
         "trained_baselines": baselines,
         "window_intervals": {} if spans is None else spans.to_json(),
+        "false_alarms": false_alarms(campaigns, evaluation.trials, stress, OWN),
         **judged["kinematic"],
     }
     trials = tuple(trial_outcome(row) for row in evaluation.trials)
@@ -146,23 +155,38 @@ def _judged(
         rows = [row for row in evaluation.trials if row.experiment == name]
         ours = [trial_outcome(row) for row in rows]
         decided = decisions_of(rows, references, evaluation.detection)
+        scored = [row.latency for row in rows if row.latency is not None]
         found[name] = {
             **figures.to_json(),
+            # evaluations of older versions have medians without missed and late detections
+            "latency_ms": summarise_latency(scored).to_json(),
+            "lead_ms": summarise_lead(scored).to_json(),
             "accounted": account(campaigns, ours, name),
-            "intervals": trial_intervals(ours),
+            "intervals": trial_intervals(ours, evaluation.detection.values()),
             "by_reference": judge_by_reference(decided),
         }
     return found
 
 
-def _network(campaigns: Sequence[Collected], found: OtherEvaluation, references: Slips) -> Json:
+def _network(
+    campaigns: Sequence[Collected],
+    found: OtherEvaluation,
+    references: Slips,
+    stress: StressRecord | None,
+) -> Json:
     """Return another network's figures, under the keys that the store's own have."""
     judged = _judged(campaigns, found, references)
     return {
         **{key: getattr(found, key) for key in ("title", "preset", "seed", "engine", "exact")},
         "detection": plain_rules(found.detection),
         **judged,
-        "kinematic": {**found.windows.to_json(), **judged["kinematic"]},
+        "kinematic": {
+            **found.windows.to_json(),
+            "false_alarms": false_alarms(
+                campaigns, found.trials, stress, f"preset: {found.preset}"
+            ),
+            **judged["kinematic"],
+        },
     }
 
 

@@ -12,6 +12,7 @@ import pandas as pd
 
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.figures import windows as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
@@ -65,6 +66,7 @@ class NetworkSection(Content):
     length_ms: int
     accuracy: Accuracy
     interval: Share
+    alarms: str
     seeds: Seeds
     strong: bool
     """Stronger methods were trained."""
@@ -91,8 +93,9 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
     ]
     history = [vars(record) for record in fitted.history]
     return NetworkSection(
-        fitted.windows.length_ms, accuracy, kinematic.interval, kinematic.seeds, bool(baselines),
-        fitted.warnings, PAPER, confusion_figure(kinematic, simulated=simulated),
+        fitted.windows.length_ms, accuracy, kinematic.interval,
+        alarm_words(kinematic.false_alarms), kinematic.seeds, bool(baselines), fitted.warnings,
+        PAPER, confusion_figure(kinematic, simulated=simulated),
         training_figure(history, fitted.chosen_epoch, simulated=simulated),
         Table(
             ["method", "argmax", "strict", "margin", "network ahead by (points)"],

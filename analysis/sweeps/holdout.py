@@ -7,7 +7,7 @@ from importlib.metadata import version
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.evaluation.evaluation import evaluation_of
-from sliplab.analysis.evaluation.trials import judge, summaries
+from sliplab.analysis.evaluation.trials import judge, quiet_alarms, summaries
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import choose_model, wanted_models
@@ -93,4 +93,5 @@ class Holdout:
             rows=tuple(judged.rows),
             kinematic=summaries(judged.rows)["kinematic"],
             evaluations=(*self.evaluations(), look),
+            false_alarms=quiet_alarms(judged.trials),
         )

@@ -24,6 +24,7 @@ from sliplab.analysis.sweeps.runner import ResultFile, sample_trials
 from sliplab.analysis.sweeps.sensitivity import CHANGE, Setting
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import several
+from sliplab.storage.schema.evaluation import TrialLatency
 from sliplab.storage.schema.sweeps import SensitivityResults, SettingScores, TrialAtSetting
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store, StoreError
@@ -121,7 +122,8 @@ def figures(setting: SettingScores) -> Figures:
     for name, found in _values(setting).items():
         there = [value for value in found.values() if value is not None]
         middle = np.median if name in _MEDIANS else np.mean
-        summary[name] = float(middle(there)) if there else None
+        value = float(middle(there)) if there else np.inf
+        summary[name] = value if np.isfinite(value) else None
     return summary
 
 
@@ -154,14 +156,24 @@ def changes(base: SettingScores, other: SettingScores) -> dict[str, tuple[float,
 
 
 def _values(setting: SettingScores) -> dict[str, Figures]:
-    """Return latencies and leads by trial; None where a trial has none."""
+    """Return latencies and leads by trial; None where a trial has none.
+
+    A latency of which medians are taken is infinite where the detection was missed or late.
+    """
     found: dict[str, Figures] = {name: {} for name in FIGURES if name != "strict"}
     for row in setting.trials:
         trial = f"{row.campaign}/{row.trial}"
         found["depth_zero_mm"][trial] = row.depth_zero_mm
         for name, key in _keys(row.experiment):
-            found[name][trial] = None if row.latency is None else getattr(row.latency, key)
+            found[name][trial] = _time(row.latency, name, key)
     return found
+
+
+def _time(latency: TrialLatency | None, name: str, key: str) -> float | None:
+    if latency is None:
+        return None
+    lost = latency.uncounted[3 if key == "latency_gross_ms" else 2]
+    return np.inf if name in _MEDIANS and lost else getattr(latency, key)
 
 
 def _keys(experiment: str) -> Iterator[tuple[str, str]]:

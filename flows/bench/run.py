@@ -21,6 +21,7 @@ from sliplab.analysis.bench.feeding import BenchError, audit, feed
 from sliplab.analysis.bench.figures import (
     Level,
     accuracy,
+    disturbed_rate,
     nuisance_scores,
     ranked,
     tested,
@@ -40,8 +41,8 @@ from sliplab.storage.schema.bench import BenchDetector, BenchResult, KeptDetecto
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.workers import WORKERS
 
-ENTRIES_VERSION = 1
-"""Incremented when a shipped detector gives other figures on the same scenes."""
+ENTRIES_VERSION = 2
+"""Incremented when a shipped detector has other figures or intervals on the same scenes."""
 NUMBERS = "bench.json"
 Advance = Callable[[], None]
 
@@ -89,7 +90,7 @@ def judged(detector: Detector, given: Sequence[Scene], advance: Advance) -> list
     """Return a detector's evidence on scenes."""
     found = []
     for scene in given:
-        found.append(Judged(feed(detector, scene), scene.slip))
+        found.append(Judged(feed(detector, scene), scene.slip, scene.world))
         advance()
     return found
 
@@ -106,6 +107,7 @@ def measure(name: str, prepared: Prepared, tests: Tests, advance: Advance) -> Be
         name=name,
         curve=tested(found, levels),
         nuisances=nuisance_scores(disturbed, levels[0].value),
+        disturbed=disturbed_rate(disturbed, levels[0].value),
         accuracy=accuracy(found),
         operations=cost.operations,
         memory_bytes=cost.memory_bytes,

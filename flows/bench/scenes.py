@@ -36,10 +36,12 @@ class Drawn:
     """A scene before it is simulated.
 
     Attributes:
-        rig: a drawn world. seed: of the trial's chance. faults: of the rig in this scene.
+        rig: a drawn world. world: its name, which scenes in the same one share.
+        seed: of the trial's chance. faults: of the rig in this scene.
     """
 
     name: str
+    world: str
     rig: RigFile
     hold_s: float
     depth_mm: float
@@ -72,7 +74,8 @@ def nuisance_scenes(size: Size, seed: int) -> dict[str, list[Drawn]]:
             chance = np.random.default_rng([drawn_by, number, hash_integer(name)])
             rig = _world(drawn_by, number)
             faults = nuisance_faults(name, hold_s, rig.scene, chance)
-            found[name].append(_drawn(f"{name} {number + 1}", rig, hold_s, rng, faults))
+            world = f"nuisances {number + 1}"
+            found[name].append(_drawn(f"{name} {number + 1}", world, rig, hold_s, rng, faults))
     return found
 
 
@@ -82,11 +85,14 @@ def _part(name: str, part: Part, seed: int) -> Iterator[Drawn]:
         for slide in range(part.slides):
             rng = np.random.default_rng([seed, number, slide])
             hold_s = _value(DEFINITION.hold_s, rng)
-            yield _drawn(f"{name} {number + 1}.{slide + 1}", rig, hold_s, rng)
+            world = f"{name} {number + 1}"
+            yield _drawn(f"{world}.{slide + 1}", world, rig, hold_s, rng)
     for hold in range(part.holds):
         rng = np.random.default_rng([seed, hold])
         hold_s = _value(DEFINITION.long_hold_s, rng)
-        yield _drawn(f"{name} hold {hold + 1}", worlds[hold % part.worlds], hold_s, rng)
+        number = hold % part.worlds
+        world = f"{name} {number + 1}"
+        yield _drawn(f"{name} hold {hold + 1}", world, worlds[number], hold_s, rng)
 
 
 def _world(seed: int, number: int) -> RigFile:
@@ -100,6 +106,7 @@ def _world(seed: int, number: int) -> RigFile:
 
 def _drawn(
     name: str,
+    world: str,
     rig: RigFile,
     hold_s: float,
     rng: np.random.Generator,
@@ -109,6 +116,7 @@ def _drawn(
     touching_mm = max(heights_mm) - min(heights_mm)
     return Drawn(
         name,
+        world,
         rig,
         hold_s,
         round(touching_mm + _value(DEFINITION.beyond_mm, rng), 2),
@@ -163,7 +171,8 @@ def simulated(drawn: Drawn) -> Scene:
         events.x[inside].copy(), events.y[inside].copy(), events.p[inside].copy(),
         t_us[inside].copy(),
     )  # fmt: skip
-    return Scene(drawn.name, kept, built.events.width, built.events.height, int(end_us), slip)
+    size = built.events.width, built.events.height
+    return Scene(drawn.name, kept, *size, int(end_us), slip, drawn.world)
 
 
 def _plan(drawn: Drawn) -> Plan:

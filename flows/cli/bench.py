@@ -56,4 +56,5 @@ def bench(
         console.print_json(found.to_json())
         return
     console.print_table(page.title(found), page.COLUMNS, page.rows(found))
+    console.show(page.interval_note(found))
     console.show(f"Latency against false alarms (simulated): {(folder / page.PLOT).resolve()}")

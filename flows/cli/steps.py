@@ -151,13 +151,17 @@ def evaluate(
 
 def _model_scores(result: NetworkScores) -> dict[str, str | int]:
     """Format the scores of a model in a few lines."""
+    from sliplab.analysis.report.alarms import rate_words
+    from sliplab.analysis.report.page import number
+
     accuracy, interval = result["accuracy"], result["interval"]
     sure = ""
     if interval.low is not None and interval.high is not None:
         sure = f" ({interval.low:.1%} to {interval.high:.1%} over {interval.trials} trials)"
     differ = "" if result["same_as_sinabs"] else "; a few counts may differ from Sinabs'"
     shown: dict[str, str | int] = {
-        "windows": accuracy.n, "engine": f"{result['engine']}{differ}",
+        "windows": f"{accuracy.n} of {interval.trials} trials",
+        "engine": f"{result['engine']}{differ}",
     }  # fmt: skip
     if accuracy.n:
         shown |= {
@@ -165,11 +169,15 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
             "argmax accuracy": f"{accuracy.argmax:.1%}",
             "margin accuracy": f"{accuracy.margin:.1%}",
         }
+    if (quiet := result["false_alarms"]) is not None:
+        shown["false alarms an hour"] = (
+            f"{rate_words(quiet)} in quiet holding ({quiet.clusters} trials, {quiet.hours:.3f} h)"
+        )
     latency = result["latency_ms"]
     for name, found in (("incipient", latency.incipient), ("gross", latency.gross)):
-        if found.median is not None:
+        if every := found.n + found.missed + found.late:
             shown[f"{name} latency"] = (
-                f"median {found.median:.0f} ms of {found.n}; {found.missed} missed, "
+                f"median {number(found.median, 0)} ms of {every}; {found.missed} missed, "
                 f"{found.late} late, {found.false_early} false early"
             )
     for name, lead in result["lead_ms"].items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,9 +11,10 @@ import typer
 from sliplab.flows.cli.common import JsonOption, RigOption
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
-from sliplab.flows.study_defaults import HELD_OUT, LABELS_CHECKED, study_protocols
+from sliplab.flows.study_defaults import HELD_OUT, LABELS_CHECKED, NETWORKS, study_protocols
 
 if TYPE_CHECKING:
+    from sliplab.flows.planning.run_request import RunRequest
     from sliplab.storage.schema.summary import OneCameraSummary, Summary
 
 app = typer.Typer()
@@ -121,6 +122,7 @@ def _chain(
     from sliplab.flows.study import study as run
     from sliplab.storage.trials.store import Store
 
+    _note_seeds(run_requests)
     outcome = run(run_requests, check, searches(run_requests) if more else (), holdout)
     store = Store.open(folder)
     one_camera = read_one_camera(store)
@@ -143,6 +145,19 @@ def _chain(
     simulated = " (simulated)" if summary.simulated else ""
     console.print_table(f"Results{simulated}", ["figure", "value", "note"], _results(summary))
     console.show(f"Report{simulated}: {page.resolve()}")
+
+
+def _note_seeds(run_requests: Sequence[RunRequest]) -> None:
+    """Say that fewer networks are trained than show by how much seeds differ."""
+    from sliplab.flows.study import study_plan
+
+    slides = study_plan(run_requests).slides
+    trained = len(slides[0].plan.protocol.analysis.training.seeds) if slides else NETWORKS
+    if trained < NETWORKS:
+        console.say(
+            f"Networks of other seeds have other figures, and this study trains {trained}: "
+            "`training: {seeds: [0, 1, 2]}` in the protocol shows by how much."
+        )
 
 
 def _results(summary: Summary | OneCameraSummary) -> list[list[str]]:

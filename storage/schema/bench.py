@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+from sliplab.storage.schema.evaluation import AlarmRate
 
 
 class MedianLatency(Part):
-    """A median over slides, missed ones infinitely late, with its 95 % interval.
+    """A median over slides, missed ones infinitely late, with its 95 % interval over worlds.
 
-    None where it is infinite, or so few slides bound nothing.
+    None where it is infinite, or so few worlds bound nothing.
     """
 
     value: Number | None
@@ -16,20 +17,11 @@ class MedianLatency(Part):
     high: Number | None
 
 
-class AlarmRate(Part):
-    """False alarms an hour without slip, with the exact 95 % interval of a Poisson rate."""
-
-    alarms: Int
-    hours: Number
-    value: Number
-    low: Number
-    high: Number
-
-
 class BenchScores(Part):
     """Alarms of a detector on some scenes, above one level of its evidence.
 
     Attributes:
+        worlds: simulated rigs of the scenes, over which intervals are; 0 in older results.
         latency_ms: from when the first tip slid. latency_paper_ms: from the paper's 2-pixel onset,
             negative before it.
         missed: slides without an alarm before gross slip. early: those of them in which a false
@@ -37,6 +29,7 @@ class BenchScores(Part):
     """
 
     slides: Int
+    worlds: Int = 0
     latency_ms: MedianLatency
     latency_paper_ms: MedianLatency
     missed: Int
@@ -64,6 +57,7 @@ class BenchDetector(Part):
     Attributes:
         curve: over the asked rates; the first one is the table's.
         nuisances: scores at the table's level, by nuisance.
+        disturbed: false alarms in all scenes with nuisances at that level; None in older results.
         accuracy: of decisions on test scenes, mean of the classes' recalls; None without classes.
         operations: of a decision, and memory_bytes of parameters, as the detector states them.
         decision_us: measured.
@@ -73,6 +67,7 @@ class BenchDetector(Part):
     name: str
     curve: tuple[BenchPoint, ...]
     nuisances: dict[str, BenchScores]
+    disturbed: AlarmRate | None = None
     accuracy: Number | None
     operations: Number | None
     memory_bytes: Int | None

@@ -292,7 +292,8 @@ class TrialScore(Part):
 class LatencyFigures(Part):
     """A latency or lead over trials, ms, of the detections that count.
 
-    n, missed, late and false_early add up to the trials.
+    n, missed, late and false_early add up to the trials. In the median missed and late ones count,
+    too: as infinitely late, and as no lead at all. It is null where it is one of these.
     """
 
     mean: Number | None
@@ -416,6 +417,19 @@ class Rate(Part):
     high: Number
 
 
+class AlarmRate(Part):
+    """False alarms an hour without slip, with its 95 % interval over trials or worlds."""
+
+    alarms: Int
+    hours: Number
+    value: Number
+    low: Number | None
+    """Null with one trial or world."""
+    high: Number | None
+    clusters: Int = 0
+    """Trials or worlds that the interval is over; 0 in older results."""
+
+
 class OnsetFigures(Part):
     """Decisions on trials by one reference onset, which need not be the label's."""
 
@@ -424,9 +438,10 @@ class OnsetFigures(Part):
     lacking: Int
     """Trials without; they are in no other figure."""
     latency_ms: LatencyByOnset
-    median_incipient_ms: tuple[Number, Number] | None
-    """95 % interval of the median incipient latency; null where so few trials bound nothing."""
-    median_gross_ms: tuple[Number, Number] | None
+    median_incipient_ms: tuple[Number | None, Number | None] | None
+    """95 % interval of the median incipient latency; null where so few trials bound nothing, an end
+    where it is infinite."""
+    median_gross_ms: tuple[Number | None, Number | None] | None
     false_early_rate: Rate | None
     """Of incipient detections; null without trials."""
     early_by_paper: Int

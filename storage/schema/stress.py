@@ -6,6 +6,14 @@ from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 from sliplab.storage.schema.evaluation import Rate
 
 
+class HourlyRate(Part):
+    """A rate per hour with its 95 % interval over trials, null with one trial."""
+
+    value: Number
+    low: Number | None
+    high: Number | None
+
+
 class StressFigures(Part):
     """A detector on the trials of one nuisance at one strength."""
 
@@ -17,14 +25,14 @@ class StressFigures(Part):
     hold_h: Number
     """Time in which the sensor held without slip, h."""
     false_alarms: Int
-    per_hour: Rate
-    """False alarms per hour of holding, with the exact Poisson interval."""
+    per_hour: HourlyRate
+    """False alarms per hour of holding; trials of the same nuisance and strength are compared."""
     clean: Rate
     """Share of the trials with no false alarm, and a slip that was detected before it was gross."""
     missed: Int
     """Slips that were not detected before they were gross."""
     latency_ms: Number | None
-    """Median from the label's onset to the detection; null: nothing detected."""
+    """Median from the label's onset to the detection, a missed one infinite; null if so."""
     latency_true_ms: Number | None
     """The same from the physical onset; null where none is known."""
 
@@ -45,6 +53,8 @@ class StressAccuracy(Part):
     nuisance: str
     strength: Number | None
     windows: Int
+    trials: Int = 0
+    """Of the windows, over which the interval is; 0 in older results."""
     strict: Rate | None
     """With an interval over trials; null without windows."""
 

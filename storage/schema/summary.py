@@ -13,6 +13,7 @@ from pydantic import Field
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 from sliplab.storage.schema.evaluation import (
     Accuracy,
+    AlarmRate,
     Baseline,
     ByClass,
     Calibration,
@@ -45,8 +46,9 @@ Outcome = Literal[
 """By a trial's incipient detection; every trial of a plan has exactly one."""
 GrossOutcome = Literal["detected", "late", "missed", "false_early", "without_onsets"]
 Known = Number | None
-Span = tuple[Number, Number] | None
-"""A 95 % interval, low and high; null where so few trials bound nothing."""
+Span = tuple[Number | None, Number | None] | None
+"""A 95 % interval, low and high; null where so few trials bound nothing, an end where it is
+infinite."""
 
 
 class Accounts(Part):
@@ -100,6 +102,10 @@ class Experiment(ExperimentScores):
 
 class NetworkWindows(Experiment):
     """A network's windows and detections on kinematic test trials."""
+
+    false_alarms: dict[str, AlarmRate] = Field(default_factory=dict)
+    """By `quiet`, in these trials before slip, and, where `sliplab stress` measured them, `none`
+    and `nuisances`: by the rule of detection in its trials without and with nuisances."""
 
     accuracy: Accuracy
     confusion: tuple[tuple[Int, ...], ...]
@@ -255,6 +261,8 @@ class Holdout(Part):
     skin_seed: Int
     model: str
     versions: tuple[str, ...]
+    false_alarms: AlarmRate | None = None
+    """In quiet holding."""
     windows: HoldoutWindows
     latency_ms: LatencyByOnset
     lead_ms: LeadFigures

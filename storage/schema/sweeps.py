@@ -10,6 +10,7 @@ from pydantic import Field
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 from sliplab.storage.schema.evaluation import (
+    AlarmRate,
     ByClass,
     Classification,
     Experiments,
@@ -109,5 +110,7 @@ class HoldoutResult(Document):
     windows: HoldoutScores
     rows: tuple[TrialScore, ...]
     kinematic: ExperimentScores
+    false_alarms: AlarmRate | None = None
+    """False early detections an hour of quiet holding; null in older results."""
     evaluations: tuple[HoldoutLook, ...]
     """Every time that the campaign was evaluated; the others are of the last time."""

@@ -10,7 +10,6 @@ from scipy.stats import chi2
 
 from sliplab.analysis.detectors.detectors import Evidence, Predictions, Smoothing
 from sliplab.analysis.detectors.latency import TrueSlip
-from sliplab.analysis.metrics.intervals import poisson_interval
 from sliplab.analysis.stress import (
     ALL,
     Outcome,
@@ -80,13 +79,6 @@ def test_an_alarm_is_false_a_detection_or_too_late(at_ns: list[int], expected: O
     assert outcome(np.array(at_ns, np.int64), SLIP, TOLERANCE) == expected
 
 
-def test_counts_have_garwoods_interval() -> None:
-    for count in (0, 1, 7, 300):
-        low, high = poisson_interval(count)
-        assert high == pytest.approx(chi2.ppf(0.975, 2 * count + 2) / 2)
-        assert low == pytest.approx(chi2.ppf(0.025, 2 * count) / 2 if count else 0.0)
-
-
 def trial(nuisance: str = "none", strength: float = 100.0, hold_s: int = 10) -> StressTrial:
     slip = TrueSlip(hold_s * S, hold_s * S + 5 * S, hold_s * S + 9 * S)
     return StressTrial(nuisance, strength, 0, slip, slip.incipient_ns - 100 * MS)
@@ -99,7 +91,38 @@ def test_figures_count_what_happened() -> None:
     assert (found.trials, found.false_alarms, found.missed) == (3, 2, 1)
     assert found.clean.value == pytest.approx(1 / 3)
     assert found.per_hour.value == pytest.approx(2 / (30 / 3600))
-    assert (found.latency_ms, found.latency_true_ms) == (40.0, 140.0)
+    assert (found.latency_ms, found.latency_true_ms) == (40.0, 140.0), "one of three missed"
+
+
+def test_rate_of_alarms_is_wider_where_trials_of_a_condition_differ() -> None:
+    """The same 72 alarms: six in each trial under brushing, or all in three of them."""
+    quiet = [(trial("none"), Outcome(0, None))] * 12
+    alike = [(trial("brush"), Outcome(6, None))] * 12
+    apart = [(trial("brush"), Outcome(24 if k < 3 else 0, None)) for k in range(12)]
+    poisson = [chi2.ppf(share, 144 + odd) / 2 for share, odd in ((0.025, 0), (0.975, 2))]
+    found = figures(ALL, None, quiet + alike).per_hour
+    # conditions differ in every repetition alike, so that is no chance
+    assert (found.low, found.high) == pytest.approx([15 * count for count in poisson])
+    wide = figures(ALL, None, quiet + apart).per_hour
+    assert wide.value == found.value
+    assert wide.low is not None
+    assert wide.high is not None
+    assert wide.high - wide.low > 3 * 15 * (poisson[1] - poisson[0])
+
+
+def test_one_trial_has_a_rate_without_interval() -> None:
+    found = figures("none", 100.0, [(trial(), Outcome(3, None))]).per_hour
+    assert (found.low, found.high) == (None, None)
+
+
+def test_missed_slips_are_infinitely_late_in_the_median() -> None:
+    at = [10 * S + ms * MS for ms in (40, 60, 80)]
+    rows = [(trial(), Outcome(0, ns)) for ns in at]
+    assert figures("none", None, rows).latency_ms == 60.0
+    missed = [(trial(), Outcome(0, None))] * 2
+    assert figures("none", None, rows + missed).latency_ms == 80.0
+    assert figures("none", None, rows + missed).latency_true_ms == 180.0
+    assert figures("none", None, rows + missed * 2).latency_ms is None
 
 
 def test_groups_hold_each_trial_once_at_each_level() -> None:

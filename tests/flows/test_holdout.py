@@ -134,8 +134,8 @@ def test_the_file_has_these_keys(store: Store) -> None:
     assert json_text(HoldoutResult.load(path).to_json()) == path.read_text()
     found = shape_of(read_json(path))
     assert list(found) == [
-        "evaluations", "key", "kinematic", "model", "protocol_seed", "rows", "simulated",
-        "skin_seed", "trials", "windows",
+        "evaluations", "false_alarms", "key", "kinematic", "model", "protocol_seed", "rows",
+        "simulated", "skin_seed", "trials", "windows",
     ]  # fmt: skip
     assert found["evaluations"] == [
         {"at": "str", "model": "str", "strict": "float", "version": "str"}

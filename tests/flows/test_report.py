@@ -471,6 +471,35 @@ def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store
     assert found["gravity: incipient latency, mean"].basis == "trials"
 
 
+def test_compared_medians_count_late_detections(store: Store) -> None:
+    summary = read_summary(store)
+    (first, *_) = [row for row in summary.trials if row.experiment == "gravity"]
+
+    def with_lost(lost: int) -> Summary:
+        rows = []
+        for k in range(40):
+            late = k < lost
+            rows.append(first.model_copy(update={
+                "trial": str(k), "outcome": "late" if late else "detected_first",
+                "gross": "missed" if late else "detected",
+                "latency_gross_ms": None if late else 50.0,
+                "latency_incipient_ms": None if late else 100.0 + k,
+                "lead_ms": None if late else 900.0 - k,
+            }))  # fmt: skip
+        return summary.model_copy(update={"trials": tuple(rows)})
+
+    found = {row.name: row for row in compare(with_lost(10), with_lost(0)).figures}
+    # of 100 to 139 ms the ten quickest came too late
+    assert found["gravity: incipient latency, median"].here == pytest.approx(129.5)
+    assert found["gravity: incipient latency, median"].there == pytest.approx(119.5)
+    assert found["gravity: lead, median"].difference == pytest.approx(-10.0)
+    # means are of those that count
+    assert found["gravity: incipient latency, mean"].here == pytest.approx(124.5)
+    none = {row.name for row in compare(with_lost(21), with_lost(0)).figures}
+    assert "gravity: incipient latency, median" not in none
+    assert "gravity: incipient latency, mean" in none
+
+
 def several_times(summary: Summary, *medians_ms: float) -> Summary:
     """The same with trained seeds of these median times of gravity trials."""
     gravity = summary.gravity

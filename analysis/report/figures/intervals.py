@@ -29,6 +29,7 @@ class Panel:
         colour: of its dots.
         zero: what stands at zero, as text; empty where zero is nothing.
         published: a line for what the paper has, and how it is called.
+        least: the smallest value that there can be.
         notes: by row, what to write at its right end, such as how many have no value.
     """
 
@@ -38,6 +39,7 @@ class Panel:
     zero: str = ""
     published: tuple[float, str] | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
+    least: float = -np.inf
 
 
 def by_condition(
@@ -61,7 +63,7 @@ def by_condition(
                 spread = rng.uniform(-0.2, 0.2, len(there))
                 axes.plot(there, place + spread, "o", ms=2.6, color=panel.colour, alpha=0.6, mew=0)
                 if len(there):
-                    span = interval(there) or (np.nan, np.nan)
+                    span = interval(there, least=panel.least) or (np.nan, np.nan)
                     axes.plot(span, [place, place], color="black", lw=1.6)
                     axes.plot(there.mean(), place, "D", color="black", ms=3.8)
                 note = panel.notes.get(row, "" if len(there) else "none")

@@ -58,7 +58,7 @@ def row_of(
     """A detector's row, as the bench makes it, without nuisances."""
 
     def judged(scenes: list[Scene]) -> list[Judged]:
-        return [Judged(feed(detector, one), one.slip) for one in scenes]
+        return [Judged(feed(detector, one), one.slip, one.world) for one in scenes]
 
     detector.train(train, validation)
     levels = validated(judged(validation), RATES)

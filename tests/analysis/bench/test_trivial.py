@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.bench.entries.trivial import Always, Blind, ByTheClock, Never, Random
-from sliplab.analysis.bench.figures import alarm_rate, ranked
+from sliplab.analysis.bench.figures import ranked
 from sliplab.analysis.bench.interface import Detector, Evidence, Scene
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.storage.schema.bench import BenchDetector, MedianLatency
 from sliplab.storage.streams import EventChunk
 from tests.analysis.bench.made import Counting, row_of, some_scenes
@@ -84,9 +85,10 @@ def test_who_breaks_the_asked_rate_on_test_scenes_comes_after_who_keeps_it() -> 
     never = row_of("never", Never(), *(some_scenes(k) for k in range(3)))
 
     def row(name: str, latency_ms: float, alarms: int) -> BenchDetector:
-        """A row with another latency and so many false alarms in an hour."""
+        """A row with another latency and so many false alarms in an hour, each in a world."""
         median = MedianLatency(value=latency_ms, low=None, high=None)
-        figures = {"latency_ms": median, "false_alarms": alarm_rate(alarms, 1.0)}
+        worlds = [1] * alarms + [0] * (8 - alarms)
+        figures = {"latency_ms": median, "false_alarms": alarm_rate(worlds, [1 / 8] * 8)}
         test = never.table.test.model_copy(update=figures)
         point = never.table.model_copy(update={"test": test})
         return never.model_copy(update={"name": name, "curve": (point,)})

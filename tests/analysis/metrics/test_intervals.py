@@ -19,6 +19,8 @@ from sliplab.analysis.metrics.intervals import (
     exact_interval,
     interval,
     mean_interval,
+    median_interval,
+    rate_interval,
     share_difference,
     share_interval,
 )
@@ -238,3 +240,95 @@ def test_seeds_differ_as_student_says() -> None:
     assert one == pytest.approx(stats.t.ppf(0.975, 2) * spread * np.sqrt(1 + 1 / 3))
     assert between_seeds([0.9], [0.8]) is None
     assert between_seeds([], a) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 300])
+def test_rate_of_clusters_that_are_alike_is_garwoods(count: int) -> None:
+    counts = np.full(30, count / 30)
+    low, high = rate_interval(counts, np.full(30, 0.1)) or (np.nan, np.nan)
+    assert 3 * high == pytest.approx(stats.chi2.ppf(0.975, 2 * count + 2) / 2)
+    assert 3 * low == pytest.approx(stats.chi2.ppf(0.025, 2 * count) / 2 if count else 0.0)
+
+
+def test_rate_of_one_cluster_has_no_interval() -> None:
+    assert rate_interval([12], [1.0]) is None
+
+
+def test_rate_is_wider_where_few_clusters_have_all_events() -> None:
+    hours = np.full(20, 0.1)
+    alike = rate_interval(np.full(20, 3.0), hours)
+    few = rate_interval(np.array([30.0, 30.0, *np.zeros(18)]), hours)
+    assert alike is not None
+    assert few is not None
+    assert few[1] - few[0] > 3 * (alike[1] - alike[0])
+
+
+def test_differences_between_strata_are_no_chance() -> None:
+    """Two conditions of the design have all events, in every repetition."""
+    counts, hours = np.array([30.0] * 4 + [0.0] * 16), np.full(20, 0.1)
+    within = rate_interval(counts, hours, np.repeat(np.arange(5), 4).tolist())
+    poisson = stats.chi2.ppf(0.975, 2 * 120 + 2) / 2 / 2
+    assert within is not None
+    assert within[1] == pytest.approx(poisson)
+    # strata of a single cluster say nothing of chance: they are compared with each other
+    assert rate_interval(counts, hours, np.arange(20).tolist()) == rate_interval(counts, hours)
+
+
+def test_median_of_single_values_is_that_by_ranks() -> None:
+    expected = interval(LATE, "median")
+    assert median_interval(LATE, range(len(LATE))) == expected
+    missed = np.r_[LATE[:7], np.inf]
+    low, high = median_interval(missed, range(8)) or (np.nan, np.nan)
+    assert low < np.median(missed) < high == np.inf
+
+
+def test_median_of_worlds_knows_that_their_values_are_alike() -> None:
+    worlds = np.repeat(np.arange(8), 50)
+    values = 100.0 + 10.0 * worlds + np.tile(np.linspace(-1, 1, 50), 8)
+    low, high = median_interval(values, worlds.tolist()) or (np.nan, np.nan)
+    assert (low, high) == pytest.approx((109.0, 161.0), abs=2.0)
+    by_ranks = interval(values, "median")
+    assert by_ranks is not None
+    assert high - low > 2 * (by_ranks[1] - by_ranks[0])
+    assert median_interval(values[:250], worlds[:250].tolist()) is None, "five worlds"
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from([10.0, 20.0, 30.0, 40.0, np.inf]), st.integers(0, 7)),
+             min_size=1, max_size=60)
+)  # fmt: skip
+def test_interval_of_a_median_of_ties_holds_it(rows: list[tuple[float, int]]) -> None:
+    values = np.array([value for value, _ in rows])
+    span = median_interval(values, [world for _, world in rows])
+    middle = np.sort(values)[(len(values) - 1) // 2]
+    if span is not None:
+        assert span[0] <= middle <= span[1]
+
+
+def test_difference_of_medians_counts_infinite_values() -> None:
+    lost = np.r_[LATE[:150], np.full(30, np.inf)]
+    found = difference(lost, LATE, "median", paired=True)
+    assert found is not None
+    assert found[0] > 0, "as many slow ones as were lost"
+    assert difference(np.r_[LATE[:80], np.full(100, np.inf)], LATE, "median") is None
+    with pytest.raises(ValueError, match="infinite"):
+        difference(lost, LATE)
+
+
+@pytest.mark.parametrize("statistic", ["mean", "median"])
+def test_interval_stops_at_the_least_that_can_be(statistic: str) -> None:
+    values = [1.0, 2.0, 2.5, 3.0, 4.0, 90.0]
+    free = interval([value - 30 for value in values], statistic)
+    assert free is not None
+    assert free[0] < 0
+    bounded = interval([value - 30 for value in values], statistic, least=0.0)
+    assert bounded == (0.0, max(free[1], 0.0))
+
+
+def test_cluster_of_a_stratum_alone_has_the_variance_of_its_count() -> None:
+    """Five alike in one condition, and one in another: Poisson's interval, no narrower."""
+    found = rate_interval([4.0] * 5 + [40.0], [0.1] * 6, ["a"] * 5 + ["b"])
+    assert found is not None
+    assert found[1] == pytest.approx(stats.chi2.ppf(0.975, 122) / 2 / 0.6)
+    assert found[0] == pytest.approx(stats.chi2.ppf(0.025, 120) / 2 / 0.6)

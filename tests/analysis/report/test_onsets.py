@@ -89,8 +89,8 @@ def test_every_decider_has_a_row_for_each_onset_and_the_sentence_adds_them_up() 
         for onset in ("2 pixels (paper)", "change point", "true (simulated)")
     ]
     rows = [row[2:] for row in section.table.rows]
-    assert rows[0][:5] == ["4 (0)", "25", "1 (1 to 81 %)", "1, 0", "–"]
-    assert rows[2][:5] == ["4 (0)", "119", "0 (0 to 60 %)", "1, 0", "1 of 1"]
+    assert rows[0][:5] == ["4 (0)", "30", "1 (1 to 81 %)", "1, 0", "–"]
+    assert rows[2][:5] == ["4 (0)", "124", "0 (0 to 60 %)", "1, 0", "1 of 1"]
     # of four false alarms by 2 pixels one is real, and 880 ms is early within the tolerance
     assert rows[6][2] == "4 (40 to 100 %)"
     assert rows[8][:5] == ["4 (0)", "49", "1 (1 to 81 %)", "0, 0", "2 of 4"]

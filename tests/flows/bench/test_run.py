@@ -131,6 +131,11 @@ def test_the_command_prints_what_it_writes(folder: Path) -> None:
     assert "simulated" in (folder / "bench.svg").read_text()
     shown = here("bench", *NAMES, "--small", "--folder", folder)
     assert "bench 1, small, seed 1 (simulated)" in shown.stdout
+    said = " ".join(shown.stdout.split())
+    assert "over 2 test worlds and 1 with nuisances; below 24 trials or worlds, here 1" in said
+    for row in data["detectors"]:
+        assert row["curve"][0]["test"]["worlds"] == 2
+        assert row["disturbed"]["low"] is None, "one world bounds nothing"
 
 
 def test_the_leaderboard_is_written_between_its_lines(folder: Path, tmp_path: Path) -> None:

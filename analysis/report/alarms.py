@@ -1,0 +1,81 @@
+"""False alarms an hour that a network's accuracy costs, in quiet holding and under nuisances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms
+from sliplab.analysis.metrics.alarm_rates import few_words
+from sliplab.analysis.report.page import number, with_interval
+from sliplab.analysis.stress import ALL, RULE
+from sliplab.storage.schema.evaluation import AlarmRate, TrialScore
+from sliplab.storage.schema.stress import StressRecord
+from sliplab.storage.streams import Json
+
+COMMAND = "sliplab stress"
+OWN = "own"
+"""Title of the store's own network in `stress.json`."""
+QUIET, UNDISTURBED, DISTURBED = "quiet", "none", "nuisances"
+
+
+def false_alarms(
+    campaigns: Sequence[Collected],
+    rows: Iterable[TrialScore],
+    record: StressRecord | None,
+    network: str,
+) -> dict[str, Json]:
+    """Return all rates of a network that are known, as plain data; see `NetworkWindows`."""
+    quiet = quiet_alarms(item_trials(campaigns, rows))
+    found = {} if quiet is None else {QUIET: quiet}
+    found |= stress_alarms(record, network)
+    return {name: rate.to_json() for name, rate in found.items()}
+
+
+def stress_alarms(record: StressRecord | None, network: str) -> dict[str, AlarmRate]:
+    """Return the rates that `sliplab stress` measured of a network with its rule.
+
+    Args:
+        network: its title in the record.
+    """
+    ours = () if record is None else record.detectors
+    rule = next((it for it in ours if it.network == network and it.rule.startswith(RULE)), None)
+    found = {}
+    for figures in () if rule is None else rule.figures:
+        name = {ALL: DISTURBED, "none": UNDISTURBED}.get(figures.nuisance)
+        if name is not None and figures.strength is None:
+            rate = figures.per_hour
+            found[name] = AlarmRate(
+                alarms=figures.false_alarms, hours=figures.hold_h, value=rate.value,
+                low=rate.low, high=rate.high, clusters=figures.trials,
+            )  # fmt: skip
+    return found
+
+
+def rate_words(rate: AlarmRate | None) -> str:
+    """Return a rate with its interval; a dash for none."""
+    if rate is None:
+        return number(None)
+    span = None if rate.low is None or rate.high is None else (rate.low, rate.high)
+    return with_interval(rate.value, span, 1 if rate.value < 100 else 0)
+
+
+def alarm_words(found: dict[str, AlarmRate]) -> str:
+    """Return what accuracy costs in false alarms as a sentence."""
+    quiet, disturbed = found.get(QUIET), found.get(DISTURBED)
+    text = "False alarms an hour (95 %, over trials): "
+    if quiet is None:
+        text += "not known in quiet holding, "
+    else:
+        text += (
+            f"{rate_words(quiet)} in quiet holding ({quiet.alarms} in {quiet.hours:.3f} h of "
+            f"{quiet.clusters} trials), "
+        )
+        if few := few_words(quiet.clusters):
+            text = text.removesuffix("), ") + f"; {few}), "
+    if disturbed is None:
+        return text + f"not measured under nuisances ({COMMAND})"
+    text += f"{rate_words(disturbed)} under nuisances"
+    if (still := found.get(UNDISTURBED)) is not None:
+        text += f", {rate_words(still)} in the same trials without one"
+    return text
