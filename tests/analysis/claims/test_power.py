@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.analysis.claims.blocks import F64
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.power import Drawing, claim_powers, more_trials, spread
 from sliplab.analysis.claims.resampling import Axis, Pilot, shared_axes
-from sliplab.analysis.claims.sequences import F64
 from sliplab.analysis.claims.simulated import claims_of, course
 from sliplab.protocols import Plan
 from sliplab.protocols.model import Protocol
