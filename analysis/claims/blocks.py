@@ -39,6 +39,21 @@ def least_blocks(share: float | None = None) -> int:
 
 
 @dataclass(frozen=True)
+class Limit:
+    """What an estimate must exceed at a look.
+
+    Attributes:
+        boundary: of the standard normal statistic, by all looks.
+        steady: of the same where the trend so far goes on to the planned end.
+        blocks: planned number of them.
+    """
+
+    boundary: float
+    steady: float
+    blocks: float
+
+
+@dataclass(frozen=True)
 class Estimate:
     """An estimate of a mean between 0 and 1.
 
@@ -58,11 +73,18 @@ class Estimate:
         return len(self.scores)
 
     @cached_property
+    def _place(self) -> F64:
+        return np.arange(self.blocks) - 0.5 * (self.blocks - 1)
+
+    @cached_property
+    def _slope(self) -> float:
+        """What the estimate changes by from one block to the next."""
+        return float(self.scores @ self._place) / float(self._place @ self._place)
+
+    @cached_property
     def _rest(self) -> F64:
         """Scores without their trend over time."""
-        place = np.arange(self.blocks) - 0.5 * (self.blocks - 1)
-        away = self.scores - self.scores.mean()
-        return np.asarray(away - (away @ place) / (place @ place) * place)
+        return np.asarray(self.scores - self.scores.mean() - self._slope * self._place)
 
     @cached_property
     def standard_error(self) -> float:
@@ -75,6 +97,22 @@ class Estimate:
         near = float(rest[1:] @ rest[:-1]) / total + 2.0 / k
         near = min(max(near, 0.0), _MOST_CORRELATION)
         return math.sqrt(total / (k - 2) / k * (1.0 + near) / (1.0 - near))
+
+    def is_beyond(self, mean: float, limit: Limit, *, above: bool) -> bool:
+        """Return whether the true mean is above a value, or below it, as surely as asked.
+
+        The mean is that of the whole campaign: where the blocks so far have a trend, it must be
+        beyond the value if that trend goes on, too.
+        """
+        if not np.isfinite(limit.boundary) or self.evidence(mean, above=above) < limit.boundary:
+            return False
+        further = 0.5 * (limit.blocks - self.blocks)
+        if further <= 0.0 or self.standard_error == 0.0:
+            return True
+        away = self.value + self._slope * further - mean
+        spread = math.sqrt(self.blocks / float(self._place @ self._place)) * further
+        error = self.standard_error * math.sqrt(1.0 + spread**2)
+        return (away if above else -away) / error >= limit.steady
 
     def evidence(self, mean: float, *, above: bool) -> float:
         """Return a standard normal statistic that is large if the true mean is beyond a value.

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sliplab.analysis.claims.blocks import F64, Estimate, block_share, least_blocks
+from sliplab.analysis.claims.blocks import F64, Estimate, Limit, block_share, least_blocks
 from sliplab.analysis.claims.boundaries import boundaries
 from sliplab.analysis.claims.evidence import (
     Evidence,
@@ -97,16 +97,20 @@ class History:
     def _by_round(self) -> dict[str, Expectation]:
         return {}
 
-    def boundary(self, claim: Claim, error: float) -> float:
-        """Return what the statistic of a claim must exceed at the last look; infinite before it."""
+    def limit(self, claim: Claim, error: float) -> Limit:
+        """Return what a claim's estimate must exceed at the last look; infinite at early ones."""
         evidence = self.evidence
         enough = evidence.block_count >= blocks_needed(claim)
         if not len(enough) or not enough[-1]:
-            return np.inf
+            return Limit(np.inf, np.inf, np.inf)
         adaptive = evidence.chances is not None
         planned = planned_end(evidence.grid, self.stopping, adaptive=adaptive)
         shares = tuple(float(n) / planned for n in evidence.looks[enough])
-        return float(boundaries(shares, error)[-1])
+        blocks = int(evidence.block_count[-1])
+        return Limit(
+            float(boundaries(shares, error)[-1]), float(boundaries((1.0,), error)[0]),
+            blocks / shares[-1],
+        )  # fmt: skip
 
     def share_below(
         self, figure: str, value: float, members: Mask, *, at: bool, missing: float | None = None
@@ -217,13 +221,13 @@ def _bound_verdict(
 ) -> tuple[bool, bool]:
     """Return whether a claim of a bound holds, and is refuted."""
     value, least = claim.value, claim.at_least is not None
-    limit = history.boundary(claim, history.stopping.error)
+    limit = history.limit(claim, history.stopping.error)
     none, all_ = (0.0, 1.0) if worst else (None, None)
     if claim.of == "mean":
         share = value / PERCENT
         figure = claim.figure
-        above = history.mean(figure, members, none).evidence(share, above=True) >= limit
-        below = history.mean(figure, members, all_).evidence(share, above=False) >= limit
+        above = history.mean(figure, members, none).is_beyond(share, limit, above=True)
+        below = history.mean(figure, members, all_).is_beyond(share, limit, above=False)
         return (above, below) if least else (below, above)
     share = QUANTILES[claim.of]
     # at least v: fewer than the share lie below v; at most v: more than the share lie at most at v
@@ -231,8 +235,8 @@ def _bound_verdict(
     def under(missing: float | None) -> Estimate:
         return history.share_below(claim.figure, value, members, at=not least, missing=missing)
 
-    fewer = under(all_).evidence(share, above=False) >= limit
-    more = under(none).evidence(share, above=True) >= limit
+    fewer = under(all_).is_beyond(share, limit, above=False)
+    more = under(none).is_beyond(share, limit, above=True)
     return (fewer, more) if least else (more, fewer)
 
 
@@ -243,13 +247,13 @@ def _interval(
     none, all_ = (0.0, 1.0) if worst else (None, None)
     error = history.stopping.error / 2.0
     if claim.of == "mean":
-        limit = history.boundary(claim, error)
+        limit = history.limit(claim, error)
         low, high = (history.mean(claim.figure, groups[-1], fill) for fill in (none, all_))
         if len(groups) == 2:
             low = low.minus(history.mean(claim.figure, groups[0], all_))
             high = high.minus(history.mean(claim.figure, groups[0], none))
         return _mean_bounds(low, high, limit, least=1.0 - len(groups))
-    limit = history.boundary(claim, error / len(groups))
+    limit = history.limit(claim, error / len(groups))
     spans = [_percentile_bounds(claim, history, members, limit, worst) for members in groups]
     if len(spans) == 1:
         return spans[0]
@@ -257,7 +261,7 @@ def _interval(
 
 
 def _mean_bounds(
-    low: Estimate, high: Estimate, limit: float, *, least: float
+    low: Estimate, high: Estimate, limit: Limit, *, least: float
 ) -> tuple[float, float]:
     """Return bounds of a mean, or of a difference of two, in percent.
 
@@ -265,8 +269,8 @@ def _mean_bounds(
         low, high: estimates with missing figures at their least, and at their most.
         least: smallest value that it can have; the largest is 1.
     """
-    bottom = _border(lambda m: low.evidence(m, above=True) >= limit, least, 1.0)
-    top = _border(lambda m: high.evidence(m, above=False) >= limit, 1.0, least)
+    bottom = _border(lambda m: low.is_beyond(m, limit, above=True), least, 1.0)
+    top = _border(lambda m: high.is_beyond(m, limit, above=False), 1.0, least)
     return PERCENT * bottom, PERCENT * top
 
 
@@ -281,10 +285,10 @@ def _border(wrong: Callable[[float], bool], inside: float, outside: float) -> fl
 
 
 def _percentile_bounds(
-    claim: Claim, history: History, members: Mask, limit: float, worst: bool
+    claim: Claim, history: History, members: Mask, limit: Limit, worst: bool
 ) -> tuple[float, float]:
     """Return bounds of a percentile."""
-    if not np.isfinite(limit):
+    if not np.isfinite(limit.boundary):
         return -np.inf, np.inf
     share = QUANTILES[claim.of]
     none, all_ = (0.0, 1.0) if worst else (None, None)
@@ -292,11 +296,11 @@ def _percentile_bounds(
 
     def too_low(value: float) -> bool:
         below = history.share_below(claim.figure, value, members, at=False, missing=all_)
-        return below.evidence(share, above=False) >= limit
+        return below.is_beyond(share, limit, above=False)
 
     def too_high(value: float) -> bool:
         below = history.share_below(claim.figure, value, members, at=True, missing=none)
-        return below.evidence(share, above=True) >= limit
+        return below.is_beyond(share, limit, above=True)
 
     # a value is refuted where one further in is
     first = _first(values, lambda value: not too_low(value))
