@@ -85,7 +85,7 @@ def test_a_claim_that_is_certain_needs_few_trials() -> None:
     (found,) = power_of(plan, normal_pilot(plan, 36, 1))
     assert found.holds == 1.0
     assert found.trials.high is not None
-    assert found.trials.high < 60
+    assert 90 < found.trials.high < 150  # a tenth of the trials is seen in 30 blocks of three
     assert found.repetitions is None
 
 
