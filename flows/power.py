@@ -18,10 +18,10 @@ import numpy as np
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.claims import learning
 from sliplab.analysis.claims import trial_figures as figures
+from sliplab.analysis.claims.blocks import F64
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.power import SHARES, Drawing, Drawn, claim_powers, spread
 from sliplab.analysis.claims.resampling import Pilot, shared_axes
-from sliplab.analysis.claims.sequences import F64
 from sliplab.analysis.claims.simulated import claims_of
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.report import power as page

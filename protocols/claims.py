@@ -177,6 +177,10 @@ class Stopping(StrictModel):
     repetitions: Annotated[int, Field(ge=1, le=1000)] = 1
     """Of each condition between two looks, with `order: shuffled` or `listed`. Every one of these
     rounds goes through all levels that a person changes."""
+    block: Annotated[int, Field(ge=2, le=MAX_TRIALS)] | None = None
+    """Trials in a row that may resemble each other, such as those after one touch, with `order:
+    shuffled` or `listed`; left out: a repetition of every condition. Only blocks count as
+    independent."""
     model: str | None = None
     """File of the network that judges the trials, from the protocol's folder; it was trained on
     other ones. Needed where a claim is about a network's output."""

@@ -11,16 +11,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliplab.analysis.claims.evidence import I64, Evidence, Grid, members_of
-from sliplab.analysis.claims.sequences import F64
-from sliplab.analysis.claims.states import Fits, History, estimate_of, state_of
+from sliplab.analysis.claims.blocks import F64, I64
+from sliplab.analysis.claims.evidence import Evidence, Grid, members_of
+from sliplab.analysis.claims.states import Fits, History, estimate_of, is_called, state_of
 from sliplab.protocols.claims import QUANTILES, Choice, Claim, Stopping
 from sliplab.protocols.hashing import hash_integer
 from sliplab.storage.schema.claims import Batch, ChosenTrial
 
 CENTRE = 0.2, 0.8
-"""Percentiles outside are about rare trials. Unequal chances make the largest weight large, which
-bounds the stakes against a small share more than a smaller spread gains."""
+"""Percentiles outside are about rare trials, which unequal chances do not find sooner; a few large
+weights would decide."""
 
 
 def next_batch(
@@ -60,7 +60,8 @@ def next_batch(
             for k in spread_out(grid, here, count, rng)
         ]
         return Batch(known=0, least=None, trials=tuple(items))
-    share = chances(History(known, {} if fits is None else fits), here, stopping, choice.random)
+    history = History(known, stopping, {} if fits is None else fits)
+    share = chances(history, here, choice.random)
     items = []
     p = share.copy()
     for _ in range(min(choice.batch, len(here))):
@@ -71,7 +72,7 @@ def next_batch(
     return Batch(known=len(known.taken), least=float(share.min()), trials=tuple(items))
 
 
-def chances(history: History, here: I64, stopping: Stopping, random: float) -> F64:
+def chances(history: History, here: I64, random: float) -> F64:
     """Return the chance of each trial of `here`, (k,), all above 0.
 
     Args:
@@ -81,9 +82,8 @@ def chances(history: History, here: I64, stopping: Stopping, random: float) -> F
     if not len(history.evidence.taken):
         return even
     total = np.zeros(len(here))
-    for claim in stopping.claims:
-        state = state_of(claim, history, stopping.error)
-        if state.holds or state.refuted:
+    for claim in history.stopping.claims:
+        if is_called(state_of(claim, history)):
             continue
         worth = _spread(claim, history)[here]
         if worth.sum() > 0.0:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from sliplab.analysis.claims.sequences import F64
+from sliplab.analysis.claims.blocks import F64
 
 _RIDGES = (0.1, 1.0, 10.0, 100.0)
 _LOG_OF_NORMAL = -0.635

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from sliplab.analysis.claims.evidence import I64
-from sliplab.analysis.claims.sequences import F64
+from sliplab.analysis.claims.blocks import F64, I64
 from sliplab.analysis.metrics.window_groups import strict_hits
 from sliplab.analysis.networks.baselines import logistic_slices
 from sliplab.analysis.windows.dataset import SampleSet

@@ -10,8 +10,8 @@ import numpy as np
 
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.resampling import Pilot
-from sliplab.analysis.claims.simulated import Course, claims_of, course, is_called
-from sliplab.analysis.claims.states import states
+from sliplab.analysis.claims.simulated import Course, claims_of, course
+from sliplab.analysis.claims.states import is_called, states
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES, Claim
 from sliplab.storage.schema.claims import ClaimState

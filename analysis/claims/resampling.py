@@ -18,9 +18,9 @@ from functools import cached_property
 
 import numpy as np
 
-from sliplab.analysis.claims.evidence import I64, Grid
+from sliplab.analysis.claims.blocks import F64, I64, block_share
+from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.expectation import expectation
-from sliplab.analysis.claims.sequences import F64
 from sliplab.protocols import Plan
 from sliplab.protocols.factors import Factor, Level
 from sliplab.protocols.yaml_file import KeyedError
@@ -149,7 +149,7 @@ class Pilot:
             centre = (near @ np.where(finite, off, 0.0) / number_near)[kind]
             # a sample's own mean is nearer to it than the true one
             wider = np.sqrt(number_near / np.maximum(number_near - 1.0, 1.0))[kind]
-            share, size = _block_effect(off, self.blocks)
+            share, size = block_share(off, self.blocks)
             smooth, scatter = _smoothing(off)
             away = smooth * (off[donor] - centre) + scatter * rng.standard_normal(len(donor))
             away = wider * np.sqrt(1.0 - share) * away + size * of_block
@@ -186,28 +186,6 @@ def _smoothing(off: F64) -> tuple[float, float]:
         return 1.0, 0.0
     shrunk = 1.0 / np.sqrt(1.0 + (width / deviation) ** 2)
     return float(shrunk), float(shrunk * width)
-
-
-def _block_effect(off: F64, blocks: I64) -> tuple[float, float]:
-    """Return the share of blocks in the variance of residuals, and its square root in their unit.
-
-    By the method of moments of one-way analysis of variance (Searle, Casella and McCulloch 1992,
-    Variance Components, section 3.6); none where there are fewer than three blocks of two trials.
-    """
-    there = np.isfinite(off)
-    _, number, sizes = np.unique(blocks[there], return_inverse=True, return_counts=True)
-    n, groups = len(number), len(sizes)
-    if groups < 3 or n < 2 * groups:
-        return 0.0, 0.0
-    means = np.bincount(number, off[there]) / sizes
-    inside = float(((off[there] - means[number]) ** 2).sum()) / (n - groups)
-    total_mean = float(off[there].mean())
-    between = float((sizes * (means - total_mean) ** 2).sum()) / (groups - 1)
-    size = (n - float((sizes**2).sum()) / n) / (groups - 1)
-    variance = max((between - inside) / size, 0.0)
-    if variance == 0.0:
-        return 0.0, 0.0
-    return variance / (variance + inside), float(np.sqrt(variance))
 
 
 def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis, ...], list[str]]:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplab.analysis.claims.blocks import F64
 from sliplab.analysis.claims.choosing import next_batch
-from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
-from sliplab.analysis.claims.sequences import F64
-from sliplab.analysis.claims.states import Fits, History, state_of, states
+from sliplab.analysis.claims.evidence import Evidence, Grid, round_ends
+from sliplab.analysis.claims.states import Fits, is_called, states
 from sliplab.protocols import Plan
-from sliplab.protocols.claims import Claim, Stopping
+from sliplab.protocols.claims import Stopping
 from sliplab.storage.schema.claims import Batch, ClaimState
 
 
@@ -58,7 +58,7 @@ def course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
         return _chosen_course(plan, grid, values)
     stopping = claims_of(plan)
     evidence = planned_evidence(plan, grid, values)
-    claims = tuple(_called(evidence, claim, stopping.error) for claim in stopping.claims)
+    claims = _called(evidence, stopping)
     settled = _settled(evidence, claims, stopping.least)
     return Course(evidence, claims, None if settled is None else int(evidence.looks[settled]))
 
@@ -68,11 +68,6 @@ def claims_of(plan: Plan) -> Stopping:
     stopping = plan.protocol.collection.stopping
     assert stopping is not None
     return stopping
-
-
-def is_called(state: ClaimState) -> bool:
-    """Return whether a claim holds or is refuted."""
-    return state.holds or state.refuted
 
 
 def _settled(evidence: Evidence, claims: Sequence[Called], least: int) -> int | None:
@@ -90,33 +85,26 @@ def planned_evidence(plan: Plan, grid: Grid, values: dict[str, F64]) -> Evidence
     A round with which it would take more trials than it may is left out.
     """
     stopping = claims_of(plan)
-    rounds = [(trial.repetition - 1) // stopping.repetitions for trial in grid.trials]
-    ends = np.flatnonzero(np.diff([*rounds, rounds[-1] + 1])) + 1
-    if stopping.most is not None:
-        ends = ends[: max(int((ends <= stopping.most).sum()), 1)]
-    taken = np.arange(int(ends[-1]))
-    shown = {name: value[: len(taken)] for name, value in values.items()}
-    return Evidence(grid, taken, np.asarray(ends, np.int64), shown)
+    ends = round_ends(grid, stopping)
+    taken = np.argsort(grid.repetition, kind="stable")[: ends[-1]]
+    shown = {name: value[taken] for name, value in values.items()}
+    return Evidence(grid, taken, ends, shown, block=stopping.block)
 
 
-def _called(evidence: Evidence, claim: Claim, error: float) -> Called:
-    """Return how a claim comes out. Once called it stays so, and the look is found by halving."""
-
-    def state(look: int) -> ClaimState:
-        return state_of(claim, History(evidence.until(look)), error)
-
-    begin, end = 0, len(evidence.looks) - 1
-    last = state(end)
-    if not is_called(last):
-        return Called(None, last)
-    while begin < end:
-        middle = (begin + end) // 2
-        found = state(middle)
-        if is_called(found):
-            end, last = middle, found
-        else:
-            begin = middle + 1
-    return Called(end, last)
+def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
+    """Return how claims come out; once all are called, no later look is made."""
+    looks: list[int | None] = [None] * len(stopping.claims)
+    at_call: dict[int, ClaimState] = {}
+    found: tuple[ClaimState, ...] = ()
+    fits: Fits = {}
+    for look in range(len(evidence.looks)):
+        found = states(evidence.until(look), stopping, fits, found)
+        for k, state in enumerate(found):
+            if looks[k] is None and is_called(state):
+                looks[k], at_call[k] = look, state
+        if None not in looks:
+            break
+    return tuple(Called(look, at_call.get(k, found[k])) for k, look in enumerate(looks))
 
 
 def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
@@ -125,10 +113,11 @@ def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
     called: dict[int, Called] = {}
     claims: tuple[Called, ...] = ()
     fits: Fits = {}
+    found: tuple[ClaimState, ...] = ()
     rounds = chosen_evidence(plan, grid, values, fits)
     evidence = next(rounds)
     while True:
-        found = states(evidence, stopping, fits)
+        found = states(evidence, stopping, fits, found)
         for number, state in enumerate(found):
             if is_called(state):
                 called.setdefault(number, Called(len(evidence.looks) - 1, state))
@@ -176,9 +165,6 @@ def _seen(
     items = [(item, batch) for batch in batches for item in batch.trials]
     items = items[: looks[-1] if looks else 0]
     taken = np.array([grid.number[item.trial] for item, _ in items], np.int64)
-    chances = Chances(
-        np.array([item.chance for item, _ in items], np.float64),
-        np.array([batch.least for _, batch in items], np.float64),
-    )
+    chances = np.array([item.chance for item, _ in items], np.float64)
     shown = {name: value[taken] for name, value in values.items()}
     return Evidence(grid, taken, np.array(looks, np.int64), shown, chances)

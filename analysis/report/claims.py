@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.claims.shown import verdict_text
 from sliplab.analysis.report.figures import claims as figures
 from sliplab.analysis.report.page import Content, Figure, Table
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.schema.claims import (
     CHOICES,
     STOPPING,
-    ClaimState,
     Look,
     StoppingRecord,
     Verdict,
@@ -26,7 +26,10 @@ ENDED: dict[Verdict, str] = {
     "all": "It ended with all its trials taken.",
     "overruled": "Its claims were settled; a person went on with --no-stopping.",
 }
-COLUMNS = ("claim", "verdict", "after (trials)", "estimate", "low", "high", "unit", "trials")
+COLUMNS = (
+    "claim", "verdict", "after (trials)", "estimate", "low", "high", "unit", "figures",
+    "undetected", "missing", "blocks", "variance between blocks (%)",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -102,14 +105,10 @@ def _row(looks: Sequence[Look], k: int) -> list[str]:
     called = [look.taken for look in looks if look.claims[k].holds or look.claims[k].refuted]
     numbers = ["–" if v is None else f"{v:.4g}" for v in (last.estimate, last.low, last.high)]
     return [
-        last.claim, verdict_of(last), str(called[0]) if called else "–", *numbers, last.unit,
-        str(last.trials),
+        last.claim, verdict_text(last), str(called[0]) if called else "–", *numbers, last.unit,
+        str(last.trials), str(last.undetected), str(last.missing), str(last.blocks),
+        "–" if last.block_share is None else f"{100.0 * last.block_share:.0f}",
     ]  # fmt: skip
-
-
-def verdict_of(state: ClaimState) -> str:
-    """Return a claim's verdict in a word."""
-    return "holds" if state.holds else "refuted" if state.refuted else "open"
 
 
 def _figure(name: str, looks: Sequence[Look], simulated: bool) -> Figure:

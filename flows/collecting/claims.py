@@ -18,9 +18,10 @@ from functools import cached_property
 import numpy as np
 
 from sliplab.analysis.claims import trial_figures as figures
+from sliplab.analysis.claims.blocks import F64
 from sliplab.analysis.claims.choosing import next_batch
-from sliplab.analysis.claims.evidence import Chances, Evidence, Grid
-from sliplab.analysis.claims.sequences import F64
+from sliplab.analysis.claims.evidence import Evidence, Grid
+from sliplab.analysis.claims.shown import count_text, verdict_text
 from sliplab.analysis.claims.states import Fits, settled, states
 from sliplab.analysis.trial_work import TrialWork
 from sliplab.flows.collecting.requests import CampaignStopped
@@ -206,24 +207,21 @@ class ClaimWatch:
         grid, there = self._grid, self._campaign.committed()
         taken: list[int] = []
         looks: list[int] = []
-        chances: Chances | None = None
+        chances: F64 | None = None
         if self._choice is None:
             for trials in self._planned[: last + 1]:
                 ids = [trial.id for trial in trials if trial.role == "measured"]
-                taken += [grid.number[name] for name in ids if name in there]
+                taken += [grid.number[name] for name in ids]
                 looks.append(len(taken))
         else:
             batches = self._batches[: max(last + 1, 0) * grid.stretches]
-            items = [(item, batch) for batch in batches for item in batch.trials]
-            taken = [grid.number[item.trial] for item, _ in items]
+            items = [item for batch in batches for item in batch.trials]
+            taken = [grid.number[item.trial] for item in items]
             sizes = np.cumsum([len(batch.trials) for batch in batches])
             looks = [int(n) for n in sizes[grid.stretches - 1 :: grid.stretches]]
             if len(sizes) % grid.stretches:
                 looks.append(int(sizes[-1]))
-            chances = Chances(
-                np.array([_number(item.chance) for item, _ in items], np.float64),
-                np.array([_number(batch.least) for _, batch in items], np.float64),
-            )
+            chances = np.array([_number(item.chance) for item in items], np.float64)
         none = TrialFigures(values={})
         names = [grid.trials[k].id for k in taken]
         made = [self._figures(name) if name in there else none for name in names]
@@ -231,7 +229,10 @@ class ClaimWatch:
             claim.figure: np.array([each.of(claim.figure) for each in made], np.float64)
             for claim in self._stopping.claims
         }
-        return Evidence(grid, np.array(taken, np.int64), np.array(looks, np.int64), values, chances)
+        return Evidence(
+            grid, np.array(taken, np.int64), np.array(looks, np.int64), values, chances,
+            self._stopping.block,
+        )  # fmt: skip
 
     def _look(self, number: int, otherwise: Verdict) -> Verdict:
         """Look at the claims after a round, and all before it; keep what was seen.
@@ -244,13 +245,14 @@ class ClaimWatch:
         record = self.record()
         looks = list(record.looks)
         if len(looks) <= number:
-            evidence = self._evidence(number)
+            evidence, there = self._evidence(number), self._campaign.committed()
             for n in range(len(looks), len(evidence.looks)):
                 seen = evidence.until(n)
-                found = states(seen, self._stopping, self._fits)
-                looks.append(
-                    Look(round=n + 1, taken=len(seen.taken), evidence=seen.digest(), claims=found)
-                )
+                before = looks[-1].claims if looks else ()
+                found = states(seen, self._stopping, self._fits, before)
+                taken = sum(self._grid.trials[k].id in there for k in seen.taken)
+                look = Look(round=n + 1, taken=taken, evidence=seen.digest(), claims=found)
+                looks.append(look)
                 self._say(looks[-1])
         done = looks[number].taken >= self._stopping.least and settled(looks[number].claims)
         verdict: Verdict = "settled" if done else otherwise
@@ -300,8 +302,8 @@ def said(state: ClaimState) -> str:
     """Return a claim's state as a line of text."""
     ends = ["-" if end is None else f"{end:.4g}" for end in (state.low, state.high)]
     value = "-" if state.estimate is None else f"{state.estimate:.4g}"
-    verdict = "holds" if state.holds else "is refuted" if state.refuted else "open"
-    return f"{state.claim}: {verdict}; {value} ({ends[0]} to {ends[1]}), {state.trials} trials"
+    found = f"{value} ({ends[0]} to {ends[1]})"
+    return f"{state.claim}: {verdict_text(state)}; {found}; {count_text(state)}"
 
 
 def _number(value: float | None) -> float:

@@ -25,13 +25,25 @@ class ClaimState(Part):
     """That is claimed; of kind `apart` the least size of a difference of either sign."""
     unit: str
     trials: Int
-    """With a figure."""
+    """With a figure that is a number."""
+    undetected: Int = 0
+    """Trials in which nothing was detected: they count as the worst."""
+    missing: Int = 0
+    """Trials without a figure, or left out: the verdict holds whatever they would have shown."""
+    blocks: Int = 0
+    """Groups of trials that count as independent."""
+    least_blocks: Int = 0
+    """Blocks before which the claim is not called."""
+    block_share: Number | None = None
+    """Share of blocks in the variance of the figure (intra-block correlation)."""
     estimate: Number | None
     low: Number | None
     """Ends of the interval, which holds at all looks together; null: no bound."""
     high: Number | None
     holds: Bool
     refuted: Bool
+    alike: Literal["holds", "refuted"] | None = None
+    """The verdict if missing trials were like the others, where it is open without that."""
 
 
 class Look(Part):

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.claims.choosing import next_batch, spread_out
-from sliplab.analysis.claims.evidence import Chances, Evidence, Grid, weighted_bets
+from sliplab.analysis.claims.evidence import Evidence, Grid, chosen_estimate
+from sliplab.analysis.claims.shown import count_text, verdict_text
+from sliplab.analysis.claims.simulated import course
 from sliplab.analysis.claims.states import settled, states
 from sliplab.protocols import Plan
 from sliplab.protocols.model import Protocol
@@ -23,10 +25,15 @@ from tests.conftest import SMALL
 WITHIN = {"figure": "slip_duration", "within": "150 ms"}
 
 
-def plan_of(*claims: dict[str, Any], repetitions: int = 6, **more: Any) -> Plan:
+def plan_of(
+    *claims: dict[str, Any], repetitions: int = 6, block: int | None = None, **more: Any
+) -> Plan:
     """The pilot's 36 conditions some times, with claims."""
     data = copy.deepcopy(SMALL)
-    data["collection"] |= {"repetitions": repetitions, "stopping": {"claims": list(claims)}, **more}
+    stopping: dict[str, Any] = {"claims": list(claims)}
+    if block is not None:
+        stopping["block"] = block
+    data["collection"] |= {"repetitions": repetitions, "stopping": stopping, **more}
     return make_plan(validate(Protocol, data, Path("p.yaml")), "p.yaml")
 
 
@@ -43,9 +50,13 @@ def shuffled(plan: Plan, y: np.ndarray) -> Iterator[tuple[ClaimState, ...]]:
     grid, stopping = Grid.of(plan), plan.protocol.collection.stopping
     assert stopping is not None
     ends = np.arange(36, len(y) + 1, 36)
-    for k, n in enumerate(ends):
-        taken = np.arange(n)
-        yield states(Evidence(grid, taken, ends[: k + 1], {"slip_duration": y[:n]}), stopping)
+    found: tuple[ClaimState, ...] = ()
+    whole = Evidence(
+        grid, np.arange(len(y)), ends, {"slip_duration": y}, block=stopping.block
+    )  # fmt: skip
+    for k in range(len(ends)):
+        found = states(whole.until(k), stopping, earlier=found)
+        yield found
 
 
 def adaptive(plan: Plan, y: np.ndarray) -> Iterator[tuple[Evidence, tuple[ClaimState, ...]]]:
@@ -57,17 +68,16 @@ def adaptive(plan: Plan, y: np.ndarray) -> Iterator[tuple[Evidence, tuple[ClaimS
     batches: list[Batch] = []
     evidence = Evidence(
         grid, np.array([], np.int64), np.array([], np.int64),
-        {"slip_duration": np.array([])}, Chances(np.array([]), np.array([])),
+        {"slip_duration": np.array([])}, np.array([]),
     )  # fmt: skip
     while (batch := next_batch(evidence, batches, stopping, choice, 5)) is not None:
         batches.append(batch)
         items = [(item, each) for each in batches for item in each.trials]
         taken = np.array([grid.number[item.trial] for item, _ in items])
         chance = [np.nan if item.chance is None else item.chance for item, _ in items]
-        least = [np.nan if each.least is None else each.least for _, each in items]
         evidence = Evidence(
             grid, taken, np.cumsum([len(each.trials) for each in batches]),
-            {"slip_duration": y[taken]}, Chances(np.array(chance), np.array(least)),
+            {"slip_duration": y[taken]}, np.array(chance),
         )  # fmt: skip
         yield evidence, states(evidence, stopping)
 
@@ -81,6 +91,7 @@ def test_a_claim_of_each_kind_is_settled_as_it_is() -> None:
         {"figure": "slip_duration", "statistic": "p90", "at_most": "4500 ms"},
         {"figure": "slip_duration", "between": between, "at_least": "300 ms"},
         {"figure": "slip_duration", "between": between, "at_most": "-300 ms"},
+        repetitions=36,
     )
     grid = Grid.of(plan)
     depth = np.array([float(dict(t.condition)["depth"]) for t in grid.trials])  # type: ignore[arg-type]
@@ -94,13 +105,14 @@ def test_a_claim_of_each_kind_is_settled_as_it_is() -> None:
     assert last[4].estimate == pytest.approx(-600, abs=40)
 
 
-def test_undetected_trials_count_as_the_worst_and_unknown_ones_not_at_all() -> None:
-    plan = plan_of({"figure": "slip_duration", "statistic": "p90", "at_most": "3500 ms"})
-    y = np.full(216, 3000.0)
+def test_undetected_trials_count_as_the_worst() -> None:
+    claim = {"figure": "slip_duration", "statistic": "p90", "at_most": "3500 ms"}
+    plan = plan_of(claim, repetitions=36)
+    y = np.full(1296, 3000.0)
     y[::50] = np.inf  # 2 %
-    y[1::20] = np.nan
     *_, last = shuffled(plan, y)
     assert last[0].holds
+    assert (last[0].trials, last[0].undetected, last[0].missing) == (1270, 26, 0)
     y[::3] = np.inf  # a third
     *_, last = shuffled(plan, y)
     assert last[0].refuted
@@ -114,15 +126,62 @@ def test_nothing_is_called_without_a_figure() -> None:
     assert (last[0].trials, last[0].low, last[0].high, last[0].estimate) == (0, None, None, None)
 
 
-def test_claims_that_are_just_false_are_seldom_called_true() -> None:
-    # 120 grids of noise alone, a look after each block; the bound is the median itself
-    plan = plan_of({"figure": "slip_duration", "at_least": "3000 ms"}, repetitions=4)
-    rng = np.random.default_rng(11)
-    called = 0
-    for _ in range(120):
-        y = 3000.0 - 1e-6 + rng.normal(0, 100, 144)
-        called += any(found[0].holds for found in shuffled(plan, y))
-    assert called <= 12  # 5 % of 120 are 6; more than 12 have a chance of 1 %
+def test_missing_figures_count_against_a_claim() -> None:
+    """A third of the conditions is bad, and mostly has no label: the claim is false."""
+    claim = {"figure": "slip_duration", "statistic": "p25", "at_least": "2500 ms"}
+    plan = plan_of(claim, repetitions=24)
+    grid, rng = Grid.of(plan), np.random.default_rng(4)
+    bad = grid.levels[:, 0] == 0
+    y = np.where(bad, 2000.0, 3200.0) + rng.normal(0, 100, len(bad))
+    y[bad & (rng.random(len(y)) < 0.9)] = np.nan
+    *_, (last,) = shuffled(plan, y)
+    assert (last.holds, last.refuted) == (False, False)
+    assert last.missing == np.isnan(y).sum()
+    assert last.alike == "holds"
+    assert f"holds if the {last.missing} missing trials were like the others" in verdict_text(last)
+    assert f"{last.missing} without a figure" in count_text(last)
+    y[np.isnan(y)] = 3200.0  # had they been good, it would be true
+    *_, (last,) = shuffled(plan, y)
+    assert last.holds
+
+
+def test_few_missing_figures_leave_a_claim_that_is_far_from_its_bound() -> None:
+    plan = plan_of({"figure": "slip_duration", "at_most": "3500 ms"}, repetitions=12)
+    y = 3000.0 + np.random.default_rng(1).normal(0, 100, 432)
+    y[::20] = np.nan
+    *_, (last,) = shuffled(plan, y)
+    assert last.holds
+
+
+def test_a_percentile_needs_so_many_blocks() -> None:
+    claim = {"figure": "slip_duration", "statistic": "p10", "at_least": "1000 ms"}
+    y = 3000.0 + np.random.default_rng(1).normal(0, 100, 36 * 36)
+    *_, (last,) = shuffled(plan_of(claim, repetitions=12), y[:432])
+    assert verdict_text(last) == "open: needs at least 30 blocks, and has 12"
+    assert last.low is None
+    *_, (last,) = shuffled(plan_of(claim, repetitions=36), y)
+    assert last.holds
+
+
+def test_blocks_of_some_trials_are_stated_by_the_protocol() -> None:
+    claim = {"figure": "slip_duration", "at_most": "3500 ms"}
+    y = 3000.0 + np.random.default_rng(1).normal(0, 100, 108)
+    *_, (last,) = shuffled(plan_of(claim, repetitions=3), y)
+    assert (last.blocks, last.holds) == (3, False)
+    *_, (last,) = shuffled(plan_of(claim, repetitions=3, block=12), y)
+    assert (last.blocks, last.holds) == (9, True)
+
+
+@pytest.mark.parametrize("between_blocks", [0.0, 25.0, 100.0])
+def test_claims_that_are_just_false_are_seldom_called_true(between_blocks: float) -> None:
+    plan = plan_of({"figure": "slip_duration", "at_least": "3000 ms"}, repetitions=12)
+    grid, rng, called = Grid.of(plan), np.random.default_rng(11), 0
+    block = np.array([trial.repetition for trial in grid.trials]) - 1
+    for _ in range(100):
+        y = 3000.0 - 1e-6 + rng.normal(0, 100, 432) + rng.normal(0, between_blocks, 12)[block]
+        found = course(plan, grid, {"slip_duration": y})
+        called += found.claims[0].state.holds
+    assert called <= 11  # 5 of 100 are stated; more than 11 have a chance of 0.4 %
 
 
 def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
@@ -138,13 +197,8 @@ def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
     members = np.ones(len(y), np.bool_)
     for _ in range(4000):
         k = int(rng.choice(len(y), p=chance))
-        one = Evidence(
-            grid, np.array([k]), np.array([1]), {},
-            Chances(chance[[k]], np.array([chance.min()])),
-        )  # fmt: skip
-        bets = weighted_bets(one, y[[k]], members, expected[None])
-        assert bets.low[0] <= bets.z[0] <= bets.high[0]
-        found.append(bets.z[0])
+        one = Evidence(grid, np.array([k]), np.array([1]), {}, chance[[k]])
+        found.append(chosen_estimate(one, y[[k]], members, expected[None], expected).value)
     error = np.std(found) / np.sqrt(len(found))
     assert abs(np.mean(found) - y.mean()) < 4 * error
 
@@ -186,7 +240,7 @@ def test_the_start_spreads_over_the_grid() -> None:
 
 def test_trials_that_tell_of_an_open_claim_are_taken_more_often() -> None:
     between = {"factor": "depth", "levels": [2.4, 3.4]}
-    claim = {"figure": "slip_duration", "between": between, "at_least": "900 ms"}
+    claim = {"figure": "slip_duration", "between": between, "within": "1 ms"}
     plan = plan_of(claim, order="adaptive", choice={"batch": 12, "start": 12, "random": 0.2})
     grid = Grid.of(plan)
     y = world(grid, 0)

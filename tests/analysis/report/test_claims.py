@@ -51,7 +51,8 @@ def test_a_claim_stands_with_the_look_that_called_it(tmp_path: Path, small: dict
     assert (shown.taken, shown.planned, shown.error, shown.chosen) == (27, 36, 10.0, False)
     (row,) = shown.table.rows
     assert row == [
-        "median latency at most 90 ms", "holds", "18", "70.5", "61", "–", "ms", "7"
+        "median latency at most 90 ms", "holds", "18", "70.5", "61", "–", "ms", "7",
+        "0", "0", "0", "–",
     ]  # fmt: skip
     data = shown.figure.data
     assert data["trials"] == [9, 18, 27]
