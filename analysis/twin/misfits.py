@@ -16,11 +16,22 @@ import numpy.typing as npt
 from scipy.ndimage import median_filter
 
 from sliplab.analysis.twin import camera_estimates
+from sliplab.analysis.twin.alignment import force_delay_ms, force_turn_deg, frame_delay_ms, view_of
+from sliplab.analysis.twin.camera_estimates import (
+    CONTRAST_TREND,
+    EVENT_DELAY,
+    NOISE_TREND,
+    PICTURE_BENT,
+    PICTURE_TURN,
+    SHIFT_TREND,
+)
 from sliplab.analysis.twin.contact_estimates import Contact
 from sliplab.analysis.twin.contact_lags import Growth, settled_lags
 from sliplab.analysis.twin.contact_slips import Slips
 from sliplab.analysis.twin.contact_springs import SCATTER, Fit
+from sliplab.analysis.twin.parameters import CAMERA, CONTACT, PARAMETERS
 from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.analysis.twin.trends import LAG, PULL, RATIO, contact_trends
 from sliplab.storage.schema.twin import MisfitCheck
 from sliplab.storage.streams import F64, I64
 
@@ -37,6 +48,19 @@ FEWEST = 20
 TILT, STICKY, BROKEN, LIGHT, RAMP, SPOT = (
     "tilt_mm_per_mm", "odd_friction", "missing_share", "line_over_noise", "ramp_mm", "spot",
 )  # fmt: skip
+SCALE, TURN, STRETCH, BENT, PERSPECTIVE, FRAME_DELAY, FORCE_DELAY, FORCE_TURN = (
+    "frame_scale", "frame_turn_deg", "frame_stretch", "frame_bent", "frame_perspective",
+    "frame_delay_ms", "force_delay_ms", "force_turn_deg",
+)  # fmt: skip
+
+CONTACT_KEYS = frozenset(it.key for it in CONTACT)
+CAMERA_KEYS = frozenset(it.key for it in CAMERA)
+FORCE_KEYS = frozenset(it.key for it in PARAMETERS if "force" in it.streams)
+IN_MM = CONTACT_KEYS | {f"event_camera.{name}" for name in ("px_per_mm", "radius_mm")} | FORCE_KEYS
+"""What frames give a length to."""
+NOISE_KEYS = frozenset(
+    f"event_camera.{name}" for name in ("noise_hz", "leak_share", "hot_pixels", "hot_hz")
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +71,9 @@ class Check:
         key: of the number. title: of the effect, for people.
         stream: that shows it. unit: of the number.
         floor: values that differ by less than this are alike.
+        touches: parameters whose intervals do not hold with the effect.
+        signed: the number is the distance from its median in worlds, either way.
+        first: comes before others, since places, times or trends that are wrong show in these too.
     """
 
     key: str
@@ -54,28 +81,75 @@ class Check:
     stream: Stream
     unit: str
     floor: float
+    touches: frozenset[str] = CONTACT_KEYS
+    signed: bool = False
+    first: bool = False
+
+
+def _view(key: str, title: str, unit: str, floor: float, signed: bool = True) -> Check:
+    return Check(key, title, "frames", unit, floor, IN_MM, signed, first=True)
+
+
+def _trend(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
+    return Check(key, f"{title} drifts during the pilot", stream, "sigma", 1.0, touches, first=True)
+
+
+def _delay(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
+    return Check(key, title, stream, "ms", 2.0, touches, signed=True, first=True)
 
 
 CHECKS = (
     Check(TILT, "plate tilted against the arm's", "frames", "mm/mm", 5e-4),
     Check(STICKY, "friction of one papilla unlike that of the others", "frames", "sigma", 0.5),
     Check(BROKEN, "slides in which a papilla is missing", "frames", "share", 0.25),
-    Check(LIGHT, "light that flickers", "events", "times noise", 0.2),
+    Check(LIGHT, "light that flickers", "events", "times noise", 0.2, CAMERA_KEYS),
     Check(RAMP, "slides that begin and end gently", "poses", "mm", 2e-3),
     Check(SPOT, "friction of one place of the plate unlike that of others", "frames", "sigma", 0.5),
-)
+    _view(TURN, "frame camera turned against the arm's axes", "deg", 0.3),
+    _view(SCALE, "scale of the frames unlike the arm's", "share", 3e-3),
+    _view(STRETCH, "scale of the frames unlike in two directions", "share", 3e-3, signed=False),
+    _view(BENT, "frames distorted by a lens", "share", 3e-3),
+    _view(PERSPECTIVE, "frame camera tilted against the plate", "share", 3e-3, signed=False),
+    _delay(FRAME_DELAY, "frames late or early against the arm's poses", "frames", IN_MM),
+    _delay(EVENT_DELAY, "frames late or early against the events", "frames", IN_MM),
+    _delay(FORCE_DELAY, "forces late or early against the arm's poses", "force", FORCE_KEYS),
+    Check(
+        FORCE_TURN, "force sensor turned against the arm's axes", "force", "deg", 1.0, FORCE_KEYS,
+        signed=True, first=True,
+    ),
+    _trend(LAG, "friction or stiffness", "frames", CONTACT_KEYS | FORCE_KEYS),
+    _trend(PULL, "stiffness or the force sensor's gain", "force", CONTACT_KEYS | FORCE_KEYS),
+    _trend(RATIO, "friction", "force", CONTACT_KEYS | FORCE_KEYS),
+    _trend(SHIFT_TREND, "stiffness or the event image's shift by force", "events",
+           CONTACT_KEYS | FORCE_KEYS),
+    _trend(CONTRAST_TREND, "contrast or threshold of events", "events", CAMERA_KEYS),
+    _trend(NOISE_TREND, "noise of the event camera", "events", NOISE_KEYS),
+    Check(
+        PICTURE_TURN, "event camera turned against the arm's axes", "events", "deg", 1.0,
+        CAMERA_KEYS, signed=True, first=True,
+    ),
+    Check(
+        PICTURE_BENT, "event camera's picture distorted against the frames", "events", "share",
+        5e-3, CAMERA_KEYS, signed=True, first=True,
+    ),
+)  # fmt: skip
 GENERAL: Mapping[Stream, str] = {
     "frames": "all that frames show",
     "force": "all that forces show",
     "events": "all that events show",
 }
 """Titles of the checks that compare all statistics of a stream."""
+SHOWN_BY: Mapping[Stream, frozenset[str]] = {
+    "frames": CONTACT_KEYS, "force": FORCE_KEYS, "events": CAMERA_KEYS,
+}  # fmt: skip
 
 
 def misfit_numbers(
     trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], contact: Contact | None
 ) -> dict[str, float]:
     """Return the number of every check by key, NaN where the slides do not tell it.
+
+    Those of the event camera come from `read_camera`.
 
     Args:
         with_events: those of the trials whose events are read.
@@ -94,6 +168,15 @@ def misfit_numbers(
         found[TILT] = gap_slope(contact.place_mm[known], raised_mm, ring[known])
         found[STICKY] = odd_friction(contact.springs, ring)
     found[SPOT] = largest_spot(contact.slips, contact.growth)
+    view = view_of(contact.slips)
+    found |= {
+        SCALE: view.scale, TURN: view.turn_deg, STRETCH: view.stretch, BENT: view.distortion,
+        PERSPECTIVE: view.perspective,
+        FRAME_DELAY: frame_delay_ms(contact.slips, contact.steady),
+        FORCE_DELAY: force_delay_ms(contact.slips, contact.growth),
+        FORCE_TURN: force_turn_deg(contact.slips),
+        **contact_trends(contact.slips, contact.steady),
+    }  # fmt: skip
     return found
 
 
@@ -406,7 +489,8 @@ def misfits(
 ) -> tuple[MisfitCheck, ...]:
     """Return the checks of a pilot, misfits first; the first one says which stream shows it.
 
-    A check for one kind of effect comes before those of all statistics: it says more. Left out is
+    A check for one kind of effect comes before those of all statistics: it says more. Those of
+    places, times and trends come before the others: these show them, too. Left out is
     what the pilot does not tell, or fewer than `FEWEST` worlds.
 
     Args:
@@ -417,13 +501,17 @@ def misfits(
     tried: list[tuple[Check, float, F64]] = []
     for check in CHECKS:
         values = np.array([world[check.key] for world in worlds], np.float64)
-        tried.append((check, numbers[check.key], values[np.isfinite(values)]))
+        values, value = values[np.isfinite(values)], numbers[check.key]
+        if check.signed and len(values):
+            middle = float(np.median(values))
+            values, value = np.abs(values - middle), abs(value - middle)
+        tried.append((check, value, values))
     streams = np.array([stream_of(name) for name in names])
     for stream, title in GENERAL.items():
         own = streams == stream
         if len(s) >= FEWEST and np.isfinite(observed[own]).any():
             values, value = distances(s[:, own], observed[own])
-            check = Check("", title, stream, "distance", 0.1)
+            check = Check("", title, stream, "distance", 0.1, SHOWN_BY[stream])
             tried.append((check, value, values[np.isfinite(values)]))
     tried = [it for it in tried if np.isfinite(it[1]) and len(it[2]) >= FEWEST]
     found = []
@@ -433,10 +521,11 @@ def misfits(
         share = tail.share(value)
         general = check.key == ""
         found.append((
-            (share >= level, general, share),
+            (share >= level, general, not check.first, share),
             MisfitCheck(
                 title=check.title, stream=check.stream, unit=check.unit, pilot=value,
                 limit=tail.limit(level), share=share, found=share < level,
+                touches=tuple(it.key for it in PARAMETERS if it.key in check.touches),
             ),
         ))  # fmt: skip
     return tuple(check for _, check in sorted(found, key=lambda it: it[0]))
