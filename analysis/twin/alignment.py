@@ -29,8 +29,8 @@ LEAST_WAY_MM = 1.0
 NOISE_MM = 0.01
 """Supposed of a tip's way, for weights only: the arm's tremor."""
 FEWEST_FRAMES = 20
-RELAX_S = (1.0, 3.0)
-"""Times with which lags are taken to grow after a slip, s."""
+RELAX_S = 1.5
+"""Time with which lags are taken to grow after a slip."""
 ROUNDS, OUTLIER = 6, 2.5
 """Of the reweighting of ways, and from how many deviations on one counts less."""
 
@@ -70,7 +70,7 @@ def view_of(slips: Slips) -> View:
         reach * (_cubic(x) - _cubic(y)),
         *(reach * (x * x[:, [k]] - y * y[:, [k]]) for k in (0, 1)),
         # what still relaxes is in proportion to the lag
-        *(-ahead * (lag * left[:, k])[:, None] for k in range(len(RELAX_S))),
+        -ahead * (lag * left)[:, None],
     ]  # fmt: skip
     error = np.stack([np.hypot(VARIATION * lag, NOISE_MM), np.full(len(lag), NOISE_MM)], axis=1)
     # along the way and across it
@@ -84,12 +84,12 @@ def view_of(slips: Slips) -> View:
     )  # fmt: skip
 
 
-def _ways(slips: Slips, i: int) -> Iterator[tuple[F64, F64, F64, F64, float, list[float]]]:
+def _ways(slips: Slips, i: int) -> Iterator[tuple[F64, F64, F64, F64, float, float]]:
     """Yield what each sliding tip of a slide goes between the middles of its way's two halves.
 
     Yields:
-        ways of the base and of the tip, mm; the tip's places there; its mean lag, mm; and how much
-        of what relaxes with each of `RELAX_S` did so in between.
+        ways of the base and of the tip, mm; the tip's places there; its mean lag, mm; and the share
+        of what relaxes that did so in between.
     """
     trial = slips.trials[i]
     moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
@@ -104,8 +104,9 @@ def _ways(slips: Slips, i: int) -> Iterator[tuple[F64, F64, F64, F64, float, lis
         if np.hypot(*way) < LEAST_WAY_MM:
             continue
         first, last = tips[a, j].mean(axis=0), tips[b, j].mean(axis=0)
-        left = [float(np.exp(-since[a] / s).mean() - np.exp(-since[b] / s).mean()) for s in RELAX_S]
-        yield way, last - first, first, last, abs(float(slips.lag_mm[i][use, j].mean())), left
+        lag, left = float(slips.lag_mm[i][use, j].mean()), np.exp(-since / RELAX_S)
+        relaxed = float(left[a].mean() - left[b].mean())
+        yield way, last - first, first, last, abs(lag), relaxed
 
 
 def _cubic(place: F64) -> F64:
@@ -156,8 +157,9 @@ def _off_their_depth(slips: Slips, values: F64) -> tuple[F64, F64]:
     return values - mean, mean
 
 
-NEAR_S = 0.04
-"""Events are counted so long before and after a slip, and in as long a time on either side."""
+NEAR_S = (0.04, 0.02, 0.01)
+"""Events are counted so long before and after a slip, and in as long a time on either side: first
+widely, to find a large delay, and then closely, where tremor moves a tip less."""
 
 
 def event_delay_ms(trials: Sequence[PilotTrial], rests: F64 | None) -> float:
@@ -171,27 +173,35 @@ def event_delay_ms(trials: Sequence[PilotTrial], rests: F64 | None) -> float:
     slips = find_slips(trials)
     if slips is None or rests is None:
         return float("nan")
-    late = total = 0.0
-    for i, trial in enumerate(slips.trials):
-        if trial.camera is None:
+    late_s = 0.0
+    for near_s in NEAR_S:
+        counts = [
+            row for i in range(len(slips.trials)) for row in _near(slips, i, rests, late_s, near_s)
+        ]
+        before, between, after = np.array(counts, np.float64).reshape(-1, 3).sum(axis=0)
+        if before <= after:
+            return float("nan")
+        late_s += near_s * float((between - before - after) / (before - after))
+    return 1e3 * late_s
+
+
+def _near(
+    slips: Slips, i: int, rests: F64, late_s: float, near_s: float
+) -> Iterator[tuple[int, ...]]:
+    """Yield events of each marker before, about and after `late_s` from its slip in a slide."""
+    trial = slips.trials[i]
+    if trial.camera is None:
+        return
+    events = trial.camera.events
+    for j in np.flatnonzero(slips.slid[i] & np.isfinite(rests[:, RADIUS])):
+        edges = slips.slipped_s[i, j] + late_s + near_s * np.array([-2.0, -1.0, 1.0, 2.0])
+        if edges[0] < 0.0 or edges[-1] > trial.slide_s:
             continue
-        for j in np.flatnonzero(slips.slid[i] & np.isfinite(rests[:, RADIUS])):
-            column, row, radius = rests[j, [COLUMN, ROW, RADIUS]]
-            edges = slips.slipped_s[i, j] + NEAR_S * np.array([-2.0, -1.0, 1.0, 2.0])
-            if edges[0] < 0.0 or edges[-1] > trial.slide_s:
-                continue
-            events = trial.camera.events
-            ends = np.searchsorted(events.t_us, edges * 1e6)
-            near = (
-                np.hypot(events.x[ends[0] : ends[-1]] - column, events.y[ends[0] : ends[-1]] - row)
-                < DISC_REACH * radius
-            )
-            before, between, after = (
-                int(near[a:b].sum()) for a, b in pairwise((ends - ends[0]).tolist())
-            )
-            late += between - before - after
-            total += before - after
-    return 1e3 * NEAR_S * late / total if total > 0.0 else float("nan")
+        column, row, radius = rests[j, [COLUMN, ROW, RADIUS]]
+        first, *ends = np.searchsorted(events.t_us, edges * 1e6).tolist()
+        part = slice(first, ends[-1])
+        inside = np.hypot(events.x[part] - column, events.y[part] - row) < DISC_REACH * radius
+        yield tuple(int(inside[a - first : b - first].sum()) for a, b in pairwise([first, *ends]))
 
 
 def force_delay_ms(slips: Slips, growth: Growth) -> float:

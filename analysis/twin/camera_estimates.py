@@ -21,7 +21,6 @@ from scipy.stats import poisson
 
 from sliplab.analysis.labels.event_tracking import find_discs
 from sliplab.analysis.twin.alignment import event_delay_ms
-from sliplab.analysis.twin.contact_slips import mean_seen
 from sliplab.analysis.twin.event_times import (
     INTERVALS_US,
     Scans,
@@ -82,10 +81,13 @@ _EDGE_PX, _CONTRAST = 0.8, 10.0
 _FEWEST_FULL = 200
 
 
-CONTRAST_TREND, NOISE_TREND, SHIFT_TREND, PICTURE_TURN, PICTURE_BENT, EVENT_DELAY = CHECKED = (
-    "contrast_trend", "noise_trend", "shift_trend", "picture_turn_deg", "picture_bent",
+CONTRAST_TREND, NOISE_TREND, SHIFT_TREND, PICTURE_TURN, EVENT_DELAY = CHECKED = (
+    "contrast_trend",
+    "noise_trend",
+    "shift_trend",
+    "picture_turn_deg",
     "event_delay_ms",
-)  # fmt: skip
+)
 """What events show of effects that no parameter of the camera makes."""
 
 
@@ -370,7 +372,7 @@ def _discs(
 
 
 def _picture(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
-    """Return how the picture lies against the arm's motion and against frames, and its trend.
+    """Return the turn of the picture against the arm's motion, and the trend of its shift.
 
     Args:
         discs: as for `_geometry`.
@@ -381,23 +383,10 @@ def _picture(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
     # markers move with the force or against it
     sign = np.sign(along.sum())
     turn = np.degrees(np.arctan2(sign * across, sign * along))
-    found = {PICTURE_TURN: float(np.median(turn))}
-    found[SHIFT_TREND] = shift_trend(trials, np.hypot(along, across))
-    places = mean_seen(np.where(np.isfinite(discs[..., [RADIUS]]), discs, np.nan))
-    layout = _tips(trials)
-    known = np.isfinite(places[:, COLUMN]) & np.isfinite(layout[:, 0])
-    if known.sum() >= 8:
-        x = layout[known] - layout[known].mean(axis=0)
-        reach = np.hypot(*x.T).max()
-        radial = x * (np.hypot(*x.T)[:, None] / reach) ** 2
-        # one distortion for columns and rows, one affine map for each
-        flat = np.column_stack([x, np.ones(len(x))])
-        rest_x = radial - flat @ np.linalg.lstsq(flat, radial, rcond=None)[0]
-        seen = places[known][:, [COLUMN, ROW]]
-        rest = seen - flat @ np.linalg.lstsq(flat, seen, rcond=None)[0]
-        scale = np.sqrt(np.ptp(seen[:, 0]) * np.ptp(seen[:, 1]) / np.prod(np.ptp(x, axis=0)))
-        found[PICTURE_BENT] = float((rest * rest_x).sum() / (rest_x**2).sum() / scale)
-    return found
+    return {
+        PICTURE_TURN: float(np.median(turn)),
+        SHIFT_TREND: shift_trend(trials, np.hypot(along, across)),
+    }
 
 
 def _counts(trial: PilotTrial, noise: _Noise, size_px: tuple[int, int]) -> NDArray[np.int32]:

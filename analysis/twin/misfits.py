@@ -8,7 +8,7 @@ all statistics of a stream with those of the worlds: they find what no other che
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,7 +21,6 @@ from sliplab.analysis.twin.camera_estimates import (
     CONTRAST_TREND,
     EVENT_DELAY,
     NOISE_TREND,
-    PICTURE_BENT,
     PICTURE_TURN,
     SHIFT_TREND,
 )
@@ -53,6 +52,9 @@ SCALE, TURN, STRETCH, BENT, PERSPECTIVE, FRAME_DELAY, FORCE_DELAY, FORCE_TURN = 
     "frame_delay_ms", "force_delay_ms", "force_turn_deg",
 )  # fmt: skip
 
+VIEWS = frozenset((SCALE, TURN, STRETCH, BENT, PERSPECTIVE))
+"""Of the frames: a picture that is wrong makes delays and trends that are none."""
+
 CONTACT_KEYS = frozenset(it.key for it in CONTACT)
 CAMERA_KEYS = frozenset(it.key for it in CAMERA)
 FORCE_KEYS = frozenset(it.key for it in PARAMETERS if "force" in it.streams)
@@ -73,7 +75,8 @@ class Check:
         floor: values that differ by less than this are alike.
         touches: parameters whose intervals do not hold with the effect.
         signed: the number is the distance from its median in worlds, either way.
-        first: comes before others, since places, times or trends that are wrong show in these too.
+        setup: tells of places, times or trends that are wrong. These show in others, too, so that
+            it comes first; and its number is near to normal, see `Tail`.
     """
 
     key: str
@@ -83,19 +86,19 @@ class Check:
     floor: float
     touches: frozenset[str] = CONTACT_KEYS
     signed: bool = False
-    first: bool = False
+    setup: bool = False
 
 
 def _view(key: str, title: str, unit: str, floor: float, signed: bool = True) -> Check:
-    return Check(key, title, "frames", unit, floor, IN_MM, signed, first=True)
+    return Check(key, title, "frames", unit, floor, IN_MM, signed, setup=True)
 
 
 def _trend(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
-    return Check(key, f"{title} drifts during the pilot", stream, "sigma", 1.0, touches, first=True)
+    return Check(key, f"{title} drifts during the pilot", stream, "sigma", 0.5, touches, setup=True)
 
 
 def _delay(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
-    return Check(key, title, stream, "ms", 2.0, touches, signed=True, first=True)
+    return Check(key, title, stream, "ms", 0.5, touches, signed=True, setup=True)
 
 
 CHECKS = (
@@ -105,17 +108,17 @@ CHECKS = (
     Check(LIGHT, "light that flickers", "events", "times noise", 0.2, CAMERA_KEYS),
     Check(RAMP, "slides that begin and end gently", "poses", "mm", 2e-3),
     Check(SPOT, "friction of one place of the plate unlike that of others", "frames", "sigma", 0.5),
-    _view(TURN, "frame camera turned against the arm's axes", "deg", 0.3),
-    _view(SCALE, "scale of the frames unlike the arm's", "share", 3e-3),
-    _view(STRETCH, "scale of the frames unlike in two directions", "share", 3e-3, signed=False),
-    _view(BENT, "frames distorted by a lens", "share", 3e-3),
-    _view(PERSPECTIVE, "frame camera tilted against the plate", "share", 3e-3, signed=False),
+    _view(TURN, "frame camera turned against the arm's axes", "deg", 0.05),
+    _view(SCALE, "scale of the frames unlike the arm's", "share", 1e-3),
+    _view(STRETCH, "scale of the frames unlike in two directions", "share", 1e-3, signed=False),
+    _view(BENT, "frames distorted by a lens", "share", 1e-3),
+    _view(PERSPECTIVE, "frame camera tilted against the plate", "share", 1e-3, signed=False),
     _delay(FRAME_DELAY, "frames late or early against the arm's poses", "frames", IN_MM),
     _delay(EVENT_DELAY, "frames late or early against the events", "frames", IN_MM),
     _delay(FORCE_DELAY, "forces late or early against the arm's poses", "force", FORCE_KEYS),
     Check(
-        FORCE_TURN, "force sensor turned against the arm's axes", "force", "deg", 1.0, FORCE_KEYS,
-        signed=True, first=True,
+        FORCE_TURN, "force sensor turned against the arm's axes", "force", "deg", 0.1, FORCE_KEYS,
+        signed=True, setup=True,
     ),
     _trend(LAG, "friction or stiffness", "frames", CONTACT_KEYS | FORCE_KEYS),
     _trend(PULL, "stiffness or the force sensor's gain", "force", CONTACT_KEYS | FORCE_KEYS),
@@ -125,12 +128,8 @@ CHECKS = (
     _trend(CONTRAST_TREND, "contrast or threshold of events", "events", CAMERA_KEYS),
     _trend(NOISE_TREND, "noise of the event camera", "events", NOISE_KEYS),
     Check(
-        PICTURE_TURN, "event camera turned against the arm's axes", "events", "deg", 1.0,
-        CAMERA_KEYS, signed=True, first=True,
-    ),
-    Check(
-        PICTURE_BENT, "event camera's picture distorted against the frames", "events", "share",
-        5e-3, CAMERA_KEYS, signed=True, first=True,
+        PICTURE_TURN, "event camera turned against the arm's axes", "events", "deg", 0.1,
+        CAMERA_KEYS, signed=True, setup=True,
     ),
 )  # fmt: skip
 GENERAL: Mapping[Stream, str] = {
@@ -436,7 +435,8 @@ def distances(s: F64, observed: F64) -> tuple[F64, float]:
 # -- the verdict -------------------------------------------------------------------------------
 
 _LEAST_TAIL = 0.1
-"""Numbers of the worlds are taken to scatter in their tail by at least so much, relative."""
+"""Numbers of the worlds are taken to scatter in their tail by at least so much, relative; where the
+numbers themselves are looked at, by their floor."""
 
 
 @dataclass(frozen=True)
@@ -444,31 +444,40 @@ class Tail:
     """The largest values of a number in the worlds: log(value + floor) has an exponential tail.
 
     A posterior predictive distribution (prior 1 / mean): with few worlds it is wider. It is longer
-    than that of a normal or log-normal number.
+    than that of a normal or log-normal number. What is near to normal has an exponential tail
+    itself, in units of the floor (`linear`), which is still longer.
 
     Attributes:
-        values: of the worlds, sorted logarithms, (n,). floor: see `Check`.
+        values: of the worlds, sorted, transformed, (n,). floor, linear: see `Check`.
     """
 
     values: F64
     floor: float
+    linear: bool = False
 
     @classmethod
-    def of(cls, values: F64, floor: float) -> Tail:
+    def of(cls, values: F64, floor: float, linear: bool = False) -> Tail:
         """Return the tail of some worlds' values."""
-        return cls(np.sort(np.log(np.maximum(values, 0.0) + floor)), floor)
+        tail = cls(values, floor, linear)
+        return replace(tail, values=np.sort(tail._scaled(values)))
+
+    def _scaled(self, values: F64) -> F64:
+        positive = np.maximum(values, 0.0)
+        result: F64 = positive / self.floor if self.linear else np.log(positive + self.floor)
+        return result
 
     @property
     def _shape(self) -> tuple[int, float, float]:
         """Return how many worlds make the tail, where it begins and the sum of their excesses."""
         k = max(round(TAIL * len(self.values)), 2)
         begin = float(self.values[-k - 1])
-        return k, begin, max(float((self.values[-k:] - begin).sum()), k * _LEAST_TAIL)
+        least = 1.0 if self.linear else _LEAST_TAIL
+        return k, begin, max(float((self.values[-k:] - begin).sum()), k * least)
 
     def share(self, value: float) -> float:
         """Return the probability of at least this value."""
         k, begin, total = self._shape
-        x = float(np.log(max(value, 0.0) + self.floor))
+        x = float(self._scaled(np.array(value)))
         if x <= begin:
             return float((self.values >= x).mean())
         return float(k / len(self.values) * (1.0 + (x - begin) / total) ** -k)
@@ -477,7 +486,7 @@ class Tail:
         """Return the value that is reached with a probability, which is less than `TAIL`."""
         k, begin, total = self._shape
         x = begin + total * ((k / len(self.values) / share) ** (1.0 / k) - 1.0)
-        return float(np.exp(x) - self.floor)
+        return float(x * self.floor if self.linear else np.exp(x) - self.floor)
 
 
 def misfits(
@@ -490,7 +499,8 @@ def misfits(
     """Return the checks of a pilot, misfits first; the first one says which stream shows it.
 
     A check for one kind of effect comes before those of all statistics: it says more. Those of
-    places, times and trends come before the others: these show them, too. Left out is
+    the frames' picture come first, and then those of times and trends, since all others show them,
+    too. Left out is
     what the pilot does not tell, or fewer than `FEWEST` worlds.
 
     Args:
@@ -517,11 +527,11 @@ def misfits(
     found = []
     for check, value, values in tried:
         level = LEVEL / len(tried)
-        tail = Tail.of(values, check.floor)
+        tail = Tail.of(values, check.floor, check.setup)
         share = tail.share(value)
         general = check.key == ""
         found.append((
-            (share >= level, general, not check.first, share),
+            (share >= level, general, not check.setup, check.key not in VIEWS, share),
             MisfitCheck(
                 title=check.title, stream=check.stream, unit=check.unit, pilot=value,
                 limit=tail.limit(level), share=share, found=share < level,

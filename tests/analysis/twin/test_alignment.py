@@ -19,7 +19,6 @@ from sliplab.analysis.twin.alignment import (
 from sliplab.analysis.twin.camera_estimates import (
     CONTRAST_TREND,
     NOISE_TREND,
-    PICTURE_BENT,
     PICTURE_TURN,
     read_camera,
 )
@@ -39,9 +38,13 @@ STIFFNESS_N_PER_MM = 0.05
 
 
 @cache
-def drawn(worn: float = 0.0, deeper_mm: float = 0.0, seed: int = 0) -> tuple[PilotTrial, ...]:
+def drawn(
+    worn: float = 0.0, deeper_mm: float = 0.0, friction: float = 1.0, seed: int = 0
+) -> tuple[PilotTrial, ...]:
     """Slides in two directions at right angles, twelve of them."""
-    made = whole_pilot(worn=worn, raised_mm=np.full(19, deeper_mm), seed=seed)
+    made = whole_pilot(
+        worn=worn, raised_mm=np.full(19, deeper_mm), friction=np.full(19, friction), seed=seed
+    )
     return tuple(trial for k, trial in enumerate(made) if k % 4 < 2)
 
 
@@ -135,8 +138,7 @@ def test_a_camera_that_is_not_aligned_is_named(
     assert all(check.stream == "frames" for check in found if check.title == title)
     assert "scene.friction.kinetic" in found[0].touches
     assert "event_camera.px_per_mm" in found[0].touches
-    if title.startswith(("frame camera turned", "scale of the frames unlike the")):
-        assert found[0].title == title
+    assert found[0].stream == "frames"
 
 
 def test_sizes_of_a_camera_that_is_not_aligned() -> None:
@@ -148,9 +150,9 @@ def test_sizes_of_a_camera_that_is_not_aligned() -> None:
     assert seen(turned(6.0))["turn_deg"] == pytest.approx(6.0, abs=0.1)
     assert seen(lambda tips: 1.05 * tips)["scale"] == pytest.approx(0.05, abs=0.005)
     assert seen(lambda tips: tips * [1.02, 1.0])["stretch"] == pytest.approx(0.02, abs=0.003)
-    reach = np.nanmax(np.hypot(*np.moveaxis(drawn()[0].tips_mm, 2, 0)))
     found = seen(bent(-0.03))["distortion"]
-    assert found == pytest.approx(-0.03 * (reach / 15.0) ** 2, rel=0.15)
+    assert -0.03 < found < -0.01  # the outermost marker is nearer than 15 mm
+    assert seen(bent(0.015))["distortion"] == pytest.approx(-found / 2.0, rel=0.1)
 
 
 @pytest.mark.parametrize("seconds", [0.03, -0.03])
@@ -197,27 +199,28 @@ def test_friction_that_drifts_is_named(worn: float, worlds: list[dict[str, float
     assert "scene.friction.kinetic" in found[0].touches
 
 
-@pytest.mark.parametrize("weaker", [0.2, -0.1])
-def test_stiffness_that_drifts_is_named(weaker: float, worlds: list[dict[str, float]]) -> None:
-    found = called(pulled(drawn(), weaker=weaker), worlds)
-    titles = [check.title for check in found]
-    assert "stiffness or the force sensor's gain drifts during the pilot" in titles
-    assert "event_camera.shift_mm_per_n" in found[0].touches
+@pytest.mark.parametrize(("weaker", "most"), [(0.0, 3.0), (0.2, np.inf), (-0.1, np.inf)])
+def test_stiffness_that_drifts_shows_in_forces_over_lags(weaker: float, most: float) -> None:
+    contact = read_contact(pulled(drawn(friction=0.7), weaker=weaker))
+    assert contact is not None
+    found = contact_trends(contact.slips, contact.steady)
+    assert found[LAG] < 3.0
+    assert (4.0 if weaker else 0.0) <= found[PULL] < most
 
 
 def test_an_error_of_depth_zero_is_no_trend() -> None:
     """Slides after another measurement of depth zero are compared with each other alone."""
     first = drawn()
-    deeper = drawn(deeper_mm=0.1)
-    both = [trial for k, trial in enumerate(first) if k % 4 < 2]
-    both += [replace(trial, zero_mm=0.1) for k, trial in enumerate(deeper) if k % 4 > 1]
+    deeper = drawn(deeper_mm=0.3)
+    both = [*first[::2], *(replace(trial, zero_mm=0.1) for trial in deeper[1::2])]
 
     def lag_trend(trials: Trials) -> float:
         contact = read_contact(trials)
         assert contact is not None
         return contact_trends(contact.slips, contact.steady)[LAG]
 
-    assert lag_trend(both) < 3.0 < lag_trend([replace(it, zero_mm=0.0) for it in both])
+    one_zero = [replace(trial, zero_mm=0.0) for trial in both]
+    assert lag_trend(both) < 3.6 < 5.0 < lag_trend(one_zero)
 
 
 def test_a_trend_needs_eight_values_and_ignores_what_they_depend_on() -> None:
@@ -250,13 +253,11 @@ def rolled(trials: Trials, deg: float) -> list[PilotTrial]:
     ]
 
 
-def test_a_turned_or_bent_event_picture_has_its_size() -> None:
+def test_a_turned_event_picture_has_its_size() -> None:
     _, plain = read_camera(seen_by_events())
     assert plain[PICTURE_TURN] == pytest.approx(0.0, abs=0.2)
     _, found = read_camera(rolled(seen_by_events(), -5.0))
     assert found[PICTURE_TURN] == pytest.approx(5.0, abs=0.2)
-    # seven markers, in one ring about one, cannot show how a lens bends a picture
-    assert np.isnan(plain[PICTURE_BENT])
 
 
 def test_noise_and_contrast_that_drift_show() -> None:
