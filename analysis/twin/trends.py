@@ -1,7 +1,7 @@
 """What changes from the first slide of a pilot to the last, which worlds do not know.
 
-Each number is a change over the whole pilot over its own standard error, by regression on the
-slides' order. Slides of one depth are compared, and those since one measurement of depth zero: an
+Each number is a change over the whole pilot in units of its own standard error, by regression on
+the slides' order. Slides of one depth are compared, and those since one measurement of depth zero: an
 error of it changes forces and lags as wear does.
 """
 
@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from sliplab.analysis.twin.contact_forces import gross_forces
 from sliplab.analysis.twin.contact_lags import SteadyLags
@@ -20,10 +22,14 @@ from sliplab.storage.streams import F64
 ALIKE = 0.005
 """Changes by this share are within what slides differ by anyway."""
 FEWEST = 8
+LEAST = 1e-300
+"""Probability that a deviate of 37 has."""
 
 
 def trend(values: F64, order: F64, others: F64) -> float:
-    """Return the change of values over their order, over its error; NaN with too few.
+    """Return how far a change of values over their order is from none; NaN with too few.
+
+    Student's t of the slope, as the standard normal deviate that is as improbable.
 
     Args:
         values: (k,), NaN where not known. order: (k,), 0 to 1. others: (k, c), what values depend
@@ -40,7 +46,9 @@ def trend(values: F64, order: F64, others: F64) -> float:
     if free < 3 or rank < 2:
         return float("nan")
     error = np.sqrt(np.sum(rest**2) / free * inverse[0, 0])
-    return abs(float(best[0])) / float(np.hypot(error, ALIKE))
+    distance = abs(float(best[0])) / float(np.hypot(error, ALIKE))
+    # few slides and many conditions leave few degrees of freedom
+    return float(norm.isf(max(student.sf(distance, free), LEAST)))
 
 
 LAG, PULL, RATIO = "lag_trend", "pull_trend", "ratio_trend"

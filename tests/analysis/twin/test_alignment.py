@@ -205,7 +205,7 @@ def test_stiffness_that_drifts_shows_in_forces_over_lags(weaker: float, most: fl
     assert contact is not None
     found = contact_trends(contact.slips, contact.steady)
     assert found[LAG] < 3.0
-    assert (4.0 if weaker else 0.0) <= found[PULL] < most
+    assert (2.0 if weaker else -1.0) <= found[PULL] < most
 
 
 def test_an_error_of_depth_zero_is_no_trend() -> None:
@@ -220,16 +220,16 @@ def test_an_error_of_depth_zero_is_no_trend() -> None:
         return contact_trends(contact.slips, contact.steady)[LAG]
 
     one_zero = [replace(trial, zero_mm=0.0) for trial in both]
-    assert lag_trend(both) < 3.6 < 5.0 < lag_trend(one_zero)
+    assert lag_trend(both) < 2.8 < 3.2 < lag_trend(one_zero)
 
 
 def test_a_trend_needs_eight_values_and_ignores_what_they_depend_on() -> None:
     order, none = np.linspace(0.0, 1.0, 20), np.empty((20, 0))
     noise = np.random.default_rng(3).normal(0.0, 0.01, 20)
     assert trend(noise, order, none) < 3.0
-    assert trend(noise - 0.1 * order, order, none) > 8.0
+    assert trend(noise - 0.1 * order, order, none) > 5.0
     other = np.tile([0.0, 1.0], 10)[:, None]
-    assert trend(noise + 5.0 * other[:, 0] - 0.1 * order, order, other) > 8.0
+    assert trend(noise + 5.0 * other[:, 0] - 0.1 * order, order, other) > 5.0
     assert np.isnan(trend(noise[:7], order[:7], none[:7]))
     assert np.isnan(plain_trend([np.nan] * 20))
     assert np.isnan(list(contact_trends(*no_forces()).values())[1:]).all()
@@ -262,8 +262,8 @@ def test_a_turned_event_picture_has_its_size() -> None:
 
 def test_noise_and_contrast_that_drift_show() -> None:
     _, plain = read_camera(seen_by_events())
-    assert plain[NOISE_TREND] < 4.0
-    assert plain[CONTRAST_TREND] < 4.0
+    assert plain[NOISE_TREND] < 3.0
+    assert plain[CONTRAST_TREND] < 3.0
     fading = []
     for number, trial in enumerate(seen_by_events()):
         assert trial.camera is not None
@@ -272,8 +272,8 @@ def test_noise_and_contrast_that_drift_show() -> None:
         columns = (column[kept] for column in (events.x, events.y, events.p, events.t_us))
         fading.append(replace(trial, camera=replace(trial.camera, events=EventChunk(*columns))))
     _, found = read_camera(fading)
-    assert found[NOISE_TREND] > 8.0
-    assert found[CONTRAST_TREND] > 8.0
+    assert found[NOISE_TREND] > 4.0
+    assert found[CONTRAST_TREND] > 4.0
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.015, -0.01])

@@ -356,7 +356,7 @@ def test_what_is_not_there_is_not_checked() -> None:
     bank, s = worlds(100, rng)
     (own, *_), observed = worlds(1, rng)
     events = np.array([stream_of(name) == "events" for name in STATISTICS])
-    blind = own | {LIGHT: float("nan")}
+    blind = own | {check.key: float("nan") for check in CHECKS if check.stream == "events"}
     names = [name for name, one in zip(STATISTICS, events, strict=True) if not one]
     found = misfits(blind, bank, names, observed[0][~events], s[:, ~events])
     assert {check.stream for check in found} == {"frames", "force", "poses"}
