@@ -39,6 +39,8 @@ Stream = Literal["frames", "events", "poses", "force"]
 
 LEVEL = 0.05
 """Share of pilots without any such effect that show a misfit, of all checks together."""
+SETUP_LEVEL = 0.01
+"""Part of it that those checks have which tell of places, times and trends."""
 TAIL = 0.2
 """Share of the worlds that the tail of a number is taken from."""
 FEWEST = 20
@@ -526,7 +528,8 @@ def misfits(
     tried = [it for it in tried if np.isfinite(it[1]) and len(it[2]) >= FEWEST]
     found = []
     for check, value, values in tried:
-        level = LEVEL / len(tried)
+        alike = sum(other.setup == check.setup for other, *_ in tried)
+        level = (SETUP_LEVEL if check.setup else LEVEL - SETUP_LEVEL) / alike
         tail = Tail.of(values, check.floor, check.setup)
         share = tail.share(value)
         general = check.key == ""

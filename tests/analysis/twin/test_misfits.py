@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from scipy.stats import lomax
 
-from sliplab.analysis.twin.camera_estimates import NAMES
+from sliplab.analysis.twin.camera_estimates import NAMES, NOISE_TREND
 from sliplab.analysis.twin.contact_estimates import read_contact
 from sliplab.analysis.twin.contact_springs import Guess, steady
 from sliplab.analysis.twin.misfits import (
     BROKEN,
     CHECKS,
     FEWEST,
+    FORCE_DELAY,
     LEVEL,
     LIGHT,
     RAMP,
@@ -24,6 +25,7 @@ from sliplab.analysis.twin.misfits import (
     STICKY,
     TAIL,
     TILT,
+    TURN,
     Tail,
     distances,
     line_over_noise,
@@ -33,6 +35,7 @@ from sliplab.analysis.twin.misfits import (
     stream_of,
 )
 from sliplab.analysis.twin.pilot import Camera, PilotTrial, Slide
+from sliplab.analysis.twin.trends import LAG, PULL
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
@@ -307,7 +310,9 @@ def test_false_alarms_keep_to_the_level(k: int) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "stream"),
     [(TILT, 0.0175, "frames"), (STICKY, 8.0, "frames"), (BROKEN, 1.0, "frames"),
-     (LIGHT, 1e4, "events"), (RAMP, 0.1, "poses"), (SPOT, 20.0, "frames")],
+     (LIGHT, 1e4, "events"), (RAMP, 0.1, "poses"), (SPOT, 20.0, "frames"),
+     (TURN, 6.0, "frames"), (LAG, 9.0, "frames"), (PULL, 9.0, "force"),
+     (NOISE_TREND, 9.0, "events"), (FORCE_DELAY, -15.0, "force")],
 )  # fmt: skip
 def test_an_effect_is_called_by_its_stream(key: str, value: float, stream: str) -> None:
     rng = np.random.default_rng(3)
@@ -316,8 +321,10 @@ def test_an_effect_is_called_by_its_stream(key: str, value: float, stream: str) 
     found = misfits(own | {key: value}, bank, STATISTICS, observed[0], s)
     title = next(check.title for check in CHECKS if check.key == key)
     assert (found[0].found, found[0].stream, found[0].title) == (True, stream, title)
-    assert found[0].pilot == pytest.approx(value)
-    assert found[0].share < LEVEL / len(found) < found[1].share
+    check = next(check for check in CHECKS if check.key == key)
+    assert found[0].pilot == pytest.approx(abs(value), abs=1.2 if check.signed else 1e-9)
+    assert set(found[0].touches) == check.touches
+    assert found[0].share < LEVEL / 9 < found[1].share
     assert found[0].limit < value
     # what other statistics show as well does not come before it
     found = misfits(own | {key: value}, bank, STATISTICS, observed[0] + 3.0, s)
