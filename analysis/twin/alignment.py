@@ -116,7 +116,7 @@ def _cubic(place: F64) -> F64:
 def _robust(design: F64, right: F64, error: F64) -> F64:
     """Return the least-squares solution in which outliers count less (Huber's weights)."""
     weight = 1.0 / error
-    best = np.zeros(design.shape[1])
+    best: F64 = np.zeros(design.shape[1])
     for _ in range(ROUNDS):
         best = np.linalg.lstsq(design * weight[:, None], right * weight, rcond=1e-9)[0]
         off = np.abs(right - design @ best) / error
