@@ -118,7 +118,8 @@ def _robust(design: F64, right: F64, error: F64) -> F64:
     weight = 1.0 / error
     best: F64 = np.zeros(design.shape[1])
     for _ in range(ROUNDS):
-        best = np.linalg.lstsq(design * weight[:, None], right * weight, rcond=1e-9)[0]
+        found = np.linalg.lstsq(design * weight[:, None], right * weight, rcond=1e-9)[0]
+        best = np.asarray(found, np.float64)
         off = np.abs(right - design @ best) / error
         usual = max(1.4826 * float(np.median(off)), 1e-9)
         weight = np.sqrt(np.minimum(1.0, OUTLIER * usual / np.maximum(off, 1e-12))) / error
