@@ -40,10 +40,12 @@ from scipy.stats import kstest, kstwo
 from threadpoolctl import threadpool_limits
 
 from sliplab.analysis.twin.misfits import misfits
+from sliplab.analysis.twin.parameters import PARAMETERS, settings_of, value_of
+from sliplab.analysis.twin.pilot import PilotTrial
 from sliplab.analysis.twin.posterior import Bank, Estimate, Fitted, fitted
 from sliplab.analysis.twin.statistics import Statistics, of_names, statistics
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin.pilots import event_trials
+from sliplab.flows.twin.pilots import event_trials, simulate_pilot
 from sliplab.flows.twin.worlds import Prior, Slides, World
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock import fault_settings as faults
@@ -59,11 +61,46 @@ TILT_DEG = 1.0
 THRESHOLD = EventCamera().threshold
 FAINT = 2.67
 """A light is seen by pixels whose threshold is so many standard deviations below the mean."""
-STREAMS = {
-    "a tilted plate": "frames", "a sticky papilla": "frames", "a broken papilla": "frames",
-    "a light on the mains": "events", "a slow ramp": "poses", "a dirty spot": "frames",
+FIRST_STREAMS = {
+    "a tilted plate": ("frames",), "a sticky papilla": ("frames",), "a broken papilla": ("frames",),
+    "a light on the mains": ("events",), "a slow ramp": ("poses",), "a dirty spot": ("frames",),
 }  # fmt: skip
 CLEAN, BANK = "clean", "bank"
+FIRST_KINDS = (BANK, CLEAN, *FIRST_STREAMS)
+"""Those whose worlds have a seed of their own; worlds of later kinds are further clean ones."""
+LATER = 1000
+TURN_DEG, SCALED, BENT, REACH_MM, LATE_S, DRIFT = 6.0, 1.05, -0.03, 15.0, 0.015, -0.2
+
+
+def turned(tips: F64) -> F64:
+    """Return places in the picture of a camera that is turned by `TURN_DEG`."""
+    cos, sin = np.cos(np.radians(TURN_DEG)), np.sin(np.radians(TURN_DEG))
+    found: F64 = tips @ np.array([[cos, sin], [-sin, cos]])
+    return found
+
+
+def scaled(tips: F64) -> F64:
+    """Return places whose scale is wrong."""
+    return tips * SCALED
+
+
+def bent(tips: F64) -> F64:
+    """Return places that a lens moves by `BENT` of their distance where this is `REACH_MM`."""
+    found: F64 = tips * (1.0 + BENT * (tips**2).sum(axis=-1, keepdims=True) / REACH_MM**2)
+    return found
+
+
+VIEWS = {"a turned camera": turned, "a wrong scale": scaled, "a distorting lens": bent}
+LATE = "late frames"
+DRIFTS = {
+    "falling stiffness": "scene.skin.youngs_modulus_mpa",
+    "falling friction": "scene.friction.kinetic",
+}
+STREAMS: Mapping[str, tuple[str, ...]] = (
+    FIRST_STREAMS
+    | dict.fromkeys((*VIEWS, LATE), ("frames",))
+    | dict.fromkeys(DRIFTS, ("frames", "force"))
+)
 KINDS = (BANK, CLEAN, *STREAMS)
 FORCES = ("without forces", "with forces")
 TENTHS = 10
@@ -82,7 +119,8 @@ def prior_of(kind: str, seed: int) -> Prior:
     """Return what worlds of a kind are drawn from."""
     rig, _ = load_rig_file(shipped_rigs()["mock_force"])
     spread = SPREAD if kind == BANK else HIDDEN_SPREAD
-    return Prior(rig, spread, seed * len(KINDS) + KINDS.index(kind))
+    own = kind if kind in FIRST_KINDS else CLEAN
+    return Prior(rig, spread, seed * len(FIRST_KINDS) + FIRST_KINDS.index(own))
 
 
 def pilot_slides() -> Slides:
@@ -95,6 +133,8 @@ def pilot_slides() -> Slides:
 def world_of(job: Job) -> World:
     """Return a world of a kind."""
     prior = prior_of(job.kind, job.seed)
+    if job.kind not in FIRST_KINDS:
+        return prior.world(LATER + job.number, pilot_slides())
     world = prior.world(job.number, pilot_slides())
     if job.kind == "a tilted plate":
         tilt_deg = prior.rig.scene.scene.contact.tilt_deg + TILT_DEG
@@ -128,12 +168,39 @@ def faults_of(
         yield faults.PlateSpot(kind="plate_spot", centre_mm=centre, radius_mm=4.0)
 
 
+def slides_of(job: Job, world: World) -> list[PilotTrial]:
+    """Return the slides that a world of a kind shows."""
+    if job.kind in DRIFTS:
+        key, trials = DRIFTS[job.kind], world.slides.trials
+        (it,) = (one for one in PARAMETERS if one.key == key)
+        value, found = value_of(world.rig.scene, it), []
+        for number, trial in enumerate(trials):
+            worn = value * (1.0 + DRIFT * number / (len(trials) - 1))
+            rig = changed(world.rig, settings_of(world.rig.scene, {key: worn}))
+            with_events = trial.id in world.slides.with_events
+            found += simulate_pilot(rig, world.slides.plan, [trial], world.seed, with_events)
+        return found
+    slides = world.take()
+    if job.kind in VIEWS:
+        return [replace(slide, tips_mm=VIEWS[job.kind](slide.tips_mm)) for slide in slides]
+    if job.kind == LATE:
+        return [late(slide) for slide in slides]
+    return slides
+
+
+def late(slide: PilotTrial) -> PilotTrial:
+    """Return a slide whose frames are stamped late by `LATE_S`."""
+    stamps = slide.frame_s + LATE_S
+    base = [np.interp(stamps, slide.frame_s, column) for column in slide.base_mm.T]
+    return replace(slide, frame_s=stamps, base_mm=np.column_stack(base))
+
+
 def shown_by(job: Job) -> dict[str, Any]:
     """Return what a world shows, with and without its forces."""
     world = world_of(job)
     found: dict[str, Any] = vars(job).copy()
     with threadpool_limits(1):
-        slides = world.take()
+        slides = slides_of(job, world)
         for name in FORCES:
             seen = slides if name == "with forces" else [replace(s, forces=None) for s in slides]
             found[name] = vars(statistics(seen, world.slides.with_events, world.guess))
@@ -191,7 +258,7 @@ def run_misfits(asked: argparse.Namespace) -> None:
                 others = [world for world in bank if world is not row]
                 called += checks_of(row, others, name)[:1]
             misfit = [check for check in called if check.found]
-            right = sum(check.stream == STREAMS.get(kind) for check in misfit)
+            right = sum(check.stream in STREAMS.get(kind, ()) for check in misfit)
             titles = [f"{check.title} [{check.stream}]" for check in misfit]
             first = "; ".join(f"{t} ({titles.count(t)})" for t in dict.fromkeys(titles))
             counted = f"{right} of {len(called)}" if kind in STREAMS else "-"

@@ -20,9 +20,9 @@ class FittedValue(StrictModel):
 
     value: Number
     """Median of what the pilot leaves likely; the rig's own value where it was not identified."""
-    low: Number
-    high: Number
-    """Central 95 % of what the pilot leaves likely."""
+    low: Number | None
+    high: Number | None
+    """Central 95 % of what the pilot leaves likely; null where a misfit touches the number."""
     unit: str = ""
     identified: bool
     """The pilot says more of it than was assumed; the rest keep the value that was assumed."""

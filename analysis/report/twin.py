@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -58,7 +59,7 @@ def render(
                 [
                     f"{it.title} ({it.unit})" if it.unit else it.title, it.key,
                     _short(it.assumed), _short(it.value) if it.identified else "–",
-                    f"{_short(it.low)} to {_short(it.high)}",
+                    _interval(it),
                     _identified(it),
                 ]
                 for it in fit.parameters
@@ -91,9 +92,17 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
+def _interval(it: ParameterFit) -> str:
+    if it.low is None or it.high is None:
+        return f"withheld: {'; '.join(it.withheld)}"
+    return f"{_short(it.low)} to {_short(it.high)}"
+
+
 def _identified(it: ParameterFit) -> str:
     if not it.identified:
         return "no"
+    if it.low is None or it.high is None:
+        return "withheld"
     return "at the edge" if it.low <= it.least or it.high >= it.most else "yes"
 
 
@@ -113,6 +122,11 @@ def _intervals(fit: TwinFit) -> str:
         figures.Factor(
             it.title, it.low / it.assumed, it.value / it.assumed, it.high / it.assumed,
             it.least / it.assumed, it.most / it.assumed, it.identified,
+        )
+        if it.low is not None and it.high is not None
+        else figures.Factor(
+            f"{it.title} (withheld)", math.nan, math.nan, math.nan,
+            it.least / it.assumed, it.most / it.assumed, False,
         )
         for it in fit.parameters
     ]  # fmt: skip

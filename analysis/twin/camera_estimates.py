@@ -20,6 +20,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import poisson
 
 from sliplab.analysis.labels.event_tracking import find_discs
+from sliplab.analysis.twin.alignment import event_delay_ms
 from sliplab.analysis.twin.event_times import (
     INTERVALS_US,
     Scans,
@@ -42,6 +43,7 @@ from sliplab.analysis.twin.rims import (
     first_moments,
     fit_rims,
 )
+from sliplab.analysis.twin.trends import plain_trend, shift_trend
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64, EventChunk
 
@@ -79,15 +81,30 @@ _EDGE_PX, _CONTRAST = 0.8, 10.0
 _FEWEST_FULL = 200
 
 
+CONTRAST_TREND, NOISE_TREND, SHIFT_TREND, PICTURE_TURN, EVENT_DELAY = CHECKED = (
+    "contrast_trend",
+    "noise_trend",
+    "shift_trend",
+    "picture_turn_deg",
+    "event_delay_ms",
+)
+"""What events show of effects that no parameter of the camera makes."""
+
+
 def camera_estimates(trials: Sequence[PilotTrial]) -> dict[str, float]:
     """Return estimates by name, see `NAMES`; NaN for those that cannot be had.
 
     Trials without an event camera, or of another camera or skin than the first, are left out.
     """
-    found = dict.fromkeys(NAMES, np.nan)
+    return read_camera(trials)[0]
+
+
+def read_camera(trials: Sequence[PilotTrial]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return `camera_estimates`, and the numbers of `CHECKED`."""
+    found, checked = dict.fromkeys(NAMES, np.nan), dict.fromkeys(CHECKED, np.nan)
     seen = [trial for trial in trials if trial.camera is not None and len(trial.camera.events)]
     if not seen:
-        return found
+        return found, checked
     size_px, markers = _size(seen[0]), seen[0].tips_mm.shape[1]
     seen = [t for t in seen if _size(t) == size_px and t.tips_mm.shape[1] == markers]
     rests = _rests(seen, size_px)
@@ -96,9 +113,24 @@ def camera_estimates(trials: Sequence[PilotTrial]) -> dict[str, float]:
     found.update(hot_pixels=float(noise.hot.sum()), hot_hz=noise.hot_hz)
     found.update(_times(seen, noise, size_px))
     found.update(_rates(seen))
+    checked[NOISE_TREND] = _noise_trend(seen, _clear(rests, size_px) & ~noise.hot)
     if rests is not None:
-        found.update(_discs(seen, rests, noise, size_px))
-    return {name: value if value > 0.0 else np.nan for name, value in found.items()}
+        checked[EVENT_DELAY] = event_delay_ms(seen, rests)
+        discs = _discs(seen, rests, noise, size_px)
+        found.update({name: value for name, value in discs.items() if name in found})
+        checked.update({name: value for name, value in discs.items() if name in checked})
+    return {name: value if value > 0.0 else np.nan for name, value in found.items()}, checked
+
+
+def _noise_trend(trials: Sequence[PilotTrial], quiet: Mask) -> float:
+    """Trend of the noise of pixels that see no disc."""
+    if not quiet.any():
+        return float("nan")
+    rates = []
+    for trial in trials:
+        events = _events(trial, trial.hold_s, trial.slide_s)
+        rates.append(quiet[events.y, events.x].sum() / (trial.slide_s - trial.hold_s))
+    return plain_trend(rates)
 
 
 def _size(trial: PilotTrial) -> tuple[int, int]:
@@ -326,11 +358,34 @@ def _discs(
     for k in (RIGHT, DOWN):
         guessed = np.nan_to_num(np.array(starts)[..., k])
         discs[..., k] = np.where(np.isnan(discs[..., k]), guessed, discs[..., k])
+    full = np.array([fit.full.sum(axis=(0, 1)) for fit in fits])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        contrasts = full[:, 1] / full[:, 0]
     return {
         "edge_px": edge_px,
         **_contrast(fits, noise_hz * seen_s, contrast),
         **_geometry(trials, discs, bool(np.isfinite(rests).all())),
         **_papillae(trials, discs),
+        CONTRAST_TREND: plain_trend(contrasts),
+        **_picture(trials, discs),
+    }
+
+
+def _picture(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
+    """Return the turn of the picture against the arm's motion, and the trend of its shift.
+
+    Args:
+        discs: as for `_geometry`.
+    """
+    right, down = discs[..., [RIGHT, DOWN]].sum(axis=1).T
+    ahead, up = np.array([trial.slide.direction for trial in trials]).T
+    along, across = right * ahead - down * up, -down * ahead - right * up
+    # markers move with the force or against it
+    sign = np.sign(along.sum())
+    turn = np.degrees(np.arctan2(sign * across, sign * along))
+    return {
+        PICTURE_TURN: float(np.median(turn)),
+        SHIFT_TREND: shift_trend(trials, np.hypot(along, across)),
     }
 
 

@@ -79,10 +79,7 @@ def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
             continue
         lag = np.column_stack([_filled(t, column) for column in slips.lag_mm[i].T])
         step = (t[-1] - t[0]) / (len(t) - 1)
-        decay = np.exp(-step / growth.relaxation_s)
-        gain = growth.maxwell * growth.relaxation_s / step * (1.0 - decay)
-        steps = np.diff(lag, axis=0, prepend=0.0)
-        stretch = lag + lfilter([gain], [1.0, -decay], steps, axis=0)
+        stretch = relaxing(lag, t, growth)
         total = np.column_stack([stretch[:, ring == r].sum(axis=1) for r in rings])
         before = (trial.forces.t_s >= -0.2) & (trial.forces.t_s < 0.0)
         pull = trial.forces.force_n[:, :2] @ slips.direction[i]
@@ -101,6 +98,16 @@ def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
             use = np.ix_(touching, touching)
             best, *_ = np.linalg.lstsq(square[level][use], product[level][touching], rcond=1e-9)
             result[level, touching] = np.where(best > 0.0, best, np.nan)
+    return result
+
+
+def relaxing(lag_mm: F64, t_s: F64, growth: Growth) -> F64:
+    """Return lags with what still relaxes of them, which a tip pulls in proportion to, (n, m)."""
+    step = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    decay = np.exp(-step / growth.relaxation_s)
+    gain = growth.maxwell * growth.relaxation_s / step * (1.0 - decay)
+    steps = np.diff(lag_mm, axis=0, prepend=0.0)
+    result: F64 = lag_mm + lfilter([gain], [1.0, -decay], steps, axis=0)
     return result
 
 

@@ -8,7 +8,7 @@ all statistics of a stream with those of the worlds: they find what no other che
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,11 +16,21 @@ import numpy.typing as npt
 from scipy.ndimage import median_filter
 
 from sliplab.analysis.twin import camera_estimates
+from sliplab.analysis.twin.alignment import force_delay_ms, force_turn_deg, frame_delay_ms, view_of
+from sliplab.analysis.twin.camera_estimates import (
+    CONTRAST_TREND,
+    EVENT_DELAY,
+    NOISE_TREND,
+    PICTURE_TURN,
+    SHIFT_TREND,
+)
 from sliplab.analysis.twin.contact_estimates import Contact
 from sliplab.analysis.twin.contact_lags import Growth, settled_lags
 from sliplab.analysis.twin.contact_slips import Slips
 from sliplab.analysis.twin.contact_springs import SCATTER, Fit
+from sliplab.analysis.twin.parameters import CAMERA, CONTACT, PARAMETERS
 from sliplab.analysis.twin.pilot import PilotTrial
+from sliplab.analysis.twin.trends import LAG, PULL, RATIO, contact_trends
 from sliplab.storage.schema.twin import MisfitCheck
 from sliplab.storage.streams import F64, I64
 
@@ -29,6 +39,8 @@ Stream = Literal["frames", "events", "poses", "force"]
 
 LEVEL = 0.05
 """Share of pilots without any such effect that show a misfit, of all checks together."""
+SETUP_LEVEL = 0.01
+"""Part of it that those checks have which tell of places, times and trends."""
 TAIL = 0.2
 """Share of the worlds that the tail of a number is taken from."""
 FEWEST = 20
@@ -37,6 +49,22 @@ FEWEST = 20
 TILT, STICKY, BROKEN, LIGHT, RAMP, SPOT = (
     "tilt_mm_per_mm", "odd_friction", "missing_share", "line_over_noise", "ramp_mm", "spot",
 )  # fmt: skip
+SCALE, TURN, STRETCH, BENT, PERSPECTIVE, FRAME_DELAY, FORCE_DELAY, FORCE_TURN = (
+    "frame_scale", "frame_turn_deg", "frame_stretch", "frame_bent", "frame_perspective",
+    "frame_delay_ms", "force_delay_ms", "force_turn_deg",
+)  # fmt: skip
+
+VIEWS = frozenset((SCALE, TURN, STRETCH, BENT, PERSPECTIVE))
+"""Of the frames: a picture that is wrong makes delays and trends that are none."""
+
+CONTACT_KEYS = frozenset(it.key for it in CONTACT)
+CAMERA_KEYS = frozenset(it.key for it in CAMERA)
+FORCE_KEYS = frozenset(it.key for it in PARAMETERS if "force" in it.streams)
+IN_MM = CONTACT_KEYS | {f"event_camera.{name}" for name in ("px_per_mm", "radius_mm")} | FORCE_KEYS
+"""What frames give a length to."""
+NOISE_KEYS = frozenset(
+    f"event_camera.{name}" for name in ("noise_hz", "leak_share", "hot_pixels", "hot_hz")
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +75,10 @@ class Check:
         key: of the number. title: of the effect, for people.
         stream: that shows it. unit: of the number.
         floor: values that differ by less than this are alike.
+        touches: parameters whose intervals do not hold with the effect.
+        signed: the number is the distance from its median in worlds, either way.
+        setup: tells of places, times or trends that are wrong. These show in others, too, so that
+            it comes first; and its number is near to normal, see `Tail`.
     """
 
     key: str
@@ -54,28 +86,71 @@ class Check:
     stream: Stream
     unit: str
     floor: float
+    touches: frozenset[str] = CONTACT_KEYS
+    signed: bool = False
+    setup: bool = False
+
+
+def _view(key: str, title: str, unit: str, floor: float, signed: bool = True) -> Check:
+    return Check(key, title, "frames", unit, floor, IN_MM, signed, setup=True)
+
+
+def _trend(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
+    return Check(key, f"{title} drifts during the pilot", stream, "sigma", 0.5, touches, setup=True)
+
+
+def _delay(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
+    return Check(key, title, stream, "ms", 0.5, touches, signed=True, setup=True)
 
 
 CHECKS = (
     Check(TILT, "plate tilted against the arm's", "frames", "mm/mm", 5e-4),
     Check(STICKY, "friction of one papilla unlike that of the others", "frames", "sigma", 0.5),
     Check(BROKEN, "slides in which a papilla is missing", "frames", "share", 0.25),
-    Check(LIGHT, "light that flickers", "events", "times noise", 0.2),
+    Check(LIGHT, "light that flickers", "events", "times noise", 0.2, CAMERA_KEYS),
     Check(RAMP, "slides that begin and end gently", "poses", "mm", 2e-3),
     Check(SPOT, "friction of one place of the plate unlike that of others", "frames", "sigma", 0.5),
-)
+    _view(TURN, "frame camera turned against the arm's axes", "deg", 0.05),
+    _view(SCALE, "scale of the frames unlike the arm's", "share", 1e-3),
+    _view(STRETCH, "scale of the frames unlike in two directions", "share", 1e-3, signed=False),
+    _view(BENT, "frames distorted by a lens", "share", 1e-3),
+    _view(PERSPECTIVE, "frame camera tilted against the plate", "share", 1e-3, signed=False),
+    _delay(FRAME_DELAY, "frames late or early against the arm's poses", "frames", IN_MM),
+    _delay(EVENT_DELAY, "frames late or early against the events", "frames", IN_MM),
+    _delay(FORCE_DELAY, "forces late or early against the arm's poses", "force", FORCE_KEYS),
+    Check(
+        FORCE_TURN, "force sensor turned against the arm's axes", "force", "deg", 0.1, FORCE_KEYS,
+        signed=True, setup=True,
+    ),
+    _trend(LAG, "friction or stiffness", "frames", CONTACT_KEYS | FORCE_KEYS),
+    _trend(PULL, "stiffness or the force sensor's gain", "force", CONTACT_KEYS | FORCE_KEYS),
+    _trend(RATIO, "friction", "force", CONTACT_KEYS | FORCE_KEYS),
+    _trend(SHIFT_TREND, "stiffness or the event image's shift by force", "events",
+           CONTACT_KEYS | FORCE_KEYS),
+    _trend(CONTRAST_TREND, "contrast or threshold of events", "events", CAMERA_KEYS),
+    _trend(NOISE_TREND, "noise of the event camera", "events", NOISE_KEYS),
+    Check(
+        PICTURE_TURN, "event camera turned against the arm's axes", "events", "deg", 0.1,
+        CAMERA_KEYS, signed=True, setup=True,
+    ),
+)  # fmt: skip
 GENERAL: Mapping[Stream, str] = {
     "frames": "all that frames show",
     "force": "all that forces show",
     "events": "all that events show",
 }
 """Titles of the checks that compare all statistics of a stream."""
+SHOWN_BY: Mapping[Stream, frozenset[str]] = {
+    "frames": CONTACT_KEYS, "force": FORCE_KEYS, "events": CAMERA_KEYS,
+}  # fmt: skip
 
 
 def misfit_numbers(
     trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], contact: Contact | None
 ) -> dict[str, float]:
     """Return the number of every check by key, NaN where the slides do not tell it.
+
+    Those of the event camera come from `read_camera`.
 
     Args:
         with_events: those of the trials whose events are read.
@@ -94,6 +169,15 @@ def misfit_numbers(
         found[TILT] = gap_slope(contact.place_mm[known], raised_mm, ring[known])
         found[STICKY] = odd_friction(contact.springs, ring)
     found[SPOT] = largest_spot(contact.slips, contact.growth)
+    view = view_of(contact.slips)
+    found |= {
+        SCALE: view.scale, TURN: view.turn_deg, STRETCH: view.stretch, BENT: view.distortion,
+        PERSPECTIVE: view.perspective,
+        FRAME_DELAY: frame_delay_ms(contact.slips, contact.steady),
+        FORCE_DELAY: force_delay_ms(contact.slips, contact.growth),
+        FORCE_TURN: force_turn_deg(contact.slips),
+        **contact_trends(contact.slips, contact.steady),
+    }  # fmt: skip
     return found
 
 
@@ -353,7 +437,8 @@ def distances(s: F64, observed: F64) -> tuple[F64, float]:
 # -- the verdict -------------------------------------------------------------------------------
 
 _LEAST_TAIL = 0.1
-"""Numbers of the worlds are taken to scatter in their tail by at least so much, relative."""
+"""Numbers of the worlds are taken to scatter in their tail by at least so much, relative; where the
+numbers themselves are looked at, by their floor."""
 
 
 @dataclass(frozen=True)
@@ -361,31 +446,40 @@ class Tail:
     """The largest values of a number in the worlds: log(value + floor) has an exponential tail.
 
     A posterior predictive distribution (prior 1 / mean): with few worlds it is wider. It is longer
-    than that of a normal or log-normal number.
+    than that of a normal or log-normal number. What is near to normal has an exponential tail
+    itself, in units of the floor (`linear`), which is still longer.
 
     Attributes:
-        values: of the worlds, sorted logarithms, (n,). floor: see `Check`.
+        values: of the worlds, sorted, transformed, (n,). floor, linear: see `Check`.
     """
 
     values: F64
     floor: float
+    linear: bool = False
 
     @classmethod
-    def of(cls, values: F64, floor: float) -> Tail:
+    def of(cls, values: F64, floor: float, linear: bool = False) -> Tail:
         """Return the tail of some worlds' values."""
-        return cls(np.sort(np.log(np.maximum(values, 0.0) + floor)), floor)
+        tail = cls(values, floor, linear)
+        return replace(tail, values=np.sort(tail._scaled(values)))
+
+    def _scaled(self, values: F64) -> F64:
+        positive = np.maximum(values, 0.0)
+        result: F64 = positive / self.floor if self.linear else np.log(positive + self.floor)
+        return result
 
     @property
     def _shape(self) -> tuple[int, float, float]:
         """Return how many worlds make the tail, where it begins and the sum of their excesses."""
         k = max(round(TAIL * len(self.values)), 2)
         begin = float(self.values[-k - 1])
-        return k, begin, max(float((self.values[-k:] - begin).sum()), k * _LEAST_TAIL)
+        least = 1.0 if self.linear else _LEAST_TAIL
+        return k, begin, max(float((self.values[-k:] - begin).sum()), k * least)
 
     def share(self, value: float) -> float:
         """Return the probability of at least this value."""
         k, begin, total = self._shape
-        x = float(np.log(max(value, 0.0) + self.floor))
+        x = float(self._scaled(np.array(value)))
         if x <= begin:
             return float((self.values >= x).mean())
         return float(k / len(self.values) * (1.0 + (x - begin) / total) ** -k)
@@ -394,7 +488,7 @@ class Tail:
         """Return the value that is reached with a probability, which is less than `TAIL`."""
         k, begin, total = self._shape
         x = begin + total * ((k / len(self.values) / share) ** (1.0 / k) - 1.0)
-        return float(np.exp(x) - self.floor)
+        return float(x * self.floor if self.linear else np.exp(x) - self.floor)
 
 
 def misfits(
@@ -406,7 +500,9 @@ def misfits(
 ) -> tuple[MisfitCheck, ...]:
     """Return the checks of a pilot, misfits first; the first one says which stream shows it.
 
-    A check for one kind of effect comes before those of all statistics: it says more. Left out is
+    A check for one kind of effect comes before those of all statistics: it says more. Those of
+    the frames' picture come first, and then those of times and trends, since all others show them,
+    too. Left out is
     what the pilot does not tell, or fewer than `FEWEST` worlds.
 
     Args:
@@ -417,26 +513,32 @@ def misfits(
     tried: list[tuple[Check, float, F64]] = []
     for check in CHECKS:
         values = np.array([world[check.key] for world in worlds], np.float64)
-        tried.append((check, numbers[check.key], values[np.isfinite(values)]))
+        values, value = values[np.isfinite(values)], numbers[check.key]
+        if check.signed and len(values):
+            middle = float(np.median(values))
+            values, value = np.abs(values - middle), abs(value - middle)
+        tried.append((check, value, values))
     streams = np.array([stream_of(name) for name in names])
     for stream, title in GENERAL.items():
         own = streams == stream
         if len(s) >= FEWEST and np.isfinite(observed[own]).any():
             values, value = distances(s[:, own], observed[own])
-            check = Check("", title, stream, "distance", 0.1)
+            check = Check("", title, stream, "distance", 0.1, SHOWN_BY[stream])
             tried.append((check, value, values[np.isfinite(values)]))
     tried = [it for it in tried if np.isfinite(it[1]) and len(it[2]) >= FEWEST]
     found = []
     for check, value, values in tried:
-        level = LEVEL / len(tried)
-        tail = Tail.of(values, check.floor)
+        alike = sum(other.setup == check.setup for other, *_ in tried)
+        level = (SETUP_LEVEL if check.setup else LEVEL - SETUP_LEVEL) / alike
+        tail = Tail.of(values, check.floor, check.setup)
         share = tail.share(value)
         general = check.key == ""
         found.append((
-            (share >= level, general, share),
+            (share >= level, general, not check.setup, check.key not in VIEWS, share),
             MisfitCheck(
                 title=check.title, stream=check.stream, unit=check.unit, pilot=value,
                 limit=tail.limit(level), share=share, found=share < level,
+                touches=tuple(it.key for it in PARAMETERS if it.key in check.touches),
             ),
         ))  # fmt: skip
     return tuple(check for _, check in sorted(found, key=lambda it: it[0]))

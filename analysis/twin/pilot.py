@@ -75,6 +75,8 @@ class PilotTrial:
         base_mm: displacement of the sensor from where its slide began, as the arm reported it, at
             the frames' times, (n, 2).
         camera: None without an event camera. forces: None without a force sensor.
+        zero_mm: the measurement of depth zero that its depth counts from: slides with another
+            number may differ by an error of it.
     """
 
     trial: str
@@ -86,6 +88,7 @@ class PilotTrial:
     base_mm: F64
     camera: Camera | None = None
     forces: Forces | None = None
+    zero_mm: float = 0.0
 
     @property
     def moved_mm(self) -> F64:
@@ -149,6 +152,7 @@ def pilot_trial(slide: Slide, recording: Recording, places: Mapping[str, Any]) -
         base_mm=base_at(seconds_after(start_ns, pose_ns), poses.xyz_mm, poses.rotvec_deg, frame_s),
         camera=camera,
         forces=forces,
+        zero_mm=recording.record.depth_zero_mm or 0.0,
     )
 
 

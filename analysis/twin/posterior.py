@@ -12,7 +12,7 @@ al. 2005; Lei et al. 2018): a poor one only makes it wide.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -270,6 +270,26 @@ def posterior(bank: Bank, observed: F64) -> Posterior:
         ValueError: fewer than `FEWEST` worlds, or another number of statistics.
     """
     return fitted(bank, np.isfinite(_checked(bank, observed))).at(observed)
+
+
+def widened(found: Posterior, slopes: F64, error: float) -> tuple[Estimate, ...]:
+    """Return estimates whose intervals allow for one more unknown that no statistic tells of.
+
+    Args:
+        slopes: of the parameters over the unknown, (p,). error: largest size of it, of which all
+            values are as likely.
+    """
+    unknown = np.linspace(-error, error, 201)
+    result = []
+    for estimate, slope, samples in zip(
+        found.estimates, slopes.tolist(), found.samples.T, strict=True
+    ):
+        if slope != 0.0 and error > 0.0:
+            low, high = np.quantile(samples[:, None] + slope * unknown, (_LEVELS[0], _LEVELS[2]))
+            low, high = min(low, estimate.low), max(high, estimate.high)
+            estimate = replace(estimate, low=float(low), high=float(high))
+        result.append(estimate)
+    return tuple(result)
 
 
 def _checked(bank: Bank, observed: F64) -> F64:

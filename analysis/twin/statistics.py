@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sliplab.analysis.twin.camera_estimates import camera_estimates
+from sliplab.analysis.twin.camera_estimates import read_camera
 from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, contact_estimates, read_contact
 from sliplab.analysis.twin.contact_springs import Guess
 from sliplab.analysis.twin.misfits import misfit_numbers
@@ -24,7 +24,7 @@ def events_of(slides: Sequence[PilotTrial], with_events: Collection[str]) -> lis
     return [slide for slide in slides if slide.trial in with_events and slide.camera is not None]
 
 
-VERSION = 4
+VERSION = 5
 """Raised with every change of a statistic or of the scene's physics: worlds are simulated anew."""
 
 
@@ -52,9 +52,10 @@ def statistics(
     seen = events_of(slides, with_events)
     contact = read_contact(slides, guess)
     found = contact_estimates(contact) if contact else {}
+    camera, checked = read_camera(seen)
     if seen:
-        found |= camera_estimates(seen)
-    return Statistics(found, misfit_numbers(slides, seen, contact))
+        found |= camera
+    return Statistics(found, misfit_numbers(slides, seen, contact) | checked)
 
 
 def of_names(values: Mapping[str, float], names: Sequence[str]) -> F64:

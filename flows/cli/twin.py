@@ -62,8 +62,16 @@ def calibrate_scene(
     worlds: WorldsOption = 240,
     spread: SpreadOption = 0.5,
     seed: SeedOption = 1,
+    gain_error: Annotated[
+        float,
+        typer.Option(
+            "--gain-error", min=0, max=0.5,
+            help="Largest error of the force sensor's gain, a share: what a check with known "
+            "weights leaves.",
+        ),
+    ] = 0.15,
     as_json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Fit a simulated rig's scene to a labelled pilot: writes a rig file, a page and numbers.
 
     Ends with exit code 1 where the pilot shows an effect that the scene lacks.
@@ -73,7 +81,7 @@ def calibrate_scene(
     from sliplab.flows.twin.calibrate import request
     from sliplab.flows.twin.needs import cheapest_path
 
-    wanted = request(rig, out, worlds, spread, seed)
+    wanted = request(rig, out, worlds, spread, seed, gain_error)
     fit = fit_to(store, _only(found), wanted)
     misfits = [check for check in fit.checks if check.found]
     if as_json:
@@ -84,7 +92,8 @@ def calibrate_scene(
     rows = [
         [
             it.title, f"{it.assumed:.4g}", f"{it.value:.4g}" if it.identified else "-",
-            f"{it.low:.4g} to {it.high:.4g}", it.unit, "yes" if it.identified else "no",
+            "withheld" if it.low is None or it.high is None else f"{it.low:.4g} to {it.high:.4g}",
+            it.unit, "yes" if it.identified else "no",
         ]
         for it in fit.parameters
     ]  # fmt: skip
@@ -94,6 +103,11 @@ def calibrate_scene(
         ["parameter", "assumed", "fitted", "95 %", "unit", "identified"],
         rows,
     )
+    if fit.gain_error:
+        console.say(
+            "force gain or stiffness: no pilot tells them apart; intervals of the stiffnesses and "
+            f"of the image's shift and growth allow for a gain that is off by {fit.gain_error:.0%}"
+        )
     if fit.needs:
         asked = ", ".join(it.title for it in fit.needs if it.verdict == "asked for")
         console.say(f"the pilot asks for: {asked or 'none of the effects'}")
@@ -108,6 +122,9 @@ def calibrate_scene(
     console.say(f"page: {out.with_suffix('.html')}")
     for check in misfits:
         console.say(f"misfit: the pilot's {check.stream} show what this scene lacks: {check.title}")
+    withheld = sum(bool(it.withheld) for it in fit.parameters)
+    if withheld:
+        console.say(f"intervals of {withheld} parameters are withheld: the misfits touch them")
     if misfits:
         raise typer.Exit(console.FAILED)
 

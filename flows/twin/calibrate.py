@@ -7,6 +7,7 @@ which parameters lead to those of the pilot. Test trials are not fitted: they ju
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +24,8 @@ from sliplab.analysis.twin.contact_estimates import NOT_LOGGED, papillae, read_c
 from sliplab.analysis.twin.contact_slips import find_slips
 from sliplab.analysis.twin.misfits import misfits
 from sliplab.analysis.twin.needs import Marks, marks
-from sliplab.analysis.twin.parameters import Parameter, settings_of, value_of
-from sliplab.analysis.twin.posterior import Bank, Estimate, Posterior, posterior
+from sliplab.analysis.twin.parameters import GAIN_SLOPES, settings_of, value_of
+from sliplab.analysis.twin.posterior import Bank, Posterior, posterior, widened
 from sliplab.analysis.twin.shown import QUANTITIES, Shown, compare, show
 from sliplab.analysis.twin.statistics import Statistics, of_names
 from sliplab.flows.running import console, orchestration
@@ -48,13 +49,21 @@ from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
 from sliplab.rigs.twin import FittedValue, Range, TwinRecord
 from sliplab.storage.files import make_folder, write_json, write_text
-from sliplab.storage.schema.twin import ParameterFit, QuantityCompared, StatisticSeen, TwinFit
+from sliplab.storage.schema.twin import (
+    MisfitCheck,
+    ParameterFit,
+    QuantityCompared,
+    StatisticSeen,
+    TwinFit,
+)
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 LIKE = 1.25
 """Noise of tracking that differs by less than this factor from the rig file's is the rig file's."""
+GAIN_ERROR = 0.15
+"""Largest error of a force sensor's gain, a share, where it was not checked with known weights."""
 PREDICTED = 12
 """Worlds of the twin in which the test trials are taken."""
 
@@ -67,6 +76,7 @@ class Calibration:
         prior: worlds around the simulated rig to start from. rig_path: the rig's file.
         out: rig file to write. worlds: to simulate.
         needs: whether to measure what the scene needs, which no parameter depends on.
+        gain_error: largest error of the force sensor's gain, a share.
     """
 
     prior: Prior
@@ -74,6 +84,7 @@ class Calibration:
     out: Path
     worlds: int
     needs: bool = True
+    gain_error: float = GAIN_ERROR
 
     @property
     def rig(self) -> RigFile:
@@ -81,7 +92,10 @@ class Calibration:
         return self.prior.rig
 
 
-def request(rig_path: Path, out: Path, worlds: int, spread: float, seed: int) -> Calibration:
+def request(
+    rig_path: Path, out: Path, worlds: int, spread: float, seed: int,
+    gain_error: float = GAIN_ERROR,
+) -> Calibration:  # fmt: skip
     """Check what is asked for before anything is simulated.
 
     Raises:
@@ -95,7 +109,7 @@ def request(rig_path: Path, out: Path, worlds: int, spread: float, seed: int) ->
     for path in (out, cheapest_path(out)):
         if path.exists() and load_rig_file(path)[0].twin is None:
             raise InputError("--out", "", str(path), "exists and is no twin: use another name")
-    return Calibration(Prior(rig, spread, seed), rig_path, out, worlds)
+    return Calibration(Prior(rig, spread, seed), rig_path, out, worlds, gain_error=gain_error)
 
 
 def fitted_rig(rig_path: Path) -> RigFile:
@@ -206,6 +220,14 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     needs = Needs()
     if wanted.needs:
         needs = measure_needs(judged, worlds[: len(twin)], [one.marks for one in twin])
+    checks = misfits(
+        scene.observed.effects,
+        [one.effects for one in scene.seen],
+        scene.bank.statistics,
+        of_names(scene.observed.fitted, scene.bank.statistics),
+        scene.bank.s,
+    )
+    gain_error = wanted.gain_error if "force" in pilot.streams else None
     fit = TwinFit(
         simulated=bool(item.info.get("simulated")),
         campaign=item.name,
@@ -216,21 +238,13 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
         worlds=len(scene.bank),
         predicted=len(twin),
         seconds=round(monotonic() - began, 1),
-        parameters=tuple(
-            parameter_fit(it, value_of(wanted.rig.scene, it), estimate)
-            for it, estimate in zip(wanted.prior.parameters, scene.found.estimates, strict=True)
-        ),
+        parameters=parameter_fits(scene, wanted.rig, gain_error or 0.0, checks),
         statistics=seen_statistics(scene),
-        checks=misfits(
-            scene.observed.effects,
-            [one.effects for one in scene.seen],
-            scene.bank.statistics,
-            of_names(scene.observed.fitted, scene.bank.statistics),
-            scene.bank.s,
-        ),
+        checks=checks,
         compared=compared(*shown),
         needs=needs.effects,
         cheapest=needs.cheapest,
+        gain_error=gain_error,
     )
     record = TwinRecord(
         campaign=fit.campaign,
@@ -324,17 +338,35 @@ def predict(worlds: Sequence[World]) -> tuple[list[Predicted], list[Predicted]]:
     return taken[:half], taken[half:]
 
 
-def parameter_fit(it: Parameter, assumed: float, estimate: Estimate) -> ParameterFit:
-    """Return what is kept of a parameter's posterior."""
-    low, high, least, most = np.exp(
-        [estimate.low, estimate.high, estimate.prior_low, estimate.prior_high]
-    )
-    value = float(np.exp(estimate.median)) if estimate.identified else assumed
-    return ParameterFit(
-        key=it.key, title=it.title, unit=it.unit, assumed=assumed, value=value,
-        low=float(low), high=float(high), least=float(least), most=float(most),
-        identified=estimate.identified,
-    )  # fmt: skip
+def parameter_fits(
+    scene: SceneFit, rig: RigFile, gain_error: float, checks: Sequence[MisfitCheck]
+) -> tuple[ParameterFit, ...]:
+    """Return what is kept of the parameters' posterior; no interval where a misfit touches one.
+
+    Args:
+        rig: with the assumed values. gain_error: largest error of the force sensor's gain.
+    """
+    known = scene.prior.parameters
+    slopes = np.array([GAIN_SLOPES.get(it.key, 0.0) for it in known])
+    found = []
+    for it, estimate in zip(
+        known, widened(scene.found, slopes, math.log1p(gain_error)), strict=True
+    ):
+        assumed = value_of(rig.scene, it)
+        low, high, least, most = np.exp(
+            [estimate.low, estimate.high, estimate.prior_low, estimate.prior_high]
+        )
+        withheld = tuple(check.title for check in checks if check.found and it.key in check.touches)
+        found.append(
+            ParameterFit(
+                key=it.key, title=it.title, unit=it.unit, assumed=assumed,
+                value=float(np.exp(estimate.median)) if estimate.identified else assumed,
+                low=None if withheld else float(low), high=None if withheld else float(high),
+                least=float(least), most=float(most), identified=estimate.identified,
+                withheld=withheld,
+            )
+        )  # fmt: skip
+    return tuple(found)
 
 
 def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:

@@ -16,6 +16,7 @@ class ParameterFit(Part):
         key: in the section `mock:` of a rig file. assumed: the rig file's value.
         value: median; low, high: central 95 %. All of what the pilot leaves likely.
         least, most: of the worlds that were simulated first.
+        withheld: misfits that touch the parameter; its interval is None then.
     """
 
     key: str
@@ -23,11 +24,12 @@ class ParameterFit(Part):
     unit: str
     assumed: Number
     value: Number
-    low: Number
-    high: Number
+    low: Number | None
+    high: Number | None
     least: Number
     most: Number
     identified: Bool
+    withheld: tuple[str, ...] = ()
 
 
 class StatisticSeen(Part):
@@ -45,6 +47,7 @@ class MisfitCheck(Part):
         stream: that shows it. pilot: what was measured. limit: largest that the scene shows.
         share: of the twin's worlds that show as much.
         found: the pilot shows more than the scene can.
+        touches: keys of parameters whose intervals do not hold with such an effect.
     """
 
     title: str
@@ -54,6 +57,7 @@ class MisfitCheck(Part):
     limit: Number
     share: Number
     found: Bool
+    touches: tuple[str, ...] = ()
 
 
 class QuantityCompared(Part):
@@ -120,6 +124,8 @@ class TwinFit(Document):
         trials: fitted; judged: test trials. worlds: simulated for the fit; predicted: of the twin.
         needs: none where there are too few test trials. cheapest: None where nothing that saves
             time can be left out.
+        gain_error: largest error of the force sensor's gain that intervals allow for, a share; None
+            without forces.
     """
 
     simulated: Bool
@@ -137,6 +143,7 @@ class TwinFit(Document):
     compared: tuple[QuantityCompared, ...] = ()
     needs: tuple[EffectNeed, ...] = ()
     cheapest: CheapestScene | None = None
+    gain_error: Number | None = None
 
 
 class Behind(Part):

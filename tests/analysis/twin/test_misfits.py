@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from scipy.stats import lomax
 
-from sliplab.analysis.twin.camera_estimates import NAMES
+from sliplab.analysis.twin.camera_estimates import NAMES, NOISE_TREND
 from sliplab.analysis.twin.contact_estimates import read_contact
 from sliplab.analysis.twin.contact_springs import Guess, steady
 from sliplab.analysis.twin.misfits import (
     BROKEN,
     CHECKS,
     FEWEST,
+    FORCE_DELAY,
     LEVEL,
     LIGHT,
     RAMP,
@@ -24,6 +25,7 @@ from sliplab.analysis.twin.misfits import (
     STICKY,
     TAIL,
     TILT,
+    TURN,
     Tail,
     distances,
     line_over_noise,
@@ -33,6 +35,7 @@ from sliplab.analysis.twin.misfits import (
     stream_of,
 )
 from sliplab.analysis.twin.pilot import Camera, PilotTrial, Slide
+from sliplab.analysis.twin.trends import LAG, PULL
 from sliplab.flows.scene_runs import changed
 from sliplab.flows.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
@@ -66,7 +69,7 @@ def base_way(t: F64, speed: float, ramp_mm_s2: float) -> tuple[F64, float]:
 
 def pilot(
     friction: F64 | None = None, raised_mm: F64 | None = None, ramp_mm_s2: float = np.inf,
-    spot: tuple[float, float] | None = None, seed: int = 0,
+    spot: tuple[float, float] | None = None, seed: int = 0, worn: float = 0.0,
 ) -> list[PilotTrial]:  # fmt: skip
     """Slides at three depths and two speeds in four directions, of papillae that are springs.
 
@@ -74,6 +77,7 @@ def pilot(
         friction: of each papilla over the usual. raised_mm: height over that of its layer.
         ramp_mm_s2: the arm's acceleration. spot: middle of a place of radius 4 mm with friction of
             0.6 of that beside it.
+        worn: share of its friction that the skin loses from the first slide to the last.
     """
     guess, rng = Guess(), np.random.default_rng(seed)
     height = (
@@ -86,7 +90,8 @@ def pilot(
         for speed in SPEEDS:
             for way in WAYS:
                 deep = depth - (guess.height_mm - height)
-                lag, _ = steady(mu * np.ones(19), height, deep, *base, guess)
+                left = 1.0 - worn * len(found) / 23
+                lag, _ = steady(left * mu * np.ones(19), height, deep, *base, guess)
                 found.append(_slide(lag, depth, speed, np.array(way), ramp_mm_s2, spot, rng))
     return found
 
@@ -279,6 +284,9 @@ def worlds(k: int, rng: np.random.Generator) -> tuple[list[dict[str, float]], F6
     rows = np.column_stack([
         0.002 * rng.rayleigh(size=k), 2.5 * rng.lognormal(0.0, 0.2, k), np.zeros(k),
         1.2 * rng.lognormal(0.0, 0.08, k), 1e-3 * rng.gamma(4.0, 0.3, k), 3.0 + rng.gumbel(size=k),
+        # those that tell of places, times and trends
+        *(np.abs(rng.normal(size=k)) if not it.signed else rng.normal(1.0, it.floor, k)
+          for it in CHECKS[6:]),
     ])  # fmt: skip
     keys = [check.key for check in CHECKS]
     return [dict(zip(keys, row, strict=True)) for row in rows.tolist()], s
@@ -293,7 +301,7 @@ def test_false_alarms_keep_to_the_level(k: int) -> None:
         pilots, observed = worlds(30, rng)
         for own, seen in zip(pilots, observed, strict=True):
             found = misfits(own, bank, STATISTICS, seen, s)
-            assert len(found) == 9
+            assert len(found) == len(CHECKS) + 3
             alarms, total = alarms + found[0].found, total + 1
     # 300 pilots: three standard deviations above the level
     assert alarms / total < LEVEL + 3.0 * np.sqrt(LEVEL * (1 - LEVEL) / total)
@@ -302,7 +310,9 @@ def test_false_alarms_keep_to_the_level(k: int) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "stream"),
     [(TILT, 0.0175, "frames"), (STICKY, 8.0, "frames"), (BROKEN, 1.0, "frames"),
-     (LIGHT, 1e4, "events"), (RAMP, 0.1, "poses"), (SPOT, 20.0, "frames")],
+     (LIGHT, 1e4, "events"), (RAMP, 0.1, "poses"), (SPOT, 20.0, "frames"),
+     (TURN, 6.0, "frames"), (LAG, 9.0, "frames"), (PULL, 9.0, "force"),
+     (NOISE_TREND, 9.0, "events"), (FORCE_DELAY, -15.0, "force")],
 )  # fmt: skip
 def test_an_effect_is_called_by_its_stream(key: str, value: float, stream: str) -> None:
     rng = np.random.default_rng(3)
@@ -311,9 +321,11 @@ def test_an_effect_is_called_by_its_stream(key: str, value: float, stream: str) 
     found = misfits(own | {key: value}, bank, STATISTICS, observed[0], s)
     title = next(check.title for check in CHECKS if check.key == key)
     assert (found[0].found, found[0].stream, found[0].title) == (True, stream, title)
-    assert found[0].pilot == pytest.approx(value)
+    check = next(check for check in CHECKS if check.key == key)
+    assert found[0].pilot == pytest.approx(abs(value), abs=1.2 if check.signed else 1e-9)
+    assert set(found[0].touches) == check.touches
     assert found[0].share < LEVEL / 9 < found[1].share
-    assert found[0].limit < value
+    assert found[0].limit < abs(value)
     # what other statistics show as well does not come before it
     found = misfits(own | {key: value}, bank, STATISTICS, observed[0] + 3.0, s)
     assert found[0].title == title
@@ -351,7 +363,7 @@ def test_what_is_not_there_is_not_checked() -> None:
     bank, s = worlds(100, rng)
     (own, *_), observed = worlds(1, rng)
     events = np.array([stream_of(name) == "events" for name in STATISTICS])
-    blind = own | {LIGHT: float("nan")}
+    blind = own | {check.key: float("nan") for check in CHECKS if check.stream == "events"}
     names = [name for name, one in zip(STATISTICS, events, strict=True) if not one]
     found = misfits(blind, bank, names, observed[0][~events], s[:, ~events])
     assert {check.stream for check in found} == {"frames", "force", "poses"}

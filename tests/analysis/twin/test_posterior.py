@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from sliplab.analysis.twin.posterior import FEWEST, Bank, Posterior, fitted, posterior
+from sliplab.analysis.twin.posterior import (
+    FEWEST,
+    Bank,
+    Estimate,
+    Posterior,
+    fitted,
+    posterior,
+    widened,
+)
 from sliplab.storage.streams import F64
 
 HALF = float(np.log(1.3))
@@ -226,3 +234,24 @@ def test_what_cannot_be_is_refused_in_one_line() -> None:
         replace(bank, lower=bank.upper)
     with pytest.raises(ValueError, match=r"^a bank of 3 parameters and 6 statistics has arrays"):
         replace(bank, s=bank.s[:, :5])
+
+
+def test_an_unknown_gain_widens_what_goes_with_it_and_no_more() -> None:
+    rng = np.random.default_rng(8)
+    samples = rng.normal([1.0, -1.0, 0.0], [0.01, 0.01, 0.01], (400, 3))
+    estimates = tuple(
+        Estimate(name, float(it.mean()), 0.01, *np.quantile(it, [0.025, 0.975]).tolist(),
+                 -2.0, 2.0, 0.01, True, ())
+        for name, it in zip("abc", samples.T, strict=True)
+    )  # fmt: skip
+    found = Posterior(estimates, samples)
+    error = np.log(1.15)
+    up, down, other = widened(found, np.array([1.0, -1.0, 0.0]), error)
+    for own, wide in zip(estimates, (up, down), strict=False):
+        assert wide.median == own.median
+        # 95 % of all gains up to the error are as likely
+        assert wide.high - wide.low == pytest.approx(2 * 0.95 * error, rel=0.03)
+        assert wide.low < own.median + np.log(1 / 1.08)
+        assert wide.high > own.median + np.log(1.08)
+    assert other == estimates[2]
+    assert widened(found, np.ones(3), 0.0) == estimates

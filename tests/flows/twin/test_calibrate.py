@@ -6,7 +6,8 @@ statistics by simple functions of its parameters, whose answer is known.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 
 import sliplab
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.twin.camera_estimates import NOISE_TREND
 from sliplab.analysis.twin.misfits import CHECKS
 from sliplab.analysis.twin.parameters import PARAMETERS, value_of
 from sliplab.analysis.twin.pilot import pilot_trial, slide_of
@@ -36,7 +38,8 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 TRIALS = 12
-EFFECTS = [check.key for check in CHECKS]
+EFFECTS = {check.key: 100.0 for check in CHECKS}
+"""Numbers of the checks that no pilot of a clean rig reaches."""
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +58,12 @@ def requested(tmp_path: Path, **changes: Any) -> calibrate.Calibration:
 
 
 def answering(
-    wanted: calibrate.Calibration, observed: dict[str, float]
+    wanted: calibrate.Calibration, observed: dict[str, float], effects: Mapping[str, float]
 ) -> Callable[[worlds.World], Statistics]:
     """Stand in for what a world shows: each statistic is the pilot's times one parameter's factor.
 
-    The number of each check for misfits is 100, which no pilot of a clean rig reaches.
+    Args:
+        effects: numbers of the checks, of every world.
     """
 
     def shown(world: worlds.World) -> Statistics:
@@ -71,7 +75,7 @@ def answering(
             name: value * factors[k % len(factors)]
             for k, (name, value) in enumerate(observed.items())
         }
-        return Statistics(found, dict.fromkeys(EFFECTS, 100.0))
+        return Statistics(found, dict(effects))
 
     return shown
 
@@ -122,9 +126,12 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     pilot = read_pilot(store, item)
     assert len(pilot.fitted) + len(pilot.judged) == TRIALS
     assert all(trial.split == "test" for trial in pilot.judged)
-    observed = pilot.statistics(worlds.guess_of(wanted.rig)).fitted
-    finite = {name: value for name, value in observed.items() if value > 0.0}
-    monkeypatch.setattr(worlds.World, "statistics", answering(wanted, finite))
+    observed = pilot.statistics(worlds.guess_of(wanted.rig))
+    finite = {name: value for name, value in observed.fitted.items() if value > 0.0}
+    # what may be off either way is as in the pilot
+    signed = {it.key: observed.effects[it.key] for it in CHECKS if it.signed}
+    shown = answering(wanted, finite, EFFECTS | signed)
+    monkeypatch.setattr(worlds.World, "statistics", shown)
     fit = calibrate.calibrate_scene(store, item, wanted)
     known = [it for it in fit.parameters if it.identified]
     assert len(known) == len(wanted.prior.parameters)
@@ -134,7 +141,8 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
         assert it.value == pytest.approx(it.assumed, rel=0.05), it.key
 
     assert {check.stream for check in fit.checks} == {"frames", "events", "poses"}
-    assert len(fit.checks) == len(CHECKS) + 2  # and all that frames and events show
+    # and all that frames and events show; without forces
+    assert len(fit.checks) == sum(it.stream != "force" for it in CHECKS) + 2
     assert not any(check.found for check in fit.checks)
 
     Draft7Validator(file_schema("twin")).validate(read_json(tmp_path / "twin.json"))
@@ -162,6 +170,38 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     assert "the twin was fitted on" in said["twin"] or "within what" in said["twin"]
 
 
+def test_no_interval_where_a_misfit_touches_its_parameter(
+    store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (item,) = collected(store, None)
+    wanted = requested(tmp_path, seed=3)  # the store keeps the worlds of other tests' seeds
+    pilot = read_pilot(store, item)
+    observed = pilot.statistics(worlds.guess_of(wanted.rig))
+    finite = {name: value for name, value in observed.fitted.items() if value > 0.0}
+    signed = {it.key: observed.effects[it.key] for it in CHECKS if it.signed}
+    # worlds in which noise hardly drifts, and the pilot's does
+    shown = answering(wanted, finite, EFFECTS | signed | {NOISE_TREND: 0.1})
+    monkeypatch.setattr(worlds.World, "statistics", shown)
+    drifting = replace(observed, effects=observed.effects | {NOISE_TREND: 30.0})
+    monkeypatch.setattr(Pilot, "statistics", lambda *_: drifting)
+    fit = calibrate.calibrate_scene(store, item, replace(wanted, needs=False))
+    title = "noise of the event camera drifts during the pilot"
+    assert [check.title for check in fit.checks if check.found] == [title]
+    withheld = {it.key for it in fit.parameters if it.withheld}
+    assert withheld == {"event_camera.noise_hz", "event_camera.leak_share",
+                        "event_camera.hot_pixels", "event_camera.hot_hz"}  # fmt: skip
+    for it in fit.parameters:
+        assert ((it.low, it.high) == (None, None)) == bool(it.withheld)
+        assert it.withheld in ((), (title,))
+    Draft7Validator(file_schema("twin")).validate(read_json(tmp_path / "twin.json"))
+    assert f"withheld: {title}" in (tmp_path / "twin.html").read_text()
+    rig, _ = load_rig_file(tmp_path / "twin.yaml")
+    assert rig.twin is not None
+    assert rig.twin.parameters["event_camera.noise_hz"].low is None
+    assert rig.twin.parameters["event_camera.edge_px"].low is not None
+    assert fit.gain_error is None  # without a force sensor
+
+
 @pytest.mark.long
 def test_what_is_not_told_keeps_the_rigs_value(
     store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
@@ -169,10 +209,10 @@ def test_what_is_not_told_keeps_the_rigs_value(
     (item,) = collected(store, None)
     wanted = requested(tmp_path, seed=2)  # the store keeps the worlds of other tests' seed
     # one statistic, of the first parameter alone
-    shown = answering(wanted, {"only": 2.0})
+    shown = answering(wanted, {"only": 2.0}, EFFECTS)
     monkeypatch.setattr(worlds.World, "statistics", shown)
     monkeypatch.setattr(
-        Pilot, "statistics", lambda *_: Statistics({"only": 2.0}, dict.fromkeys(EFFECTS, 1.0))
+        Pilot, "statistics", lambda *_: Statistics({"only": 2.0}, dict.fromkeys(EFFECTS, 100.0))
     )
     fit = calibrate.calibrate_scene(store, item, wanted)
     assert [it.key for it in fit.parameters if it.identified] == [PARAMETERS[0].key]
