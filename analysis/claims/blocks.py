@@ -74,7 +74,7 @@ class Estimate:
 
     @cached_property
     def _place(self) -> F64:
-        return np.arange(self.blocks) - 0.5 * (self.blocks - 1)
+        return np.asarray(np.arange(self.blocks) - 0.5 * (self.blocks - 1), np.float64)
 
     @cached_property
     def _slope(self) -> float:
@@ -159,7 +159,8 @@ def of_trials(value: float, off: F64, weights: F64, blocks: I64, count: int) -> 
         value: the estimate. off: (n,) what each trial is off its expectation; weights: (n,) of each
             in the estimate. blocks: (n,) number of each trial's block, from 0; count: of blocks.
     """
-    return Estimate(value, count * np.bincount(blocks, weights * off, minlength=count))
+    parts = np.bincount(blocks, weights * off, minlength=count)
+    return Estimate(value, np.asarray(count * parts, np.float64))
 
 
 def block_share(off: F64, blocks: I64) -> tuple[float, float]:

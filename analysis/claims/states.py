@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -169,7 +170,7 @@ def state_of(claim: Claim, history: History) -> ClaimState:
     y = evidence.values[claim.figure]
     used = np.any(groups, axis=0)[evidence.taken]
     missing = int(np.isnan(y[used]).sum())
-    alike = None
+    alike: Literal["holds", "refuted"] | None = None
     if missing and not holds and not against:
         span = _interval(claim, history, groups, worst=False)
         would, would_not = _called(claim, history, groups, span, worst=False)

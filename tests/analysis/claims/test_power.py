@@ -104,7 +104,7 @@ def test_a_claim_that_the_plan_cannot_have_says_how_many_repetitions_would() -> 
     assert found.never == 1.0
     assert found.trials.median is None
     assert found.repetitions is not None
-    (enough,) = power_of(plan_of([claim], repetitions=4 * found.repetitions), pilot, 6)
+    (enough,) = power_of(plan_of([claim], repetitions=2 * found.repetitions), pilot, 6)
     assert enough.trials.median is not None
     assert 0.4 < enough.trials.median / (3 * found.repetitions) < 2.5
 
