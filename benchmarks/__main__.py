@@ -17,7 +17,7 @@ from benchmarks.measure import SEED, Figures, machine, versions
 
 NAMES = (
     "storage", "scene", "clocks", "clock_kinds", "labels", "labels_truth", "network", "live",
-    "orchestration", "acquisition", "scale", "fewer",
+    "orchestration", "acquisition", "scale", "fewer", "statements",
 )  # fmt: skip
 LIMIT_S = 900
 

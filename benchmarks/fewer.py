@@ -50,7 +50,8 @@ ERROR = 0.05
 TIMES = 5
 """Grids of which the truth is the figure."""
 ORDERS = ("shuffled", "adaptive")
-TRIALS, BATCH = 864, 24
+TRIALS, BATCH, BLOCK = 864, 24, 12
+"""Of the grid, of a batch, and of a block: the slides of a world share nothing."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ def plan_of(order: str, claims: Sequence[dict[str, Any]], setting: Setting) -> P
     data = parse_yaml(source.read_text(), source)
     data["collection"] |= {
         "order": order, "seed": setting.seed,
-        "stopping": {"error": ERROR, "claims": list(claims)},
+        "stopping": {"error": ERROR, "claims": list(claims), "block": BLOCK},
     }  # fmt: skip
     if order == "adaptive":
         data["collection"]["choice"] = {"batch": setting.batch}

@@ -7,14 +7,15 @@ A campaign has 24 repetitions of the pilot's 36 conditions, whose figures are dr
 conditions, and scatter of 100 ms between trials. On top of that its blocks differ, or its trials
 resemble the ones before, or drift, or lack a figure. A false claim is false by the least that there
 is, and is looked at after each block; an interval is that of the whole campaign. The truth is that
-of conditions repeated for ever; with a drift, that of the campaign's time. All figures are drawn.
+of conditions repeated for ever; with a drift, that of the campaign's time. Below that the intervals
+of clustered alarms and of medians over worlds (`interval_coverage`). All figures are drawn.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
@@ -27,6 +28,7 @@ import numpy.typing as npt
 from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
+from benchmarks.interval_coverage import Coverage, alarm_rates, medians_by_world
 from benchmarks.measure import SEED, Figures
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.simulated import course, planned_evidence
@@ -287,7 +289,15 @@ def measure(campaigns: int = 200, cores: int = 2) -> Figures:
         name = f"{row.statement}, {row.kind}"
         found[f"{name}: wrong_percent"] = 100.0 * row.wrong / (2 * row.campaigns)
         found[f"{name}: held_percent"] = 100.0 * row.held / row.campaigns
+    for each in clustered(5 * campaigns):
+        found[f"{each.clusters} clusters, {each.case}: held_percent"] = 100.0 * each.share
     return found
+
+
+def clustered(draws: int) -> Iterator[Coverage]:
+    """Yield the coverage of alarm rates and of medians over worlds."""
+    yield from alarm_rates(draws, sizes=(24, 156))
+    yield from medians_by_world(draws, sizes=(6, 16))
 
 
 def main() -> None:
@@ -297,6 +307,9 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=2)
     asked = parser.parse_args()
     print("\n".join(lines(rows_of(asked.campaigns, asked.seed, asked.cores))))
+    print("\n| clusters | alarms, or medians | 95 % interval holds (95 %) |\n| --- | --- | --- |")
+    for each in clustered(5 * asked.campaigns):
+        print(f"| {each.clusters} | {each.case} | {_share(each.held, each.draws)} |")
 
 
 if __name__ == "__main__":

@@ -131,8 +131,11 @@ def _repetitions(drawing: Drawing, campaigns: Sequence[Drawn], k: int) -> int | 
 def more_trials(claim: Claim, state: ClaimState) -> float:
     """Return how many times the trials would call an open claim, by widths like 1 / sqrt(n).
 
-    Infinite where no bound is known yet, or the estimate is what is claimed.
+    With too few blocks, at least so many. Infinite where no bound is known yet, or the estimate is
+    what is claimed.
     """
+    if state.blocks < state.least_blocks:
+        return state.least_blocks / max(state.blocks, 1)
     at, low, high, value = state.estimate, state.low, state.high, claim.value
     if low is None or high is None or at is None:
         return math.inf

@@ -29,6 +29,7 @@ TINY: dict[str, dict[str, Any]] = {
         "saturating": 20,
     },
     "fewer": {"worlds": 1, "adaptive": 1, "cores": 1},
+    "statements": {"campaigns": 1, "cores": 1},
 }
 PROMISED = {
     "orchestration": {
@@ -66,11 +67,17 @@ PROMISED = {
         "shuffled_worst_claim_wrong_percent", "adaptive_worst_claim_wrong_percent",
         "shuffled_true_trials_percent", "adaptive_true_trials_percent", "adaptive_over_shuffled",
     },
+    "statements": {
+        "median of a time, blocks differ by 50 %: wrong_percent",
+        "mean of a share, AR(1) of 0.9: held_percent",
+        "16 clusters, 50% of the variance between worlds: held_percent",
+    },
 }  # fmt: skip
 
 
 MARKS = {
     "acquisition": pytest.mark.realtime, "scene": pytest.mark.long, "fewer": pytest.mark.long,
+    "statements": pytest.mark.long,
 }  # fmt: skip
 """The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
 campaigns."""
