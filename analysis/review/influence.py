@@ -20,7 +20,7 @@ from sliplab.analysis.metrics.intervals import Span, interval
 from sliplab.analysis.review.doubt import LabelDoubt
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.protocols.hashing import hash_integer
-from sliplab.storage.schema.evaluation import Evaluation, TrialScore
+from sliplab.storage.schema.evaluation import Evaluation, TrialLatency, TrialScore
 from sliplab.storage.streams import F64, I64
 
 DRAWS = 1000
@@ -30,6 +30,8 @@ TIMES = {
     "lead_ms": "lead",
 }  # fmt: skip
 """Times of a trial that figures are over, and their names."""
+LOST_MS = {"latency_incipient_ms": np.inf, "latency_gross_ms": np.inf, "lead_ms": -np.inf}
+"""What a missed or late detection counts as in a median."""
 STATISTICS: tuple[Literal["median", "mean"], ...] = ("median", "mean")
 Name = tuple[str, str]
 """Campaign and trial."""
@@ -122,7 +124,7 @@ class Figure:
 
 
 def _statistic(statistic: str, sums: F64, sizes: F64) -> F64:
-    """Median or mean over the last axis, trials of size 0 left out; NaN without any."""
+    """Median or mean over the last axis without trials of size 0; NaN of none, or if infinite."""
     if statistic == "mean":
         total = sizes.sum(axis=-1)
         return np.asarray(np.where(total, sums.sum(axis=-1) / np.where(total, total, 1), np.nan))
@@ -132,7 +134,8 @@ def _statistic(statistic: str, sums: F64, sizes: F64) -> F64:
         np.take_along_axis(ordered, np.maximum(at, 0), axis=-1)[..., 0]
         for at in ((count - 1) // 2, count // 2)
     ]
-    return np.asarray((middle[0] + middle[1]) / 2)
+    found = np.asarray((middle[0] + middle[1]) / 2)
+    return np.asarray(np.where(np.isfinite(found), found, np.nan))
 
 
 def time_figures(
@@ -158,37 +161,51 @@ def time_figures(
             if name in places
         }
         for time, title in TIMES.items():
-            known = [getattr(row.latency, time, None) for row in rows]
-            now = np.array([np.nan if value is None else value for value in known], np.float64)
-            there = np.isfinite(now)
+            now = np.array([_time(row.latency, time) for row in rows], np.float64)
             for statistic in STATISTICS:
+                sums, sizes = _counted(now, statistic)
+                drawn_times = {
+                    place: _counted(times[time], statistic) for place, times in reviews.items()
+                }
+                span = interval(now[sizes > 0], statistic)
+                if span is not None and not np.isfinite(span).all():
+                    span = None
                 found.append(
                     Figure(
-                        f"{statistic} {title}", experiment, "ms", statistic, places,
-                        np.where(there, now, 0.0), there.astype(np.float64),
-                        {
-                            place: (np.where(np.isfinite(times[time]), times[time], 0.0),
-                                    np.isfinite(times[time]).astype(np.float64))
-                            for place, times in reviews.items()
-                        },
-                        interval(now[there], statistic),
+                        f"{statistic} {title}", experiment, "ms", statistic, places, sums, sizes,
+                        drawn_times, span,
                     )
                 )  # fmt: skip
     return found
 
 
+def _time(latency: TrialLatency | None, time: str) -> float:
+    """Return a time of a trial, ms; infinite where it was lost, NaN where it does not count."""
+    if latency is None:
+        return np.nan
+    kind = "gross" if time == "latency_gross_ms" else "incipient"
+    lost = getattr(latency, f"missed_{kind}") or getattr(latency, f"late_{kind}_ms") is not None
+    if lost:
+        return LOST_MS[time]
+    value = getattr(latency, time)
+    return np.nan if value is None else float(value)
+
+
+def _counted(times: F64, statistic: str) -> tuple[F64, F64]:
+    """Return sums and sizes of times; lost ones count in the median alone, as in reports."""
+    there = np.isfinite(times) if statistic == "mean" else ~np.isnan(times)
+    return np.where(there, times, 0.0), there.astype(np.float64)
+
+
 def _times(row: TrialScore, tolerance_ns: int, end_ns: int, drawn: Drawn) -> dict[str, F64]:
-    """Return the times of a trial's detections, ms, in each draw; NaN where they do not count."""
+    """Return the times of a trial's detections, ms, in each draw; see `_time`."""
 
     def since(found_ns: int | None, onset_ns: I64, end_ns: I64) -> F64:
         found = NEVER if found_ns is None else found_ns
-        out = (
-            ~drawn.usable
-            | (found == NEVER)
-            | is_false_early(found, onset_ns, tolerance_ns)
-            | is_late(found, end_ns)
-        )
-        return np.where(out, np.nan, (found - onset_ns) / 1e6)
+        lost = (found == NEVER) | is_late(found, end_ns)
+        out = ~drawn.usable | (is_false_early(found, onset_ns, tolerance_ns) & ~lost)
+        times = np.where(lost, np.inf, (found - onset_ns) / 1e6)
+        return np.where(out, np.nan, times)
 
     incipient, gross = drawn.incipient_ns, drawn.gross_ns
     latency = since(row.detected_incipient_ns, incipient, gross)
@@ -196,7 +213,7 @@ def _times(row: TrialScore, tolerance_ns: int, end_ns: int, drawn: Drawn) -> dic
     return {
         "latency_incipient_ms": latency,
         "latency_gross_ms": since(row.detected_gross_ns, gross, np.maximum(end_ns, gross)),
-        "lead_ms": np.where(np.isfinite(latency), (gross - found) / 1e6, np.nan),
+        "lead_ms": np.where(np.isinf(latency), -np.inf, (gross - found) / 1e6 + 0.0 * latency),
     }
 
 

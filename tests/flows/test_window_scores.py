@@ -86,7 +86,7 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
     assert found.windows.accuracy.margin == expected
     (seed,) = found.windows.seeds.each
     assert seed.margin == expected
-    assert expected != metrics.accuracy(kept["counts"], kept["y"], 8.0).margin
+    assert expected != metrics.accuracy(kept["counts"], kept["y"], 30.0).margin
 
 
 def test_each_sample_says_its_trial(two: Store) -> None:
