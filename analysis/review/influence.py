@@ -213,7 +213,7 @@ def _times(row: TrialScore, tolerance_ns: int, end_ns: int, drawn: Drawn) -> dic
     return {
         "latency_incipient_ms": latency,
         "latency_gross_ms": since(row.detected_gross_ns, gross, np.maximum(end_ns, gross)),
-        "lead_ms": np.where(np.isinf(latency), -np.inf, (gross - found) / 1e6 + 0.0 * latency),
+        "lead_ms": np.where(np.isfinite(latency), (gross - found) / 1e6, -latency),
     }
 
 
