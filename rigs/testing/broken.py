@@ -207,7 +207,11 @@ def force_driver(broken: type[ExampleForce]) -> Driver[Any]:
 STOP = "stop while moving"
 LIMITS = "limits", "limits of turn and depth"
 BROKEN = (
-    Broken(arm_driver(NewestFirst), ("times in order", "host times", "counter wraps"), "poses: "),
+    Broken(
+        arm_driver(NewestFirst),
+        ("times in order", "poses", "host times", "counter wraps"),
+        "poses: ",
+    ),
     Broken(arm_driver(ClockNotWatched), ("clock falls back",), "came after"),
     Broken(arm_driver(StopWaits), (STOP, "close while moving"), "stop had not returned"),
     Broken(arm_driver(StopSendsNothing), (STOP,), "still moving when the call returned"),

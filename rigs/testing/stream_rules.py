@@ -257,7 +257,7 @@ def _close(bench: StreamBench) -> None:
 )
 def _wraps(bench: StreamBench) -> None:
     for wrap_s in sorted(bench.wraps_s):
-        bench.seek(round((wrap_s - 1.0) * 1e9))
+        bench.seek(round((wrap_s - 0.4) * 1e9))
         bench.connect()
         bench.start()
         _check_order(bench.flow(round((wrap_s - WRAP_S) * 1e9)))

@@ -342,7 +342,8 @@ class SerialSyncBox:
                 self._early.append(body)
             return True
         passed_us = (self._now_ns() - self._asked_ns) // 1000
-        latest_us = passed_us + passed_us // 50
+        # by the host's clock, or by what the box's own clock last said
+        latest_us = max(passed_us + passed_us // 50, self._clock_us - train.first_us)
         if kind == "P":
             number, bit, us = numbers
             since_us = train.tick(number, bit, us, latest_us + TICK_AHEAD_US)
