@@ -598,7 +598,8 @@ BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleSync, wrapped("device_ns", 1000), "read_clock"), (WRAPS,), "went on by",
     ),
     "PulseCounterWraps": (
-        reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"), (WRAPS,), "no pulse had|silent for",
+        reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"), (WRAPS,),
+        "no pulse had|silent for",
     ),
     "EndOfPulses": (
         reports(ExampleSync, lambda c: replace(c, t_ns=c.t_ns + 2_500_000), "read_pulses"), DATA,
