@@ -44,7 +44,7 @@ class Limit:
 
     Attributes:
         boundary: of the standard normal statistic, by all looks.
-        steady: of the same where the trend so far goes on to the planned end.
+        steady: of the same where the trend so far continues to the planned end.
         blocks: planned number of them.
     """
 
@@ -102,7 +102,7 @@ class Estimate:
         """Return whether the true mean is above a value, or below it, as surely as asked.
 
         The mean is that of the whole campaign: where the blocks so far have a trend, it must be
-        beyond the value if that trend goes on, too.
+        beyond the value if that trend continues, too.
         """
         if not np.isfinite(limit.boundary) or self.evidence(mean, above=above) < limit.boundary:
             return False

@@ -13,7 +13,7 @@ def verdict_text(state: ClaimState) -> str:
         return f"open: needs at least {state.least_blocks} blocks, and has {state.blocks}"
     if state.alike is not None:
         missing = f"the {state.missing} missing trials"
-        return f"open: {state.alike} if {missing} were like the others, which nobody knows"
+        return f"open: {state.alike} if {missing} were like the others"
     return "open"
 
 
