@@ -157,9 +157,11 @@ def plan_of(order: str, claims: Sequence[dict[str, Any]], setting: Setting) -> P
     data = parse_yaml(source.read_text(), source)
     data["collection"] |= {
         "order": order, "seed": setting.seed,
-        "stopping": {"error": ERROR, "claims": list(claims), "block": BLOCK},
+        "stopping": {"error": ERROR, "claims": list(claims)},
     }  # fmt: skip
-    if order == "adaptive":
+    if order == "shuffled":
+        data["collection"]["stopping"]["block"] = BLOCK
+    else:
         data["collection"]["choice"] = {"batch": setting.batch}
     return make_plan(validate(Protocol, data, source), str(source))
 

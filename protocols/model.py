@@ -219,6 +219,12 @@ class Collection(StrictModel):
             )
         if self.choice is not None and self.order != "adaptive":
             yield KeyedError("collection.choice", None, "is only used by order: adaptive")
+        if self.stopping is not None and self.stopping.block is not None and self.adaptive:
+            yield KeyedError(
+                "collection.stopping.block", self.stopping.block,
+                "has no meaning with order: adaptive, whose batches are the blocks "
+                "(collection.choice.batch)",
+            )  # fmt: skip
         if self.stopping is not None:
             yield from self.stopping.factor_faults(self.all_factors)
 

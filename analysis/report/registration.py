@@ -15,7 +15,12 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import sha256
-from sliplab.storage.trials.registration import registration_files, registrations, stamps
+from sliplab.storage.trials.registration import (
+    registration_files,
+    registration_problems,
+    registrations,
+    stamps,
+)
 from sliplab.storage.trials.store import IMPORTED, Campaign, Store
 
 
@@ -83,6 +88,13 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
                 after, rig = each.after, each.rig is not None
                 found += campaign_deviations(item, each, path)
                 found += _evaluation_deviations(store, campaigns, item)
+        problems = [
+            Deviation("damaged registration", "–", f"{path.name}: {what}")
+            for path, what in registration_problems(item.campaign)
+        ]
+        if problems:  # what the files state of their time proves nothing
+            found = [*problems, *found]
+            after = "but its registrations are damaged, missing or changed"
     except (InputError, StoreError) as error:
         after = after or "but cannot be read"
         found.append(Deviation("a file cannot be read", "–", str(error)))

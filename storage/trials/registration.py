@@ -34,6 +34,13 @@ from sliplab.storage.trials.store import REGISTRATIONS, Campaign
 STAMPS = (".tsr", ".ots")
 """Endings of stamps: responses of RFC 3161, and proofs of OpenTimestamps."""
 FILE = re.compile(r"(?P<file>(?P<number>\d{4,8})\.json)(?P<stamp>\.tsr|\.ots)?")
+_SEQUENCE = 0x30
+"""Tag of ASN.1."""
+_PROOF = b"\x00OpenTimestamps\x00\x00Proof\x00"
+_KINDS = {
+    ".tsr": "is no response of a time-stamping authority (RFC 3161)",
+    ".ots": "is no proof of OpenTimestamps",
+}
 _MOST_BYTES = 1 << 20
 """Of a stamp: far more than any has."""
 
@@ -67,8 +74,10 @@ def add_registration(campaign: Campaign, content: Json) -> Path:
         content: all keys but format, campaign, number, previous and sum.
 
     Raises:
-        StoreError: an earlier one is damaged, or the number was taken in the meantime.
+        StoreError: an earlier one is damaged or missing, or the number was taken in the meantime.
     """
+    for damaged, what in registration_problems(campaign):
+        raise StoreError(f"{damaged}: {what}; restore it from a copy")
     before = registrations(campaign)
     number = before[-1][1].number + 1 if before else 1
     data = {
@@ -110,6 +119,8 @@ def attach_stamp(files: Sequence[Path], stamp: Path) -> Path:
         raise InputError(
             "--stamp", "", str(stamp), f"cannot be read: {error.strerror or error}"
         ) from None
+    if not _is_stamp(data, ending):
+        raise InputError("--stamp", "", str(stamp), _KINDS[ending])
     path = next((it for it in reversed(files) if _stamp_problem(data, it) is None), None)
     if path is None:
         problem = _stamp_problem(data, files[-1])
@@ -134,6 +145,16 @@ def _write_new(path: Path, data: bytes) -> None:
     if not write_new_bytes(path, data):
         raise StoreError(f"{path}: exists and is never overwritten")
     protect(path)
+
+
+def _is_stamp(data: bytes, ending: str) -> bool:
+    """Return whether data begin as a stamp does: a response with its status, or a proof."""
+    if ending == ".ots":
+        return data.startswith(_PROOF)
+    if len(data) < 2 or data[0] != _SEQUENCE:
+        return False
+    head = 2 + (data[1] & 0x7F if data[1] & 0x80 else 0)  # DER: a long length has bytes of its own
+    return data[head : head + 1] == bytes([_SEQUENCE])  # a request begins with its version
 
 
 def _stamp_problem(data: bytes, path: Path) -> str | None:

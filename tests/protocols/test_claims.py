@@ -64,6 +64,9 @@ def test_adaptive_order_needs_claims_and_a_choice_needs_it(
         load_plan(written(tmp_path, small, order="adaptive"))
     with pytest.raises(InputError, match=r"collection\.choice.*only used by order: adaptive"):
         load_plan(written(tmp_path, small, order="shuffled", choice={"batch": 3}))
+    stopping = {"claims": [CLAIM], "block": 4}
+    with pytest.raises(InputError, match=r"stopping\.block.*whose batches are the blocks"):
+        load_plan(written(tmp_path, small, order="adaptive", stopping=stopping))
 
 
 def test_claims_change_no_trial_and_no_hash(tmp_path: Path, small: dict[str, Any]) -> None:

@@ -11,7 +11,8 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.flows.register import register
-from sliplab.storage.files import read_json, write_json
+from sliplab.storage.files import read_json, sha256, write_json
+from sliplab.storage.trials.registration import registration_files
 from sliplab.storage.trials.store import Store
 from tests.flows.older import older_store
 
@@ -85,3 +86,25 @@ def test_section_escapes_what_it_shows(store: Store) -> None:
     assert title == "Registration, and deviations from it"
     assert "text of the protocol" in page
     assert "<script>" not in page
+
+
+@pytest.mark.parametrize("deleted", [False, True])
+def test_changed_or_missing_registration_proves_nothing(store: Store, deleted: bool) -> None:
+    campaign = store.campaign("small")
+    (path,) = registration_files(campaign)
+    session = campaign.folder / "bench" / "0001.json"
+    session.parent.mkdir(exist_ok=True)
+    write_json(session, {"registration": sha256(path)})  # begun with it
+    before = registration_key(store, collected(store))
+    if deleted:
+        path.unlink()
+    else:
+        path.chmod(0o644)
+        path.write_text(path.read_text().replace("2026", "2025"))
+    section = registration_section(store, collected(store))
+    assert section is not None
+    (shown,) = section.campaigns
+    assert shown.after == "but its registrations are damaged, missing or changed"
+    assert shown.deviations.rows[0][0] == "damaged registration"
+    assert "missing or changed" in shown.deviations.rows[-1 if deleted else 1][2]
+    assert registration_key(store, collected(store)) not in ([], before)

@@ -47,6 +47,12 @@ CONTENT: dict[str, Any] = {
 }  # fmt: skip
 
 
+HEADS = {
+    ".tsr": bytes.fromhex("30820100 3003 020100"),  # a response begins with its status
+    ".ots": b"\x00OpenTimestamps\x00\x00Proof\x00",
+}
+
+
 def registered(where: Campaign, count: int = 1) -> list[Path]:
     """Register a campaign some times."""
     return [add_registration(where, CONTENT) for _ in range(count)]
@@ -173,23 +179,36 @@ def test_stamp_goes_to_the_registration_that_it_is_of(tmp_path: Path, ending: st
     where = campaign(tmp_path / "store")
     files = registered(where, 2)
     stamp = tmp_path / f"answer{ending}"
-    stamp.write_bytes(b"signed " + bytes.fromhex(sha256(files[0])) + b" by an authority")
+    stamp.write_bytes(HEADS[ending] + bytes.fromhex(sha256(files[0])) + b" by an authority")
     assert attach_stamp(files, stamp) == files[0].with_name(f"0001.json{ending}")
     assert attach_stamp(files, stamp)  # the same once more changes nothing
     assert [path.name for path in stamps(files[0])] == [f"0001.json{ending}"]
     assert stamps(files[1]) == []
     assert problems(where) == {}
-    stamp.write_bytes(b"of another file")
+    stamp.write_bytes(HEADS[ending] + b"of another file")
     with pytest.raises(InputError, match="does not contain the SHA-256"):
         attach_stamp(files, stamp)
+    # a request to an authority begins with its version
+    stamp.write_bytes(bytes.fromhex("3059 020101") + bytes.fromhex(sha256(files[0])))
+    with pytest.raises(InputError, match=r"is no response of a time|is no proof of OpenTimestamps"):
+        attach_stamp(files, stamp)
+
+
+def test_nothing_is_registered_after_a_damaged_registration(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "store")
+    (path,) = registered(where)
+    path.chmod(0o644)
+    path.write_text(path.read_text().replace('"planned": 3', '"planned": 4'))
+    with pytest.raises(StoreError, match="does not match its checksum; restore it from a copy"):
+        registered(where)
 
 
 def test_second_authority_does_not_overwrite_the_first(tmp_path: Path) -> None:
     files = registered(campaign(tmp_path / "store"))
     digest = bytes.fromhex(sha256(files[0]))
     for ending in (".tsr", ".ots"):
-        (tmp_path / f"one{ending}").write_bytes(digest + b"1")
-        (tmp_path / f"two{ending}").write_bytes(digest + b"2")
+        (tmp_path / f"one{ending}").write_bytes(HEADS[ending] + digest + b"1")
+        (tmp_path / f"two{ending}").write_bytes(HEADS[ending] + digest + b"2")
         attach_stamp(files, tmp_path / f"one{ending}")
     with pytest.raises(StoreError, match="never overwritten"):
         attach_stamp(files, tmp_path / "two.tsr")
