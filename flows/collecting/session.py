@@ -128,10 +128,17 @@ def _claim_watch(
 
 
 def refresh(run_request: RunRequest) -> Campaign:
-    """Recover the store and write the campaign's description, where there is nothing to take."""
+    """Recover the store and describe the campaign, where there is nothing to take.
+
+    Claims are looked at, too: a collection may have ended right after its last trial.
+    """
     store = Store.create(run_request.store)
     with store_lock(store):
-        return _recover(store, run_request)
+        campaign = _recover(store, run_request)
+        with _claim_watch(run_request, store, campaign) as claims:
+            if claims is not None:
+                claims.next_trials()
+        return campaign
 
 
 def _recover(store: Store, run_request: RunRequest) -> Campaign:

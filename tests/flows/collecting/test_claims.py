@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting.session import open_session
+from sliplab.flows.collecting.session import open_session, refresh
 from sliplab.flows.planning.run_request import Claims, RunRequest, make_request
 from sliplab.protocols import InputError
 from sliplab.storage.schema.claims import CHOICES, STOPPING, ChoiceRecord, StoppingRecord
@@ -178,6 +178,23 @@ def test_other_claims_are_looked_at_anew(tmp_path: Path) -> None:
     assert json.loads(record.model_dump_json())["verdict"] == "most"
 
 
+@pytest.mark.usefixtures("in_a_thread")
+@pytest.mark.parametrize("order", ["shuffled", "adaptive"])
+def test_a_collection_cut_after_its_last_trial_is_looked_at_by_the_next(
+    tmp_path: Path, order: str
+) -> None:
+    options = {} if order == "shuffled" else {"choice": {"batch": 3, "start": 3}}
+    run_request = request(tmp_path / "a", [NEVER], order=order, repetitions=2, **options)
+    assert len(collect(run_request)) == 6
+    whole = record_of(run_request)
+    path = campaign_of(run_request).folder / STOPPING
+    cut = whole.model_copy(update={"verdict": "open", "looks": whole.looks[:1]})
+    path.write_text(json.dumps(cut.to_json()))  # as if killed before the last look
+    refresh(run_request)
+    assert record_of(run_request) == whole
+    assert (whole.verdict, whole.looks[-1].taken) == ("all", 6)
+
+
 def test_a_claim_about_a_network_needs_one(tmp_path: Path) -> None:
     lead = {"figure": "lead", "within": "10 ms"}
     with pytest.raises(InputError, match=r"collection\.stopping\.model.*needed"):
@@ -190,7 +207,7 @@ def test_a_claim_about_a_network_needs_one(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.xdist_group("scene")
 def test_through_real_drivers_a_campaign_ends_by_its_claims(tmp_path: Path) -> None:
-    data = quick(trials=2, repetitions=5)
+    data = quick(trials=2, repetitions=9)
     data["collection"] |= {
         "order": "adaptive", "choice": {"batch": 2, "start": 2},
         "stopping": {"error": 0.4, "claims": [SURE]},
@@ -201,7 +218,7 @@ def test_through_real_drivers_a_campaign_ends_by_its_claims(tmp_path: Path) -> N
     campaign = Store.open(store).campaign("quick")
     record = StoppingRecord.load(campaign.folder / STOPPING)
     assert (record.verdict, record.looks[-1].taken) == ("settled", taken)
-    assert taken < 10
+    assert taken < 18
     assert len(campaign.committed()) == taken
     assert answer(*words)["taken"] == 0
-    assert answer(*words, "--no-stopping")["taken"] == 10 - taken
+    assert answer(*words, "--no-stopping")["taken"] == 18 - taken
