@@ -137,7 +137,7 @@ ACCELERATION_MM_S2 = 500.0
 STOP_MM_S2 = 2000.0
 _ORIGIN = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _TICK_S = 0.002
-LATE_S = 0.005
+LATE_S = 0.02
 """Delay after which a packet is dropped: a controller is never late, but networks lose packets."""
 WATCH_S = 0.02
 """Cycle of the watchdog module, s."""

@@ -14,6 +14,7 @@ BAUD = 500_000
 LEAST_HZ, MOST_HZ = 1.0, 1000.0
 ALL_TO_HZ = 200.0
 """Rate up to which the box reports every tick; above it, only ticks with a code bit 1."""
+_BEGUN = f"B {NAME}".encode("ascii")
 _DIGITS = 15
 LONGEST_LINE = 80
 """Longest line, bytes; longer data without an end are discarded."""
@@ -58,7 +59,8 @@ class LineReader:
     def bodies(self, data: bytes) -> list[str]:
         """Return the bodies of the lines that `data` completes."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        bodies = [unseal(line) for line in lines]
+        # a reset cuts a line, and the report of the restart follows without a line feed
+        bodies = [unseal(line[max(line.find(_BEGUN), 0) :]) for line in lines]
         if len(self._rest) > LONGEST_LINE:
             self._rest = b""
             self.wrong += 1

@@ -166,7 +166,7 @@ def test_poses_alone_can_show_that_the_controller_has_stopped_it(abb_pair: MakeA
 def test_stop_does_not_wait_for_a_path_that_is_being_sent(abb_pair: MakeAbb) -> None:
     """And the arm does not move after it."""
     arm, robot = abb_pair()
-    robot.slow(0.5)
+    robot.slow(0.2)  # of REQUEST_S: a busy machine has the rest
     starting = threading.Thread(target=arm.start, args=(SLIDE,))
     starting.start()
     until(lambda: arm._may_move, 10 * REQUEST_S)

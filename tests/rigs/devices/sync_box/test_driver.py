@@ -18,7 +18,7 @@ from sliplab.rigs.core.capabilities import RigError, SyncBox
 from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.rigs.devices.sync_box.driver import SerialSyncBox, Train
 from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
-from sliplab.rigs.devices.sync_box.line import LineReader, seal, unseal
+from sliplab.rigs.devices.sync_box.line import NAME, LineReader, seal, unseal
 from sliplab.rigs.devices.sync_box.port import JOIN_S, TRIES, SyncBoxFault
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 
@@ -494,6 +494,14 @@ def test_lines_are_cut_wherever_they_are_split() -> None:
         bodies = [body for part in parts for body in reader.bodies(part)]
         assert bodies == [f"P {n} 1 {n * 1000}" for n in range(20)]
         assert reader.wrong >= 1
+
+
+def test_a_restart_in_the_middle_of_a_line_is_read() -> None:
+    """The reset leaves the line without a line feed, sometimes with half a byte."""
+    banner = seal(f"B {NAME}")
+    for cut in (b"P 12 1 3", b"P 12 1 3\xf8", b"\x00", b""):
+        assert LineReader().bodies(cut + banner) == [f"B {NAME}"]
+    assert LineReader().bodies(b"P 12" + banner.replace(b"2*", b"3*")) == []
 
 
 @pytest.mark.parametrize(

@@ -284,7 +284,7 @@ def test_a_reset_is_noticed_and_survived(run: Run, connect: Connect) -> None:
     box.start(100.0, SEED)
     board.process.send_signal(signal.SIGUSR1)
     with pytest.raises(SyncBoxFault, match="restarted"):  # noqa: PT012
-        for _ in range(300):
+        for _ in range(1200):
             box.read_pulses()
             threading.Event().wait(0.01)
     pulses = train(box, 100.0, "regular", 40)
