@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import copy
 import ctypes
 import gc
 import os
+import shutil
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +23,7 @@ settings.load_profile("sliplab")
 
 # tests that run at the same time have stand-ins of their own, at the same addresses
 os.environ["SLIPLAB_RUNTIME"] = tempfile.mkdtemp(prefix="sliplab-rigs-")
+atexit.register(shutil.rmtree, os.environ["SLIPLAB_RUNTIME"], ignore_errors=True)
 
 SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import copy
 import math
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from tests.conftest import ROOT, SMALL
 
 # Prefect reads these when it is imported, which happens when a test module imports a flow
 _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
+atexit.register(shutil.rmtree, _HOME, ignore_errors=True)
 os.environ["PREFECT_HOME"] = _HOME
 
 from sliplab.analysis.report.sources import report_folder  # noqa: E402
