@@ -1,0 +1,91 @@
+"""What the program prints and writes, with the parts replaced that differ from run to run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from sliplab.flows.cli.app import app
+from sliplab.storage.trials.store import Store
+from tests.command_line import answer, here
+from tests.conftest import ROOT
+from tests.flows.collecting.test_session import short
+from tests.flows.conftest import write
+from tests.flows.older import older_store
+
+FIXTURES = Path(__file__).parent / "fixtures"
+QUICK_ANSWERS = (
+    ("rigs",),
+    ("plan", "kinematic", "--rig", "rehearsal"),
+    ("plan", "gravity", "--rig", "rehearsal"),
+    ("plan", "disturbance", "--rig", "rehearsal"),
+)
+STORE_ANSWERS = ("trials", "verify", "sync", "label")
+LONG = 10_000
+_TIMES = (
+    (r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?", "TIME"),
+    (r"\b[0-9a-f]{64}\b", "HASH"),
+)
+
+
+def help_text() -> str:
+    """Return the help of every command, one after the other."""
+    text = "".join(f"$ {words} --help\n{text}\n" for words, text in _helps())
+    text = re.sub(r"Usage: .*?sliplab", "Usage: sliplab", text)  # by which program it runs
+    return re.sub(r" +$", "", text, flags=re.MULTILINE)
+
+
+def _helps() -> Iterator[tuple[str, str]]:
+    waiting: list[tuple[tuple[str, ...], Any]] = [((), typer.main.get_command(app))]
+    while waiting:
+        words, command = waiting.pop()
+        yield " ".join(("sliplab", *words)), here(*words, "--help").stdout
+        below = getattr(command, "commands", {})
+        waiting += [((*words, name), below[name]) for name in sorted(below, reverse=True)]
+
+
+def answers(folder: Path) -> dict[str, Any]:
+    """Return the JSON of commands, of shipped files and of a store of an older version."""
+    store = older_store(folder / "older")
+    asked = [*QUICK_ANSWERS, *((name, str(store)) for name in STORE_ANSWERS)]
+    return {
+        " ".join(words).replace(str(folder), "FOLDER"): _short(neutral(answer(*words), folder))
+        for words in asked
+    }
+
+
+def _short(value: Any) -> Any:
+    """Return a long text's hash."""
+    text = json.dumps(value)
+    return value if len(text) < LONG else hashlib.sha256(text.encode()).hexdigest()
+
+
+def checksums(folder: Path) -> dict[str, str]:
+    """Collect three slides on the simulated rig; return the checksum of each trial."""
+    protocol = write(folder / "short.yaml", short())
+    answer("collect", protocol, "--rig", "rehearsal", "--store", folder / "store")
+    return {
+        each.trial_id: each.checksum
+        for campaign in Store.open(folder / "store").campaigns()
+        for each in campaign.recordings()
+    }
+
+
+def neutral(value: Any, folder: Path) -> Any:
+    """Return JSON without times, hashes and the places of files."""
+    text = json.dumps(value)
+    for place, word in (
+        (folder, "FOLDER"),
+        (ROOT / ".links" / "sliplab", "SHIPPED"),
+        (ROOT, "ROOT"),
+    ):
+        text = text.replace(str(place), word)
+    for pattern, word in _TIMES:
+        text = re.sub(pattern, word, text)
+    return json.loads(text)

@@ -1,0 +1,53 @@
+"""A change that means to change nothing leaves these as they are.
+
+`python -m tests.goldens.test_goldens` writes the fixtures again, where a change is meant.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.goldens.made import FIXTURES, answers, checksums, help_text
+
+
+@pytest.fixture(autouse=True)
+def width(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+def test_help_of_every_command() -> None:
+    assert help_text() == (FIXTURES / "help.txt").read_text()
+
+
+def test_answers_to_programs(tmp_path: Path) -> None:
+    expected = json.loads((FIXTURES / "answers.json").read_text())
+    found = answers(tmp_path)
+    assert list(found) == list(expected)
+    for words, answer in expected.items():
+        assert found[words] == answer, words
+
+
+def test_bytes_of_simulated_trials(tmp_path: Path) -> None:
+    assert checksums(tmp_path) == json.loads((FIXTURES / "checksums.json").read_text())
+
+
+def main() -> None:
+    """Write the fixtures."""
+    os.environ["COLUMNS"] = "100"
+    FIXTURES.mkdir(exist_ok=True)
+    (FIXTURES / "help.txt").write_text(help_text())
+    with tempfile.TemporaryDirectory() as folder:
+        for name, found in (("answers", answers), ("checksums", checksums)):
+            (Path(folder) / name).mkdir()
+            text = json.dumps(found(Path(folder) / name), indent=1)
+            (FIXTURES / f"{name}.json").write_text(f"{text}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
