@@ -172,7 +172,7 @@ def commands() -> str:
     """The whole command line, as `--help` says it."""
     import typer
 
-    from sliplab.flows.cli.app import app
+    from sliplab.flows.cli.app import command_line
 
     lines = [
         "# Commands",
@@ -187,7 +187,7 @@ def commands() -> str:
         "found together, `faults` lists each with its file, key, value and message.",
         "",
     ]
-    for words, command in _walk("sliplab", typer.main.get_command(app)):
+    for words, command in _walk("sliplab", typer.main.get_command(command_line())):
         arguments = [item for item in command.params if item.param_type_name == "argument"]
         options = [item for item in command.params if item.param_type_name == "option"]
         usage = [_argument(item) for item in arguments]

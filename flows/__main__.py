@@ -66,9 +66,9 @@ def _run() -> int:
         from sliplab.flows.cli import errors
 
         try:
-            from sliplab.flows.cli.app import app
+            from sliplab.flows.cli.app import command_line
 
-            code = app(standalone_mode=False)
+            code = command_line(sys.argv[1:])(standalone_mode=False)
             if code == console.INTERRUPTED:
                 _ignore_signals()
                 return errors.interruption().report()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
-from sliplab.analysis.detectors.detectors import Levels, Smoothing, Tuned
+from sliplab.analysis.detectors.detectors import RULE, Levels, Smoothing, Tuned
 from sliplab.analysis.detectors.predictions import predict_trials
 from sliplab.analysis.evaluation.detectors import detector_work
 from sliplab.analysis.labels.reviewed import Labels
@@ -21,7 +21,6 @@ from sliplab.analysis.networks.models import (
     training_settings,
     wanted_models,
 )
-from sliplab.analysis.stress import RULE
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection

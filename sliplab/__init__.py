@@ -22,6 +22,10 @@ __path__ += [
     str(links) for links in [Path(__file__).parents[1] / ".links" / "sliplab"] if links.is_dir()
 ]
 
+from sliplab.moved import install as _install  # noqa: E402
+
+_install()
+
 if TYPE_CHECKING:
     from sliplab.flows.api import (
         Events,

@@ -28,6 +28,20 @@ atexit.register(shutil.rmtree, os.environ["SLIPLAB_RUNTIME"], ignore_errors=True
 SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
 
 
+@pytest.fixture(scope="session")
+def rig_path() -> Path:
+    """The shipped rig for rehearsals: tracks in place of videos, which take most of the time."""
+    return ROOT / "rigs" / "rehearsal.yaml"
+
+
+@pytest.fixture(scope="session")
+def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Any:
+    """Both small campaigns, run once through every step; who changes the store puts it back."""
+    from tests.flows.conftest import run_small_study
+
+    return run_small_study(tmp_path_factory.mktemp("study"), rig_path)
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Do not import files without the mark that ``-m 'MARK and ...'`` requires."""
     mark = config.option.markexpr.split(" and ")[0]

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-PACKAGES = ("protocols", "rigs", "storage", "analysis", "flows")
+PACKAGES = ("protocols", "rigs", "storage", "analysis", "flows", "plugins")
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 

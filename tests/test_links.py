@@ -12,7 +12,10 @@ from tests.conftest import ROOT
 def test_links_show_every_package_and_file() -> None:
     links = {path.name: path.resolve() for path in (ROOT / ".links" / "sliplab").iterdir()}
     top = {path.name: path for path in (ROOT / "sliplab").iterdir() if path.is_file()}
-    below = {name: ROOT / name for name in ("protocols", "storage", "rigs", "analysis", "flows")}
+    below = {
+        name: ROOT / name
+        for name in ("protocols", "storage", "rigs", "analysis", "flows", "plugins")
+    }
     links.pop("__pycache__", None)
     assert links == top | below
 

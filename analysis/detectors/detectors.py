@@ -27,6 +27,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Array = npt.NDArray[np.integer] | FloatArray
 
+RULE = "rule, "
+"""Beginning of the name of a network's rule of detection among detectors."""
 ADDED = 0.5
 """Windows added to each bin of a histogram (Krichevsky and Trofimov, 1981): no bin stays empty."""
 

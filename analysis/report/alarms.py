@@ -2,54 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms
 from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.analysis.report.page import number, with_interval
-from sliplab.analysis.stress import ALL, RULE
+from sliplab.protocols.plugin import plugins
 from sliplab.storage.schema.evaluation import AlarmRate, TrialScore
-from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.streams import Json
 
 COMMAND = "sliplab stress"
 OWN = "own"
-"""Title of the store's own network in `stress.json`."""
+"""Title of the store's own network."""
 QUIET, UNDISTURBED, DISTURBED = "quiet", "none", "nuisances"
 
 
 def false_alarms(
     campaigns: Sequence[Collected],
     rows: Iterable[TrialScore],
-    record: StressRecord | None,
+    programs: Mapping[str, Json],
     network: str,
 ) -> dict[str, Json]:
-    """Return all rates of a network that are known, as plain data; see `NetworkWindows`."""
-    quiet = quiet_alarms(item_trials(campaigns, rows))
-    found = {} if quiet is None else {QUIET: quiet}
-    found |= stress_alarms(record, network)
-    return {name: rate.to_json() for name, rate in found.items()}
-
-
-def stress_alarms(record: StressRecord | None, network: str) -> dict[str, AlarmRate]:
-    """Return the rates that `sliplab stress` measured of a network with its rule.
+    """Return all rates of a network that are known, as plain data; see `NetworkWindows`.
 
     Args:
-        network: its title in the record.
+        programs: results of further commands, by name; plug-ins read rates from them.
+        network: its title in them.
     """
-    ours = () if record is None else record.detectors
-    rule = next((it for it in ours if it.network == network and it.rule.startswith(RULE)), None)
-    found = {}
-    for figures in () if rule is None else rule.figures:
-        name = {ALL: DISTURBED, "none": UNDISTURBED}.get(figures.nuisance)
-        if name is not None and figures.strength is None:
-            rate = figures.per_hour
-            found[name] = AlarmRate(
-                alarms=figures.false_alarms, hours=figures.hold_h, value=rate.value,
-                low=rate.low, high=rate.high, clusters=figures.trials,
-            )  # fmt: skip
-    return found
+    quiet = quiet_alarms(item_trials(campaigns, rows))
+    found = {} if quiet is None else {QUIET: quiet}
+    for alarms in plugins().hooks("false_alarms"):
+        found |= alarms(programs, network)
+    return {name: rate.to_json() for name, rate in found.items()}
 
 
 def rate_words(rate: AlarmRate | None) -> str:

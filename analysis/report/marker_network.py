@@ -73,7 +73,7 @@ def with_classifier(
 ) -> OneCameraSummary:
     """Add the classifier's figures, under the names that the spiking network's have."""
     evaluation = judged.evaluation
-    parts = judged_part(campaigns, evaluation, window_intervals(store, evaluation.key), {}, {})
+    parts = judged_part(campaigns, evaluation, window_intervals(store, evaluation.key), {}, {}, {})
     return OneCameraSummary.model_validate({
         **summary.to_json(),
         **parts,

@@ -104,14 +104,21 @@ def _environment() -> Environment:
 
 
 def render_page(
-    template: str, sections: Sequence[Content] = (), *, simulated: bool, **values: object
+    template: str | Path, sections: Sequence[Content] = (), *, simulated: bool, **values: object
 ) -> str:
     """Render a page of sections under the top that `template` and its `values` give it.
 
     Everything in it is escaped but the figures' SVG.
+
+    Args:
+        template: a file of `templates` by name, or a plug-in's file.
     """
     rendered = [render_section(section, simulated=simulated) for section in sections]
-    page = _environment().get_template(template)
+    environment = _environment()
+    if isinstance(template, Path):
+        page = environment.from_string(template.read_text(encoding="utf-8"))
+    else:
+        page = environment.get_template(template)
     return page.render(sections=rendered, simulated=simulated, **values)
 
 

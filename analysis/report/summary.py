@@ -28,7 +28,6 @@ from sliplab.storage.schema.evaluation import (
     TrainedBaseline,
     WindowIntervals,
 )
-from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.schema.summary import (
     Difference,
     Hashes,
@@ -73,12 +72,9 @@ def make_summary(sources: Sources) -> Summary:
         StoreError: another program's result is of another shape.
     """
     campaigns, evaluation = sources.campaigns, sources.evaluation
-    stress = None
-    if "stress" in sources.programs:
-        stress = parse_program("stress", StressRecord, sources.programs["stress"])
     judged = judged_part(
         campaigns, evaluation, sources.window_intervals, sources.baselines, sources.references,
-        stress,
+        sources.programs,
     )  # fmt: skip
     holdout = None
     if "holdout" in sources.programs:
@@ -88,7 +84,7 @@ def make_summary(sources: Sources) -> Summary:
         "simulated": sources.store.simulated,
         **judged,
         "networks": {
-            name: _network(campaigns, of, sources.references, stress)
+            name: _network(campaigns, of, sources.references, sources.programs)
             for name, of in sources.networks.items()
         },
         "paper": _paper(sources.settings, campaigns),
@@ -130,7 +126,7 @@ def judged_part(
     spans: WindowIntervals | None,
     baselines: Mapping[str, TrainedBaseline],
     references: Slips,
-    stress: StressRecord | None = None,
+    programs: Mapping[str, Json],
 ) -> dict[str, Any]:
     """Return `kinematic`, `gravity`, `disturbance` and `trials` of an evaluation."""
     judged = _judged(campaigns, evaluation, references)
@@ -139,7 +135,7 @@ def judged_part(
         **{name: windows[name] for name in _WINDOWS},
         "trained_baselines": baselines,
         "window_intervals": {} if spans is None else spans.to_json(),
-        "false_alarms": false_alarms(campaigns, evaluation.trials, stress, OWN),
+        "false_alarms": false_alarms(campaigns, evaluation.trials, programs, OWN),
         **judged["kinematic"],
     }
     trials = tuple(trial_outcome(row) for row in evaluation.trials)
@@ -172,7 +168,7 @@ def _network(
     campaigns: Sequence[Collected],
     found: OtherEvaluation,
     references: Slips,
-    stress: StressRecord | None,
+    programs: Mapping[str, Json],
 ) -> Json:
     """Return another network's figures, under the keys that the store's own have."""
     judged = _judged(campaigns, found, references)
@@ -183,7 +179,7 @@ def _network(
         "kinematic": {
             **found.windows.to_json(),
             "false_alarms": false_alarms(
-                campaigns, found.trials, stress, f"preset: {found.preset}"
+                campaigns, found.trials, programs, f"preset: {found.preset}"
             ),
             **judged["kinematic"],
         },

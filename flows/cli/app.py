@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import typer
+from typer.main import get_command_name
 
 from sliplab.flows.cli import (
-    bench,
     collect,
     control,
     detect,
@@ -22,12 +23,14 @@ from sliplab.flows.cli import (
     schema,
     steps,
     store,
-    stress,
     study,
     sweeps,
     twin,
 )
 from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import PluginError, import_foreign
 
 app = typer.Typer(
     name="sliplab",
@@ -63,9 +66,7 @@ for part in (
     power.app,
     steps.app,
     sweeps.app,
-    bench.app,
     study.app,
-    stress.app,
     store.app,
     rigs.app,
     control.app,
@@ -79,3 +80,52 @@ for part in (
 ):
     app.add_typer(part)
 rigs.calibrate_app.add_typer(twin.app)
+
+GROUPS = {"teach": rigs.teach_app, "calibrate": rigs.calibrate_app}
+"""Groups that plug-ins extend."""
+
+
+def _first_words(part: typer.Typer) -> Iterator[str]:
+    for group in part.registered_groups:
+        if isinstance(group.name, str):
+            yield group.name
+        elif group.typer_instance is not None:
+            yield from _first_words(group.typer_instance)
+    for command in part.registered_commands:
+        assert command.callback is not None
+        yield command.name or get_command_name(command.callback.__name__)
+
+
+_CORE = frozenset(_first_words(app))
+_added: set[str] = set()
+
+
+def command_line(words: Sequence[str] = ()) -> typer.Typer:
+    """Return the command line with the plug-ins' commands that the given words may name.
+
+    A command of the core loads no plug-in. Without a command, such as for the help, all are there.
+
+    Raises:
+        InputError: the command of a plug-in that cannot be imported.
+    """
+    word = next((word for word in words if not word.startswith("-")), None)
+    if word in _CORE and word not in GROUPS:
+        return app
+    commands = plugins().commands()
+    for each in [word] if word in commands else sorted(commands):
+        for place in commands[each]:
+            _add(each, place, needed=each == word)
+    return app
+
+
+def _add(word: str, place: str, needed: bool) -> None:
+    if place in _added:
+        return
+    try:
+        part = import_foreign(place)
+    except PluginError as error:
+        if needed:
+            raise InputError("COMMAND", "", word, f"cannot be loaded: {error}") from None
+        return
+    _added.add(place)
+    GROUPS.get(word, app).add_typer(part)

@@ -27,11 +27,11 @@ def schema(
     as_json: JsonOption = False,
 ) -> None:
     """Print the JSON Schema of a protocol, a rig file, an adapter or a document in a store."""
-    from sliplab.flows.planning.schema import KINDS, file_schema
+    from sliplab.flows.planning.schema import file_schema, kinds
     from sliplab.storage.files import write_json
 
-    if kind not in KINDS:
-        raise InputError("KIND", "", kind, one_of(kind, KINDS))
+    if kind not in kinds():
+        raise InputError("KIND", "", kind, one_of(kind, kinds()))
     made = file_schema(kind)
     if out is None:
         console.print_json(made)

@@ -20,10 +20,11 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.model import Protocol
+from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import import_foreign
 from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
-from sliplab.storage.schema.bench import BenchResult
 from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.drift import DriftFit
@@ -31,7 +32,6 @@ from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.power import PowerRecord
 from sliplab.storage.schema.reflex import ReflexStudy
-from sliplab.storage.schema.stress import StressRecord
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.schema.twin import TwinFit, TwinGap
@@ -57,12 +57,9 @@ DOCUMENTS: dict[str, tuple[type[Document], str]] = {
     "drift": (DriftFit, "The drift of a campaign's reference trials, by SlipLab"),
     "gap": (TwinGap, "Networks of a twin, tested on the rig that it imitates, by SlipLab"),
     "power": (PowerRecord, "Trials that claims need, by SlipLab"),
-    "stress": (StressRecord, "Detectors under nuisances, by SlipLab"),
     "reflex": (ReflexStudy, "Drops that reflexes prevent, by SlipLab"),
-    "bench": (BenchResult, "The table of the bench of detectors, by SlipLab"),
 }
-"""Documents of a store, with the titles of their schemas."""
-KINDS = (*FILES, *DOCUMENTS)
+"""Documents of a store, with the titles of their schemas; plug-ins have further ones."""
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"
 
@@ -82,10 +79,23 @@ class _Described(GenerateJsonSchema):
         return False
 
 
+def kinds() -> tuple[str, ...]:
+    """Return the kinds of files and documents that have a schema."""
+    return (*FILES, *DOCUMENTS, *plugins().documents())
+
+
+def document_model(kind: str) -> tuple[type[Document], str]:
+    """Return the model of a document and the title of its schema."""
+    if kind in DOCUMENTS:
+        return DOCUMENTS[kind]
+    place, title = plugins().documents()[kind]
+    return import_foreign(place), title
+
+
 def file_schema(kind: str) -> Schema:
-    """Return the JSON Schema (draft 7) of one of `KINDS`, as plain data."""
+    """Return the JSON Schema (draft 7) of one of `kinds()`, as plain data."""
     load_packages()  # their units, too
-    model, title = FILES[kind] if kind in FILES else DOCUMENTS[kind]
+    model, title = FILES[kind] if kind in FILES else document_model(kind)
     return {
         "$schema": _DIALECT,
         **(_rig_schema() if kind == "rig" else _made(model)),

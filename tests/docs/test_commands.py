@@ -15,11 +15,11 @@ import pytest
 import typer
 from typer.exceptions import TyperException
 
-from sliplab.flows.cli.app import app
+from sliplab.flows.cli.app import command_line
 from tests.conftest import ROOT
 from tests.docs.blocks import PAGES, Command, blocks, commands
 
-ROOT_COMMAND: Any = typer.main.get_command(app)
+ROOT_COMMAND: Any = typer.main.get_command(command_line())
 NUMBERS = {"N": "1", "P": "8000", "S": "1", "MS": "1"}
 """Placeholders of numbers in a synopsis, and values to substitute."""
 MAKEFILES = {"docs/sync-box.md": "rigs/firmware/Makefile"}

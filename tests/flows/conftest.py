@@ -11,7 +11,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 
 from tests.conftest import ROOT, SMALL
@@ -94,18 +93,8 @@ def write(path: Path, data: dict[str, Any]) -> Path:
     return path
 
 
-@pytest.fixture(scope="session")
-def rig_path() -> Path:
-    """The shipped rig for rehearsals: tracks in place of videos, which take most of the time."""
-    return ROOT / "rigs" / "rehearsal.yaml"
-
-
-@pytest.fixture(scope="session")
-def ran(
-    tmp_path_factory: pytest.TempPathFactory, rig_path: Path
-) -> tuple[list[RunRequest], Outcome]:
-    """Both small campaigns, run once through every step; who changes the store puts it back."""
-    folder = tmp_path_factory.mktemp("study")
+def run_small_study(folder: Path, rig_path: Path) -> tuple[list[RunRequest], Outcome]:
+    """Run both small campaigns through every step."""
     protocols = [
         write(folder / "tiny.yaml", tiny()),
         write(folder / "tiny_gravity.yaml", tiny_gravity()),

@@ -11,7 +11,7 @@ from typing import Any
 
 import typer
 
-from sliplab.flows.cli.app import app
+from sliplab.flows.cli.app import command_line
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer, here
 from tests.conftest import ROOT
@@ -42,7 +42,7 @@ def help_text() -> str:
 
 
 def _helps() -> Iterator[tuple[str, str]]:
-    waiting: list[tuple[tuple[str, ...], Any]] = [((), typer.main.get_command(app))]
+    waiting: list[tuple[tuple[str, ...], Any]] = [((), typer.main.get_command(command_line()))]
     while waiting:
         words, command = waiting.pop()
         yield " ".join(("sliplab", *words)), here(*words, "--help").stdout

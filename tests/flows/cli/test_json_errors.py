@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import typer
 
-from sliplab.flows.cli.app import app
+from sliplab.flows.cli.app import command_line
 from sliplab.flows.running import stopping
 from sliplab.flows.running.cluster import ClusterError
 from sliplab.rigs.core.capabilities import ArmFault
@@ -85,7 +85,7 @@ def commands() -> Iterator[str]:
             else:
                 yield " ".join((*words, name))
 
-    return walk(typer.main.get_command(app), ())
+    return walk(typer.main.get_command(command_line()), ())
 
 
 def error_of(*words: object) -> dict[str, Any]:

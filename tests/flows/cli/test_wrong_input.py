@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import pytest
 import typer
 
-from sliplab.flows.cli.app import app
+from sliplab.flows.cli.app import command_line
 from sliplab.protocols.shown import MASK
 from tests.command_line import here
 from tests.conftest import ROOT
@@ -337,7 +337,7 @@ def test_a_wrong_rig_file(case: str, command: str, tmp_path: Path) -> None:
 
 
 def _options(
-    group: typer.Typer = app, prefix: str = ""
+    group: typer.Typer, prefix: str = ""
 ) -> dict[str, tuple[Any, typer.models.ParameterInfo]]:
     """Type and information of every numeric option of every command, by their names."""
     found = {}
@@ -361,7 +361,7 @@ def _options(
     return found
 
 
-OPTIONS = _options()
+OPTIONS = _options(command_line())
 
 
 def test_there_are_numeric_options() -> None:

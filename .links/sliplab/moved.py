@@ -1,0 +1,1 @@
+../../sliplab/moved.py

@@ -1,0 +1,1 @@
+"""Subjects that not every lab needs; each is complete in its own folder."""

@@ -1,0 +1,21 @@
+"""An open bench of slip detectors: their interface, scenes and figures, and those that ship."""
+
+from __future__ import annotations
+
+from sliplab.protocols.plugin import Plugin
+
+_STRESS = "sliplab.plugins.bench.stress"
+PLUGIN = Plugin(
+    commands={
+        "bench": "sliplab.plugins.bench.command:app",
+        "stress": f"{_STRESS}.command:app",
+    },
+    documents={
+        "bench": (
+            "sliplab.plugins.bench.document:BenchResult",
+            "The table of the bench of detectors, by SlipLab",
+        ),
+        "stress": (f"{_STRESS}.document:StressRecord", "Detectors under nuisances, by SlipLab"),
+    },
+    hooks={"false_alarms": f"{_STRESS}.rates:report_alarms"},
+)

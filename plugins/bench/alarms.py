@@ -1,0 +1,102 @@
+"""Alarms of evidence above a level, and the level of a rate of false ones.
+
+Evidence above the level is an alarm. It lasts a second, in which the detector says nothing else;
+evidence that is above the level afterwards is the next alarm. So a detector that cries always has
+an alarm each second. Alarms before the first tip slides are false, in a hold as in the motion that
+follows it. The first alarm after that, before gross slip, detects the slip; where a false alarm
+lasts until the slip, the slip counts as missed, since nobody could know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.plugins.bench.interface import Evidence, Slip
+
+ALARM_US = 1_000_000
+US_PER_HOUR = 3_600_000_000
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Evidence on a scene with the truth, and the scene's world, empty if it shares none."""
+
+    evidence: Evidence
+    slip: Slip
+    world: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Alarms of one scene.
+
+    Attributes:
+        false: alarms before the first tip slid.
+        detected_us: the alarm that detected the slip; None where none did.
+        early: a false alarm lasted until the slip.
+    """
+
+    slip: Slip
+    false: int
+    detected_us: int | None
+    early: bool
+
+
+def alarm_times(t_us: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the beginnings of alarms, of the times at which evidence exceeds the level."""
+    found = []
+    at = 0
+    while at < len(t_us):
+        begin = int(t_us[at])
+        found.append(begin)
+        at = int(np.searchsorted(t_us, begin + ALARM_US))
+    return np.array(found, np.int64)
+
+
+def outcome(judged: Judged, level: float) -> Outcome:
+    """Return a scene's alarms above a level."""
+    slip, evidence = judged.slip, judged.evidence
+    above = evidence.t_us[evidence.value > level]
+    split = int(np.searchsorted(above, slip.physical_us))
+    false = alarm_times(above[:split])
+    if len(false) and false[-1] + ALARM_US > slip.physical_us:
+        return Outcome(slip, len(false), None, True)
+    after = above[split:]
+    detected = int(after[0]) if len(after) and after[0] < slip.gross_us else None
+    return Outcome(slip, len(false), detected, False)
+
+
+def hours_without_slip(scenes: Sequence[Judged]) -> float:
+    """Return the hours of scenes in which nothing slips."""
+    return sum(scene.slip.physical_us for scene in scenes) / US_PER_HOUR
+
+
+def level_at(scenes: Sequence[Judged], allowed: int) -> float:
+    """Return the lowest level at which scenes have at most so many false alarms.
+
+    Found exactly: fewer times exceed a higher level, and fewer times are in as many alarms at most.
+    It is a value of the evidence, which must be exceeded, or -inf where nothing bounds it.
+    """
+    before = []
+    for scene in scenes:
+        quiet = slice(0, int(np.searchsorted(scene.evidence.t_us, scene.slip.physical_us)))
+        before.append((scene.evidence.t_us[quiet], scene.evidence.value[quiet]))
+
+    def fits(level: float) -> bool:
+        count = 0
+        for t_us, value in before:
+            count += len(alarm_times(t_us[value > level]))
+            if count > allowed:
+                return False
+        return True
+
+    levels = np.unique(np.concatenate([[-np.inf], *(value for _, value in before)]))
+    low, high = 0, len(levels) - 1
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if fits(levels[middle]) else (middle + 1, high)
+    return float(levels[low])

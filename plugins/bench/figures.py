@@ -1,0 +1,169 @@
+"""Figures of a detector in the bench, and the order of the table.
+
+Levels are set on validation scenes alone, by `validated`; `tested` applies them to test scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.metrics.intervals import median_interval
+from sliplab.plugins.bench.alarms import (
+    Judged,
+    Outcome,
+    hours_without_slip,
+    level_at,
+    outcome,
+)
+from sliplab.plugins.bench.document import (
+    BenchDetector,
+    BenchPoint,
+    BenchScores,
+    MedianLatency,
+)
+from sliplab.plugins.bench.interface import NO_LABEL
+from sliplab.storage.schema.evaluation import AlarmRate
+
+RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""Asked false alarms an hour; the first one is the table's."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level of evidence, set on validation scenes.
+
+    Attributes:
+        asked: false alarms an hour. allowed: in all validation scenes.
+    """
+
+    asked: float
+    allowed: int
+    value: float
+
+
+def validated(scenes: Sequence[Judged], rates: Sequence[float] = RATES) -> list[Level]:
+    """Return the lowest level of each rate at which validation scenes keep it."""
+    hours = hours_without_slip(scenes)
+    found = []
+    for rate in rates:
+        allowed = int(np.floor(rate * hours + 1e-9))
+        found.append(Level(rate, allowed, level_at(scenes, allowed)))
+    return found
+
+
+def tested(scenes: Sequence[Judged], levels: Sequence[Level]) -> tuple[BenchPoint, ...]:
+    """Return the scores of test scenes at levels that are set already."""
+    return tuple(
+        BenchPoint(
+            asked=level.asked,
+            allowed=level.allowed,
+            level=float(level.value) if np.isfinite(level.value) else None,
+            test=scores(scenes, level.value),
+        )
+        for level in levels
+    )
+
+
+def scores(scenes: Sequence[Judged], level: float) -> BenchScores:
+    """Return the scores of scenes at a level."""
+    outcomes = [outcome(scene, level) for scene in scenes]
+    worlds = _worlds(scenes)
+    return BenchScores(
+        slides=len(outcomes),
+        worlds=len(set(worlds)),
+        latency_ms=_median(outcomes, [it.slip.physical_us for it in outcomes], worlds),
+        latency_paper_ms=_median(outcomes, [it.slip.paper_us for it in outcomes], worlds),
+        missed=sum(it.detected_us is None for it in outcomes),
+        early=sum(it.early for it in outcomes),
+        false_alarms=_alarm_rate(scenes, outcomes),
+    )
+
+
+def _worlds(scenes: Sequence[Judged]) -> list[str]:
+    """Return the world of each scene; one that shares none has its place as a name."""
+    return [scene.world or f"scene {place}" for place, scene in enumerate(scenes)]
+
+
+def _median(
+    outcomes: Sequence[Outcome], onsets_us: Sequence[int], worlds: Sequence[str]
+) -> MedianLatency:
+    late = np.array(
+        [
+            np.inf if it.detected_us is None else (it.detected_us - onset_us) / 1e3
+            for it, onset_us in zip(outcomes, onsets_us, strict=True)
+        ]
+    )
+    low, high = median_interval(late, worlds) or (None, None)
+    value = float(np.median(late)) if len(late) else None
+    return MedianLatency(value=_finite(value), low=_finite(low), high=_finite(high))
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and np.isfinite(value) else None
+
+
+def _alarm_rate(scenes: Sequence[Judged], outcomes: Sequence[Outcome]) -> AlarmRate:
+    """Return the rate of false alarms with its interval over worlds."""
+    _, world = np.unique(_worlds(scenes), return_inverse=True)
+    counts = np.bincount(world, [found.false for found in outcomes])
+    times = np.bincount(world, [hours_without_slip([scene]) for scene in scenes])
+    return alarm_rate(counts, times)
+
+
+def accuracy(scenes: Sequence[Judged], length_us: int = 30_000) -> float | None:
+    """Return the mean recall of the classes, of decisions on scenes; None without classes.
+
+    Args:
+        length_us: of the windows that decisions are about: the truth is that in their middle.
+    """
+    right, every = np.zeros(len(CLASSES)), np.zeros(len(CLASSES))
+    for scene in scenes:
+        found, slip = scene.evidence, scene.slip
+        middle = found.t_us - length_us // 2
+        true = (middle >= slip.paper_us).astype(np.int64) + (middle >= slip.gross_us)
+        said = found.label != NO_LABEL
+        every += np.bincount(true[said], minlength=len(CLASSES))
+        right += np.bincount(true[said & (found.label == true)], minlength=len(CLASSES))
+    return float((right / every).mean()) if every.all() else None
+
+
+def ranked(rows: Sequence[BenchDetector]) -> list[BenchDetector]:
+    """Return detectors, the best first.
+
+    By the median latency from the physical slip at the table's level. Those that detect less than
+    half of the slips have none, and come last, by how many they miss. Of the others, those whose
+    test scenes show more false alarms than were asked for come after those that keep the rate: the
+    lower bound of their rate is above it.
+    """
+
+    def key(row: BenchDetector) -> tuple[bool, bool, float, int, float, str]:
+        point = row.table
+        latency = point.test.latency_ms.value
+        low = point.test.false_alarms.low
+        broken = low is not None and low > point.asked
+        return (
+            latency is None,
+            latency is not None and broken,
+            latency or 0.0,
+            point.test.missed,
+            point.test.false_alarms.value,
+            row.name,
+        )
+
+    return sorted(rows, key=key)
+
+
+def nuisance_scores(scenes: Mapping[str, Sequence[Judged]], level: float) -> dict[str, BenchScores]:
+    """Return the scores at a level by nuisance."""
+    return {name: scores(found, level) for name, found in scenes.items()}
+
+
+def disturbed_rate(scenes: Mapping[str, Sequence[Judged]], level: float) -> AlarmRate | None:
+    """Return false alarms in all scenes with nuisances at a level; None without such scenes."""
+    every = [scene for found in scenes.values() for scene in found]
+    return _alarm_rate(every, [outcome(scene, level) for scene in every]) if every else None

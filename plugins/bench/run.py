@@ -1,0 +1,308 @@
+"""`sliplab bench`: detectors on the scenes of the bench.
+
+Whatever is chosen is chosen by `prepare`, which has no test scene. What a detector gave is kept as
+soon as it is complete, so that a run that was stopped resumes with the next detector.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from multiprocessing import active_children
+from pathlib import Path
+
+from sliplab.flows.running import console, stopping
+from sliplab.plugins.bench import scenes
+from sliplab.plugins.bench.alarms import Judged, hours_without_slip
+from sliplab.plugins.bench.definition import SIZES, VERSION, Size
+from sliplab.plugins.bench.document import BenchDetector, BenchResult, KeptDetector
+from sliplab.plugins.bench.feeding import BenchError, audit, feed
+from sliplab.plugins.bench.figures import (
+    Level,
+    accuracy,
+    disturbed_rate,
+    nuisance_scores,
+    ranked,
+    tested,
+    validated,
+)
+from sliplab.plugins.bench.interface import Detector, Evidence, Scene
+from sliplab.plugins.bench.nuisances import NUISANCES
+from sliplab.plugins.bench.registry import contents, make_detector
+from sliplab.plugins.bench.scenes import Drawn
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import write_json
+from sliplab.storage.process import out_of_reach
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.workers import WORKERS
+
+ENTRIES_VERSION = 2
+"""Incremented when a shipped detector has other figures or intervals on the same scenes."""
+NUMBERS = "bench.json"
+Advance = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Training:
+    """Scenes that everybody knows: those that train, and those that choose."""
+
+    train: Sequence[Scene]
+    validation: Sequence[Scene]
+
+
+@dataclass(frozen=True)
+class Tests:
+    """Scenes in worlds that the user's seed draws."""
+
+    scenes: Sequence[Scene]
+    nuisances: Mapping[str, Sequence[Scene]]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A trained detector with the levels of its evidence, chosen without test scenes."""
+
+    detector: Detector
+    levels: list[Level]
+    train_s: float
+
+
+def prepare(detector: Detector, training: Training, advance: Advance) -> Prepared:
+    """Train a detector, and set its levels on validation scenes.
+
+    Args:
+        advance: called after the training and after each scene.
+    """
+    start = time.perf_counter()
+    detector.train(training.train, training.validation)
+    train_s = time.perf_counter() - start
+    advance()
+    found = judged(detector, training.validation, advance)
+    return Prepared(detector, validated(found), train_s)
+
+
+def judged(detector: Detector, given: Sequence[Scene], advance: Advance) -> list[Judged]:
+    """Return a detector's evidence on scenes."""
+    found = []
+    for scene in given:
+        found.append(Judged(feed(detector, scene), scene.slip, scene.world))
+        advance()
+    return found
+
+
+def measure(name: str, prepared: Prepared, tests: Tests, advance: Advance) -> BenchDetector:
+    """Return the figures of a detector on test scenes."""
+    detector, levels = prepared.detector, prepared.levels
+    found = judged(detector, tests.scenes, advance)
+    disturbed = {
+        nuisance: judged(detector, given, advance) for nuisance, given in tests.nuisances.items()
+    }
+    cost = detector.cost()
+    return BenchDetector(
+        name=name,
+        curve=tested(found, levels),
+        nuisances=nuisance_scores(disturbed, levels[0].value),
+        disturbed=disturbed_rate(disturbed, levels[0].value),
+        accuracy=accuracy(found),
+        operations=cost.operations,
+        memory_bytes=cost.memory_bytes,
+        decision_us=audit(detector, tests.scenes[0]).decision_us,
+        train_s=prepared.train_s,
+    )
+
+
+@dataclass
+class Bench:
+    """The scenes of one size and seed, simulated when they are first needed.
+
+    Attributes:
+        advance: called after each simulated scene.
+    """
+
+    size: Size
+    seed: int
+    advance: Advance = lambda: None
+
+    @property
+    def count(self) -> int:
+        """Number of all scenes."""
+        return sum(self.counts.values())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of scenes by part."""
+        parts = {name: getattr(self.size, name) for name in ("train", "validation", "test")}
+        found = {name: part.worlds * part.slides + part.holds for name, part in parts.items()}
+        return {**found, "nuisances": self.size.nuisance * len(NUISANCES)}
+
+    @cached_property
+    def training(self) -> Training:
+        """Scenes that train and choose."""
+        train, validation = scenes.training_scenes(self.size)
+        return Training(self._simulated(train), self._simulated(validation))
+
+    @cached_property
+    def tests(self) -> Tests:
+        """Test scenes."""
+        nuisances = scenes.nuisance_scenes(self.size, self.seed)
+        return Tests(
+            self._simulated(scenes.test_scenes(self.size, self.seed)),
+            {name: self._simulated(drawn) for name, drawn in nuisances.items()},
+        )
+
+    @property
+    def fed(self) -> int:
+        """Number of scenes that a detector is fed, and one for its training."""
+        return self.count - self.counts["train"] + 1
+
+    @property
+    def hours(self) -> dict[str, float]:
+        """Hours without slip of the validation and test scenes."""
+        none = Evidence.of([], [])
+        return {
+            name: hours_without_slip([Judged(none, scene.slip) for scene in part])
+            for name, part in (
+                ("validation", self.training.validation), ("test", self.tests.scenes),
+            )
+        }  # fmt: skip
+
+    def _simulated(self, drawn: Sequence[Drawn]) -> list[Scene]:
+        found = []
+        for one in drawn:
+            found.append(scenes.simulated(one))
+            _give_memory_back()
+            self.advance()
+        return found
+
+
+def _give_memory_back() -> None:
+    """Return what a simulation has freed.
+
+    It lies between the events of scenes that are kept, where glibc's allocator keeps it: 15 MB a
+    scene, 11 GB in the full set.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A detector to judge."""
+
+    name: str
+    size: Size
+    seed: int
+
+
+@lru_cache(maxsize=1)
+def _bench(size: Size, seed: int) -> Bench:
+    """Return the scenes; a process simulates them once."""
+    return Bench(size, seed)
+
+
+def _judge(job: Job, advance: Advance | None = None) -> KeptDetector:
+    """Judge a detector, in one thread of this process.
+
+    Raises:
+        InputError: it breaks the rules of the bench.
+    """
+    with suppress(ModuleNotFoundError):  # of an extra that a detector may do without
+        from sliplab.analysis.networks.training import limit_threads
+
+        limit_threads(1)  # torch's threads wait for each other busily
+    bench = _bench(job.size, job.seed)
+    bench.advance = advance or (lambda: None)
+    detector = make_detector(job.name)
+    try:
+        prepared = prepare(detector, bench.training, bench.advance)
+        row = measure(job.name, prepared, bench.tests, bench.advance)
+    except BenchError as error:
+        raise InputError("DETECTOR", "", job.name, str(error)) from None
+    finally:
+        detector.close()
+    return KeptDetector(row=row, hours=bench.hours)
+
+
+def _judge_each(jobs: Sequence[Job], workers: int, done: Callable[[KeptDetector], None]) -> None:
+    """Judge detectors, several at once in processes of their own.
+
+    Args:
+        done: called with each as soon as it is complete.
+    """
+    if min(workers, len(jobs)) < 2:
+        scenes_of = _bench(jobs[0].size, jobs[0].seed)
+        total = scenes_of.count + len(jobs) * scenes_of.fed
+        with console.bar("bench (scenes, simulated)", total) as bar:
+            for job in jobs:
+                done(_judge(job, bar.advance))
+        return
+    with (
+        console.bar("bench (detectors, simulated)", len(jobs)) as bar,
+        ProcessPoolExecutor(min(workers, len(jobs)), WORKERS, stopping.leave_to_parent) as pool,
+    ):
+        try:
+            with out_of_reach():
+                futures = [pool.submit(_judge, job) for job in jobs]
+            for judged_one in as_completed(futures):
+                found = judged_one.result()
+                done(found)
+                bar.advance(1, found.row.name)
+        except BaseException:
+            for worker in active_children():
+                worker.terminate()  # what it had not returned is made again
+            raise
+
+
+def run_bench(
+    names: Sequence[str], size: str, seed: int, folder: Path, workers: int = 1
+) -> BenchResult:
+    """Judge detectors that were not judged yet; return the table of all that are named.
+
+    Args:
+        names: of detectors, see `analysis.bench.registry`. size: one of `SIZES`.
+        seed: of the test worlds.
+        folder: keeps what a detector gave, and the table.
+        workers: processes at the most; each simulates the scenes for itself.
+
+    Raises:
+        InputError: there is no such detector, it breaks the rules of the bench, or `folder` is a
+            file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("--folder", "", str(folder), "must be a folder")
+    twice = next((name for name in names if list(names).count(name) > 1), None)
+    if twice is not None:
+        raise InputError("DETECTOR", "", twice, "must be named once")
+    for name in names:
+        make_detector(name).close()  # wrong input fails before anything is simulated
+    kept = Derived(folder / "detectors")
+    keys = {
+        name: make_key("bench", VERSION, [name, contents(name)], [ENTRIES_VERSION, size, seed])
+        for name in names
+    }
+
+    def keep(found: KeptDetector) -> None:
+        key = keys[found.row.name]
+        kept.write(key[:16], key, found)
+
+    missing = [name for name, key in keys.items() if not kept.fresh(key[:16], key)]
+    if missing:
+        _judge_each([Job(name, SIZES[size], seed) for name in missing], workers, keep)
+    found = [kept.load(key[:16], KeptDetector) for key in keys.values()]
+    result = BenchResult(
+        simulated=True,
+        version=VERSION,
+        size=size,
+        seed=seed,
+        scenes=Bench(SIZES[size], seed).counts,
+        hours=found[0].hours,
+        detectors=tuple(ranked([one.row for one in found])),
+    )
+    write_json(folder / NUMBERS, result.to_json())
+    return result

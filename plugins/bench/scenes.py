@@ -1,0 +1,222 @@
+"""Scenes of the bench: drawn worlds and motions, simulated. None is stored, since they repeat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplab.flows.scene_runs import Memory, changed, with_true_times
+from sliplab.flows.twin.worlds import ZERO_MM, Prior, other_specimen
+from sliplab.plugins.bench.definition import DEFINITION, VERSION, Part, Size, Span
+from sliplab.plugins.bench.interface import Scene, Slip
+from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
+from sliplab.protocols import Plan
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.plan import make_plan
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.mock.fault_settings import AnyFault
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_inheritance import shipped_rigs
+from sliplab.storage.streams import EventChunk
+
+FRAMES_PX = 32
+SYNC_HZ = 100
+POLL_S = 2.0
+"""Nothing waits for the streams; all that is read at once is in memory several times."""
+AFTER_GROSS_US = 1_500_000
+"""A scene ends so long after gross slip: later alarms say nothing, and training needs no more."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A scene before it is simulated.
+
+    Attributes:
+        rig: a drawn world. world: its name, which scenes in the same one share.
+        seed: of the trial's chance. faults: of the rig in this scene.
+    """
+
+    name: str
+    world: str
+    rig: RigFile
+    hold_s: float
+    depth_mm: float
+    speed_mm_s: float
+    direction_deg: float
+    seed: int
+    faults: tuple[AnyFault, ...] = ()
+
+
+def training_scenes(size: Size) -> tuple[list[Drawn], list[Drawn]]:
+    """Return the scenes that train and that choose, the same for everybody."""
+    train = list(_part("train", size.train, DEFINITION.train_seed))
+    return train, list(_part("validation", size.validation, DEFINITION.validation_seed))
+
+
+def test_scenes(size: Size, seed: int) -> list[Drawn]:
+    """Return test scenes in worlds that a seed draws."""
+    return list(_part("test", size.test, hash_integer("bench test", VERSION, seed)))
+
+
+def nuisance_scenes(size: Size, seed: int) -> dict[str, list[Drawn]]:
+    """Return scenes with each nuisance, in worlds that a seed draws; the same in each."""
+    drawn_by = hash_integer("bench nuisances", VERSION, seed)
+    found: dict[str, list[Drawn]] = {}
+    for name in NUISANCES:
+        found[name] = []
+        for number in range(size.nuisance):
+            rng = np.random.default_rng([drawn_by, number])
+            hold_s = _value(DEFINITION.nuisance_hold_s, rng)
+            chance = np.random.default_rng([drawn_by, number, hash_integer(name)])
+            rig = _world(drawn_by, number)
+            faults = nuisance_faults(name, hold_s, rig.scene, chance)
+            world = f"nuisances {number + 1}"
+            found[name].append(_drawn(f"{name} {number + 1}", world, rig, hold_s, rng, faults))
+    return found
+
+
+def _part(name: str, part: Part, seed: int) -> Iterator[Drawn]:
+    worlds = [_world(seed, number) for number in range(part.worlds)]
+    for number, rig in enumerate(worlds):
+        for slide in range(part.slides):
+            rng = np.random.default_rng([seed, number, slide])
+            hold_s = _value(DEFINITION.hold_s, rng)
+            world = f"{name} {number + 1}"
+            yield _drawn(f"{world}.{slide + 1}", world, rig, hold_s, rng)
+    for hold in range(part.holds):
+        rng = np.random.default_rng([seed, hold])
+        hold_s = _value(DEFINITION.long_hold_s, rng)
+        number = hold % part.worlds
+        world = f"{name} {number + 1}"
+        yield _drawn(f"{name} hold {hold + 1}", world, worlds[number], hold_s, rng)
+
+
+def _world(seed: int, number: int) -> RigFile:
+    """Return a simulated rig with other parameters, another skin and an error of depth zero."""
+    rig, _ = load_rig_file(shipped_rigs()[DEFINITION.rig])
+    values = Prior(rig, DEFINITION.spread, seed).values(number)
+    rng = np.random.default_rng([seed, number, hash_integer("specimen")])
+    zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
+    return with_true_times(other_specimen(rig, values, int(rng.integers(2**31)), zero_mm))
+
+
+def _drawn(
+    name: str,
+    world: str,
+    rig: RigFile,
+    hold_s: float,
+    rng: np.random.Generator,
+    faults: tuple[AnyFault, ...] = (),
+) -> Drawn:
+    heights_mm = rig.scene.scene.skin.heights_mm
+    touching_mm = max(heights_mm) - min(heights_mm)
+    return Drawn(
+        name,
+        world,
+        rig,
+        hold_s,
+        round(touching_mm + _value(DEFINITION.beyond_mm, rng), 2),
+        _value(DEFINITION.speed_mm_s, rng),
+        _value(DEFINITION.direction_deg, rng),
+        int(rng.integers(2**31)),
+        faults,
+    )
+
+
+def _value(span: Span, rng: np.random.Generator) -> float:
+    """Draw a number of a motion, in hundredths."""
+    if span.logarithmic:
+        return round(math.exp(rng.uniform(math.log(span.low), math.log(span.high))), 2)
+    return round(float(rng.uniform(span.low, span.high)), 2)
+
+
+def simulated(drawn: Drawn) -> Scene:
+    """Simulate a scene.
+
+    Raises:
+        RigError: nothing slips in it.
+    """
+    built = build_rig(changed(drawn.rig, {"faults": drawn.faults}))
+    built.poll_s = POLL_S
+    sink, plan = Memory(), _plan(drawn)
+    try:
+        built.connect()
+        built.frames.set_region(FRAMES_PX, FRAMES_PX)
+        done = built.run_trial(plan.program(plan.trials[0]), sink, drawn.seed, None, SYNC_HZ)
+    finally:
+        built.close()
+    truth = done.truth
+    assert truth is not None, "a simulated rig has a truth"
+    begin_ns, end_ns = done.recorded_ns
+    end_us = (end_ns - begin_ns) // 1000
+    moved_ns = next(step.start_ns for step, _ in done.steps if step.phase == "slide")
+
+    def since(onset_ns: int | None) -> int:
+        """Return microseconds since the scene began; its end for what never came."""
+        if onset_ns is None:
+            return end_us
+        return min((onset_ns - truth["reference_ns"] + moved_ns - begin_ns) // 1000, end_us)
+
+    slip = Slip(*(since(truth[key]) for key in ("first_slip_ns", "incipient_ns", "gross_ns")))
+    end_us = min(end_us, slip.gross_us + AFTER_GROSS_US)
+    events = EventChunk.joined(sink.events)
+    t_us = events.t_us - begin_ns // 1000
+    inside = slice(*np.searchsorted(t_us, (0, end_us)))
+    # copies: views would keep what follows in memory
+    kept = EventChunk(
+        events.x[inside].copy(), events.y[inside].copy(), events.p[inside].copy(),
+        t_us[inside].copy(),
+    )  # fmt: skip
+    size = built.events.width, built.events.height
+    return Scene(drawn.name, kept, *size, int(end_us), slip, drawn.world)
+
+
+def _plan(drawn: Drawn) -> Plan:
+    """Return a plan of one slide after a hold."""
+    protocol = {
+        "protocol": 1,
+        "name": "bench",
+        "title": "A slide of the bench",
+        "collection": {
+            "experiment": "kinematic",
+            "seed": 1,
+            "factors": {"direction": {"unit": "deg", "values": [drawn.direction_deg]}},
+            "repetitions": 1,
+            "motion": [
+                {"phase": "approach", "clearance": "5 mm", "speed": "20 mm/s"},
+                {"phase": "press", "depth": f"{drawn.depth_mm} mm", "speed": "2 mm/s"},
+                {"phase": "hold", "settle": "1 s", "duration": f"{drawn.hold_s} s"},
+                {
+                    "phase": "slide",
+                    "distance": f"{DEFINITION.distance_mm} mm",
+                    "speed": f"{drawn.speed_mm_s} mm/s",
+                    "direction": "$direction",
+                },
+                {"phase": "release", "clearance": "5 mm", "speed": "10 mm/s"},
+                {"phase": "return", "speed": "20 mm/s"},
+            ],
+            "recording": {"region": {"width": "41.6 mm", "height": "41.6 mm"}},
+            "limits": {
+                "depth": "4.5 mm",
+                "speed": "50 mm/s",
+                "clearance": "20 mm",
+                "workspace": {
+                    "x": {"low": "-10 mm", "high": "10 mm"},
+                    "y": {"low": "-10 mm", "high": "10 mm"},
+                },
+                "duration": "300 s",
+            },
+            "gates": {
+                "sync_uncertainty": {"hardware_trigger": "1 ms"},
+                "frames_lost": 0,
+                "event_gap": "50 ms",
+                "retakes": 0,
+            },
+        },
+        "analysis": {},
+    }
+    return make_plan(Protocol.model_validate(protocol), "the bench's scenes")

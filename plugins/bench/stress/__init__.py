@@ -1,0 +1,1 @@
+"""Detectors under nuisances: trials, figures and page."""

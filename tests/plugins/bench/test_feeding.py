@@ -1,0 +1,76 @@
+"""Rules that a detector must keep, and what is said where it does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sliplab.plugins.bench.feeding import BenchError, audit, feed
+from sliplab.plugins.bench.interface import Detector, Evidence, Scene
+from sliplab.storage.streams import EventChunk
+from tests.plugins.bench.made import Counting, scene
+
+
+@pytest.fixture(scope="module")
+def one() -> Scene:
+    return scene(np.random.default_rng(1), 2.0)
+
+
+class Answering(Detector):
+    """Gives the same answer to each chunk, moved by the time before it."""
+
+    def __init__(self, t_us: list[int], value: list[float], label: list[int] | None = None) -> None:
+        self._answer = (t_us, value, label)
+
+    def begin(self, width: int, height: int) -> None:
+        self._before_us = 0
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        t_us, value, label = self._answer
+        found = Evidence.of(self._before_us + np.array(t_us), value, label)
+        self._before_us = until_us
+        return found
+
+
+@pytest.mark.parametrize(
+    ("detector", "said"),
+    [
+        (Answering([0], [1.0]), "evidence at 0 us; must be after 0 us"),
+        (Answering([1_000_001], [1.0]), "must be after 0 us and not after 1000000 us"),
+        (Answering([5, 5], [1.0, 2.0]), "times of evidence must increase"),
+        (Answering([5], [np.nan]), "must be finite or -inf"),
+        (Answering([5], [np.inf]), "must be finite or -inf"),
+        (Answering([5], [1.0], [3]), "label = 3: must be -1"),
+        (Answering([5], [1.0, 2.0]), r"1 times, \(2,\) values"),
+    ],
+)
+def test_evidence_that_is_none_is_refused(detector: Detector, said: str, one: Scene) -> None:
+    with pytest.raises(BenchError, match=said):
+        feed(detector, one)
+
+
+def test_evidence_depends_on_earlier_events_alone(one: Scene) -> None:
+    class LooksAhead(Counting):
+        """Its evidence is how many events the whole chunk has."""
+
+        def push(self, events: EventChunk, until_us: int) -> Evidence:
+            found = super().push(events, until_us)
+            return Evidence.of(found.t_us, np.full(len(found), len(events)))
+
+    assert len(audit(Counting(), one).evidence) == one.end_us // 10_000
+    with pytest.raises(BenchError, match="must depend on earlier events alone"):
+        audit(LooksAhead(), one)
+
+
+def test_all_events_are_given_once_and_in_time(one: Scene) -> None:
+    seen: list[int] = []
+
+    class Watching(Answering):
+        def push(self, events: EventChunk, until_us: int) -> Evidence:
+            assert (events.t_us < until_us).all()
+            assert (events.t_us >= self._before_us).all()
+            seen.extend(events.t_us.tolist())
+            return super().push(events, until_us)
+
+    feed(Watching([], []), one)
+    assert seen == one.events.t_us.tolist()

@@ -1,0 +1,185 @@
+"""The bench from detectors' names to its table, on a few scenes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from sliplab.plugins.bench import run, scenes
+from sliplab.plugins.bench.definition import SIZES, Part, Size
+from sliplab.plugins.bench.document import BenchResult
+from sliplab.plugins.bench.entries.thresholds import Rate
+from sliplab.plugins.bench.interface import Scene
+from sliplab.plugins.bench.nuisances import NUISANCES
+from sliplab.protocols.errors import InputError
+from tests.command_line import here
+
+TINY = Size(Part(1, 2, 0), Part(1, 3, 0), Part(2, 2, 0), 1)
+NAMES = ("rate", "always", "random")
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SIZES, "small", TINY)
+    run._bench.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bench")
+
+
+def choices(found: BenchResult) -> dict[str, list[tuple[float, int, float | None]]]:
+    """All that was chosen, by detector."""
+    return {
+        row.name: [(point.asked, point.allowed, point.level) for point in row.curve]
+        for row in found.detectors
+    }
+
+
+def test_other_test_worlds_change_figures_and_no_choice(folder: Path) -> None:
+    one, other = (run.run_bench(NAMES, "small", seed, folder) for seed in (1, 2))
+    assert choices(one) == choices(other)
+    figures = [
+        {row.name: row.table.test.to_json() for row in found.detectors} for found in (one, other)
+    ]
+    assert figures[0]["rate"] != figures[1]["rate"]
+    assert one.hours["validation"] == other.hours["validation"]
+    assert one.hours["test"] != other.hours["test"]
+
+
+def test_choices_are_made_before_a_test_scene_is_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    done: list[str] = []
+    simulated, validated = scenes.simulated, run.validated
+
+    def simulate(drawn: scenes.Drawn) -> Scene:
+        done.append(drawn.name.split()[0])
+        return simulated(drawn)
+
+    def choose(*args: object) -> object:
+        done.append("chosen")
+        return validated(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(scenes, "simulated", simulate)
+    monkeypatch.setattr(run, "validated", choose)
+    run.run_bench(["rate"], "small", 1, tmp_path)
+    assert done[: done.index("chosen")] == ["train"] * 2 + ["validation"] * 3
+    assert set(done[done.index("chosen") + 1 :]) == {"test", *NUISANCES}
+
+
+def test_a_detector_is_trained_on_training_and_validation_scenes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[list[str]] = []
+
+    def train(self: Rate, given: Sequence[Scene], validation: Sequence[Scene]) -> None:
+        seen.extend([one.name for one in part] for part in (given, validation))
+
+    monkeypatch.setattr(Rate, "train", train)
+    run.run_bench(["rate"], "small", 1, tmp_path)
+    assert seen == [
+        ["train 1.1", "train 1.2"],
+        ["validation 1.1", "validation 1.2", "validation 1.3"],
+    ]
+
+
+def test_a_stopped_run_resumes_with_the_next_detector(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stopped(self: Rate, *_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Rate, "train", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run.run_bench(["always", "rate", "never"], "small", 1, tmp_path)
+    trained: list[str] = []
+    prepare = run.prepare
+
+    def prepared(detector: object, *rest: object) -> object:
+        trained.append(type(detector).__name__)
+        return prepare(detector, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "prepare", prepared)
+    found = run.run_bench(["always", "rate", "never"], "small", 1, tmp_path)
+    assert trained == ["Rate", "Never"]
+    assert {row.name for row in found.detectors} == {"always", "rate", "never"}
+
+
+@pytest.mark.long
+def test_processes_give_the_figures_of_one(folder: Path, tmp_path: Path) -> None:
+    one = run.run_bench(NAMES, "small", 1, folder)
+    several = run.run_bench(NAMES, "small", 1, tmp_path, workers=2)
+    timed = {"decision_us": 0.0, "train_s": 0.0}
+    rows, others = (
+        [row.model_copy(update=timed) for row in found.detectors] for found in (one, several)
+    )
+    assert rows == others
+
+
+def test_the_command_prints_what_it_writes(folder: Path) -> None:
+    done = here("bench", *NAMES, "--small", "--folder", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    data = json.loads(done.stdout)
+    assert data == json.loads((folder / "bench.json").read_text())
+    assert data["simulated"] is True
+    assert "simulated" in (folder / "bench.svg").read_text()
+    shown = here("bench", *NAMES, "--small", "--folder", folder)
+    assert "bench 1, small, seed 1 (simulated)" in shown.stdout
+    said = " ".join(shown.stdout.split())
+    assert "over 2 test worlds and 1 with nuisances; below 24 trials or worlds, here 1" in said
+    for row in data["detectors"]:
+        assert row["curve"][0]["test"]["worlds"] == 2
+        assert row["disturbed"]["low"] is None, "one world bounds nothing"
+
+
+def test_the_leaderboard_is_written_between_its_lines(folder: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Bench\n\n<!-- bench: written by `sliplab bench` -->\nold\n<!-- bench: end -->\n\nafter\n"
+    )
+    for _ in range(2):
+        words = ("bench", *NAMES, "--small", "--folder", folder, "--leaderboard", page)
+        assert here(*words).returncode == 0
+    text = page.read_text()
+    assert text.startswith("# Bench\n\n<!--")
+    assert text.endswith("<!-- bench: end -->\n\nafter\n")
+    assert text.count("| rate |") == 2
+    assert "old" not in text
+    assert "**simulated**" in text
+    assert (tmp_path / "images" / "bench.svg").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("rat",), "DETECTOR = rat: must be one of paper, ours"),
+        (("rat",), "did you mean 'rate'?"),
+        (("rate", "rate"), "DETECTOR = rate: must be named once"),
+        (("no_such_module:Thing",), "no module no_such_module to import"),
+        (("json:nothing",), "cannot be made: AttributeError"),
+        (("collections:Counter",), "is a Counter, not a"),
+        (("rate", "--leaderboard", "nowhere.md"), "nowhere.md"),
+    ],
+)
+def test_wrong_input_is_said_before_anything_is_simulated(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = here("bench", *words, "--small", "--folder", tmp_path / "f")
+    assert done.returncode == 2
+    assert said in done.stderr.replace("\n", " ")
+    assert not (tmp_path / "f").exists()
+
+
+def test_a_detector_that_breaks_the_rules_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Rate, "push", lambda *_: 3)
+    with pytest.raises(InputError, match=r"DETECTOR = rate: .*: push returned int"):
+        run.run_bench(["rate"], "small", 1, tmp_path)

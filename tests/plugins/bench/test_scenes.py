@@ -1,0 +1,97 @@
+"""Scenes of the bench: frozen, drawn by seeds, with the truth at its time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sliplab.plugins.bench import definition, scenes
+from sliplab.plugins.bench.definition import SIZES, Part, Size
+from sliplab.plugins.bench.interface import Scene
+from sliplab.plugins.bench.nuisances import NUISANCES
+from sliplab.protocols.hashing import hash_data
+
+SIZE = Size(Part(2, 2, 0), Part(1, 2, 1), Part(2, 2, 1), 1)
+
+
+def test_version_1_is_frozen() -> None:
+    sizes = {name: dataclasses.asdict(size) for name, size in SIZES.items()}
+    found = hash_data([dataclasses.asdict(definition.DEFINITION), sizes])
+    assert definition.VERSION == 1
+    assert found[:16] == "e89981f755f2b300", (
+        "what changes the scenes is another version of the bench"
+    )
+
+
+def test_its_scenes_are_what_they_were() -> None:
+    # another simulation gives other scenes: then it is another version, too
+    first = scenes.simulated(scenes.training_scenes(SIZES["small"])[0][0])
+    slip = first.slip
+    assert (slip.physical_us, slip.paper_us, slip.gross_us) == pytest.approx(
+        (7_805_270, 7_869_758, 13_419_878), abs=20
+    )
+    assert len(first.events) == pytest.approx(241_764, rel=1e-3)
+
+
+def test_a_seed_draws_the_test_worlds_and_nothing_else() -> None:
+    one, same, other = (scenes.test_scenes(SIZE, seed) for seed in (1, 1, 2))
+    assert one == same
+    assert not {drawn.rig.model_dump_json() for drawn in one} & {
+        drawn.rig.model_dump_json() for drawn in other
+    }
+    known = {drawn.rig.model_dump_json() for part in scenes.training_scenes(SIZE) for drawn in part}
+    assert not known & {drawn.rig.model_dump_json() for drawn in (*one, *other)}
+    assert [drawn.name for drawn in one] == [drawn.name for drawn in other]
+
+
+def test_a_larger_set_begins_with_the_worlds_of_a_smaller_one() -> None:
+    more = dataclasses.replace(SIZE, train=Part(3, 3, 0))
+    few, many = scenes.training_scenes(SIZE)[0], scenes.training_scenes(more)[0]
+    assert [drawn for drawn in many if drawn.name in {it.name for it in few}] == few
+
+
+@pytest.fixture(scope="module")
+def slides() -> list[Scene]:
+    return [scenes.simulated(drawn) for drawn in scenes.test_scenes(SIZE, 1)]
+
+
+def test_a_scene_repeats_to_the_event(slides: list[Scene]) -> None:
+    again = scenes.simulated(scenes.test_scenes(SIZE, 1)[1])
+    for name in ("x", "y", "p", "t_us"):
+        assert np.array_equal(getattr(again.events, name), getattr(slides[1].events, name))
+    assert again.slip == slides[1].slip
+
+
+def test_a_tip_slips_in_the_motion_and_its_marker_moves_later(slides: list[Scene]) -> None:
+    for drawn, scene in zip(scenes.test_scenes(SIZE, 1), slides, strict=True):
+        slip = scene.slip
+        assert drawn.hold_s * 1e6 < slip.physical_us < slip.paper_us < slip.gross_us
+        assert slip.gross_us <= scene.end_us
+        # the marker of a tip that slides as fast as the arm needs 0.1 mm, as of the rig's 20 px/mm
+        assert slip.paper_us - slip.physical_us >= 0.9e6 * 0.1 / drawn.speed_mm_s
+
+
+def test_events_rise_when_the_arm_moves_and_not_before(slides: list[Scene]) -> None:
+    for drawn, scene in zip(scenes.test_scenes(SIZE, 1), slides, strict=True):
+        moved_us = round(drawn.hold_s * 1e6)
+        edges = np.searchsorted(
+            scene.events.t_us, moved_us + np.array([-200_000, 0, 50_000, 250_000])
+        )
+        before, _, after = np.diff(edges)
+        assert after > 1.5 * before
+
+
+@pytest.mark.parametrize("name", NUISANCES)
+def test_a_nuisance_changes_the_events_and_hardly_the_slip(name: str) -> None:
+    (drawn,) = scenes.nuisance_scenes(SIZE, 1)[name]
+    disturbed = scenes.simulated(drawn)
+    clean = scenes.simulated(dataclasses.replace(drawn, faults=()))
+    hold_us = 1e6 * drawn.hold_s
+    if name in {"tap_table", "tap_arm", "vibration"}:  # these go through the contact
+        assert disturbed.slip.gross_us == pytest.approx(clean.slip.gross_us, abs=5e5)
+        assert disturbed.slip.physical_us >= 0.9 * hold_us
+    else:
+        assert disturbed.slip == clean.slip
+    assert len(disturbed.events) != len(clean.events) or name == "flicker"

@@ -1,0 +1,111 @@
+"""Plug-ins: what they declare is found, and loaded when it is used."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.protocols import plugin
+from sliplab.protocols.plugin import Plugin, plugins
+from tests.conftest import ROOT
+
+LOADED = """
+import contextlib, io, json, sys
+from sliplab.flows.cli.app import command_line
+
+words = json.loads(sys.argv[1])
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(sys.stderr):
+    command_line(words)(words, standalone_mode=False)
+print(json.dumps([name for name in sys.modules if name.startswith("sliplab.plugins")]))
+"""
+
+
+def loaded(*words: str) -> list[str]:
+    """Run a command in a process of its own; return the modules of plug-ins that it loads."""
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, json.dumps(words)],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    found: list[str] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def test_a_command_of_the_core_loads_no_plug_in(tmp_path: Path) -> None:
+    assert loaded("plan", "pilot", "--json") == []
+    collected = loaded(
+        "collect", "pilot", "--rig", "mock", "--store", str(tmp_path), "--trials", "1"
+    )
+    assert collected == []
+    assert "sliplab.plugins.bench.command" in loaded("bench", "--help")
+    assert "sliplab.plugins.bench.run" not in loaded("bench", "--help")
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Write packages that are found beside those that are installed."""
+
+    def install(name: str, declared: str) -> None:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        (tmp_path / f"{name}.py").write_text(declared)
+        info = tmp_path / f"{name}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[{plugin.GROUP}]\n{name} = {name}:PLUGIN\n")
+
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plugins.cache_clear()
+    yield install
+    plugins.cache_clear()
+
+
+def test_packages_of_others_declare_the_same(installed: Any) -> None:
+    installed(
+        "lab_subject",
+        "from sliplab.protocols.plugin import Plugin\n"
+        "PLUGIN = Plugin(hooks={'place': 'lab_subject:answer'}, commands={'rub': 'lab_subject:x'})"
+        "\n"
+        "def answer(): return 42\n",
+    )
+    found = plugins()
+    assert isinstance(found.found["lab_subject"], Plugin)
+    assert [hook() for hook in found.hooks("place")] == [42]
+    assert found.commands()["rub"] == ["lab_subject:x"]
+    assert found.faults == ()
+
+
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [
+        ("raise OSError('no camera')", "OSError: no camera"),
+        ("import sys; sys.exit(3)", "exit code 3"),
+        ("PLUGIN = 4", "is a int, not a Plugin"),
+        ("", "has no attribute 'PLUGIN'"),
+    ],
+)
+def test_one_that_is_broken_is_named_and_harms_no_other(
+    installed: Any, declared: str, said: str
+) -> None:
+    installed("lab_broken", declared)
+    found = plugins()
+    assert "bench" in found.found
+    (fault,) = found.faults
+    assert fault.startswith("the plug-in lab_broken cannot be used: ")
+    assert said in fault
+
+
+def test_names_from_before_a_move_still_work() -> None:
+    code = (
+        "import sliplab.analysis.bench.interface as old, sliplab.plugins.bench.interface as new;"
+        "from sliplab.analysis.bench import registry; import sliplab.plugins.bench.registry as r;"
+        "print(old is new, registry is r, new.__spec__.name)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True", "True", "sliplab.plugins.bench.interface"]
