@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from sliplab.analysis.twin.drift import drifts
-from sliplab.analysis.twin.parameters import drawn
-from sliplab.analysis.twin.statistics import of_names
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin.drift import FRICTION, OneSpecimen
-from sliplab.flows.twin.worlds import Slides, World, guess_of, other_specimen, simulated
+from sliplab.plugins.twin.drift.estimates import drifts
+from sliplab.plugins.twin.drift.flow import FRICTION, OneSpecimen
+from sliplab.plugins.twin.parameters import drawn
+from sliplab.plugins.twin.statistics import of_names
+from sliplab.plugins.twin.worlds import Slides, World, guess_of, other_specimen, simulated
 from sliplab.protocols import load_plan
 from sliplab.protocols.shipped import shipped_protocols
 from sliplab.rigs.rig_file import load_rig_file

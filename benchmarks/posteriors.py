@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import SEED
-from sliplab.analysis.twin.posterior import IDENTIFIED, Bank, fitted
+from sliplab.plugins.twin.posterior import IDENTIFIED, Bank, fitted
 from sliplab.storage.streams import F64
 
 HALF = float(np.log(1.3))

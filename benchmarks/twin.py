@@ -39,20 +39,20 @@ from matplotlib.figure import Figure
 from scipy.stats import kstest, kstwo
 from threadpoolctl import threadpool_limits
 
-from sliplab.analysis.twin.misfits import misfits
-from sliplab.analysis.twin.parameters import PARAMETERS, settings_of, value_of
-from sliplab.analysis.twin.pilot import PilotTrial
-from sliplab.analysis.twin.posterior import Bank, Estimate, Fitted, fitted
-from sliplab.analysis.twin.statistics import Statistics, of_names, statistics
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin.pilots import event_trials, simulate_pilot
-from sliplab.flows.twin.worlds import Prior, Slides, World
+from sliplab.plugins.twin.document import MisfitCheck
+from sliplab.plugins.twin.misfits import misfits
+from sliplab.plugins.twin.parameters import PARAMETERS, settings_of, value_of
+from sliplab.plugins.twin.pilot import PilotTrial
+from sliplab.plugins.twin.pilots import event_trials, simulate_pilot
+from sliplab.plugins.twin.posterior import Bank, Estimate, Fitted, fitted
+from sliplab.plugins.twin.statistics import Statistics, of_names, statistics
+from sliplab.plugins.twin.worlds import Prior, Slides, World
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock import fault_settings as faults
 from sliplab.rigs.mock.settings import EventCamera
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
-from sliplab.storage.schema.twin import MisfitCheck
 from sliplab.storage.streams import F64
 
 ROOT = Path(__file__).parents[1]

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.analysis.twin.effects import Effect, effects_of
-from sliplab.analysis.twin.needs import Marked, Need, marked, marks, need
-from sliplab.analysis.twin.parameters import PARAMETERS, value_of
 from sliplab.flows.scene_runs import changed
-from sliplab.flows.twin.needs import WORLDS
-from sliplab.flows.twin.worlds import Slides, World, guess_of, other_rig
+from sliplab.plugins.twin.effects import Effect, effects_of
+from sliplab.plugins.twin.needs.flow import WORLDS
+from sliplab.plugins.twin.needs.judging import Marked, Need, marked, marks, need
+from sliplab.plugins.twin.parameters import PARAMETERS, value_of
+from sliplab.plugins.twin.worlds import Slides, World, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock.settings import Papilla, skin_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file

@@ -54,8 +54,8 @@ from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration
 from sliplab.flows.train import train
-from sliplab.flows.twin.calibrate import calibrate_scene, request
-from sliplab.flows.twin.worlds import touch_depth_mm
+from sliplab.plugins.twin.calibrate import calibrate_scene, request
+from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file

@@ -9,7 +9,9 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-MOVED = {"sliplab.analysis.bench": "sliplab.plugins.bench"}
+MOVED = {
+    "sliplab.analysis.bench": "sliplab.plugins.bench",
+}
 """Old names of packages, and what they are now."""
 
 

@@ -25,7 +25,6 @@ from sliplab.flows.cli import (
     store,
     study,
     sweeps,
-    twin,
 )
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
@@ -79,7 +78,6 @@ for part in (
     new.app,
 ):
     app.add_typer(part)
-rigs.calibrate_app.add_typer(twin.app)
 
 GROUPS = {"teach": rigs.teach_app, "calibrate": rigs.calibrate_app}
 """Groups that plug-ins extend."""

@@ -27,14 +27,12 @@ from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
 from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.document import Document
-from sliplab.storage.schema.drift import DriftFit
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.power import PowerRecord
 from sliplab.storage.schema.reflex import ReflexStudy
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
-from sliplab.storage.schema.twin import TwinFit, TwinGap
 
 Schema = dict[str, Any]
 FILES: dict[str, tuple[type[BaseModel], str]] = {
@@ -53,9 +51,6 @@ DOCUMENTS: dict[str, tuple[type[Document], str]] = {
         ClassSummary,
         "The summary of a report of SlipLab on recordings of classes",
     ),
-    "twin": (TwinFit, "A fit of a simulated rig to a pilot, by SlipLab"),
-    "drift": (DriftFit, "The drift of a campaign's reference trials, by SlipLab"),
-    "gap": (TwinGap, "Networks of a twin, tested on the rig that it imitates, by SlipLab"),
     "power": (PowerRecord, "Trials that claims need, by SlipLab"),
     "reflex": (ReflexStudy, "Drops that reflexes prevent, by SlipLab"),
 }

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
-from sliplab.flows.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.plugins.bench.definition import DEFINITION, VERSION, Part, Size, Span
 from sliplab.plugins.bench.interface import Scene, Slip
 from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
+from sliplab.plugins.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import kstest
 
 from benchmarks.twin import called_of_bank, coverage_lines, draw_ranks, ranks_of
-from sliplab.analysis.twin.posterior import Bank
+from sliplab.plugins.twin.posterior import Bank
 
 
 def linear_bank(worlds: int = 200) -> Bank:

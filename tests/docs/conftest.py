@@ -7,14 +7,11 @@ from pathlib import Path
 
 import pytest
 
+# Prefect at home in a folder of the tests, before anything imports it
+import tests.flows.conftest  # noqa: F401
 from tests.conftest import ROOT
 
-# Prefect at home in a folder of the tests, before anything imports it
-from tests.flows.conftest import rig_path
-
-__all__ = ["rig_path"]
-
-PACKAGES = ("protocols", "rigs", "storage", "analysis", "flows")
+PACKAGES = ("protocols", "rigs", "storage", "analysis", "flows", "plugins")
 
 
 @pytest.fixture(scope="session")

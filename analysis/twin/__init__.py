@@ -1,1 +1,0 @@
-"""Fitting a simulated rig to a pilot: what its trials say of the scene's parameters."""

@@ -1,1 +1,0 @@
-"""Twins: a simulated rig's scene fitted to the slides of a pilot."""

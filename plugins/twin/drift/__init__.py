@@ -1,0 +1,1 @@
+"""Drift along a campaign: its reference trials, each fitted by the scene."""

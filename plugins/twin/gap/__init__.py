@@ -1,0 +1,1 @@
+"""Networks that a twin has trained, tested on the rig that it imitates."""
