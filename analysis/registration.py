@@ -13,11 +13,12 @@ from sliplab.protocols.claims import Claim
 from sliplab.protocols.differences import comparable_collection, differences
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.plan import Plan, parse_plan
+from sliplab.protocols.shown import plural
 from sliplab.protocols.yaml_file import parse_yaml, read_text, without_secrets
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.claims import STOPPING, StoppingRecord
-from sliplab.storage.schema.registration import Registration, plural
+from sliplab.storage.schema.registration import Registration
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import AGAIN, RIG, QuarantineEntry

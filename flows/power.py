@@ -100,7 +100,7 @@ def plan_with_claims(
     Raises:
         InputError: there is no claim, one is wrong, or a network is needed.
     """
-    plan = load_plan(protocol, enable)
+    plan = load_plan(protocol, enable, judged=model is None and not texts)
     collection = plan.protocol.collection
     stopping = collection.stopping
     if texts:

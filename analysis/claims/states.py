@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from sliplab.analysis.claims.blocks import F64, Estimate, Limit, block_share, least_blocks
+from sliplab.analysis.claims.blocks import F64, Estimate, Limit, block_share
 from sliplab.analysis.claims.boundaries import boundaries
 from sliplab.analysis.claims.evidence import (
     Evidence,
@@ -101,7 +101,7 @@ class History:
     def limit(self, claim: Claim, error: float) -> Limit:
         """Return what a claim's estimate must exceed at the last look; infinite at early ones."""
         evidence = self.evidence
-        enough = evidence.block_count >= blocks_needed(claim)
+        enough = evidence.block_count >= claim.least_blocks
         if not len(enough) or not enough[-1]:
             return Limit(np.inf, np.inf, np.inf)
         adaptive = evidence.chances is not None
@@ -152,11 +152,6 @@ class History:
         return chosen_estimate(evidence, x, members, guess(self.expected(figure)), latest)
 
 
-def blocks_needed(claim: Claim) -> int:
-    """Return the number of blocks before which a claim is not called."""
-    return least_blocks(None if claim.of == "mean" else QUANTILES[claim.of])
-
-
 def state_of(claim: Claim, history: History) -> ClaimState:
     """Return the state of a claim by the last look alone.
 
@@ -186,7 +181,7 @@ def state_of(claim: Claim, history: History) -> ClaimState:
         undetected=int(np.isinf(y[used]).sum()),
         missing=missing,
         blocks=int(evidence.block_count[-1]) if len(evidence.looks) else 0,
-        least_blocks=blocks_needed(claim),
+        least_blocks=claim.least_blocks,
         block_share=share,
         estimate=_estimate_of(claim, history, groups),
         low=low if np.isfinite(low) else None,

@@ -20,7 +20,14 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences
 from sliplab.protocols.templates import written_out
-from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
+from sliplab.protocols.yaml_file import (
+    KeyedError,
+    input_error,
+    mask_secrets,
+    parse_yaml,
+    read_text,
+    without_secrets,
+)
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.claims import STOPPING, ChoiceRecord, StoppingRecord
@@ -151,7 +158,7 @@ def make_request(
         NoStore: the folder holds something else.
         StoreError: the campaign was started under another collection.
     """
-    plan = load_plan(protocol, enable)
+    plan = load_plan(protocol, enable, judged=claims != "ignore")
     rig_file, rig_text = load_rig_file(rig)
     check_plan(rig_file, plan, str(rig))
     if plan.protocol.collection.plate is not None and not rig_file.has_plate:
@@ -180,19 +187,10 @@ def judging_model(plan: Plan) -> Path | None:
         InputError: one is needed, and there is none.
     """
     claims = plan.protocol.collection.stopping
-    if claims is None or not claims.needs_network:
-        return None
-    key = "collection.stopping.model"
-    if claims.model is not None:
-        path = Path(plan.file).parent / claims.model
-        if not path.is_file():
-            raise InputError(plan.file, key, claims.model, f"{path} is no file")
-        return path.resolve()
-    raise InputError(
-        plan.file, key, None,
-        "is needed: a claim is about a network's output; name the file of a trained one, such as "
-        "STORE/models/seed0.pt of a pilot",
-    )  # fmt: skip
+    try:
+        return None if claims is None else claims.network_file(plan.file)
+    except KeyedError as error:
+        raise input_error(plan.file, error) from None
 
 
 def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
