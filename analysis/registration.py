@@ -163,13 +163,13 @@ def _trial_deviations(
     more = sorted(committed - planned)
     if more:
         yield Deviation(
-            "more trials than registered", f"{len(planned)} trials", _listed(more, "other")
+            "more trials than registered", plural(len(planned), "trial"), _listed(more, "other")
         )
     missing = len(planned - committed)
     if missing:
         ended = _verdict(item) in ("settled", "most")
         yield Deviation(
-            "fewer trials than registered", f"{len(planned)} trials",
+            "fewer trials than registered", plural(len(planned), "trial"),
             f"{len(planned) - missing}"
             + ("; the campaign was ended by its claims" if ended else ""),
         )  # fmt: skip

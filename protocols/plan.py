@@ -27,7 +27,7 @@ from sliplab.protocols.program import Dwell, Program
 from sliplab.protocols.quantity import FactorRef, canonical, to_decimal
 from sliplab.protocols.rounds import block_warnings, check_first_round
 from sliplab.protocols.shipped import protocol_path
-from sliplab.protocols.shown import did_you_mean
+from sliplab.protocols.shown import did_you_mean, plural
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.templates import in_terms_of_template
 from sliplab.protocols.units import file_text
@@ -117,7 +117,7 @@ class Plan:
 
     def __repr__(self) -> str:
         hours = self.total_seconds / 3600
-        return f"<Plan {self.protocol.name}: {len(self)} trials, {hours:.2f} h of motion>"
+        return f"<Plan {self.protocol.name}: {plural(len(self), 'trial')}, {hours:.2f} h of motion>"
 
     def table(self) -> pd.DataFrame:
         """The trials as a table, in the order in which they are taken; units in the headers."""
@@ -325,15 +325,15 @@ class Plan:
 
 
 def load_plan(
-    path: Path, enable: Iterable[str] = (), *, stored: bool = False, judged: bool = False
+    path: Path, enable: Iterable[str] = (), judged: bool = False, *, stored: bool = False
 ) -> Plan:
     """Read the protocol at `path` and expand it.
 
     Args:
         path: of the file, or the name of a protocol that ships with the package (``pilot``).
         enable: levels to switch on, as ``factor=level`` (``disturbance=125``).
-        stored: it is a campaign's own copy, which is not held to rules that came after it.
         judged: the network that its claims need must be there.
+        stored: it is a campaign's own copy, which is not held to rules that came after it.
 
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.

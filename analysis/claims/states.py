@@ -7,7 +7,7 @@ have shown.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -49,7 +49,12 @@ def states(
     found = [state_of(claim, history) for claim in stopping.claims]
     for k, before in enumerate(earlier):
         if is_called(before):
-            update = {"holds": before.holds, "refuted": before.refuted, "alike": None}
+            update = {
+                "holds": before.holds,
+                "refuted": before.refuted,
+                "alike": None,
+                "trend": None,
+            }
             found[k] = found[k].model_copy(update=update)
     return tuple(found)
 
@@ -170,6 +175,10 @@ def state_of(claim: Claim, history: History) -> ClaimState:
         span = _interval(claim, history, groups, worst=False)
         would, would_not = _called(claim, history, groups, span, worst=False)
         alike = "holds" if would else "refuted" if would_not else None
+    trend: Literal["holds", "refuted"] | None = None
+    if not holds and not against:
+        would, would_not = _called(claim, history, groups, (low, high), worst=True, trend=False)
+        trend = "holds" if would else "refuted" if would_not else None
     fit = history.expected_after(claim.figure, len(evidence.taken))
     share, _ = block_share(np.where(used, y - fit.mean[evidence.taken], np.nan), evidence.blocks)
     return ClaimState(
@@ -189,6 +198,7 @@ def state_of(claim: Claim, history: History) -> ClaimState:
         holds=holds,
         refuted=against,
         alike=alike,
+        trend=trend,
     )
 
 
@@ -199,10 +209,15 @@ def _called(
     span: tuple[float, float],
     *,
     worst: bool,
+    trend: bool = True,
 ) -> tuple[bool, bool]:
-    """Return whether a claim holds, and whether it is refuted."""
+    """Return whether a claim holds, and whether it is refuted.
+
+    Args:
+        trend: it must be so where the trend so far continues, too; an interval has that in it.
+    """
     if claim.between is None and claim.within is None:  # sharper than by an interval of two ends
-        return _bound_verdict(claim, history, groups[0], worst=worst)
+        return _bound_verdict(claim, history, groups[0], worst=worst, trend=trend)
     low, high = span
     if claim.within is not None:
         return bool(high - low <= 2.0 * claim.value), False
@@ -213,11 +228,13 @@ def _called(
 
 
 def _bound_verdict(
-    claim: Claim, history: History, members: Mask, *, worst: bool
+    claim: Claim, history: History, members: Mask, *, worst: bool, trend: bool
 ) -> tuple[bool, bool]:
     """Return whether a claim of a bound holds, and is refuted."""
     value, least = claim.value, claim.at_least is not None
     limit = history.limit(claim, history.stopping.error)
+    if not trend:
+        limit = replace(limit, steady=-np.inf)
     none, all_ = (0.0, 1.0) if worst else (None, None)
     if claim.of == "mean":
         share = value / PERCENT

@@ -6,7 +6,7 @@ key by key. Nothing here needs Prefect, so a wrong input is answered at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict
 
@@ -106,21 +106,42 @@ class RunRequest:
 
     def _begun(self, campaign: Campaign) -> set[str] | None:
         """Return the trials that a campaign had begun when its claims ended it; else None."""
-        collection = self.plan.protocol.collection
-        claims = collection.stopping
+        record, collection = self._ended_by_claims(campaign), self.plan.protocol.collection
+        if record is None or collection.stopping is None:
+            return None
+        if collection.adaptive is not None:
+            batches = ChoiceRecord.of(campaign.folder).batches
+            return {item.trial for batch in batches for item in batch.trials}
+        repetitions = len(record.looks) * collection.stopping.repetitions
+        return {t.id for t in self.plan if t.role == "measured" and t.repetition <= repetitions}
+
+    def _ended_by_claims(self, campaign: Campaign) -> StoppingRecord | None:
+        """Return the looks of a campaign that its claims ended; else None."""
+        claims = self.plan.protocol.collection.stopping
         if claims is None or self.claims != "use":
             return None
         try:
             record = StoppingRecord.load(campaign.folder / STOPPING)
         except FileNotFoundError:
             return None
-        if record.section != section_hash(claims) or record.verdict not in ("settled", "most"):
-            return None
-        if collection.adaptive is not None:
-            batches = ChoiceRecord.of(campaign.folder).batches
-            return {item.trial for batch in batches for item in batch.trials}
-        repetitions = len(record.looks) * claims.repetitions
-        return {t.id for t in self.plan if t.role == "measured" and t.repetition <= repetitions}
+        ended = record.section == section_hash(claims) and record.verdict in ("settled", "most")
+        return record if ended else None
+
+    def end_reason(self, campaign: Campaign) -> str:
+        """Return why a collection ended that nothing interrupted."""
+        if replace(self, most=None).due_trials(campaign):
+            return f"as many trials as --trials {self.most} allows"
+        claims, record = self.plan.protocol.collection.stopping, self._ended_by_claims(campaign)
+        if record is not None and claims is not None:
+            if record.verdict == "settled":
+                return "all claims are settled"
+            return f"another round would exceed collection.stopping.most = {claims.most}"
+        if pending_trials(self.plan, campaign):
+            return "all requested trials are taken"
+        excluded = len(excluded_trials(self.plan, campaign))
+        if excluded:
+            return f"all trials are taken but {excluded} that were skipped or set aside"
+        return "all trials are taken"
 
     def counts(self, campaign: Campaign) -> CampaignCounts:
         """Count what the campaign holds now; planned = committed + missing."""
