@@ -140,7 +140,7 @@ def reasons_for_doubt(label: TrialLabel) -> list[tuple[int, str]]:
         found.append((SLIGHT, f"{plural(label.markers_lost, 'time')} a marker was not seen"))
     if label.plate_lost:
         found.append(
-            (SLIGHT, (f"the plate's marker was not seen in {plural(label.plate_lost, 'frame')}"))
+            (SLIGHT, f"the plate's marker was not seen in {plural(label.plate_lost, 'frame')}")
         )
     return sorted(dict.fromkeys(found), key=lambda item: -item[0])
 

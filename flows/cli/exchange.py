@@ -240,7 +240,7 @@ def _model_pairs(result: Exported) -> dict[str, str]:
     checked = result["onnx_windows_equal"]
     return {
         "files": ", ".join(Path(file).name for file in result["files"]),
-        "onnx": (f"{checked} of {plural(checked, 'window')} as in Sinabs")
+        "onnx": f"{checked} of {plural(checked, 'window')} as in Sinabs"
         if checked
         else "not written",
         "speck": "fits, one core a layer" if result["speck_fits"] else "does not fit",

@@ -61,7 +61,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         Check(
             "protocol and limits",
             True,
-            (f"{plural(len(run_request.plan), 'trial')} within all limits"),
+            f"{plural(len(run_request.plan), 'trial')} within all limits",
         ),
         Check("campaign", True, f"{len(pending)} of {len(run_request.plan)} still to collect"),
     ]

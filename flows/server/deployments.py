@@ -287,7 +287,7 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
     taken = sum(item["taken"] for item in outcome.collected)
     # of steps of one name, the last
     done = {step["step"]: step["done"] for step in outcome.steps}
-    return (f"{plural(taken, 'trial')} taken; ") + ", ".join(
+    return f"{plural(taken, 'trial')} taken; " + ", ".join(
         f"{name}: {n} done" for name, n in done.items()
     )
 

@@ -193,7 +193,9 @@ def again(campaign: Campaign, trials: Iterable[str], by: Json) -> dict[str, str]
         if known.pop(trial, None) is not None:
             done.append("no longer set aside")
         if count := _reset_attempts(campaign, trial, by):
-            done.append(f"{plural(count, 'failed attempt')} forgotten")
+            done.append(
+                f"{plural(count, 'failed attempt')} count{'s' if count == 1 else ''} no longer"
+            )
         did[trial] = "; ".join([*done, "will be taken again"] if done else ["was pending already"])
     if len(known) < before:
         write_json(campaign.folder / SKIPPED, known)
