@@ -34,6 +34,7 @@ from sliplab.flows.running.parallel_map import START_S, parallel_map_flow, run_t
 from sliplab.flows.running.run_records import timed
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import Claim, Stopping
+from sliplab.protocols.consistency import check_consistency
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.yaml_file import (
@@ -100,7 +101,7 @@ def plan_with_claims(
     Raises:
         InputError: there is no claim, one is wrong, or a network is needed.
     """
-    plan = load_plan(protocol, enable)
+    plan = load_plan(protocol, enable, judged=model is None and not texts)
     collection = plan.protocol.collection
     stopping = collection.stopping
     if texts:
@@ -111,7 +112,12 @@ def plan_with_claims(
             "--claim", "", None, f"is needed: {plan.file} has no claims (collection.stopping)"
         )
     changed = collection.model_copy(update={"stopping": stopping})
-    plan = make_plan(plan.protocol.model_copy(update={"collection": changed}), plan.file, enable)
+    changed_protocol = plan.protocol.model_copy(update={"collection": changed})
+    try:
+        check_consistency(changed_protocol)
+    except KeyedError as error:
+        raise input_error("--claim", error) from None
+    plan = make_plan(changed_protocol, plan.file, enable)
     return plan, judging_model(plan, model)
 
 

@@ -16,26 +16,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtr
 
+from sliplab.protocols.claims import LEAST_BLOCKS
+
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
-LEAST_BLOCKS = 6
-"""Blocks before which nothing is called."""
-RARE = 3.0
-"""Blocks times share of the trials beyond a percentile, before which nothing is called: trials of
-one cause may all lie in one block, and 3 / share blocks miss it with a chance of 5 % at most."""
 _MOST_CORRELATION = 0.9
 _LEAST_CHANCE = 1e-300
-
-
-def least_blocks(share: float | None = None) -> int:
-    """Return the number of blocks before which a claim is not called.
-
-    Args:
-        share: of a percentile; None for a mean.
-    """
-    if share is None:
-        return LEAST_BLOCKS
-    return max(LEAST_BLOCKS, math.ceil(RARE / min(share, 1.0 - share) - 1e-9))
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ class ClaimState(Part):
     refuted: Bool
     alike: Literal["holds", "refuted"] | None = None
     """The verdict if missing trials were like the others, where it is open without that."""
+    trend: Literal["holds", "refuted"] | None = None
+    """The verdict if the trend so far did not continue, where it is open without that."""
 
 
 class Look(Part):

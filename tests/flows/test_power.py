@@ -158,6 +158,13 @@ def test_a_wrong_claim_names_option_key_and_value(
     assert (error["key"], error["value"]) == (key, value)
 
 
+def test_claim_given_twice_is_refused(ran: Ran, protocol: Path) -> None:
+    words = (protocol, "--store", ran[0][0].store)
+    error = error_of(*words, "--claim", DURATION, "--claim", DURATION)
+    assert error["key"] == "--claim collection.stopping.claims[1]"
+    assert "is the same as claims[0]" in error["message"]
+
+
 def test_a_protocol_without_claims_and_levels_outside_are_refused(
     ran: Ran, protocol: Path, tmp_path: Path
 ) -> None:
