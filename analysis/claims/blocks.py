@@ -149,19 +149,20 @@ def of_trials(value: float, off: F64, weights: F64, blocks: I64, count: int) -> 
     return Estimate(value, np.asarray(count * parts, np.float64))
 
 
-def block_share(off: F64, blocks: I64) -> tuple[float, float]:
+def block_share(off: F64, blocks: I64, least: int = 3) -> tuple[float, float]:
     """Return the share of blocks in the variance of residuals, and its square root in their unit.
 
     By the method of moments of one-way analysis of variance (Searle, Casella and McCulloch 1992,
-    Variance Components, section 3.6); none where there are fewer than three blocks of two trials.
+    Variance Components, section 3.6); none where there are fewer than `least` blocks of two trials.
 
     Args:
         off: (n,) residuals; those that are not finite are left out. blocks: (n,) of each.
+        least: 2 or more.
     """
     there = np.isfinite(off)
     _, number, sizes = np.unique(blocks[there], return_inverse=True, return_counts=True)
     n, groups = len(number), len(sizes)
-    if groups < 3 or n < 2 * groups:
+    if groups < least or n < 2 * groups:
         return 0.0, 0.0
     means = np.bincount(number, off[there]) / sizes
     inside = float(((off[there] - means[number]) ** 2).sum()) / (n - groups)

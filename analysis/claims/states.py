@@ -127,9 +127,18 @@ class History:
             at: figures at the value count as below. missing: what trials without a figure count as;
                 None: they are left out.
         """
-        y = self.evidence.values[figure]
-        x = np.where(np.isnan(y), np.nan, (y <= value) if at else (y < value))
-        return self._estimate(figure, x, members, lambda fit: fit.below(value), missing)
+        key = figure, value, members.tobytes(), at, missing
+        if key not in self._shares:
+            y = self.evidence.values[figure]
+            x = np.where(np.isnan(y), np.nan, (y <= value) if at else (y < value))
+            found = self._estimate(figure, x, members, lambda fit: fit.below(value), missing)
+            self._shares[key] = found
+        return self._shares[key]
+
+    @cached_property
+    def _shares(self) -> dict[tuple[object, ...], Estimate]:
+        """Shares below values, which claims about one figure have in common."""
+        return {}
 
     def mean(self, figure: str, members: Mask, missing: float | None = None) -> Estimate:
         """Return the mean of a share in percent, as a number from 0 to 1; see `share_below`."""
