@@ -13,11 +13,12 @@ from sliplab.protocols.claims import Claim
 from sliplab.protocols.differences import comparable_collection, differences
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.plan import Plan, parse_plan
+from sliplab.protocols.shown import plural
 from sliplab.protocols.yaml_file import parse_yaml, read_text, without_secrets
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.claims import STOPPING, StoppingRecord
-from sliplab.storage.schema.registration import Registration, plural
+from sliplab.storage.schema.registration import Registration
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import AGAIN, RIG, QuarantineEntry
@@ -162,13 +163,13 @@ def _trial_deviations(
     more = sorted(committed - planned)
     if more:
         yield Deviation(
-            "more trials than registered", f"{len(planned)} trials", _listed(more, "other")
+            "more trials than registered", plural(len(planned), "trial"), _listed(more, "other")
         )
     missing = len(planned - committed)
     if missing:
         ended = _verdict(item) in ("settled", "most")
         yield Deviation(
-            "fewer trials than registered", f"{len(planned)} trials",
+            "fewer trials than registered", plural(len(planned), "trial"),
             f"{len(planned) - missing}"
             + ("; the campaign was ended by its claims" if ended else ""),
         )  # fmt: skip

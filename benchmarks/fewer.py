@@ -6,9 +6,9 @@
 A world is the simulated rig `rehearsal` with its parameters drawn 30 % around the defaults and
 another skin; the contact alone is simulated, so that all 864 slides of the kinematic grid take a
 fraction of a second. Figures are the physical ones: the first slip of any tip, and the time from
-there to the centre's. Every world has the same claims, stated around its own truth: of the grid
-taken ten times for `order: shuffled`, and of the grid itself for `order: adaptive`, which is what
-either estimates. A false one is false by the least that there is: a bound at the truth itself.
+there to the centre's. Every world has the same claims, stated around its own truth, that of the
+grid taken five times, whichever the order. A false one is false by the least that there is: a bound
+at the truth itself.
 
 Campaigns look after every block of `order: shuffled` (288 trials), or after every batch of
 `order: adaptive`. All figures are simulated.
@@ -206,8 +206,7 @@ def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, An
         for order in ORDERS if number < adaptive else ORDERS[:1]:
             row[order] = []
             for stated in CLAIMS:
-                whole = grids[stated.figure] if order == "shuffled" else values[stated.figure]
-                true = truth(stated, np.atleast_2d(whole), grid)
+                true = truth(stated, grids[stated.figure], grid)
                 (call,) = campaign(order, [claim_of(stated, true)], values, setting)
                 row[order].append(call and (call.trials, call.wrong(stated, true)))
     return row

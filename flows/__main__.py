@@ -15,6 +15,9 @@ from contextlib import suppress
 
 from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads
 
+END_LIMIT_S = 1.0
+"""Longest wait for semaphores to be removed when the program ends at once, s."""
+
 
 def main() -> None:
     """Run the command line; ends the process with its exit code."""
@@ -38,11 +41,26 @@ def main() -> None:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
     if own:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: os._exit(code))  # all has been said
+            signal.signal(number, lambda *_: _end(code))  # all has been said
     orchestration = sys.modules.get("sliplab.flows.running.orchestration")
     if orchestration is not None and not orchestration.close():
-        os._exit(code)
+        _end(code)
     sys.exit(code)
+
+
+def _end(code: int) -> None:
+    """End the program at once.
+
+    Semaphores of worker processes are removed first: their tracker would report a leak.
+    """
+    util = sys.modules.get("multiprocessing.util")
+    if util is not None:
+        with suppress(RuntimeError):  # no thread can be started
+            # in a thread: the main one may hold a lock that is needed
+            cleaning = threading.Thread(target=util._run_finalizers, args=(0,), daemon=True)
+            cleaning.start()
+            cleaning.join(END_LIMIT_S)
+    os._exit(code)
 
 
 def _end_on_signals() -> None:
@@ -51,7 +69,7 @@ def _end_on_signals() -> None:
     def end(*_: object) -> None:
         stopping = sys.modules.get("sliplab.flows.running.stopping")
         requested = getattr(stopping, "requested", None)  # it may just be imported
-        os._exit(130 if requested and requested() else _fail("interrupted", 130))
+        _end(130 if requested and requested() else _fail("interrupted", 130))
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup

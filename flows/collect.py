@@ -35,11 +35,13 @@ class CollectResult(CampaignCounts):
     Attributes:
         taken: attempts; retaken: those of a trial that an attempt failed of before.
         left_out: trials that the request did not want yet.
+        ended: why the collection ended.
     """
 
     taken: int
     retaken: int
     left_out: int
+    ended: str
 
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
@@ -69,11 +71,14 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
         # inside a flow Prefect has installed its own handlers
         with progress.begin(trials), stopping.signals():
             collector.rig.connect()
+            begun = 0
             while trials:
                 taken = 0
                 while taken < len(trials):
                     taken += take_trials(Opaque(collector), Opaque(trials[taken:]))
-                trials = session.more() if request.most is None else []
+                begun += len(trials)
+                room = None if request.most is None else request.most - begun
+                trials = session.more()[:room] if room != 0 else []
                 progress.add(trials)
         left_out = session.left_out
         if session.claims is not None:
@@ -83,6 +88,7 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
             "taken": collector.taken,
             "retaken": collector.retaken,
             "left_out": left_out,
+            "ended": request.end_reason(collector.campaign),
         }
 
 
@@ -107,4 +113,5 @@ def collect(run_request: RunRequest) -> CollectResult:
         "taken": 0,
         "retaken": 0,
         "left_out": len(pending_trials(run_request.plan, campaign)),
+        "ended": run_request.end_reason(campaign),
     }

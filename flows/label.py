@@ -20,6 +20,7 @@ from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import run_trials
 from sliplab.flows.steps import StepResult
+from sliplab.protocols.shown import plural
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text
@@ -70,7 +71,8 @@ def report_states(labels: Labels, campaigns: list[Collected]) -> Reviewed:
         return {}
     if states["stale"]:
         console.say(
-            f"warning: decisions on {states['stale']} trials were made on labels that have "
+            f"warning: decisions on {plural(states['stale'], 'trial')} were made on labels "
+            "that have "
             f"changed since and are not applied; see `sliplab review {labels.store.folder}`"
         )
     return {"reviewed": states}

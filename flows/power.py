@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -18,10 +19,16 @@ import numpy as np
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.claims import learning
 from sliplab.analysis.claims import trial_figures as figures
-from sliplab.analysis.claims.blocks import F64
+from sliplab.analysis.claims.blocks import F64, I64
 from sliplab.analysis.claims.evidence import Grid
 from sliplab.analysis.claims.power import SHARES, Drawing, Drawn, claim_powers, spread
-from sliplab.analysis.claims.resampling import Pilot, shared_axes
+from sliplab.analysis.claims.resampling import (
+    ONE_SESSION,
+    Pilot,
+    Sessions,
+    sessions_text,
+    shared_axes,
+)
 from sliplab.analysis.claims.simulated import claims_of
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.report import power as page
@@ -34,6 +41,7 @@ from sliplab.flows.running.parallel_map import START_S, parallel_map_flow, run_t
 from sliplab.flows.running.run_records import timed
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import Claim, Stopping
+from sliplab.protocols.consistency import check_consistency
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.yaml_file import (
@@ -55,6 +63,9 @@ FEWEST = 6
 """Trials of a pilot with a figure."""
 FEWEST_TRAINING = 8
 """Training trials of which a quarter can train."""
+MOST_SHARE = 100.0
+PAUSE_S = 3600.0
+"""Between two trials of a pilot, from which on the second begins another session."""
 CAMPAIGNS, ADAPTIVE_CAMPAIGNS = 100, 20
 """Drawn where the plan gives the order, and where trials are chosen, which takes longer."""
 SPLITS = ("train", "validation", "test")
@@ -74,7 +85,7 @@ class Request:
     Attributes:
         plan: with the claims. pilot: trials whose figures are used.
         campaigns: of the store that they are from, with trials that train.
-        judge: makes the figures. drawn: number of campaigns.
+        judge: makes the figures. drawn: number of campaigns. sessions: of each of them.
         classifier: of the learning curve; None: none is asked for.
     """
 
@@ -86,6 +97,7 @@ class Request:
     drawn: int
     seed: int
     classifier: Classifier | None
+    sessions: Sessions = ONE_SESSION
 
 
 def plan_with_claims(
@@ -100,7 +112,7 @@ def plan_with_claims(
     Raises:
         InputError: there is no claim, one is wrong, or a network is needed.
     """
-    plan = load_plan(protocol, enable)
+    plan = load_plan(protocol, enable, judged=model is None and not texts)
     collection = plan.protocol.collection
     stopping = collection.stopping
     if texts:
@@ -111,7 +123,12 @@ def plan_with_claims(
             "--claim", "", None, f"is needed: {plan.file} has no claims (collection.stopping)"
         )
     changed = collection.model_copy(update={"stopping": stopping})
-    plan = make_plan(plan.protocol.model_copy(update={"collection": changed}), plan.file, enable)
+    changed_protocol = plan.protocol.model_copy(update={"collection": changed})
+    try:
+        check_consistency(changed_protocol)
+    except KeyedError as error:
+        raise input_error("--claim", error) from None
+    plan = make_plan(changed_protocol, plan.file, enable)
     return plan, judging_model(plan, model)
 
 
@@ -163,12 +180,18 @@ def request(
     drawn: int | None = None,
     seed: int = 1,
     classifier: Classifier | None = LOGISTIC,
+    sessions: Sessions = ONE_SESSION,
 ) -> Request:
     """Check what is asked for.
 
     Raises:
-        InputError: the store has no trials of the protocol's experiment.
+        InputError: the store has no trials of the protocol's experiment, or sessions are wrong.
     """
+    for option, share in (("--between", sessions.between), ("--drift", sessions.drift)):
+        if share is not None and not 0.0 <= share <= MOST_SHARE:
+            raise InputError(option, "", str(share), f"must be from 0 to {MOST_SHARE:g}")
+    if sessions.between is not None and sessions.count == 1:
+        raise InputError("--between", "", str(sessions.between), "needs --sessions of 2 or more")
     experiment = plan.protocol.collection.experiment
     used = [it for it in campaigns if it.recorded is None and it.experiment == experiment]
     # a network that the store trained has seen the others
@@ -189,7 +212,7 @@ def request(
     adaptive = plan.protocol.collection.adaptive is not None
     count = drawn or (ADAPTIVE_CAMPAIGNS if adaptive else CAMPAIGNS)
     judge = figures.Judge(plan.protocol.analysis, model)
-    return Request(store, plan, used, pilot, judge, count, seed, classifier)
+    return Request(store, plan, used, pilot, judge, count, seed, classifier, sessions)
 
 
 def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
@@ -229,7 +252,8 @@ def foretell(asked: Request) -> PowerRecord:
         InputError: the pilot has too few figures, or lacks levels of the protocol.
     """
     pilot, notes = read_pilot(asked)
-    drawing = Drawing(asked.plan, pilot, asked.seed)
+    notes += sessions_text(pilot, asked.sessions)
+    drawing = Drawing(asked.plan, pilot, asked.seed, asked.sessions)
     found = drawn_campaigns(drawing, asked.drawn)
     curve, more = learning_curve(asked)
     plan, stopping = asked.plan, claims_of(asked.plan)
@@ -247,6 +271,8 @@ def foretell(asked: Request) -> PowerRecord:
         campaigns=asked.drawn,
         planned=planned,
         repetitions=plan.protocol.collection.repetitions,
+        sessions=asked.sessions.count,
+        drift=asked.sessions.drift,
         hours=hours,
         notes=(*notes, *more),
         claims=claim_powers(drawing, found),
@@ -292,7 +318,27 @@ def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
     blocks = [(item.name, trial.block) for item, trial, _ in asked.pilot]
     numbers = {block: number for number, block in enumerate(dict.fromkeys(blocks))}
     number = np.array([numbers[block] for block in blocks], np.int64)
-    return Pilot(axes, tuple(conditions), number, values), notes
+    return Pilot(axes, tuple(conditions), number, values, sessions_of(asked.pilot)), notes
+
+
+def sessions_of(pilot: Sequence[PilotTrial]) -> I64:
+    """Return the number of each trial's session, (n,).
+
+    A session is of one campaign and one skin, without a pause of `PAUSE_S`.
+    """
+    known = [item.campaign.provenance(recording) for item, _, recording in pilot]
+    kinds: dict[tuple[str, str | None], list[tuple[datetime, datetime, int]]] = {}
+    for k, ((item, _, _), it) in enumerate(zip(pilot, known, strict=True)):
+        began = datetime.fromisoformat(it.started or "1970-01-01T00:00:00+00:00")
+        ended = began if it.ended is None else datetime.fromisoformat(it.ended)
+        kinds.setdefault((item.name, it.skin), []).append((began, ended, k))
+    found, number = np.zeros(len(known), np.int64), -1
+    for trials in kinds.values():
+        last: datetime | None = None
+        for began, ended, k in sorted(trials):
+            number += last is None or (began - last).total_seconds() >= PAUSE_S
+            found[k], last = number, ended
+    return found
 
 
 def drawn_campaigns(drawing: Drawing, count: int) -> list[Drawn]:

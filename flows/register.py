@@ -46,7 +46,7 @@ def register(
         Locked: another program writes into the store.
     """
     enable = tuple(enable)
-    plan = load_plan(protocol, enable)
+    plan = load_plan(protocol, enable, judged=True)
     text = read_text(Path(plan.file), "protocol")
     model = judging_model(plan)
     content: Json = {

@@ -26,6 +26,7 @@ from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import run_trials
 from sliplab.flows.steps import StepResult
+from sliplab.protocols.shown import plural
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import SYNC, Store, StoreError
@@ -125,7 +126,7 @@ def tables(result: SyncDone) -> list[tuple[str, list[list[str]]]]:
                 f"{numbers['uncertainty_us']['worst']:.1f}", f"{drift[0]:.1f} to {drift[1]:.1f}",
                 "-" if pulses is None else " / ".join(map(str, pulses.values())),
             ])  # fmt: skip
-        trials = f"{known['trials']} trials, {known['refitted']} refitted"
+        trials = f"{plural(known['trials'], 'trial')}, {known['refitted']} refitted"
         title = f"Clocks of {campaign}{simulated}: {trials}, {known['changed']} changed"
         found.append((title, rows))
     return found

@@ -6,9 +6,11 @@ alike. Which figures there are, their units and statistics are in `FIGURES`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, PlainSerializer, WithJsonSchema, field_validator
@@ -16,6 +18,7 @@ from pydantic import Field, PlainSerializer, WithJsonSchema, field_validator
 from sliplab.protocols.factors import MAX_TRIALS, ContextLevel, Factor, unknown_factor
 from sliplab.protocols.hashing import hash_data
 from sliplab.protocols.quantity import canonical, parse
+from sliplab.protocols.shown import one_of
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 FigureName = Literal[
@@ -26,6 +29,11 @@ Kind = Literal["within", "at_least", "at_most", "apart"]
 QUANTILES: Mapping[str, float] = {
     "median": 0.5, "p05": 0.05, "p10": 0.1, "p25": 0.25, "p75": 0.75, "p90": 0.9, "p95": 0.95,
 }  # fmt: skip
+LEAST_BLOCKS = 6
+"""Blocks before which nothing is called."""
+RARE = 3.0
+"""Blocks times share of the trials beyond a percentile, before which nothing is called: trials of
+one cause may all lie in one block, and 3 / share blocks miss it with a chance of 5 % at most."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +65,24 @@ FIGURES: Mapping[str, Figure] = {
 
 def _quantity(info: Any, raw: object) -> object:
     name = info.data.get("figure")
-    if raw is None or name not in FIGURES:
-        return raw
+    if raw is None or name not in FIGURES:  # an unknown figure is a fault already
+        return None
     return parse(raw, FIGURES[name].canonical)
+
+
+def _statistic(info: Any, raw: object) -> object:
+    figure = info.data.get("figure")
+    known = ("mean",) if figure == "accuracy" else tuple(QUANTILES)
+    if raw is None or raw in known or figure is None:
+        return raw
+    if figure == "accuracy":
+        raise ValueError("must be 'mean' for the accuracy")
+    if raw == "mean":
+        raise ValueError(
+            "must be 'median' or a percentile such as 'p95': times have no bound, and a trial "
+            "without a detection has none"
+        )
+    raise ValueError("must be 'median'" if raw == "p50" else one_of(raw, known))
 
 
 Amount = Annotated[
@@ -89,6 +112,7 @@ class Claim(StrictModel):
     at_least: Amount | None = None
     at_most: Amount | None = None
 
+    _known = field_validator("statistic", mode="before")(lambda raw, info: _statistic(info, raw))
     _read = field_validator("within", "at_least", "at_most", mode="before")(
         lambda raw, info: _quantity(info, raw)
     )
@@ -103,13 +127,6 @@ class Claim(StrictModel):
                 "must have exactly one of 'within', 'at_least' and 'at_most'"
                 f"{', not ' + ' and '.join(said) if said else ''}"
             )
-        if self.figure == "accuracy" and self.statistic not in {None, "mean"}:
-            raise KeyedError(".statistic", self.statistic, "must be 'mean' for the accuracy")
-        if self.figure != "accuracy" and self.statistic == "mean":
-            raise KeyedError(
-                ".statistic", "mean", "must be 'median' or a percentile such as 'p95': times have "
-                "no bound, and a trial without a detection has none",
-            )  # fmt: skip
         if self.within is not None and self.within <= 0:
             raise KeyedError(".within", canonical(self.within), "must be more than 0")
         return self
@@ -118,6 +135,14 @@ class Claim(StrictModel):
     def of(self) -> Statistic:
         """The statistic, the default written out."""
         return self.statistic or ("mean" if self.figure == "accuracy" else "median")
+
+    @property
+    def least_blocks(self) -> int:
+        """Number of blocks before which the claim is not called."""
+        if self.of == "mean":
+            return LEAST_BLOCKS
+        share = QUANTILES[self.of]
+        return max(LEAST_BLOCKS, math.ceil(RARE / min(share, 1.0 - share) - 1e-9))
 
     @property
     def kind(self) -> Kind:
@@ -151,6 +176,13 @@ class Claim(StrictModel):
             "apart": "in size at least ",
         }  # fmt: skip
         return f"{words} {said[self.kind]}{self.value:g} {figure.unit}"
+
+
+def repeated(claims: Sequence[Claim]) -> Iterator[int | None]:
+    """Yield the number of the earlier claim that each claim repeats; None where it is new."""
+    plain = [claim.model_copy(update={"statistic": claim.of}) for claim in claims]
+    for k, claim in enumerate(plain):
+        yield plain.index(claim) if claim in plain[:k] else None
 
 
 class Choice(StrictModel):
@@ -197,6 +229,28 @@ class Stopping(StrictModel):
     def needs_network(self) -> bool:
         """Whether a claim is about the output of a network."""
         return any(FIGURES[claim.figure].network for claim in self.claims)
+
+    def network_file(self, protocol: str | Path) -> Path | None:
+        """Return the file of the network that judges the claims; None where none is needed.
+
+        Args:
+            protocol: the file that names it.
+
+        Raises:
+            KeyedError: one is needed, and there is none.
+        """
+        if not self.needs_network:
+            return None
+        key = "collection.stopping.model"
+        if self.model is None:
+            raise KeyedError(
+                key, None, "is needed: a claim is about a network's output; name the file of a "
+                "trained one, such as STORE/models/seed0.pt of a pilot",
+            )  # fmt: skip
+        path = Path(protocol).parent / self.model
+        if not path.is_file():
+            raise KeyedError(key, self.model, f"{path} is no file")
+        return path.resolve()
 
     def factor_faults(self, factors: Mapping[str, Factor]) -> Iterator[KeyedError]:
         """Return a fault for each compared factor or level that the plan does not have."""

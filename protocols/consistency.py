@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from itertools import pairwise
 
+from sliplab.protocols.claims import repeated
 from sliplab.protocols.factors import Factor, unknown_factor
 from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.motion import check_reference_limits
@@ -18,7 +19,7 @@ from sliplab.protocols.phases import PlateMotion
 from sliplab.protocols.quantity import canonical, check_size
 from sliplab.protocols.settings import Split
 from sliplab.protocols.split import check_split
-from sliplab.protocols.yaml_file import KeyedError, raise_all
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, raise_all
 
 FULL_TURN = 360
 
@@ -37,6 +38,7 @@ def check_consistency(protocol: Protocol) -> None:
             lambda: _check_directions(collection),
             lambda: _check_plate(collection),
             lambda: _check_references(collection),
+            lambda: _check_claims(collection),
         )
     )
 
@@ -65,6 +67,25 @@ def _check_held_out(split: Split) -> Iterator[KeyedError]:
                     yield KeyedError(f"{key}[{index}]", level, "is listed twice as held out")
                 if part == "validation_levels" and level in split.test_levels.get(name, ()):
                     yield KeyedError(key, level, "is already held out for testing")
+
+
+def _check_claims(collection: Collection) -> Iterator[KeyedError]:
+    """Claims differ, and no key of theirs is empty."""
+    stopping = collection.stopping
+    parts: dict[str, StrictModel | None] = {"stopping": stopping, "choice": collection.choice}
+    claims = () if stopping is None else stopping.claims
+    parts |= {f"stopping.claims[{k}]": claim for k, claim in enumerate(claims)}
+    for place, part in parts.items():
+        for name in () if part is None else sorted(part.model_fields_set):
+            if getattr(part, name) is None:
+                yield KeyedError(
+                    f"collection.{place}.{name}", None, "is empty: give a value, or leave it out"
+                )
+    for k, earlier in enumerate(repeated(claims)):
+        if earlier is not None:
+            yield KeyedError(
+                f"collection.stopping.claims[{k}]", None, f"is the same as claims[{earlier}]"
+            )
 
 
 def _check_directions(collection: Collection) -> Iterator[KeyedError]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,8 +25,9 @@ from sliplab.protocols.motion import build_program, check_limits, path_fault
 from sliplab.protocols.nuisances import requests
 from sliplab.protocols.program import Dwell, Program
 from sliplab.protocols.quantity import FactorRef, canonical, to_decimal
+from sliplab.protocols.rounds import block_warnings, check_first_round
 from sliplab.protocols.shipped import protocol_path
-from sliplab.protocols.shown import did_you_mean
+from sliplab.protocols.shown import did_you_mean, plural
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.templates import in_terms_of_template
 from sliplab.protocols.units import file_text
@@ -116,7 +117,7 @@ class Plan:
 
     def __repr__(self) -> str:
         hours = self.total_seconds / 3600
-        return f"<Plan {self.protocol.name}: {len(self)} trials, {hours:.2f} h of motion>"
+        return f"<Plan {self.protocol.name}: {plural(len(self), 'trial')}, {hours:.2f} h of motion>"
 
     def table(self) -> pd.DataFrame:
         """The trials as a table, in the order in which they are taken; units in the headers."""
@@ -270,7 +271,7 @@ class Plan:
                     f"collection.context.{name}: has {len(self.enabled[name])} levels and nobody "
                     "is asked to change it; write changeover: person if somebody does"
                 )
-        return found
+        return [*found, *block_warnings(self.protocol.collection, self.enabled)]
 
     @cached_property
     def collection_hash(self) -> str:
@@ -323,39 +324,62 @@ class Plan:
         return hash_data(self.protocol.analysis.model_dump(mode="json"))
 
 
-def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -> Plan:
+def load_plan(
+    path: Path, enable: Iterable[str] = (), judged: bool = False, *, stored: bool = False
+) -> Plan:
     """Read the protocol at `path` and expand it.
 
     Args:
         path: of the file, or the name of a protocol that ships with the package (``pilot``).
         enable: levels to switch on, as ``factor=level`` (``disturbance=125``).
+        judged: the network that its claims need must be there.
         stored: it is a campaign's own copy, which is not held to rules that came after it.
 
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
     path = path if stored else protocol_path(path)
-    return parse_plan(read_text(path, "protocol"), path, enable, stored=stored)
+    return parse_plan(read_text(path, "protocol"), path, enable, stored=stored, judged=judged)
 
 
-def parse_plan(text: str, path: Path, enable: Iterable[str] = (), *, stored: bool = False) -> Plan:
+def parse_plan(
+    text: str,
+    path: Path,
+    enable: Iterable[str] = (),
+    *,
+    stored: bool = False,
+    judged: bool = False,
+) -> Plan:
     """Expand a protocol that was read from `path`; arguments and errors as of `load_plan`."""
     document = parse_leniently(text, path)
     try:
-        protocol = validate(Protocol, document, path, None if stored else _check)
-        return make_plan(protocol, str(path), enable)
+        check = partial(_check, path=path if judged else None)
+        protocol = validate(Protocol, document, path, None if stored else check)
+        plan = make_plan(protocol, str(path), enable)
+        if not stored:  # with the levels that were switched on
+            check_first_round(protocol.collection, plan.enabled)
+        return plan
+    except KeyedError as error:
+        raise input_error(path, error) from None
     except InputError as error:
         raise InputError.joined(
             in_terms_of_template(each, document) for each in error.faults
         ) from None
 
 
-def _check(protocol: Protocol) -> None:
-    """Check a protocol that a person gives. Raises KeyedError, all that is wrong."""
+def _check(protocol: Protocol, path: Path | None) -> None:
+    """Check a protocol that a person gives. Raises KeyedError, all that is wrong.
+
+    Args:
+        path: of the file, if the network that it names must be there.
+    """
+    levels, stopping = _levels(protocol), protocol.collection.stopping
     raise_all(
         (
             lambda: check_consistency(protocol),
-            lambda: check_limits(protocol, _levels(protocol)),
+            lambda: check_limits(protocol, levels),
+            lambda: check_first_round(protocol.collection, levels),
+            lambda: stopping.network_file(path) if path is not None and stopping else None,
         )
     )
 

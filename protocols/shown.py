@@ -92,6 +92,12 @@ def one_of(name: object, names: Iterable[str]) -> str:
     return f"must be one of {', '.join(known)}{did_you_mean(str(name), known)}"
 
 
+def plural(count: int, noun: str) -> str:
+    """Return a count with its noun: "1 trial", "2 trials", "3 batches"."""
+    end = "" if count == 1 else "es" if noun.endswith(("s", "x", "ch", "sh")) else "s"
+    return f"{count} {noun}{end}"
+
+
 def printable(text: str) -> str:
     """`text` with control codes written out (``\\x1b``); line breaks and tabs stay."""
     return CONTROL.sub(lambda found: _escaped(found[0]), text)

@@ -576,6 +576,7 @@ def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError
 def _faults(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
     """Return the faults of `error`, their keys below `model` as `KeyedError` has them."""
     items = sorted(_of_one_choice(error.errors()), key=lambda i: i["type"] != "extra_forbidden")
+    items = [item for item in items if not _is_short_by_faults(item, items)]
     meant = {_key((*item["loc"][:-1], close)) for item in items if (close := _close(model, item))}
     found: dict[str, KeyedError] = {}
     for item in items:
@@ -593,6 +594,14 @@ def _of_one_choice(items: Sequence[Any]) -> Iterator[Any]:
         choices = [k for k, part in enumerate(loc) if _WAY_OF_UNION.fullmatch(str(part))]
         if all(first.setdefault(loc[:k], loc[k]) == loc[k] for k in choices):
             yield item
+
+
+def _is_short_by_faults(item: Any, items: Sequence[Any]) -> bool:
+    """Return whether a list is too short because pydantic leaves out its wrong items."""
+    loc = item["loc"]
+    return item["type"] == "too_short" and any(
+        len(other["loc"]) > len(loc) and other["loc"][: len(loc)] == loc for other in items
+    )
 
 
 def _close(model: type[BaseModel], item: Any) -> str | None:
@@ -636,7 +645,8 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
         found = value.get(tag) if isinstance(value, dict) else value
         hint = did_you_mean(str(found), tags.split(", ")) if found is not None else ""
         return KeyedError(f"{key}.{tag}", found, f"must be one of {tags}{hint}")
-    message = re.sub("^Input should", "must", item["msg"])
+    message = re.sub("^[A-Z][a-z]+ should", "must", item["msg"])
+    message = re.sub(" after validation, not [0-9]+$", "", message)
     expected = _EXPECTED.get(kind, message[0].lower() + message[1:])
     if value is None:
         return KeyedError(key, None, f"is empty; {expected}")

@@ -16,26 +16,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtr
 
+from sliplab.protocols.claims import LEAST_BLOCKS
+
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
-LEAST_BLOCKS = 6
-"""Blocks before which nothing is called."""
-RARE = 3.0
-"""Blocks times share of the trials beyond a percentile, before which nothing is called: trials of
-one cause may all lie in one block, and 3 / share blocks miss it with a chance of 5 % at most."""
 _MOST_CORRELATION = 0.9
 _LEAST_CHANCE = 1e-300
-
-
-def least_blocks(share: float | None = None) -> int:
-    """Return the number of blocks before which a claim is not called.
-
-    Args:
-        share: of a percentile; None for a mean.
-    """
-    if share is None:
-        return LEAST_BLOCKS
-    return max(LEAST_BLOCKS, math.ceil(RARE / min(share, 1.0 - share) - 1e-9))
 
 
 @dataclass(frozen=True)
@@ -163,19 +149,20 @@ def of_trials(value: float, off: F64, weights: F64, blocks: I64, count: int) -> 
     return Estimate(value, np.asarray(count * parts, np.float64))
 
 
-def block_share(off: F64, blocks: I64) -> tuple[float, float]:
+def block_share(off: F64, blocks: I64, least: int = 3) -> tuple[float, float]:
     """Return the share of blocks in the variance of residuals, and its square root in their unit.
 
     By the method of moments of one-way analysis of variance (Searle, Casella and McCulloch 1992,
-    Variance Components, section 3.6); none where there are fewer than three blocks of two trials.
+    Variance Components, section 3.6); none where there are fewer than `least` blocks of two trials.
 
     Args:
         off: (n,) residuals; those that are not finite are left out. blocks: (n,) of each.
+        least: 2 or more.
     """
     there = np.isfinite(off)
     _, number, sizes = np.unique(blocks[there], return_inverse=True, return_counts=True)
     n, groups = len(number), len(sizes)
-    if groups < 3 or n < 2 * groups:
+    if groups < least or n < 2 * groups:
         return 0.0, 0.0
     means = np.bincount(number, off[there]) / sizes
     inside = float(((off[there] - means[number]) ** 2).sum()) / (n - groups)

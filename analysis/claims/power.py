@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sliplab.analysis.claims.evidence import Grid
-from sliplab.analysis.claims.resampling import Pilot
+from sliplab.analysis.claims.resampling import ONE_SESSION, Pilot, Sessions
 from sliplab.analysis.claims.simulated import Course, claims_of, course
 from sliplab.analysis.claims.states import is_called, states
 from sliplab.protocols import Plan
@@ -51,12 +51,16 @@ class Drawing:
     plan: Plan
     pilot: Pilot
     seed: int
+    sessions: Sessions = ONE_SESSION
 
     def campaign(self, number: int) -> Drawn:
         """Draw a campaign."""
         grid = Grid.of(self.plan)
-        values = self.pilot.campaign(grid, np.random.default_rng([self.seed, number]))
-        found = course(self.plan, grid, values)
+        rng = np.random.default_rng([self.seed, number])
+        in_blocks = self.plan.protocol.collection.adaptive is None
+        values = self.pilot.without(self.sessions).campaign(grid, rng, in_blocks=in_blocks)
+        over_time = self.pilot.over_time(self.plan, grid, self.sessions, rng)
+        found = course(self.plan, grid, values, over_time)
         looks = found.evidence.looks
         return Drawn(
             tuple(None if it.look is None else int(looks[it.look]) for it in found.claims),

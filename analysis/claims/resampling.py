@@ -3,7 +3,8 @@
 A trial's figure is that of one of the pilot's trials of the same condition, or of the nearest
 ones, moved by what the factors' effects differ between the two conditions. So undetected and
 missing ones come as often as the pilot has them there, and all figures of a trial belong together.
-Blocks differ as much as the pilot's do. The pilot is itself one of many that might have been: it is
+Blocks differ as much as the pilot's do, sessions as much as is stated or as the pilot's do; a
+drift is drawn where one is stated. The pilot is itself one of many that might have been: it is
 drawn anew in the same way before each campaign (a hierarchical bootstrap: Davison and Hinkley 1997,
 Bootstrap Methods and their Application, section 3.8). Few values, drawn again and again, would give
 percentiles in steps, so each is moved by a little more chance, and their spread is kept (Silverman
@@ -19,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from sliplab.analysis.claims.blocks import F64, I64, block_share
-from sliplab.analysis.claims.evidence import Grid
+from sliplab.analysis.claims.evidence import Grid, planned_end
 from sliplab.analysis.claims.expectation import expectation
 from sliplab.protocols import Plan
 from sliplab.protocols.factors import Factor, Level
@@ -27,6 +28,8 @@ from sliplab.protocols.yaml_file import KeyedError
 
 DONORS = 10
 """Trials of a pilot that a figure may come from, at least."""
+ASSUMED = 0.3
+"""Of `Sessions.between` where a pilot of one session cannot show it."""
 MOST_PERCENT = 100.0
 TURN_DEG = 360.0
 Condition = Mapping[str, Level]
@@ -96,6 +99,25 @@ class Axis:
 
 
 @dataclass(frozen=True)
+class Sessions:
+    """Sessions of a planned campaign, such as days, mountings or skins, and its drift.
+
+    Attributes:
+        count: of equally many trials.
+        between: standard deviation between sessions, as a share of that between the trials of a
+            block; None: as in the pilot, or `ASSUMED` where it is of one session.
+        drift: from the first trial to the last, as a share of the same; up or down by chance.
+    """
+
+    count: int = 1
+    between: float | None = None
+    drift: float = 0.0
+
+
+ONE_SESSION = Sessions()
+
+
+@dataclass(frozen=True)
 class Pilot:
     """Trials whose figures are known.
 
@@ -104,25 +126,108 @@ class Pilot:
         blocks: (n,) number of each trial's block.
         values: (n,) by figure, in its unit; NaN where a trial has none, infinite where nothing was
             detected.
+        sessions: (n,) number of each trial's session; None: all are of one.
     """
 
     axes: tuple[Axis, ...]
     conditions: tuple[Condition, ...]
     blocks: I64
     values: dict[str, F64]
+    sessions: I64 | None = None
 
-    def campaign(self, grid: Grid, rng: np.random.Generator) -> dict[str, F64]:
-        """Draw the figures of a campaign, (N,) by figure."""
+    @property
+    def session_count(self) -> int:
+        """Number of sessions."""
+        return 1 if self.sessions is None else len(np.unique(self.sessions))
+
+    @cached_property
+    def _off(self) -> dict[str, F64]:
+        """What each trial is off its condition's expected figure, (n,) by figure."""
+        own = [tuple(condition[axis.name] for axis in self.axes) for condition in self.conditions]
+        code, _ = self._coded(own, np.random.default_rng(0))
+        return {
+            name: y - expectation(code, np.arange(len(y)), y).mean
+            for name, y in self.values.items()
+        }
+
+    def scatter(self, figure: str) -> float:
+        """Return the standard deviation between the trials of a block, in the figure's unit."""
+        off = self._off[figure]
+        there = off[np.isfinite(off)]
+        share, _ = block_share(off, self.blocks)
+        return float(np.sqrt(1.0 - share) * there.std(ddof=1)) if len(there) > 1 else 0.0
+
+    def between(self, figure: str, sessions: Sessions) -> float:
+        """Return the deviation between planned sessions, as a share of `scatter`."""
+        if sessions.between is not None:
+            return sessions.between
+        if self.session_count < 2 or self.sessions is None:
+            return ASSUMED
+        off, of, scatter = self._off[figure], self.sessions, self.scatter(figure)
+        first, block = np.unique(self.blocks, return_index=True, return_inverse=True)[1:]
+        if len(first) >= 2 * self.session_count:  # else sessions and blocks cannot be told apart
+            there = np.isfinite(off)
+            count = np.bincount(block[there], minlength=len(first))
+            total = np.bincount(block[there], off[there], minlength=len(first))
+            off, of = np.where(count > 0, total / np.maximum(count, 1), np.nan), of[first]
+        return block_share(off, of, least=2)[1] / scatter if scatter > 0.0 else 0.0
+
+    def without(self, sessions: Sessions) -> Pilot:
+        """Return the pilot without differences between its sessions, where these are drawn."""
+        if self.sessions is None or sessions.count == 1 or sessions.between == 0.0:
+            return self
+        values = {name: y.copy() for name, y in self.values.items()}
+        for session in np.unique(self.sessions):
+            here = self.sessions == session
+            for name, off in self._off.items():
+                there = off[here & np.isfinite(off)]
+                values[name][here] -= there.mean() if len(there) else 0.0
+        return replace(self, values=values)
+
+    def over_time(
+        self, plan: Plan, grid: Grid, sessions: Sessions, rng: np.random.Generator
+    ) -> dict[str, F64]:
+        """Draw what time adds to a campaign's trials, (N,) by figure, in the order taken.
+
+        That is of sessions, of a drift, and of the batches of an adaptive campaign, which are its
+        blocks.
+        """
+        choice, stopping = plan.protocol.collection.adaptive, plan.protocol.collection.stopping
+        assert stopping is not None
+        place = np.arange(len(grid.trials))
+        end = planned_end(grid, stopping, adaptive=choice is not None)
+        session = np.minimum(place * sessions.count // end, sessions.count - 1)
+        of_session = rng.standard_normal(sessions.count)[session] * (sessions.count > 1)
+        trend = rng.choice([-1.0, 1.0]) * (place / max(end - 1, 1) - 0.5)
+        of_batch = np.zeros(len(place))
+        if choice is not None:
+            first = max(choice.start // grid.stretches, 2) * grid.stretches
+            batch = np.maximum((place - first) // (choice.batch * grid.stretches) + 1, 0)
+            of_batch = rng.standard_normal(len(place))[batch]
+        found = {}
+        for name, off in self.without(sessions)._off.items():
+            shift = self.between(name, sessions) * of_session + sessions.drift * trend
+            found[name] = self.scatter(name) * shift + block_share(off, self.blocks)[1] * of_batch
+        return found
+
+    def campaign(
+        self, grid: Grid, rng: np.random.Generator, *, in_blocks: bool = True
+    ) -> dict[str, F64]:
+        """Draw the figures of a campaign, (N,) by figure.
+
+        Args:
+            in_blocks: blocks of the plan's order differ.
+        """
         blocks = np.array([trial.block for trial in grid.trials], np.int64)
         conditions = [dict(trial.condition) for trial in grid.trials]
-        return self._again(rng)._drawn(conditions, blocks, rng)
+        return self._again(rng)._drawn(conditions, blocks if in_blocks else None, rng)
 
     def _again(self, rng: np.random.Generator) -> Pilot:
         """Draw the pilot anew."""
         return replace(self, values=self._drawn(self.conditions, self.blocks, rng))
 
     def _drawn(
-        self, conditions: Sequence[Condition], blocks: I64, rng: np.random.Generator
+        self, conditions: Sequence[Condition], blocks: I64 | None, rng: np.random.Generator
     ) -> dict[str, F64]:
         count = len(self.conditions)
         kinds: dict[tuple[Level, ...], int] = {}
@@ -138,8 +243,10 @@ class Pilot:
         # the k-th of a row's donors, k even over them
         pick = np.floor(rng.random(len(kind)) * near.sum(axis=1)[kind]).astype(np.int64)
         donor = np.argsort(~near, axis=1, kind="stable")[kind, pick]
-        _, number = np.unique(blocks, return_inverse=True)
-        of_block = rng.standard_normal(int(number.max()) + 1)[number]
+        of_block = np.zeros(len(kind))
+        if blocks is not None:
+            _, number = np.unique(blocks, return_inverse=True)
+            of_block = rng.standard_normal(int(number.max()) + 1)[number]
         found: dict[str, F64] = {}
         for name, y in self.values.items():
             mean = expectation(code, np.arange(count), y).mean
@@ -169,6 +276,26 @@ class Pilot:
             code.append(weights)
             places.append(axis.places(weights))
         return np.hstack(code), np.hstack(places)
+
+
+def sessions_text(pilot: Pilot, sessions: Sessions) -> Iterator[str]:
+    """Yield which sessions and drift are drawn, and what the pilot does not show of them."""
+    there, only = pilot.session_count, "a pilot of one session cannot show how sessions differ"
+    sizes = ", ".join(f"{pilot.between(name, sessions):.2f} ({name})" for name in pilot.values)
+    sizes += " of the scatter between trials"
+    if sessions.count == 1:
+        shown = only if there == 1 else f"the pilot's {there} differ by {sizes}"
+        yield f"one session is drawn (see --sessions): {shown}"
+    else:
+        how = "" if sessions.between is not None else ", which is assumed"
+        if there > 1 and sessions.between is None:
+            how = f", as the pilot's {there} do"
+        known = f": {only}" if there == 1 else ""
+        yield f"{sessions.count} sessions are drawn, which differ by {sizes}{how}{known}"
+    if sessions.drift:
+        yield f"a drift of {sessions.drift:g} of the scatter between trials is drawn, up or down"
+    else:
+        yield "no drift is drawn (see --drift)"
 
 
 def _smoothing(off: F64) -> tuple[float, float]:

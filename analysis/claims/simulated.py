@@ -11,13 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sliplab.analysis.claims.blocks import F64
+from sliplab.analysis.claims.blocks import F64, I64
 from sliplab.analysis.claims.choosing import next_batch
 from sliplab.analysis.claims.evidence import Evidence, Grid, round_ends
 from sliplab.analysis.claims.states import Fits, is_called, states
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import Stopping
 from sliplab.storage.schema.claims import Batch, ClaimState
+
+Figures = dict[str, F64]
+PERCENT = 100.0
 
 
 @dataclass(frozen=True)
@@ -48,16 +51,19 @@ class Course:
     ended: int | None
 
 
-def course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
+def course(
+    plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None
+) -> Course:  # fmt: skip
     """Return how a campaign of a plan with claims goes.
 
     Args:
         grid: of the plan. values: (N,) by figure, of its trials in its order.
+        over_time: (N,) by figure, what the first, second, ... trial that is taken shows more.
     """
     if plan.protocol.collection.adaptive is not None:
-        return _chosen_course(plan, grid, values)
+        return _chosen_course(plan, grid, values, over_time)
     stopping = claims_of(plan)
-    evidence = planned_evidence(plan, grid, values)
+    evidence = planned_evidence(plan, grid, values, over_time)
     claims = _called(evidence, stopping)
     settled = _settled(evidence, claims, stopping.least)
     return Course(evidence, claims, None if settled is None else int(evidence.looks[settled]))
@@ -79,7 +85,19 @@ def _settled(evidence: Evidence, claims: Sequence[Called], least: int) -> int | 
     return next(enough, None)
 
 
-def planned_evidence(plan: Plan, grid: Grid, values: dict[str, F64]) -> Evidence:
+def _shown(values: Figures, taken: I64, over_time: Figures | None) -> Figures:
+    """Return the figures of trials in the order taken."""
+    found = {name: value[taken] for name, value in values.items()}
+    for name, added in (over_time or {}).items():
+        found[name] = found[name] + added[: len(taken)]
+        if name == "accuracy":
+            found[name] = np.clip(found[name], 0.0, PERCENT)
+    return found
+
+
+def planned_evidence(
+    plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None
+) -> Evidence:
     """Return all that a campaign sees whose order its plan gives, with a look after each round.
 
     A round with which it would take more trials than it may is left out.
@@ -87,7 +105,7 @@ def planned_evidence(plan: Plan, grid: Grid, values: dict[str, F64]) -> Evidence
     stopping = claims_of(plan)
     ends = round_ends(grid, stopping)
     taken = np.argsort(grid.repetition, kind="stable")[: ends[-1]]
-    shown = {name: value[taken] for name, value in values.items()}
+    shown = _shown(values, taken, over_time)
     return Evidence(grid, taken, ends, shown, block=stopping.block)
 
 
@@ -107,14 +125,16 @@ def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
     return tuple(Called(look, at_call.get(k, found[k])) for k, look in enumerate(looks))
 
 
-def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
+def _chosen_course(
+    plan: Plan, grid: Grid, values: Figures, over_time: Figures | None
+) -> Course:  # fmt: skip
     """Return how an adaptive campaign goes: it takes one more round than it needs."""
     stopping = claims_of(plan)
     called: dict[int, Called] = {}
     claims: tuple[Called, ...] = ()
     fits: Fits = {}
     found: tuple[ClaimState, ...] = ()
-    rounds = chosen_evidence(plan, grid, values, fits)
+    rounds = chosen_evidence(plan, grid, values, fits, over_time)
     evidence = next(rounds)
     while True:
         found = states(evidence, stopping, fits, found)
@@ -134,19 +154,20 @@ def _chosen_course(plan: Plan, grid: Grid, values: dict[str, F64]) -> Course:
 
 
 def chosen_evidence(
-    plan: Plan, grid: Grid, values: dict[str, F64], fits: Fits
+    plan: Plan, grid: Grid, values: Figures, fits: Fits, over_time: Figures | None = None
 ) -> Iterator[Evidence]:
     """Yield what an adaptive campaign has seen after each round; it goes on to the whole grid.
 
     Args:
-        fits: as for `states`.
+        fits: as for `states`. over_time: as for `course`.
     """
     stopping, choice = claims_of(plan), plan.protocol.collection.adaptive
     assert choice is not None
     batches: list[Batch] = []
     looks: list[int] = []
     while True:
-        known = _seen(grid, batches, looks[:-1], values)  # nobody waits for the last round's
+        # the next batch does not wait for the last round's figures
+        known = _seen(grid, batches, looks[:-1], values, over_time)
         for _ in range(grid.stretches):
             batch = next_batch(known, batches, stopping, choice, plan.seed, fits)
             if batch is not None:
@@ -155,16 +176,20 @@ def chosen_evidence(
         if looks and taken == looks[-1]:
             return
         looks.append(taken)
-        yield _seen(grid, batches, looks, values)
+        yield _seen(grid, batches, looks, values, over_time)
 
 
 def _seen(
-    grid: Grid, batches: Sequence[Batch], looks: Sequence[int], values: dict[str, F64]
+    grid: Grid,
+    batches: Sequence[Batch],
+    looks: Sequence[int],
+    values: Figures,
+    over_time: Figures | None,
 ) -> Evidence:
     """Return what rounds that end at `looks` show."""
     items = [(item, batch) for batch in batches for item in batch.trials]
     items = items[: looks[-1] if looks else 0]
     taken = np.array([grid.number[item.trial] for item, _ in items], np.int64)
     chances = np.array([item.chance for item, _ in items], np.float64)
-    shown = {name: value[taken] for name, value in values.items()}
+    shown = _shown(values, taken, over_time)
     return Evidence(grid, taken, np.array(looks, np.int64), shown, chances)

@@ -7,13 +7,13 @@ have shown.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from sliplab.analysis.claims.blocks import F64, Estimate, Limit, block_share, least_blocks
+from sliplab.analysis.claims.blocks import F64, Estimate, Limit, block_share
 from sliplab.analysis.claims.boundaries import boundaries
 from sliplab.analysis.claims.evidence import (
     Evidence,
@@ -49,7 +49,12 @@ def states(
     found = [state_of(claim, history) for claim in stopping.claims]
     for k, before in enumerate(earlier):
         if is_called(before):
-            update = {"holds": before.holds, "refuted": before.refuted, "alike": None}
+            update = {
+                "holds": before.holds,
+                "refuted": before.refuted,
+                "alike": None,
+                "trend": None,
+            }
             found[k] = found[k].model_copy(update=update)
     return tuple(found)
 
@@ -101,7 +106,7 @@ class History:
     def limit(self, claim: Claim, error: float) -> Limit:
         """Return what a claim's estimate must exceed at the last look; infinite at early ones."""
         evidence = self.evidence
-        enough = evidence.block_count >= blocks_needed(claim)
+        enough = evidence.block_count >= claim.least_blocks
         if not len(enough) or not enough[-1]:
             return Limit(np.inf, np.inf, np.inf)
         adaptive = evidence.chances is not None
@@ -122,9 +127,18 @@ class History:
             at: figures at the value count as below. missing: what trials without a figure count as;
                 None: they are left out.
         """
-        y = self.evidence.values[figure]
-        x = np.where(np.isnan(y), np.nan, (y <= value) if at else (y < value))
-        return self._estimate(figure, x, members, lambda fit: fit.below(value), missing)
+        key = figure, value, members.tobytes(), at, missing
+        if key not in self._shares:
+            y = self.evidence.values[figure]
+            x = np.where(np.isnan(y), np.nan, (y <= value) if at else (y < value))
+            found = self._estimate(figure, x, members, lambda fit: fit.below(value), missing)
+            self._shares[key] = found
+        return self._shares[key]
+
+    @cached_property
+    def _shares(self) -> dict[tuple[object, ...], Estimate]:
+        """Shares below values, which claims about one figure have in common."""
+        return {}
 
     def mean(self, figure: str, members: Mask, missing: float | None = None) -> Estimate:
         """Return the mean of a share in percent, as a number from 0 to 1; see `share_below`."""
@@ -152,11 +166,6 @@ class History:
         return chosen_estimate(evidence, x, members, guess(self.expected(figure)), latest)
 
 
-def blocks_needed(claim: Claim) -> int:
-    """Return the number of blocks before which a claim is not called."""
-    return least_blocks(None if claim.of == "mean" else QUANTILES[claim.of])
-
-
 def state_of(claim: Claim, history: History) -> ClaimState:
     """Return the state of a claim by the last look alone.
 
@@ -175,6 +184,10 @@ def state_of(claim: Claim, history: History) -> ClaimState:
         span = _interval(claim, history, groups, worst=False)
         would, would_not = _called(claim, history, groups, span, worst=False)
         alike = "holds" if would else "refuted" if would_not else None
+    trend: Literal["holds", "refuted"] | None = None
+    if not holds and not against:
+        would, would_not = _called(claim, history, groups, (low, high), worst=True, trend=False)
+        trend = "holds" if would else "refuted" if would_not else None
     fit = history.expected_after(claim.figure, len(evidence.taken))
     share, _ = block_share(np.where(used, y - fit.mean[evidence.taken], np.nan), evidence.blocks)
     return ClaimState(
@@ -186,7 +199,7 @@ def state_of(claim: Claim, history: History) -> ClaimState:
         undetected=int(np.isinf(y[used]).sum()),
         missing=missing,
         blocks=int(evidence.block_count[-1]) if len(evidence.looks) else 0,
-        least_blocks=blocks_needed(claim),
+        least_blocks=claim.least_blocks,
         block_share=share,
         estimate=_estimate_of(claim, history, groups),
         low=low if np.isfinite(low) else None,
@@ -194,6 +207,7 @@ def state_of(claim: Claim, history: History) -> ClaimState:
         holds=holds,
         refuted=against,
         alike=alike,
+        trend=trend,
     )
 
 
@@ -204,10 +218,15 @@ def _called(
     span: tuple[float, float],
     *,
     worst: bool,
+    trend: bool = True,
 ) -> tuple[bool, bool]:
-    """Return whether a claim holds, and whether it is refuted."""
+    """Return whether a claim holds, and whether it is refuted.
+
+    Args:
+        trend: it must be so where the trend so far continues, too; an interval has that in it.
+    """
     if claim.between is None and claim.within is None:  # sharper than by an interval of two ends
-        return _bound_verdict(claim, history, groups[0], worst=worst)
+        return _bound_verdict(claim, history, groups[0], worst=worst, trend=trend)
     low, high = span
     if claim.within is not None:
         return bool(high - low <= 2.0 * claim.value), False
@@ -218,11 +237,13 @@ def _called(
 
 
 def _bound_verdict(
-    claim: Claim, history: History, members: Mask, *, worst: bool
+    claim: Claim, history: History, members: Mask, *, worst: bool, trend: bool
 ) -> tuple[bool, bool]:
     """Return whether a claim of a bound holds, and is refuted."""
     value, least = claim.value, claim.at_least is not None
     limit = history.limit(claim, history.stopping.error)
+    if not trend:
+        limit = replace(limit, steady=-np.inf)
     none, all_ = (0.0, 1.0) if worst else (None, None)
     if claim.of == "mean":
         share = value / PERCENT

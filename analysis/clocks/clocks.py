@@ -42,6 +42,7 @@ from sliplab.analysis.clocks.pulse_match import (
     match_trains,
     tick_of,
 )
+from sliplab.protocols.shown import plural
 from sliplab.storage.clockmap import ClockMap
 
 Ints = NDArray[np.int64]
@@ -276,7 +277,8 @@ def _train(times: Ints, name: str) -> Ints:
     if array.size < MIN_PULSES:
         raise ClockRefused(
             "too_few_pulses",
-            f"the {name} has {array.size} pulses; at least {MIN_PULSES} are needed: {WIRED}",
+            f"the {name} has {plural(array.size, 'pulse')}; at least {MIN_PULSES} are "
+            f"needed: {WIRED}",
         )
     return np.sort(array.astype(np.int64))
 

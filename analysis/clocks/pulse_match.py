@@ -16,6 +16,7 @@ from scipy import fft
 
 from sliplab.analysis.clocks.clock_line import theil_sen
 from sliplab.analysis.clocks.pulse_kernels import fullest, pair, partners, quantile
+from sliplab.protocols.shown import plural
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -230,7 +231,8 @@ def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
         if marks.size != 1:
             raise NoMatchError(
                 "ambiguous",
-                f"the regular train of the {name} has {marks.size} start markers (a pulse with "
+                f"the regular train of the {name} has {plural(marks.size, 'start marker')} "
+                "(a pulse with "
                 f"{silence / 1e9:g} s of silence after it) and needs exactly one: record from "
                 "before the box starts, or send a code (lfsr)",
             )
@@ -238,7 +240,8 @@ def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
         if after.size < MIN_PULSES:
             raise NoMatchError(
                 "too_few_pulses",
-                f"the {name} has {after.size} pulses after the start marker; at least {MIN_PULSES} "
+                f"the {name} has {plural(after.size, 'pulse')} after the start marker; at "
+                f"least {MIN_PULSES} "
                 f"are needed: {WIRED}",
             )
         found.append((float(once[marks[0]]), float(np.median(np.diff(after)))))

@@ -30,6 +30,7 @@ from sliplab.analysis.clocks.clocks import (
     fit_clock,
     fit_numbered,
 )
+from sliplab.protocols.shown import plural
 from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTiming, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
@@ -377,9 +378,9 @@ class _Pulses:
             ]
             raise ClockRefused(
                 "residuals",
-                f"its clock fell back by more than {RESTART_NS / 1e6:g} ms, {len(stretches) - 1} "
-                f"times during the trial: the device restarted, or its clock was set; "
-                f"{UNDISTURBED}",
+                f"its clock fell back by more than {RESTART_NS / 1e6:g} ms, "
+                f"{plural(len(stretches) - 1, 'time')} during the trial: the device restarted, or "
+                f"its clock was set; {UNDISTURBED}",
             )
         return self._fit(stamps, clock, grade)
 

@@ -29,6 +29,7 @@ from sliplab.analysis.labels.places import Places, places_of
 from sliplab.analysis.labels.rest import Reference, offsets
 from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
 from sliplab.protocols.settings import Labelling
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.label import (
     ChangePoints,
     OnsetDoubts,
@@ -167,7 +168,9 @@ class Label:
             most = slipped.max()
             found.append(f"markers that moved in the hold: {len(slipped)}, by {most:.1f} px")
         if self.places.plate_lost:
-            found.append(f"the plate's marker was not seen in {self.places.plate_lost} frames")
+            found.append(
+                f"the plate's marker was not seen in {plural(self.places.plate_lost, 'frame')}"
+            )
         if self.places.plate is not None and self.onsets.gross_ns is not None and not self.rest_ns:
             found.append("the plate was not seen to rest: its slip ends with the motion")
         if self.places.tilted:

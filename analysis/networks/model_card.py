@@ -11,6 +11,7 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.classification import CLASSES, score
 from sliplab.analysis.networks.activity import Activity
 from sliplab.analysis.networks.training import Fitted
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.export import (
     CardData,
     CardModel,
@@ -98,7 +99,7 @@ def _warnings(fitted: Fitted, data: CardData, splits: Mapping[str, SplitResult])
     test = splits.get("test")
     if test is None or test.trials < FEW_TRIALS:
         trials = 0 if test is None else test.trials
-        found.append(f"only {trials} test trials of the training campaigns")
+        found.append(f"only {plural(trials, 'test trial')} of the training campaigns")
     return tuple(found)
 
 

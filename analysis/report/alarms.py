@@ -9,6 +9,7 @@ from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms
 from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.analysis.report.page import number, with_interval
 from sliplab.protocols.plugin import plugins
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import AlarmRate, TrialScore
 from sliplab.storage.streams import Json
 
@@ -54,7 +55,7 @@ def alarm_words(found: dict[str, AlarmRate]) -> str:
     else:
         text += (
             f"{rate_words(quiet)} in quiet holding ({quiet.alarms} in {quiet.hours:.3f} h of "
-            f"{quiet.clusters} trials), "
+            f"{plural(quiet.clusters, 'trial')}), "
         )
         if few := few_words(quiet.clusters):
             text = text.removesuffix("), ") + f"; {few}), "

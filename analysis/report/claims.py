@@ -38,7 +38,7 @@ class Claimed:
 
     Attributes:
         error: chance at most of calling a claim that is false, percent.
-        chosen: its trials were chosen by what they tell.
+        target: what claims are about. chosen: its trials were chosen by what they tell.
     """
 
     name: str
@@ -46,6 +46,7 @@ class Claimed:
     taken: int
     planned: int
     ended: str
+    target: str
     chosen: bool
     table: Table
     figure: Figure
@@ -91,6 +92,7 @@ def claims_section(campaigns: Sequence[Collected], *, simulated: bool) -> Claims
                 record.looks[-1].taken,
                 sum(trial.role == "measured" for trial in item.plan),
                 ENDED[record.verdict],
+                record.target,
                 (item.campaign.folder / CHOICES).exists(),
                 Table(COLUMNS, [_row(record.looks, k) for k in range(len(stopping.claims))]),
                 _figure(item.name, record.looks, simulated),

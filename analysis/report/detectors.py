@@ -10,6 +10,7 @@ import pandas as pd
 
 from sliplab.analysis.report.figures.tradeoffs import latency_over_rate
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import (
     DetectorComparison,
     DetectorRate,
@@ -123,7 +124,7 @@ def _tables(entries: Sequence[tuple[str, DetectorScores]], trials: int) -> list[
     for allowed, same in places.items():
         asked = " or ".join(percent(rates[place].asked) for place in same)
         bound = f"at most {allowed}" if allowed else "less than one trial, so none"
-        caption = f"{asked} of {trials} validation trials false early: {bound}."
+        caption = f"{asked} of {plural(trials, 'validation trial')} false early: {bound}."
         rows = [
             [title, str(entry.stride_ms), *_cells(entry.rates[same[0]])] for title, entry in entries
         ]

@@ -12,6 +12,7 @@ from sliplab.analysis.report.alarms import QUIET, rate_words
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
 from sliplab.analysis.report.page import Content, Table, percent, with_interval
 from sliplab.analysis.report.seeds import seed_words
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import AlarmRate, LatencyByOnset, Share
 from sliplab.storage.schema.summary import (
     Holdout,
@@ -94,9 +95,9 @@ def _rows(
     for name, title in titles.items():
         row = windows[name]
         span = None if row.low is None or row.high is None else (100 * row.low, 100 * row.high)
-        n = f"{row.trials} trials, {row.n} windows"
+        n = f"{plural(row.trials, 'trial')}, {plural(row.n, 'window')}"
         rows.append([title, _with(percent(row.share), span, 1, "%"), n])
-    held = "–" if quiet is None else f"{quiet.clusters} trials, {quiet.hours:.3f} h"
+    held = "–" if quiet is None else f"{plural(quiet.clusters, 'trial')}, {quiet.hours:.3f} h"
     rows.append(["false alarms an hour, quiet holding", rate_words(quiet), held])
     for kind, latency in (("incipient", latencies.incipient), ("gross", latencies.gross)):
         known = intervals.of(f"latency_{kind}_ms")
@@ -106,13 +107,13 @@ def _rows(
             if statistic == "median":  # missed and late ones are in it
                 all_of += latency.missed + latency.late
             text = with_interval(value, span, 0, "ms")
-            rows.append([f"{kind} latency, {statistic}", text, f"{all_of} trials"])
+            rows.append([f"{kind} latency, {statistic}", text, f"{plural(all_of, 'trial')}"])
         counts = {word: getattr(latency, name) for name, word in _OUT.items()}
         all_of = latency.n + sum(counts.values())
         for word, count in counts.items():
             low, high = exact_interval(count, all_of)
             value = _with(str(count), (100 * low, 100 * high), 1, "%")
-            rows.append([f"{kind}: {word}", value, f"{all_of} trials"])
+            rows.append([f"{kind}: {word}", value, f"{plural(all_of, 'trial')}"])
     return rows
 
 

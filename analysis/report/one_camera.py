@@ -44,6 +44,7 @@ from sliplab.analysis.report.summary import (
 )
 from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.windows.dataset import recorded_span
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.summary import Labels, MotionRate, OneCameraSummary, StepLeftOut
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
@@ -199,7 +200,7 @@ def headline(summary: OneCameraSummary) -> list[Number]:
             Number(
                 "events in the motion",
                 number(None if rate.motion is None else rate.motion / 1000, 1, "thousand/s"),
-                f"median of {rate.trials} trials of {name}",
+                f"median of {plural(rate.trials, 'trial')} of {name}",
             )
         )
     if summary.one_camera == "events":

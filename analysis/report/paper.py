@@ -15,6 +15,7 @@ from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Table, number, percent
 from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.report.seeds import seed_words
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import AlarmRate, Share
 from sliplab.storage.schema.summary import Experiment, Network, NetworkWindows, Paper, Span, Summary
 
@@ -118,7 +119,7 @@ def _alarms(found: dict[str, AlarmRate]) -> list[Row]:
     rows = []
     for name, title in names.items():
         rate = found.get(name)
-        count = "–" if rate is None else f"{rate.clusters} trials, {rate.hours:.3f} h"
+        count = "–" if rate is None else f"{plural(rate.clusters, 'trial')}, {rate.hours:.3f} h"
         rows.append(Row(title, "–", rate_words(rate), count=count))
     return rows
 
@@ -130,7 +131,7 @@ def _percents(row: Share | None) -> str:
 
 
 def _count(row: Share | None) -> str:
-    return "–" if row is None else f"{row.trials} trials ({row.n} windows)"
+    return "–" if row is None else f"{plural(row.trials, 'trial')} ({plural(row.n, 'window')})"
 
 
 def _confused(confusion: Sequence[Sequence[int]]) -> Row:
@@ -141,7 +142,7 @@ def _confused(confusion: Sequence[Sequence[int]]) -> Row:
     if not pairs[a, b]:
         return Row(name, paper, "none")
     words = f"{CLASS_WORDS[a]} and {CLASS_WORDS[b]}"
-    return Row(name, paper, words, count=f"{pairs[a, b]} windows")
+    return Row(name, paper, words, count=plural(pairs[a, b], "window"))
 
 
 def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) -> list[Row]:
@@ -156,7 +157,7 @@ def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) 
                 f"{PAPER[f'{kind}_latency'].text} after onset",
                 number(found.mean, 0, "ms"),
                 _ms(kinematic.intervals.of(f"latency_{kind}_ms").mean),
-                f"{found.n} trials; {found.missed} missed, {found.late} late, "
+                f"{plural(found.n, 'trial')}; {found.missed} missed, {found.late} late, "
                 f"{found.false_early} early",
             )
         )

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from sliplab.analysis.claims.power import MOST_OPEN
 from sliplab.analysis.report.figures import power as figures
 from sliplab.analysis.report.page import Figure, Table, percent, render_page
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.power import ClaimPower, Learning, PowerRecord, Spread
 
 COLUMNS = ("claim", "trials", "80 %", "holds", "refuted", "open", "repetitions needed")
@@ -65,7 +66,7 @@ def impossible(it: ClaimPower, record: PowerRecord) -> str:
     if it.repetitions is None:
         return f"{said}no number of repetitions is foreseen that calls it"
     return (
-        f"{said}about {it.repetitions} repetitions of each condition in place of "
+        f"{said}about {plural(it.repetitions, 'repetition')} of each condition in place of "
         f"{record.repetitions} would call it (an estimate: widths fall with the root of the number "
         "of trials)"
     )

@@ -6,6 +6,7 @@ from sliplab.analysis.report.alarms import COMMAND, DISTURBED, QUIET, rate_words
 from sliplab.analysis.report.latency import smallest_lead
 from sliplab.analysis.report.page import Number, number, percent
 from sliplab.analysis.report.seeds import seed_words
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.summary import Experiment, Kinematic, OneCameraSummary, Summary
 
 _BODIES = {"kinematic": "the slide", "gravity": "the plate", "disturbance": "the plate"}
@@ -27,7 +28,8 @@ def slip_tiles(summary: Summary | OneCameraSummary, note: str = "") -> list[Numb
         Number(
             "incipient latency",
             number(latency.median, 0, "ms"),
-            f"median of {latency.n + latency.missed + latency.late} trials; {latency.missed} "
+            f"median of {plural(latency.n + latency.missed + latency.late, 'trial')}; "
+            f"{latency.missed} "
             f"missed, {latency.late} late, {latency.false_early} false early{note}",
         ),
         *_gross(summary),
@@ -51,14 +53,15 @@ def _accuracy(kinematic: Kinematic) -> Number:
     return Number(
         "window accuracy",
         percent(kinematic.accuracy.strict),
-        f"strict, n = {kinematic.interval.trials} trials ({kinematic.accuracy.n} windows); {seeds}",
+        f"strict, n = {plural(kinematic.interval.trials, 'trial')} "
+        f"({plural(kinematic.accuracy.n, 'window')}); {seeds}",
     )
 
 
 def _alarms(kinematic: Kinematic) -> Number:
     quiet = kinematic.false_alarms.get(QUIET)
     disturbed = kinematic.false_alarms.get(DISTURBED)
-    held = "" if quiet is None else f", {quiet.clusters} trials, {quiet.hours:.3f} h"
+    held = "" if quiet is None else f", {plural(quiet.clusters, 'trial')}, {quiet.hours:.3f} h"
     under = f"not measured ({COMMAND})" if disturbed is None else rate_words(disturbed)
     return Number(
         "false alarms an hour", rate_words(quiet),

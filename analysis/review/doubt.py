@@ -23,6 +23,7 @@ from sliplab.analysis.labels.onsets import last_off_axis
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.labels.slip_times import WIDEST_NS
 from sliplab.protocols import Trial
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.label import KINDS, LABELS, Kind, RuleOnsets, TrialLabel
 from sliplab.storage.streams import F64, I64
 from sliplab.storage.trials.derived import Derived
@@ -136,9 +137,11 @@ def reasons_for_doubt(label: TrialLabel) -> list[tuple[int, str]]:
             found.append((ODD, nothing))
     found += [(ODD, text) for text in label.flags]
     if label.markers_lost:
-        found.append((SLIGHT, f"{label.markers_lost} times a marker was not seen"))
+        found.append((SLIGHT, f"{plural(label.markers_lost, 'time')} a marker was not seen"))
     if label.plate_lost:
-        found.append((SLIGHT, f"the plate's marker was not seen in {label.plate_lost} frames"))
+        found.append(
+            (SLIGHT, f"the plate's marker was not seen in {plural(label.plate_lost, 'frame')}")
+        )
     return sorted(dict.fromkeys(found), key=lambda item: -item[0])
 
 

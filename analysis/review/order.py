@@ -31,6 +31,7 @@ from sliplab.analysis.review.influence import (
 )
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import STEP as SAMPLES
+from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.trials.derived import Derived
@@ -150,7 +151,9 @@ def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
     evaluation, notes = _evaluation(store, waiting)
     unlabelled = sum(len(item.trials) - len(every[item.name]) for item in campaigns)
     if unlabelled:
-        notes.append(f"{unlabelled} trials have no label of their present state: `sliplab label`")
+        notes.append(
+            f"{plural(unlabelled, 'trial')} without a label of the present state: `sliplab label`"
+        )
     decided = sum(len(cases) for cases in every.values()) - len(waiting)
     if evaluation is not None and evaluation.reviewed is None and decided:
         notes.append(

@@ -15,6 +15,7 @@ from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, P
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
+from sliplab.protocols.shown import plural
 from sliplab.rigs.core.capabilities import Pose, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.teaching import OBLIQUE_SLOPE, Creep, MarkerFinder, Touch, jog_poses, touch
@@ -211,12 +212,12 @@ def teach_zero(
         "by_markers_mm": None,
         "difference_mm": None,
     }
-    method = f"event rate, {repeats} touches at {creep.speed_mm_s:g} mm/s"
+    method = f"event rate, {plural(repeats, 'touch')} at {creep.speed_mm_s:g} mm/s"
     if with_markers:
         markers = np.array(depths["markers"])
         difference = zero - float(markers.mean())
         residual = max(residual, float(np.ptp(markers)) / 2, abs(difference) / 2)
-        method = f"event rate, checked by marker motion, {repeats} touches each"
+        method = f"event rate, checked by marker motion, {plural(repeats, 'touch')} each"
         entry |= {"by_markers": mm(float(markers.mean())), "difference": mm(difference)}
         figures |= {"by_markers_mm": markers.tolist(), "difference_mm": difference}
         if abs(difference) > MOST_DIFFERENCE_MM:

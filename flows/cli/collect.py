@@ -42,7 +42,7 @@ def plan(
     from sliplab.flows.planning import plan_view
     from sliplab.protocols.plan import load_plan
 
-    found = load_plan(protocol, enable or ())
+    found = load_plan(protocol, enable or (), True)
     needed, scene = None, None
     if rig is not None:
         from sliplab.flows.planning.estimate import plan_bytes

@@ -26,6 +26,11 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
+_WITH_TRIALS = {
+    "collect", "sync", "label", "train", "evaluate", "generalise", "guesses", "holdout", "study",
+    "demo", "stress", "tradeoff", "push", "pull", "import", "serve", "migrate", "reflex",
+}  # fmt: skip
+"""Commands that take trials or process them, and resume."""
 _EXPECTED = {
     "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
     "OutputLost", "WorkerKilled", "WorkNotBegun", "MainModuleError",
@@ -78,7 +83,10 @@ class Failure:
 
 def interruption() -> Failure:
     """Return the failure of a program that the user stopped."""
-    return Failure(INTERRUPTED, console.INTERRUPTED)
+    text = "interrupted: nothing is left half-written; run the same command again"
+    if _command().removeprefix("sliplab ") in _WITH_TRIALS:
+        text = INTERRUPTED
+    return Failure(text, console.INTERRUPTED)
 
 
 def is_arm_fault(error: Exception) -> bool:

@@ -20,7 +20,7 @@ from sliplab.flows.cli.common import (
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.shown import one_of
+from sliplab.protocols.shown import one_of, plural
 
 if TYPE_CHECKING:
     from sliplab.flows.export_model import Exported
@@ -240,9 +240,11 @@ def _model_pairs(result: Exported) -> dict[str, str]:
     checked = result["onnx_windows_equal"]
     return {
         "files": ", ".join(Path(file).name for file in result["files"]),
-        "onnx": f"{checked} of {checked} windows as in Sinabs" if checked else "not written",
+        "onnx": f"{checked} of {plural(checked, 'window')} as in Sinabs"
+        if checked
+        else "not written",
         "speck": "fits, one core a layer" if result["speck_fits"] else "does not fit",
-        "8 bits: equal counts": f"{change.equal_counts:.1%} of {change.windows} windows",
+        "8 bits: equal counts": f"{change.equal_counts:.1%} of {plural(change.windows, 'window')}",
         "8 bits: equal class": f"{change.equal_class:.1%}",
         "strict accuracy": f"{accuracy['real'].strict:.1%}, with 8 bits "
         f"{accuracy['whole'].strict:.1%}",

@@ -45,6 +45,25 @@ def power(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**31, help="Of the draws.")] = 1,
+    sessions: Annotated[
+        int,
+        typer.Option("--sessions", min=1, max=1000, help="Days, mountings or skins to plan for."),
+    ] = 1,
+    between: Annotated[
+        float | None,
+        typer.Option(
+            "--between",
+            help="Deviation between sessions, as a share of that between trials; default: the "
+            "pilot's, or 0.3 where it is of one session.",
+        ),
+    ] = None,
+    drift: Annotated[
+        float,
+        typer.Option(
+            "--drift",
+            help="From the first trial to the last, as a share of the deviation between trials.",
+        ),
+    ] = 0.0,
     network: Annotated[
         bool,
         typer.Option("--network", help="Train the network itself for the learning curve."),
@@ -61,6 +80,7 @@ def power(
     pilot = open_store(store)
     prepare_store(store)  # before anything imports Prefect
     from sliplab.analysis.campaigns import collected
+    from sliplab.analysis.claims.resampling import Sessions
     from sliplab.flows.planning.plan_view import print_power
     from sliplab.flows.power import Classifier, measure_power, plan_with_claims, request
 
@@ -68,7 +88,8 @@ def power(
     classifier: Classifier | None = "network" if network else "logistic"
     if no_training:
         classifier = None
-    asked = request(pilot, collected(pilot, names), plan, judging, draws, seed, classifier)
+    time = Sessions(sessions, between, drift)
+    asked = request(pilot, collected(pilot, names), plan, judging, draws, seed, classifier, time)
     out = pilot.folder / "report" if out is None else out
     found = measure_power(asked, out)
     if as_json:

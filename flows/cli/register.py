@@ -40,12 +40,21 @@ def register(
             "campaign's registration that it is of, instead of registering again.",
         ),
     ] = None,
+    show: Annotated[
+        bool,
+        typer.Option(
+            "--show", help="List the campaign's registrations and deviations; register nothing."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Register protocol, claims and analysis settings; the report lists every later deviation.
 
     A file is added to the store, which a third party can stamp or sign; none is ever overwritten.
     """
+    if show:
+        _show(protocol, store, campaign, as_json)
+        return
     if stamp is not None:
         _attach(protocol, store, campaign, stamp, as_json)
         return
@@ -70,6 +79,33 @@ def register(
         **(made.taken.to_json() if as_json else {}),
     }
     finish(result, f"registered in {store}", as_json)
+
+
+def _show(protocol: Path, store: Path, campaign: str | None, as_json: bool) -> None:
+    """Print whether a campaign is registered, and what deviates from that; no evaluation is needed.
+
+    Raises:
+        NoStore: there is no store.
+        InputError: the protocol.
+    """
+    from sliplab.analysis.campaigns import collected
+    from sliplab.analysis.report.registration import registration_section
+    from sliplab.flows.register import registration_line
+    from sliplab.protocols.plan import load_plan
+    from sliplab.storage.trials.store import Store
+
+    opened, plan = Store.open(store), load_plan(protocol)
+    found = opened.campaign(campaign or plan.name)
+    line = registration_line(found, plan)
+    section = registration_section(opened, collected(opened, [found.name])) if found.begun else None
+    tables = [] if section is None else [item.deviations for item in section.campaigns]
+    rows = [dict(zip(table.columns, row, strict=True)) for table in tables for row in table.rows]
+    if as_json:
+        console.print_json({"campaign": found.name, "registered": line, "deviations": rows})
+        return
+    console.show(line)
+    for table in tables:
+        console.print_table("deviations", table.columns, table.rows or [["none", "", ""]])
 
 
 def _attach(protocol: Path, store: Path, campaign: str | None, stamp: Path, as_json: bool) -> None:

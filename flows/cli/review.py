@@ -10,6 +10,7 @@ import typer
 from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
     from sliplab.analysis.review.order import ReviewOrder, Waiting
@@ -67,7 +68,9 @@ def review(
         if found is not None:
             _print_order(trials, found, count or COUNT)
         if address is not None:
-            console.say(f"{len(trials.rows)} trials, {waiting} to review. Ctrl-C ends the page:")
+            console.say(
+                f"{plural(len(trials.rows), 'trial')}, {waiting} to review. Ctrl-C ends the page:"
+            )
             console.show(address)
 
     if page:
@@ -130,7 +133,10 @@ def _print_order(trials: TrialList, found: ReviewOrder, count: int) -> None:
         )
         for item in first
     ]  # fmt: skip
-    title = f"{len(first)} of {len(found.trials)} trials in doubt, by what a review would change"
+    title = (
+        f"{len(first)} of {plural(len(found.trials), 'trial')} in doubt, by what a "
+        "review would change"
+    )
     console.print_table(title + simulated, columns, rows)
     gains = found.gains(count)
     if not gains:

@@ -20,6 +20,7 @@ from sliplab.flows.cli.common import (
 from sliplab.flows.running import console
 from sliplab.flows.steps import run_step
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
     from sliplab.flows.judge_network import NetworkScores
@@ -157,10 +158,12 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
     accuracy, interval = result["accuracy"], result["interval"]
     sure = ""
     if interval.low is not None and interval.high is not None:
-        sure = f" ({interval.low:.1%} to {interval.high:.1%} over {interval.trials} trials)"
+        sure = (
+            f" ({interval.low:.1%} to {interval.high:.1%} over {plural(interval.trials, 'trial')})"
+        )
     differ = "" if result["same_as_sinabs"] else "; a few counts may differ from Sinabs'"
     shown: dict[str, str | int] = {
-        "windows": f"{accuracy.n} of {interval.trials} trials",
+        "windows": f"{accuracy.n} of {plural(interval.trials, 'trial')}",
         "engine": f"{result['engine']}{differ}",
     }  # fmt: skip
     if accuracy.n:
@@ -171,7 +174,8 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
         }
     if (quiet := result["false_alarms"]) is not None:
         shown["false alarms an hour"] = (
-            f"{rate_words(quiet)} in quiet holding ({quiet.clusters} trials, {quiet.hours:.3f} h)"
+            f"{rate_words(quiet)} in quiet holding ({plural(quiet.clusters, 'trial')}, "
+            f"{quiet.hours:.3f} h)"
         )
     latency = result["latency_ms"]
     for name, found in (("incipient", latency.incipient), ("gross", latency.gross)):

@@ -17,7 +17,7 @@ from sliplab.flows.cli.common import (
 )
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.shown import did_you_mean
+from sliplab.protocols.shown import did_you_mean, plural
 
 if TYPE_CHECKING:
     from sliplab.storage.trials.store import Campaign, Store
@@ -65,7 +65,7 @@ def trials(
         from sliplab.storage.trials.catalogue import write_table
 
         write_table(table, output)
-        console.say(f"{len(table)} trials: {output}")
+        console.say(f"{plural(len(table), 'trial')}: {output}")
     if as_json:
         import json
 
@@ -84,7 +84,9 @@ def trials(
         spare = len(shown) - 2  # a row is its campaign and its trial
         console.print_table(f"trials of {store}{simulated}", shown, rows, limit=40, spare=spare)
         print_excluded(excluded)
-        console.say(f"{len(table)} trials; --json and --output have all {table.shape[1]} columns")
+        console.say(
+            f"{plural(len(table), 'trial')}; --json and --output have all {table.shape[1]} columns"
+        )
 
 
 @app.command()
@@ -128,7 +130,9 @@ def verify(
 
         with store_lock(opened):
             moved = quarantine_damaged(opened, problems)
-        console.say(f"{len(moved)} damaged trials were quarantined; `sliplab collect` retakes them")
+        console.say(
+            f"{plural(len(moved), 'damaged trial')} quarantined; `sliplab collect` retakes them"
+        )
     torn = salvaged(opened)
     for trial in torn:
         console.say(f"{trial}: was salvaged from a damaged file: intact, but not all of it")
@@ -158,9 +162,9 @@ def verify(
                 console.say(f"{item.path}: {item.what}")
         if wrong:
             rows = [[item.path, item.what] for item in wrong]
-            console.print_table(f"{len(wrong)} problems", ["where", "what is wrong"], rows)
+            console.print_table(plural(len(wrong), "problem"), ["where", "what is wrong"], rows)
         else:
-            console.show(f"{total} trials, all intact")
+            console.show(f"{plural(total, 'trial')}, all intact")
     if wrong:
         raise typer.Exit(console.FAILED)
 
@@ -320,9 +324,9 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
         )
     elif problems:
         rows = [[item.path, item.what] for item in problems]
-        console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
+        console.print_table(plural(len(problems), "problem"), ["where", "what is wrong"], rows)
     else:
-        console.show(f"{trials} trials, all intact")
+        console.show(f"{plural(trials, 'trial')}, all intact")
     if problems:
         raise typer.Exit(console.FAILED)
 

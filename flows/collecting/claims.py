@@ -35,6 +35,7 @@ from sliplab.storage.process import out_of_reach
 from sliplab.storage.schema.claims import (
     CHOICES,
     STOPPING,
+    TARGET,
     ChoiceRecord,
     ClaimState,
     Look,
@@ -293,7 +294,7 @@ class ClaimWatch:
 
     def _say(self, look: Look) -> None:
         simulated = "simulated " if self._run_request.rig.simulated else ""
-        console.say(f"after {look.taken} {simulated}trials:")
+        console.say(f"after {look.taken} {simulated}trials, of {TARGET}:")
         for state in look.claims:
             console.say(f"  {said(state)}")
 

@@ -21,6 +21,7 @@ from sliplab.flows.planning.run_request import CampaignCounts, RunRequest
 from sliplab.flows.running import console, orchestration, stopping
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_text
+from sliplab.protocols.shown import plural
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -143,7 +144,9 @@ class Progress:
         with self._lock:
             share = 100.0 * self._done / self._total if self._total else 0.0
             words = ", ".join(f"{n} {what}" for what, n in sorted(self.outcomes.items()))
-            return min(share, 100.0), f"{self._done} of {self._total} trials: {words or 'none yet'}"
+            return min(share, 100.0), (
+                f"{self._done} of {plural(self._total, 'trial')}: {words or 'none yet'}"
+            )
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from typing import TypedDict
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import console
 from sliplab.protocols import InputError, Plan, Trial
+from sliplab.protocols.shown import plural
 from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
 
@@ -107,11 +108,15 @@ def print_excluded(excluded: Sequence[ExcludedTrial]) -> None:
     if not excluded:
         return
     rows = [
-        [item["trial"], item["by"] or f"gates, {item['attempts']} attempts", item["cause"]]
+        [
+            item["trial"],
+            item["by"] or f"gates, {plural(item['attempts'], 'attempt')}",
+            item["cause"],
+        ]
         for item in excluded
     ]
     console.print_table(
-        f"{len(rows)} excluded trials (`sliplab again` retakes them)",
+        f"{plural(len(rows), 'excluded trial')} (`sliplab again` retakes them)",
         ["trial", "by", "cause"],
         rows,
         limit=40,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from sliplab.flows.running import console
 from sliplab.protocols import Plan
+from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
     from sliplab.rigs.levels import Choice, SlipExpected
@@ -152,7 +153,7 @@ def _stretches(found: Plan) -> str:
     sizes = [last - first + 1 for first, last in found.stretches()]
     if len(sizes) > MOST_STRETCHES:
         return f"{len(sizes)} of {min(sizes)} to {max(sizes)} trials"
-    return ", ".join(f"{size} trials" for size in sizes)
+    return ", ".join(plural(size, "trial") for size in sizes)
 
 
 def _claims(found: Plan) -> Iterator[str]:
@@ -161,7 +162,10 @@ def _claims(found: Plan) -> Iterator[str]:
     if collection.stopping is None:
         return
     if (choice := collection.adaptive) is not None:
-        how = f"every batch of {choice.batch} trials, which are chosen then, not in this order"
+        how = (
+            f"every batch of {plural(choice.batch, 'trial')}, which are chosen then, not "
+            "in this order"
+        )
     else:
         often = collection.stopping.repetitions
         how = f"{'each' if often == 1 else f'every {often}'} repetition of all conditions"
@@ -221,7 +225,7 @@ def print_power(power: PowerRecord) -> None:
     from sliplab.analysis.report.power import COLUMNS, rows, sentence
 
     kind = "simulated pilot" if power.simulated else "pilot"
-    title = f"claims of {power.protocol}, by {power.pilot_trials} trials of a {kind}"
+    title = f"claims of {power.protocol}, by {plural(power.pilot_trials, 'trial')} of a {kind}"
     console.print_table(title, COLUMNS, rows(power), spare=0)
     for note in power.notes:
         console.say(f"note: {note}")

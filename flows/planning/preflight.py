@@ -17,6 +17,7 @@ from sliplab.flows.planning.run_request import RunRequest, check_disk, make_requ
 from sliplab.flows.running.console import size
 from sliplab.protocols import InputError
 from sliplab.protocols.program import Move
+from sliplab.protocols.shown import plural
 from sliplab.rigs.core.calibration import COMMANDS, find_faults, measured_on
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth, RigError
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
@@ -57,7 +58,11 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     run_request = make_request(protocol, rig, store, enable=enable)
     pending = pending_trials(run_request.plan, Store(store).campaign(run_request.campaign))
     found = [
-        Check("protocol and limits", True, f"{len(run_request.plan)} trials within all limits"),
+        Check(
+            "protocol and limits",
+            True,
+            f"{plural(len(run_request.plan), 'trial')} within all limits",
+        ),
         Check("campaign", True, f"{len(pending)} of {len(run_request.plan)} still to collect"),
     ]
     found.append(Check("outside camera", True, _outside_camera(run_request)))
@@ -65,7 +70,9 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     found += [Check("hint", True, text, True) for text in run_request.plan.warnings()]
     if (twin := run_request.rig.twin) is not None:
         cautions = list(warnings(twin, run_request.plan))
-        within = f"within what it was fitted on: {twin.trials} trials of '{twin.campaign}'"
+        within = (
+            f"within what it was fitted on: {plural(twin.trials, 'trial')} of '{twin.campaign}'"
+        )
         found += [Check("twin", True, text, bool(cautions)) for text in cautions or [within]]
     try:
         free = check_disk([run_request])

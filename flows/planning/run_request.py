@@ -6,7 +6,7 @@ key by key. Nothing here needs Prefect, so a wrong input is answered at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict
 
@@ -20,7 +20,14 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences
 from sliplab.protocols.templates import written_out
-from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
+from sliplab.protocols.yaml_file import (
+    KeyedError,
+    input_error,
+    mask_secrets,
+    parse_yaml,
+    read_text,
+    without_secrets,
+)
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.claims import STOPPING, ChoiceRecord, StoppingRecord
@@ -99,21 +106,42 @@ class RunRequest:
 
     def _begun(self, campaign: Campaign) -> set[str] | None:
         """Return the trials that a campaign had begun when its claims ended it; else None."""
-        collection = self.plan.protocol.collection
-        claims = collection.stopping
+        record, collection = self._ended_by_claims(campaign), self.plan.protocol.collection
+        if record is None or collection.stopping is None:
+            return None
+        if collection.adaptive is not None:
+            batches = ChoiceRecord.of(campaign.folder).batches
+            return {item.trial for batch in batches for item in batch.trials}
+        repetitions = len(record.looks) * collection.stopping.repetitions
+        return {t.id for t in self.plan if t.role == "measured" and t.repetition <= repetitions}
+
+    def _ended_by_claims(self, campaign: Campaign) -> StoppingRecord | None:
+        """Return the looks of a campaign that its claims ended; else None."""
+        claims = self.plan.protocol.collection.stopping
         if claims is None or self.claims != "use":
             return None
         try:
             record = StoppingRecord.load(campaign.folder / STOPPING)
         except FileNotFoundError:
             return None
-        if record.section != section_hash(claims) or record.verdict not in ("settled", "most"):
-            return None
-        if collection.adaptive is not None:
-            batches = ChoiceRecord.of(campaign.folder).batches
-            return {item.trial for batch in batches for item in batch.trials}
-        repetitions = len(record.looks) * claims.repetitions
-        return {t.id for t in self.plan if t.role == "measured" and t.repetition <= repetitions}
+        ended = record.section == section_hash(claims) and record.verdict in ("settled", "most")
+        return record if ended else None
+
+    def end_reason(self, campaign: Campaign) -> str:
+        """Return why a collection ended that nothing interrupted."""
+        if replace(self, most=None).due_trials(campaign):
+            return f"as many trials as --trials {self.most} allows"
+        claims, record = self.plan.protocol.collection.stopping, self._ended_by_claims(campaign)
+        if record is not None and claims is not None:
+            if record.verdict == "settled":
+                return "all claims are settled"
+            return f"another round would exceed collection.stopping.most = {claims.most}"
+        if pending_trials(self.plan, campaign):
+            return "all requested trials are taken"
+        excluded = len(excluded_trials(self.plan, campaign))
+        if excluded:
+            return f"all trials are taken but {excluded} that were skipped or set aside"
+        return "all trials are taken"
 
     def counts(self, campaign: Campaign) -> CampaignCounts:
         """Count what the campaign holds now; planned = committed + missing."""
@@ -151,7 +179,7 @@ def make_request(
         NoStore: the folder holds something else.
         StoreError: the campaign was started under another collection.
     """
-    plan = load_plan(protocol, enable)
+    plan = load_plan(protocol, enable, judged=claims != "ignore")
     rig_file, rig_text = load_rig_file(rig)
     check_plan(rig_file, plan, str(rig))
     if plan.protocol.collection.plate is not None and not rig_file.has_plate:
@@ -180,19 +208,10 @@ def judging_model(plan: Plan) -> Path | None:
         InputError: one is needed, and there is none.
     """
     claims = plan.protocol.collection.stopping
-    if claims is None or not claims.needs_network:
-        return None
-    key = "collection.stopping.model"
-    if claims.model is not None:
-        path = Path(plan.file).parent / claims.model
-        if not path.is_file():
-            raise InputError(plan.file, key, claims.model, f"{path} is no file")
-        return path.resolve()
-    raise InputError(
-        plan.file, key, None,
-        "is needed: a claim is about a network's output; name the file of a trained one, such as "
-        "STORE/models/seed0.pt of a pilot",
-    )  # fmt: skip
+    try:
+        return None if claims is None else claims.network_file(plan.file)
+    except KeyedError as error:
+        raise input_error(plan.file, error) from None
 
 
 def _check_same(run_request: RunRequest, campaign: Campaign) -> None:

@@ -35,6 +35,7 @@ from sliplab.flows.server.service import Service, service
 from sliplab.flows.steps import STEPS
 from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
 from sliplab.protocols import InputError
+from sliplab.protocols.shown import plural
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.errors import disk_error
 from sliplab.storage.remote.mirror import open_store
@@ -286,7 +287,9 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
     taken = sum(item["taken"] for item in outcome.collected)
     # of steps of one name, the last
     done = {step["step"]: step["done"] for step in outcome.steps}
-    return f"{taken} trials taken; " + ", ".join(f"{name}: {n} done" for name, n in done.items())
+    return f"{plural(taken, 'trial')} taken; " + ", ".join(
+        f"{name}: {n} done" for name, n in done.items()
+    )
 
 
 def _steps(here: Service, campaigns: list[str], name: str, **options: Any) -> str:

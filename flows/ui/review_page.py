@@ -31,6 +31,7 @@ from sliplab.flows.ui.review_widgets import (
     history_html,
     lines_html,
 )
+from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import U8
 from sliplab.storage.trials import review
@@ -106,7 +107,7 @@ class Page:
         self._mark()
         left = sum(item.state in {"open", "stale"} for item in self._rows)
         self._head()
-        self.see.count.text = f"{len(self._rows)} trials, {left} to review"
+        self.see.count.text = f"{plural(len(self._rows), 'trial')}, {left} to review"
 
     def _head(self) -> None:
         if self.shown is not None:

@@ -8,6 +8,7 @@ from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, MedianLatency
 from sliplab.plugins.bench.registry import SHIPPED as _SHIPPED
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.schema.evaluation import AlarmRate
 
@@ -34,7 +35,7 @@ def interval_note(found: BenchResult) -> str:
     rates = [row.disturbed for row in found.detectors if row.disturbed is not None]
     disturbed = [rate.clusters for rate in rates if rate.clusters]
     worlds = max(it.worlds for it in tests)
-    text = f"Intervals are 95 %, over {worlds} test worlds"
+    text = f"Intervals are 95 %, over {plural(worlds, 'test world')}"
     if disturbed:
         text += f" and {max(disturbed)} with nuisances"
     few = few_words(min([worlds, *disturbed]))
@@ -110,7 +111,8 @@ def write_leaderboard(page: Path, found: BenchResult) -> None:
         "",
         f"`{command} --seed {found.seed}`, scenes of version {found.version}, **simulated**: "
         f"{found.scenes['train']} training, {found.scenes['validation']} validation and "
-        f"{found.scenes['test']} test scenes, {hours['validation']:.2f} and {hours['test']:.2f} "
+        f"{plural(found.scenes['test'], 'test scene')}, {hours['validation']:.2f} and "
+        f"{hours['test']:.2f} "
         f"hours without slip. {interval_note(found)}",
         "",
         *_markdown([row[:COSTS] for row in every]),

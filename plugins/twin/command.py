@@ -10,6 +10,7 @@ import typer
 from sliplab.flows.cli.common import CampaignOption, JsonOption, RigOption, StoreArgument
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
@@ -204,7 +205,7 @@ def calibrate_gap(
     if as_json:
         console.print_json({"folder": str(out), **found.to_json()})
         return
-    trials = f"{found.trials}{' simulated' if found.simulated else ''} test trials"
+    trials = plural(found.trials, ("simulated " if found.simulated else "") + "test trial")
     rows = [cells(it) for it in found.networks]
     console.print_table(f"gap of the twin {found.rig}, {trials}", COLUMNS, rows, spare=4)
     console.say(f"page: {out / NAME}.html")

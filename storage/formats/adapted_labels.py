@@ -11,6 +11,7 @@ from sliplab.protocols.adapter import CLASSES, Adapter
 from sliplab.protocols.adapter_parts import GivenMotion, GivenOnsets, GivenSpans
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
+from sliplab.protocols.shown import plural
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.tables import Row, exact_ns, read_rows
 
@@ -120,7 +121,9 @@ def find_labels(
         return FoundLabels({}, [])
     if without := [id_ for id_ in trials if id_ not in found]:
         some = ", ".join(without[:_SOME])
-        warnings.append(f"no label for {len(without)} trials ({some}); imported without one")
+        warnings.append(
+            f"no label for {plural(len(without), 'trial')} ({some}); imported without one"
+        )
     if not found:
         raise InputError(file, "labels", None, "fits no trial: none of them would have a label")
     if adapter.classes:
@@ -252,7 +255,7 @@ def _matched(
             f"row {row.number} ({', '.join(row.values.get(c, '') for c in part.match)})"
             for row in left[:_SOME]
         )
-        warnings.append(f"{left[0].place}: {len(left)} rows are of no trial: {some}")
+        warnings.append(f"{left[0].place}: {plural(len(left), 'row')} of no trial: {some}")
     return found
 
 

@@ -19,6 +19,7 @@ from sliplab.protocols.adapter_parts import (
     WrenchFiles,
 )
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import (
     MOST_PX,
@@ -308,7 +309,7 @@ def _frame_times(folder: DataFolder, name: str, part: FrameTimes) -> tuple[I64, 
         else:
             columns, wrong = read_columns(folder, name, "csv", {"t": part.column})
             if wrong:  # which frame is of which time is unknown from there on
-                raise FormatError(f"has {wrong} rows without a number")
+                raise FormatError(f"has {plural(wrong, 'row')} without a number")
             found = columns["t"]
     except FormatError as error:
         where = "streams.frames.times"

@@ -16,6 +16,7 @@ from sliplab.protocols.adapter_parts import BUILT_IN, FieldRule
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
 from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
+from sliplab.protocols.shown import plural
 from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
@@ -237,7 +238,9 @@ class _Finding:
         if not found:
             self._none(key, text)
         if len(found) > 1:
-            raise self._error(key, text, f"fits {len(found)} files: {', '.join(found[:_SOME])}")
+            raise self._error(
+                key, text, (f"fits {plural(len(found), 'file')}: {', '.join(found[:_SOME])}")
+            )
         self._used.add(found[0])
         return found[0]
 
@@ -397,7 +400,9 @@ class _Finding:
         counts = Counter(key for trial in trials for key in trial.missing)
         for key, count in counts.items():
             some = [trial.id for trial in trials if key in trial.missing][:_SOME]
-            self._warnings.append(f"{key}: no file for {count} trials ({', '.join(some)})")
+            self._warnings.append(
+                f"{key}: no file for {plural(count, 'trial')} ({', '.join(some)})"
+            )
 
 
 def _built_in(name: str) -> dict[str, str]:

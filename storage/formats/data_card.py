@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pyarrow as pa
 
+from sliplab.protocols.shown import plural
 from sliplab.storage.formats import ros2_messages as ros2
 from sliplab.storage.formats.mcap_trials import COLUMNS_TOPIC
 from sliplab.storage.formats.publication import Publication
@@ -113,7 +114,7 @@ def data_card(publication: Publication, tables: Mapping[str, pa.Table], form: st
     part = (
         "."
         if simulated == publication.count
-        else f" in part: {simulated} of {publication.count} trials."
+        else f" in part: {simulated} of {plural(publication.count, 'trial')}."
     )
     first = [f"Simulated data{part}", ""] if simulated else []
     licence = f"{about.licence}" if about.licence else (

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.files import json_text, safe_name
 from sliplab.storage.formats.foreign import (
@@ -569,7 +570,9 @@ def _fill_frames(
     content.check_order(stream, content.rows[stream], done)
     content.check_images(stream, alike)
     if repeated:
-        content.warnings.append(f"{repeated:,} frames of {stream} have the time of the one before")
+        content.warnings.append(
+            f"{plural(repeated, 'frame')} of {stream} with the time of the one before"
+        )
     return ends, size
 
 

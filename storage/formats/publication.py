@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing
 from sliplab.storage.trials.recording import Recording
@@ -142,7 +143,8 @@ class Publication:
         names = ", ".join(campaign.name for campaign in self.campaigns)
         simulated = "Simulated data. " if self.simulated else ""
         return (
-            f"{simulated}{self.count} trials of tactile slip (campaigns: {names}) with events, "
+            f"{simulated}{plural(self.count, 'trial')} of tactile slip (campaigns: {names}) "
+            "with events, "
             "frames, arm poses and clocks on one time line. Recorded and published with SlipLab."
         )
 

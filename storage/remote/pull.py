@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import (
     inside,
@@ -268,8 +269,9 @@ class _Pull:
             self.done.withdrawn += 1
         if lost:
             self.done.problems.append(
-                f"{self.remote.url}: campaign '{self.campaign.name}': {len(lost)} trials that were "
-                f"pulled are neither listed nor marked as withdrawn, and are left as they are: "
+                f"{self.remote.url}: campaign '{self.campaign.name}': "
+                f"{plural(len(lost), 'pulled trial')} "
+                f"neither listed nor marked as withdrawn, left unchanged: "
                 f"{', '.join(lost[:3])}{' ...' if len(lost) > 3 else ''}"
             )
 

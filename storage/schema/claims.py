@@ -15,6 +15,10 @@ Verdict = Literal["open", "settled", "most", "all", "overruled"]
 """`most`: as many trials as the protocol takes at most; `all`: nothing is left to take."""
 
 
+TARGET = "conditions repeated for ever, each counted alike"
+"""What claims are about, whichever order gives the trials; not the trials of the grid alone."""
+
+
 class ClaimState(Part):
     """One claim at one look; numbers are in its unit."""
 
@@ -44,6 +48,8 @@ class ClaimState(Part):
     refuted: Bool
     alike: Literal["holds", "refuted"] | None = None
     """The verdict if missing trials were like the others, where it is open without that."""
+    trend: Literal["holds", "refuted"] | None = None
+    """The verdict if the trend so far did not continue, where it is open without that."""
 
 
 class Look(Part):
@@ -66,6 +72,7 @@ class StoppingRecord(Document):
     model: str | None
     """Hash of the network's file; null where no claim needs one."""
     verdict: Verdict
+    target: str = TARGET
     looks: tuple[Look, ...] = ()
 
 

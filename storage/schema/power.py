@@ -93,6 +93,10 @@ class PowerRecord(Document):
     planned: Int
     """Measured trials of the whole plan, at most `most` of its claims."""
     repetitions: Int
+    sessions: Int = 1
+    """That each campaign was drawn with."""
+    drift: Number = 0.0
+    """From the first trial to the last, as a share of the scatter between trials."""
     hours: Number
     """Of motion of the whole plan; maintenance and people's work are left out."""
     notes: tuple[str, ...]

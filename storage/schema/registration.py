@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from sliplab.protocols.shown import plural
 from sliplab.storage.schema.document import Document, Int, Part
-
-
-def plural(count: int, noun: str) -> str:
-    """Return a count with its noun."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 class RegisteredProtocol(Part):

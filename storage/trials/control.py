@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, safe_name, write_json, write_new_json
 from sliplab.storage.process import now, user_name
@@ -192,7 +193,9 @@ def again(campaign: Campaign, trials: Iterable[str], by: Json) -> dict[str, str]
         if known.pop(trial, None) is not None:
             done.append("no longer set aside")
         if count := _reset_attempts(campaign, trial, by):
-            done.append(f"{count} failed attempts count no longer")
+            done.append(
+                f"{plural(count, 'failed attempt')} count{'s' if count == 1 else ''} no longer"
+            )
         did[trial] = "; ".join([*done, "will be taken again"] if done else ["was pending already"])
     if len(known) < before:
         write_json(campaign.folder / SKIPPED, known)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.storage.errors import StoreError, own_fault
 from sliplab.storage.files import read_json, temporary_files
@@ -367,7 +368,7 @@ def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) ->
             problems.append((folder / DATA, what))
             continue
         problems += [
-            (folder / DATA, f"{count} rows of {path}/{part}, the record says {said.rows}")
+            (folder / DATA, f"{plural(count, 'row')} of {path}/{part}, the record says {said.rows}")
             for part, count in counts[name].items()
             if count != said.rows
         ]
@@ -404,7 +405,7 @@ def _camera_problems(folder: Path, record: TrialRecord) -> Found:
             problems += _data_problems(data, reader, counts, pixels)
         stated_rows = {f"{said.kind}/t": said.rows, "event_pulses/t": said.pulses or 0}
         problems += [
-            (data, f"{counts[column]} rows of {column}, the record says {rows}")
+            (data, f"{plural(counts[column], 'row')} of {column}, the record says {rows}")
             for column, rows in stated_rows.items()
             if counts[column] != rows
         ]
@@ -416,7 +417,7 @@ def _frame_problems(data: Path, video: Path, tracks: list[str], counts: dict[str
     """Check for a row of tracks, or a picture in the video, for every frame."""
     frames, encoded = counts["frames/t"], video.exists()
     problems: Found = [
-        (data, f"{counts[name]} rows of {name}, not {frames}")
+        (data, f"{plural(counts[name], 'row')} of {name}, not {frames}")
         for name in tracks
         if counts[name] != frames
     ]

@@ -70,6 +70,7 @@ PROMISED = {
     "statements": {
         "median of a time, blocks differ by 50 %: wrong_percent",
         "mean of a share, AR(1) of 0.9: held_percent",
+        "median of a time, drift of 100 %; adaptive: wrong_percent",
         "16 clusters, 50% of the variance between worlds: held_percent",
     },
 }  # fmt: skip

@@ -12,9 +12,11 @@ import pytest
 from sliplab.analysis.claims import learning, trial_figures
 from sliplab.flows import power
 from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.power import sessions_of
 from sliplab.flows.study import Outcome
 from sliplab.protocols.plan import load_plan
 from sliplab.storage.schema.power import PowerRecord
+from sliplab.storage.schema.trial import Provenance
 from tests.command_line import answer, here
 from tests.flows.conftest import tiny, write
 
@@ -133,6 +135,60 @@ def test_a_learning_curve_is_trained_once(
     assert answer(*words, "--no-training")["learning"] is None
 
 
+def test_sessions_are_drawn_and_printed(ran: Ran, protocol: Path, tmp_path: Path) -> None:
+    words = (
+        "power", protocol, "--store", ran[0][0].store, "--claim", DURATION, "--out", tmp_path,
+        "--draws", 10,
+    )  # fmt: skip
+    done = here(*words, "--sessions", 4, "--drift", 0.5)
+    assert done.returncode == 0
+    told = " ".join((done.stdout + done.stderr).split())
+    assert "4 sessions are drawn, which differ by 0.30 (slip_duration)" in told
+    assert "a pilot of one session cannot show how sessions differ" in told
+    assert "a drift of 0.5 of the scatter between trials is drawn" in told
+    record = PowerRecord.load(tmp_path / "power.json")
+    assert (record.sessions, record.drift) == (4, 0.5)
+    assert "4 sessions are drawn" in (tmp_path / "power.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "key", "value"),
+    [
+        (("--between", 0.5), "--between", "0.5"),
+        (("--sessions", 3, "--between", "nan"), "--between", "nan"),
+        (("--drift", -1), "--drift", "-1.0"),
+    ],
+)
+def test_wrong_sessions_name_option_and_value(
+    options: tuple[object, ...], key: str, value: str, ran: Ran, protocol: Path
+) -> None:
+    error = error_of(protocol, "--store", ran[0][0].store, "--claim", DURATION, *options)
+    assert (error["key"], error["value"]) == (key, value)
+
+
+class Times:
+    """A campaign of which only hours and skins of its trials are known."""
+
+    name = "pilot"
+
+    def provenance(self, recording: tuple[int, str]) -> Provenance:
+        """Half an hour from a full one on."""
+        hour, skin = recording
+        began, ended = (f"2026-11-01T{hour:02}:{minute}:00+00:00" for minute in ("00", "30"))
+        return Provenance(started=began, ended=ended, skin=skin)
+
+    @property
+    def campaign(self) -> Times:
+        """Itself."""
+        return self
+
+
+def test_a_pause_or_another_skin_begins_a_session() -> None:
+    trials = [(9, "a"), (10, "a"), (12, "a"), (12, "b"), (13, "a"), (13, "b")]
+    pilot: Any = [(Times(), None, trial) for trial in trials]
+    assert sessions_of(pilot).tolist() == [0, 0, 1, 2, 1, 2]
+
+
 @pytest.mark.parametrize(
     ("claim", "key", "value"),
     [
@@ -156,6 +212,13 @@ def test_a_wrong_claim_names_option_key_and_value(
 ) -> None:
     error = error_of(protocol, "--store", ran[0][0].store, "--claim", claim)
     assert (error["key"], error["value"]) == (key, value)
+
+
+def test_claim_given_twice_is_refused(ran: Ran, protocol: Path) -> None:
+    words = (protocol, "--store", ran[0][0].store)
+    error = error_of(*words, "--claim", DURATION, "--claim", DURATION)
+    assert error["key"] == "--claim collection.stopping.claims[1]"
+    assert "is the same as claims[0]" in error["message"]
 
 
 def test_a_protocol_without_claims_and_levels_outside_are_refused(

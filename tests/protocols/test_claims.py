@@ -9,8 +9,10 @@ import pytest
 import yaml
 
 from sliplab.protocols import InputError, load_plan
+from sliplab.protocols.claims import Claim
 
 CLAIM = {"figure": "lead", "statistic": "p05", "at_least": "360 ms"}
+SHARE = {"figure": "accuracy", "at_least": "90 %"}
 
 
 def written(folder: Path, data: dict[str, Any], **collection: Any) -> Path:
@@ -24,7 +26,7 @@ def written(folder: Path, data: dict[str, Any], **collection: Any) -> Path:
 @pytest.mark.parametrize(
     ("stopping", "key", "right"),
     [
-        ({"claims": []}, "claims", "at least 1"),
+        ({"claims": []}, "claims", "must have at least 1 item"),
         ({"claims": [{**CLAIM, "figure": "led"}]}, "claims[0].figure", "'lead'"),
         ({"claims": [{**CLAIM, "statistic": "mean"}]}, "claims[0].statistic", "'median'"),
         ({"claims": [{"figure": "accuracy", "statistic": "p05", "within": "1 %"}]},
@@ -34,6 +36,14 @@ def written(folder: Path, data: dict[str, Any], **collection: Any) -> Path:
         ({"claims": [{**CLAIM, "at_least": "360"}]}, "claims[0].at_least", "unit"),
         ({"claims": [{**CLAIM, "at_least": "36 mm"}]}, "claims[0].at_least", "s, ms, min"),
         ({"claims": [{"figure": "lead", "within": "0 ms"}]}, "claims[0].within", "more than 0"),
+        ({"claims": [{**CLAIM, "statistic": "p50"}]}, "claims[0].statistic", "must be 'median'"),
+        ({"claims": [{**CLAIM, "statistic": "p94"}]}, "claims[0].statistic", "'p95'"),
+        ({"claims": [{**CLAIM, "between": None}]}, "claims[0].between", "empty"),
+        ({"claims": [CLAIM, SHARE, {**CLAIM, "at_least": "0.36 s"}]}, "claims[2]",
+         "is the same as claims[0]"),
+        ({"claims": [CLAIM], "block": None}, "block", "empty"),
+        ({"claims": [CLAIM], "most": None}, "most", "empty"),
+        ({"claims": [CLAIM], "most": 35}, "most", "at least 36"),
         ({"claims": [CLAIM], "error": 0}, "error", "greater than 0"),
         ({"claims": [CLAIM], "error": 0.51}, "error", "0.5"),
         ({"claims": [CLAIM], "least": 10, "most": 9}, "most", "at least"),
@@ -55,6 +65,8 @@ def test_what_cannot_be_meant_is_refused_with_its_key(
         load_plan(written(tmp_path, small, stopping=stopping))
     assert caught.value.key == f"collection.stopping.{key}"
     assert right in str(caught.value)
+    more = [fault.key for fault in caught.value.more]
+    assert more == ([f"collection.stopping.{key[:-3]}[1]"] if key.endswith("levels[0]") else [])
 
 
 def test_adaptive_order_needs_claims_and_a_choice_needs_it(
@@ -95,3 +107,89 @@ def test_rounds_go_through_all_levels_that_a_person_changes(
     blocks = [trial.block for trial in plan]
     assert blocks == sorted(blocks)
     assert len(set(blocks)) == 8
+
+
+def test_stored_protocol_with_repeated_claim_empty_key_and_low_most_is_read(
+    tmp_path: Path, small: dict[str, Any]
+) -> None:
+    stopping = {"claims": [CLAIM, {**CLAIM}], "block": None, "most": 3}
+    path = written(tmp_path, small, stopping=stopping)
+    assert len(load_plan(path, stored=True)) == 36
+    with pytest.raises(InputError) as caught:
+        load_plan(path, judged=True)
+    keys = [fault.key.removeprefix("collection.stopping.") for fault in caught.value.faults]
+    assert keys == ["block", "claims[1]", "most", "model"]
+
+
+def test_first_round_with_enabled_levels_above_most_is_refused(
+    tmp_path: Path, small: dict[str, Any]
+) -> None:
+    small["collection"]["factors"]["depth"]["optional"] = [3.0]
+    path = written(tmp_path, small, stopping={"claims": [CLAIM], "most": 40})
+    assert len(load_plan(path)) == 36
+    with pytest.raises(InputError, match=r"collection\.stopping\.most = 40: must be at least 48"):
+        load_plan(path, ["depth=3.0"])
+
+
+def test_least_blocks_of_each_statistic() -> None:
+    statistics = (None, "median", "p25", "p90", "p05")
+    found = [Claim.model_validate({**CLAIM, "statistic": each}) for each in statistics]
+    assert [claim.least_blocks for claim in found] == [6, 6, 12, 30, 60]
+    assert Claim.model_validate(SHARE).least_blocks == 6
+
+
+@pytest.mark.parametrize(
+    ("collection", "stopping", "lacks"),
+    [
+        ({"repetitions": 6}, {}, None),
+        ({"repetitions": 5}, {}, "the plan has 5, so it cannot be called: collection.repetitions = "
+         "5 must be at least 6, or collection.stopping.block must be at most 35"),
+        ({"repetitions": 1}, {"block": 6}, None),
+        ({"repetitions": 1}, {"block": 36}, "collection.repetitions = 1 must be at least 6, or "
+         "collection.stopping.block = 36 must be at most 7"),
+        ({"repetitions": 9}, {"most": 200}, "the plan has 5, so it cannot be called: "
+         "collection.stopping.most = 200 must be at least 216"),
+        ({"repetitions": 9}, {"most": 216}, None),
+        ({"repetitions": 9}, {"most": 216, "repetitions": 4}, "the plan has 4, so it cannot be "
+         "called: collection.stopping.most = 216 must be at least 288"),
+        ({"repetitions": 3, "order": "adaptive"}, {}, None),
+        ({"repetitions": 2, "order": "adaptive"}, {}, "the plan has 4, so it cannot be called: "
+         "collection.repetitions = 2 must be at least 3, or collection.choice.batch = 12 must be "
+         "at most 8"),
+        ({"repetitions": 3, "order": "adaptive"}, {"most": 95},
+         "collection.stopping.most = 95 must be at least 96"),
+    ],
+)  # fmt: skip
+def test_warning_of_claim_with_too_few_blocks_names_key_and_remedy(
+    tmp_path: Path,
+    small: dict[str, Any],
+    collection: dict[str, Any],
+    stopping: dict[str, Any],
+    lacks: str | None,
+) -> None:
+    claims = [{**CLAIM, "statistic": "median"}, SHARE]
+    plan = load_plan(
+        written(tmp_path, small, stopping={"claims": claims, **stopping}, **collection)
+    )
+    found = [line for line in plan.warnings() if line.startswith("collection.stopping.claims[")]
+    if lacks is None:
+        assert found == []
+        return
+    assert len(found) == 2
+    for number, line in enumerate(found):
+        assert line.startswith(f"collection.stopping.claims[{number}] (")
+        assert "needs 6 blocks" in line
+        assert lacks in line
+
+
+def test_warning_counts_blocks_of_each_level_that_a_person_changes(
+    tmp_path: Path, small: dict[str, Any]
+) -> None:
+    small["collection"]["context"] = {"skin": {"values": ["a", "b"], "changeover": "person"}}
+    claims = [{**CLAIM, "statistic": "median"}]
+    few = load_plan(
+        written(tmp_path, small, repetitions=2, stopping={"claims": claims, "block": 36})
+    )
+    assert "the plan has 4" in few.warnings()[-1]
+    enough = written(tmp_path, small, repetitions=3, stopping={"claims": claims, "block": 36})
+    assert load_plan(enough).warnings() == []

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol
-from sliplab.protocols.shown import MASK, is_secret, printable, shown, shown_key
+from sliplab.protocols.shown import MASK, is_secret, plural, printable, shown, shown_key
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, without_secrets
 from sliplab.rigs.core.registry import listed, load_driver
 from sliplab.rigs.rig_file import RigFile
@@ -142,3 +142,9 @@ def test_sections_called_key_hold_no_secret() -> None:
     assert error.message == "adapter.yaml: factors.key.field = 7: must be text"
     assert MASK in InputError("rig.yaml", "devices.arm.key", "hunter2", "is unknown").message
     assert MASK in InputError("rig.yaml", "devices.auth.user", "hunter2", "is unknown").message
+
+
+def test_plural_of_one_has_no_ending() -> None:
+    counts = [plural(n, noun) for n, noun in ((0, "trial"), (1, "trial"), (2, "missing trial"))]
+    assert counts == ["0 trials", "1 trial", "2 missing trials"]
+    assert [plural(2, noun) for noun in ("touch", "box")] == ["2 touches", "2 boxes"]

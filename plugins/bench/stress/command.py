@@ -9,6 +9,7 @@ import typer
 
 from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
+from sliplab.protocols.shown import plural
 
 app = typer.Typer()
 
@@ -49,7 +50,8 @@ def stress(
         return
     simulated = " (simulated)" if record.simulated else ""
     console.print_table(
-        f"{record.trials} trials under nuisances, {record.hold_h:.2f} h of holding{simulated}",
+        f"{plural(record.trials, 'trial')} under nuisances, {record.hold_h:.2f} h of "
+        f"holding{simulated}",
         COLUMNS,
         [cells(title(detector), of(detector, ALL)) for detector in record.detectors],
     )

@@ -35,6 +35,7 @@ from sliplab.plugins.twin.worlds import (
     simulated,
 )
 from sliplab.protocols import Trial
+from sliplab.protocols.shown import plural
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.trials.derived import Derived
@@ -118,7 +119,8 @@ def read_references(store: Store, item: Collected) -> References:
         sums.update(recording.checksum.encode())
     if len(trials) < FEWEST:
         raise StoreError(
-            f"campaign '{item.name}': has {len(trials)} reference trials, and a trend takes "
+            f"campaign '{item.name}': has {plural(len(trials), 'reference trial')}, and a "
+            "trend takes "
             f"{FEWEST}; ask for more by collection.references in its protocol"
         )
     return References(tuple(trials), slides, sums.hexdigest())

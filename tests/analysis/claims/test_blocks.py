@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from sliplab.analysis.claims.blocks import Estimate, block_share, least_blocks, of_trials
+from sliplab.analysis.claims.blocks import Estimate, block_share, of_trials
 
 F = Callable[[np.random.Generator], np.ndarray]
 CASES: dict[str, F] = {
@@ -75,7 +75,6 @@ def test_equal_blocks_are_bounded_by_their_number() -> None:
 
 def test_few_blocks_call_nothing() -> None:
     assert of(np.array([0.1, 0.1, 0.11, 0.1, 0.1])).evidence(0.9, above=False) == -np.inf
-    assert [least_blocks(share) for share in (None, 0.5, 0.25, 0.9, 0.05)] == [6, 6, 12, 30, 60]
 
 
 def test_a_difference_cancels_what_blocks_share() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
@@ -11,8 +12,15 @@ import pytest
 
 from sliplab.analysis.claims.blocks import F64
 from sliplab.analysis.claims.evidence import Grid
-from sliplab.analysis.claims.power import Drawing, claim_powers, more_trials, spread
-from sliplab.analysis.claims.resampling import Axis, Pilot, shared_axes
+from sliplab.analysis.claims.power import Drawing, Drawn, claim_powers, more_trials, spread
+from sliplab.analysis.claims.resampling import (
+    ASSUMED,
+    Axis,
+    Pilot,
+    Sessions,
+    sessions_text,
+    shared_axes,
+)
 from sliplab.analysis.claims.simulated import claims_of, course
 from sliplab.protocols import Plan
 from sliplab.protocols.model import Protocol
@@ -235,3 +243,113 @@ def test_least_and_most_bound_a_campaign() -> None:
     short = plan_of([MEDIAN], stopping={"most": 20})
     found = course(short, grid, values)
     assert (found.ended, len(found.evidence.taken)) == (None, 18)
+
+
+def pilot_of_sessions(plan: Plan, away: float) -> Pilot:
+    """Six sessions of four blocks of six trials, by turns above and below 1 s; scatter 100 ms."""
+    sessions = np.arange(144) // 24
+    values = 1000.0 + np.random.default_rng(4).normal(0.0, 100.0, 144)
+    values += away * (-1.0) ** sessions
+    found = pilot_of(plan, [DEPTHS[k % 3] for k in range(144)], {"first_slip": values})
+    return replace(found, blocks=np.arange(144) // 6, sessions=sessions)
+
+
+def drawn(plan: Plan, pilot: Pilot, sessions: Sessions) -> list[Drawn]:
+    """Draw campaigns."""
+    drawing = Drawing(plan, pilot, 1, sessions)
+    return [drawing.campaign(k) for k in range(10)]
+
+
+def median_trials(campaigns: list[Drawn]) -> float:
+    """Median of the trials after which the first claim is called; infinite for never."""
+    return float(np.median([it.called[0] or np.inf for it in campaigns]))
+
+
+def test_sessions_that_differ_need_more_trials() -> None:
+    plan = plan_of([{"figure": "first_slip", "within": "80 ms"}], repetitions=120)
+    pilot = normal_pilot(plan, 36, 1)
+    alike = drawn(plan, pilot, Sessions())
+    apart = drawn(plan, pilot, Sessions(6, 1.0))
+    assert median_trials(apart) > 1.2 * median_trials(alike)
+    assert drawn(plan, pilot, Sessions(6, 1.0)) == apart
+
+
+@pytest.mark.parametrize("collection", [{}, {"order": "adaptive"}])
+def test_sessions_without_differences_and_drift_change_nothing(collection: dict[str, Any]) -> None:
+    plan = plan_of([MEDIAN], repetitions=20, **collection)
+    for pilot in (normal_pilot(plan, 36, 1), pilot_of_sessions(plan, 100.0)):
+        alike = drawn(plan, pilot, Sessions())
+        assert drawn(plan, pilot, Sessions(1, 0.0, 0.0)) == alike
+        if not collection:
+            rng = np.random.default_rng([1, 0])
+            values = pilot.campaign(Grid.of(plan), rng)
+            none = course(plan, Grid.of(plan), values)
+            assert alike[0].states == tuple(it.state for it in none.claims)
+            assert drawn(plan, pilot, Sessions(4, 0.0)) == alike
+
+
+def test_a_pilot_of_sessions_shows_how_they_differ() -> None:
+    plan = plan_of([MEDIAN])
+    unknown, given = Sessions(6), Sessions(6, 0.7)
+    assert pilot_of_sessions(plan, 200.0).between("first_slip", unknown) == pytest.approx(
+        2.2, rel=0.2
+    )
+    assert pilot_of_sessions(plan, 0.0).between("first_slip", unknown) < 0.3
+    assert pilot_of_sessions(plan, 200.0).between("first_slip", given) == 0.7
+    assert normal_pilot(plan, 36, 1).between("first_slip", unknown) == ASSUMED
+
+
+def test_sessions_and_a_drift_are_drawn_in_the_order_of_trials() -> None:
+    plan = plan_of([MEDIAN], stopping={"most": 90})
+    grid, pilot = Grid.of(plan), pilot_of_sessions(plan, 150.0)
+    found = np.array([
+        pilot.over_time(plan, grid, Sessions(3), np.random.default_rng(k))["first_slip"][:90]
+        for k in range(200)
+    ])  # fmt: skip
+    of_session = found.reshape(200, 3, 30)
+    assert np.ptp(of_session, axis=2).max() == 0.0
+    size = pilot.between("first_slip", Sessions(3)) * pilot.scatter("first_slip")
+    assert of_session[:, :, 0].std() == pytest.approx(size, rel=0.1)
+    drift = pilot.over_time(plan, grid, Sessions(drift=2.0), np.random.default_rng(1))["first_slip"]
+    assert abs(drift[89] - drift[0]) == pytest.approx(2.0 * pilot.scatter("first_slip"))
+
+
+def test_differences_between_a_pilots_sessions_are_not_drawn_twice() -> None:
+    """The pilot's trials scatter by 100 ms once sessions of their own are drawn."""
+    plan = plan_of([MEDIAN])
+    pilot = pilot_of_sessions(plan, 200.0)
+    rest = pilot.without(Sessions(4))
+    assert np.std(rest.values["first_slip"]) == pytest.approx(100.0, rel=0.15)
+    assert np.std(pilot.values["first_slip"]) > 150.0
+    assert pilot.without(Sessions(1)) is pilot
+
+
+def test_batches_are_the_blocks_of_an_adaptive_campaign() -> None:
+    plan = plan_of([MEDIAN], order="adaptive", choice={"batch": 15, "start": 30})
+    rng = np.random.default_rng(2)
+    blocks = np.arange(120) // 6
+    values = rng.normal(0.0, 100.0, 20)[blocks] + rng.normal(0.0, 30.0, 120)
+    depths = [DEPTHS[k % 3] for k in range(120)]
+    pilot = replace(pilot_of(plan, depths, {"first_slip": values}), blocks=blocks)
+    grid = Grid.of(plan)
+    added = pilot.over_time(plan, grid, Sessions(), np.random.default_rng(1))["first_slip"]
+    assert np.flatnonzero(np.diff(added)).tolist() == [29 + 15 * k for k in range(10)]
+    many = [pilot.over_time(plan, grid, Sessions(), np.random.default_rng(k)) for k in range(50)]
+    assert np.std([each["first_slip"][::15] for each in many]) == pytest.approx(100.0, rel=0.2)
+
+
+def test_what_is_drawn_and_what_a_pilot_of_one_session_cannot_show_is_stated() -> None:
+    plan = plan_of([MEDIAN])
+    one, many = normal_pilot(plan, 36, 1), pilot_of_sessions(plan, 100.0)
+    cannot = "a pilot of one session cannot show how sessions differ"
+    assert list(sessions_text(one, Sessions())) == [
+        f"one session is drawn (see --sessions): {cannot}", "no drift is drawn (see --drift)",
+    ]  # fmt: skip
+    found, drift = sessions_text(one, Sessions(4, drift=0.5))
+    assert found.startswith("4 sessions are drawn, which differ by 0.30 (first_slip)")
+    assert found.endswith(f"which is assumed: {cannot}")
+    assert drift.startswith("a drift of 0.5 of the scatter")
+    assert "one session is drawn (see --sessions): the pilot's 6" in next(
+        sessions_text(many, Sessions())
+    )
+    assert next(sessions_text(many, Sessions(2))).endswith("as the pilot's 6 do")

@@ -163,6 +163,28 @@ def test_a_percentile_needs_so_many_blocks() -> None:
     assert last.holds
 
 
+def test_open_claim_with_interval_beyond_its_bound_says_why() -> None:
+    claim = {"figure": "slip_duration", "at_least": "2000 ms"}
+    y = 3000.0 + np.random.default_rng(1).normal(0, 100, 36 * 24)
+    first = next(s for (s,) in shuffled(plan_of(claim, repetitions=24), y) if s.blocks == 6)
+    assert (first.holds, first.trend) == (False, None)
+    assert first.low is not None
+    assert first.low > 2000.0
+    assert verdict_text(first) == (
+        "open: the interval is beyond the bound, but a call this early takes more blocks"
+    )
+
+
+@pytest.mark.parametrize(("kind", "verdict"), [("at_most", "holds"), ("at_least", "refuted")])
+def test_open_claim_that_its_trend_would_undo_says_so(kind: str, verdict: str) -> None:
+    plan = plan_of({"figure": "slip_duration", kind: "3000 ms"}, repetitions=24)
+    y = world(Grid.of(plan), 1) + np.linspace(-600, 600, 36 * 24)
+    (found,) = next(states for states in shuffled(plan, y) if states[0].blocks == 7)
+    assert (found.holds, found.refuted, found.trend) == (False, False, verdict)
+    text = f"open: {verdict} only if the trend so far does not continue to the end"
+    assert verdict_text(found) == text
+
+
 def test_blocks_of_some_trials_are_stated_by_the_protocol() -> None:
     claim = {"figure": "slip_duration", "at_most": "3500 ms"}
     y = 3000.0 + np.random.default_rng(1).normal(0, 100, 108)

@@ -60,6 +60,7 @@ def test_a_claim_stands_with_the_look_that_called_it(tmp_path: Path, small: dict
     _, text = render_section(section, simulated=True)
     assert "27 of 36 trials" in text
     assert "every claim is settled" in text
+    assert "Claims and estimates are of conditions repeated for ever" in text
     assert "simulated" in text
     assert claims_key([item])
 

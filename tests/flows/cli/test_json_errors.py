@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import typer
 
+from sliplab.flows.cli import errors
 from sliplab.flows.cli.app import command_line
 from sliplab.flows.running import stopping
 from sliplab.flows.running.cluster import ClusterError
@@ -236,6 +237,20 @@ def test_an_arm_that_does_not_stop_is_said_to_whoever_pressed_ctrl_c(
     assert done.returncode == 1
     assert "press its emergency stop" in done.stderr
     assert "press its emergency stop" in json.loads(done.stdout)["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("command", "of_trials"), [("plan", False), ("register", False), ("power", False),
+                               ("verify", False), ("collect", True), ("label", True)],
+)  # fmt: skip
+def test_interrupted_command_names_trials_only_where_it_resumes_them(
+    command: str, of_trials: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["sliplab", command, "x", "--json"])
+    found = errors.interruption().message
+    assert found.startswith("interrupted: ")
+    assert ("trial" in found) == of_trials
+    assert "run the same command" in found
 
 
 def test_a_missing_file_of_a_store_is_named(tmp_path: Path) -> None:

@@ -58,6 +58,9 @@ def test_registered_campaign_is_collected_and_deviations_are_reported(tmp_path: 
     assert (made["number"], made["when"], made["planned"]) == (1, "before the first trial", 6)
     assert answer("verify", store)["problems"] == []
     before = path.read_bytes()
+    shown = answer("register", protocol, "--store", store, "--show")
+    assert "was registered before the first trial, " in shown["registered"]
+    assert shown["deviations"] == []
 
     done = here("collect", protocol, "--rig", rig, "--store", store, "--trials", 1)
     assert done.returncode == 0, done.stderr
@@ -81,6 +84,16 @@ def test_registered_campaign_is_collected_and_deviations_are_reported(tmp_path: 
     for text in ("error level of claims", "stopping overruled", "fewer trials than registered"):
         assert text in page
     assert key(store) != old
+
+    shown = here("register", protocol, "--store", store, "--show")  # nothing was evaluated
+    assert shown.returncode == 0, shown.stderr
+    assert "was registered before the first trial, " in words(shown.stdout)
+    for text in ("error level of claims", "stopping overruled", "fewer trials than registered"):
+        assert text in words(shown.stdout)
+    found = answer("register", protocol, "--store", store, "--show")
+    assert {"deviation": "stopping overruled", "registered": "–"}.items() <= (
+        next(row for row in found["deviations"] if "overruled" in row["deviation"]).items()
+    )
 
     again = here("register", protocol, "--store", store)
     assert again.returncode == 0

@@ -14,7 +14,7 @@ from sliplab.flows.planning.run_request import Claims, RunRequest, make_request
 from sliplab.protocols import InputError
 from sliplab.storage.schema.claims import CHOICES, STOPPING, ChoiceRecord, StoppingRecord
 from sliplab.storage.trials.store import Campaign, Store
-from tests.command_line import answer
+from tests.command_line import answer, here
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write
@@ -193,6 +193,55 @@ def test_a_collection_cut_after_its_last_trial_is_looked_at_by_the_next(
     refresh(run_request)
     assert record_of(run_request) == whole
     assert (whole.verdict, whole.looks[-1].taken) == ("all", 6)
+
+
+def end_of(folder: Path, *options: object, claims: list[dict[str, Any]], **stopping: Any) -> Any:
+    """What `collect` prints at its end, of three short slides, eight of each."""
+    run_request = request(folder, claims, stopping=stopping)
+    words = (folder / "p.yaml", "--rig", folder / "rig.yaml", "--store", run_request.store)
+    return answer("collect", *words, *options)
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_collect_takes_so_many_trials_over_rounds_and_says_why_it_ended(tmp_path: Path) -> None:
+    found = end_of(tmp_path / "a", "--trials", 4, claims=[NEVER])
+    assert (found["taken"], found["ended"]) == (4, "as many trials as --trials 4 allows")
+    found = end_of(tmp_path / "a", "--trials", 4, claims=[NEVER], most=8)
+    assert found["taken"] == 2
+    assert found["ended"] == "another round would exceed collection.stopping.most = 8"
+    found = end_of(tmp_path / "a", claims=[SURE])
+    assert found["ended"] == "all claims are settled"
+    assert end_of(tmp_path / "a", claims=[SURE])["ended"] == found["ended"]  # nothing to do
+    found = end_of(tmp_path / "a", "--no-stopping", claims=[SURE])
+    assert (found["committed"], found["ended"]) == (24, "all trials are taken")
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_plan_and_collect_warn_of_claim_without_enough_blocks(tmp_path: Path) -> None:
+    run_request = request(tmp_path / "a", [SURE, NEVER])
+    protocol = tmp_path / "a" / "p.yaml"
+    (warning,) = [it for it in answer("plan", protocol)["warnings"] if "claims[" in it]
+    assert "claims[1]" in warning
+    assert "needs 60 blocks, and the plan has 8" in warning
+    assert "collection.repetitions = 8 must be at least 60" in warning
+    words = (protocol, "--rig", tmp_path / "a" / "rig.yaml", "--store", run_request.store)
+    done = here("collect", *words, "--trials", 1)
+    assert warning in done.stderr
+    assert "as many trials as --trials 1 allows" in done.stdout
+    assert warning in here("plan", protocol).stderr
+
+
+def test_plan_refuses_missing_network_with_all_other_faults(tmp_path: Path) -> None:
+    protocol = tmp_path / "p.yaml"
+    data = short()
+    lead = {"figure": "lead", "within": "10 ms"}
+    data["collection"]["stopping"] = {"claims": [lead], "model": "none.pt", "most": 1}
+    done = here("plan", write(protocol, data))
+    assert done.returncode == 2
+    lines = done.stderr.splitlines()
+    assert "collection.stopping.most = 1" in lines[0]
+    assert "collection.stopping.model = none.pt" in lines[1]
+    assert "none.pt is no file" in lines[1]
 
 
 def test_a_claim_about_a_network_needs_one(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from sliplab.flows.running import console, stopping
+from tests.conftest import ROOT
 
 
 @pytest.fixture
@@ -189,3 +190,24 @@ def test_signal_before_or_after_the_work_is_said_in_one_line(
     assert done.returncode == 130, done.stderr
     assert done.stderr.startswith("interrupted")
     assert len(done.stderr.splitlines()) == 1
+
+
+AT_THE_END = """
+import multiprocessing, os, signal, sys, types
+from sliplab.flows.__main__ import main
+
+lock = multiprocessing.get_context("spawn").Lock()
+server = types.ModuleType("orchestration")
+server.close = lambda: os.kill(os.getpid(), signal.SIGINT)
+sys.modules["sliplab.flows.running.orchestration"] = server
+sys.argv[1:] = ["--version"]
+main()
+"""
+
+
+def test_signal_while_the_program_ends_leaves_no_semaphore() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", AT_THE_END], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("sliplab ")

@@ -40,7 +40,7 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     assert report_states(labels, [made.item])["reviewed"]["stale"] == 1
     assert report_states(Labels(made.store), [made.item]) == {}
     assert (
-        "decisions on 1 trials were made on labels that have changed since"
+        "decisions on 1 trial were made on labels that have changed since"
         in capsys.readouterr().err
     )
     rows = TrialList(made.store).rows
@@ -89,7 +89,7 @@ def test_doubts_are_told_once_and_gravest_first() -> None:
             "doubts": {"incipient": None, "gross": "hidden"}}  # fmt: skip
     assert [text for _, text in reasons_for_doubt(TrialLabel.model_validate(data))] == [
         "gross: hidden", "no slip was found", "2 times a marker was not seen",
-        "the plate's marker was not seen in 1 frames",
+        "the plate's marker was not seen in 1 frame",
     ]  # fmt: skip
 
 

@@ -154,7 +154,7 @@ def test_all_trials_are_listed_doubtful_ones_first(served: Served, tab: Tab) -> 
     tab.page.locator(".doubtful-first input").uncheck()
     expect(tab.chosen()).to_contain_text(served.made.ids[0])
     tab.page.locator(".by-decision select").select_option("doubtful")
-    expect(tab.page.get_by_text("1 trials, 1 to review")).to_be_visible()
+    expect(tab.page.get_by_text("1 trial, 1 to review")).to_be_visible()
     tab.page.locator(".by-decision select").select_option("all")
     tab.find(served.made.ids[-1])
     expect(tab.row(served.made.ids[-1])).to_be_visible()

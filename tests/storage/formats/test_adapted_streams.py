@@ -137,7 +137,7 @@ def test_wrong_times_of_frames_name_the_file_of_times(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     write_frames(folder, "numpy", some_frames(3))
     for times, column, message in (
-        ("1\nx\n2\n", 0, "has 1 rows without a number"),
+        ("1\nx\n2\n", 0, "has 1 row without a number"),
         ("1\n2\n3\n", "t", "has no column t; there are 1"),
     ):
         (folder / "times.csv").write_text(times)

@@ -596,4 +596,4 @@ def test_a_frame_that_cannot_be_right_is_left_out(tmp_path: Path, name: str) -> 
     assert result["frames"] == 4
     assert [int(levels[0, 0]) for levels in found.frames()] == [0, 10, 20, 30]
     says = "1 of 5 messages of /camera/image_raw are left out"
-    assert ("1 frames " if name == "earlier" else says) in result["warnings"][0]
+    assert ("1 frame " if name == "earlier" else says) in result["warnings"][0]
