@@ -265,7 +265,7 @@ def run_bench(
     """Judge detectors that were not judged yet; return the table of all that are named.
 
     Args:
-        names: of detectors, see `analysis.bench.registry`. size: one of `SIZES`.
+        names: of detectors, see `registry`. size: one of `SIZES`.
         seed: of the test worlds.
         folder: keeps what a detector gave, and the table.
         workers: processes at the most; each simulates the scenes for itself.
