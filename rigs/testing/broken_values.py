@@ -405,7 +405,7 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     ),
     "HostTimeStands": (
         reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"), (HOST,),
-        "host_ns (was|of the newest)",
+        "host_ns (was|of)",
     ),
     "CommandedPose": (CommandedPose, (POSES,), "and not there in the"),
     "PoseLate": (PoseLate, (POSES,), "and not there in the"),

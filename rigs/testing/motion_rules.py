@@ -83,8 +83,7 @@ def _speed(bench: ArmBench) -> None:
     begin, since = report.before, 0
     for number, segment in enumerate(path, 1):
         begin, since = _check_segment(report, course, number, begin, segment, since)
-    place = bench.place()
-    to = Pose(_moved(place.xyz_mm, WAYS[1], -SLOW_MM), place.rotvec_deg)
+    to = replace(path[1].to, xyz_mm=_moved(path[1].to.xyz_mm, WAYS[1], -SLOW_MM))
     slow = Segment(to, min(SLOW_MM_S, bench.speed_mm_s))
     report = follow(bench, slow)
     course = true_course(bench, report.begin_s, report.end_s)
@@ -157,7 +156,7 @@ def _poses(bench: ArmBench) -> None:
     if not bench.host_clock:
         _check_kept(bench)
     report = Report(bench.clock_s(), bench.place(), clock_offset_ns(bench))
-    bench.arrive(replace(segment, to=bench.home))
+    bench.arrive(bench.to(0.0))
     report.answers.append(ask(bench, "read_poses", bench.arm.read_poses))
     _check_samples(bench, report)
     at_rest = ask(bench, "pose", bench.arm.pose).value
