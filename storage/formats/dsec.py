@@ -191,7 +191,7 @@ def _lab_events(
 ) -> tuple[I64, I64, Any, I64, float]:
     """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
     xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
-    step_us = resolution_us(ts, 1e6) if np.asarray(ts).dtype.kind == "f" else 1e6
+    step_us = resolution_us(ts, 1e6, whole_us=1e6)
     return _pixels(xs), _pixels(ys), _polarities(ps), rounded_us(ts, 1e6), step_us
 
 
