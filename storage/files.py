@@ -6,8 +6,9 @@ visible by its own rename, files are only flushed.
 
 A killed program may leave a temporary file or folder. Its name contains the machine and the process
 (`.NAME.sliplab-PLACE.PID.tmp`); the next program that writes into the same folder deletes it. On a
-shared folder another machine's process cannot be seen: its files are left alone for a day. Older
-versions wrote `.NAME.PID.tmp`, which are deleted in a store only, as nothing else writes there.
+shared folder another machine's process cannot be seen: its files are left alone for a day, by the
+clock that stamps them. Older versions wrote `.NAME.PID.tmp`, which are deleted in a store only, as
+nothing else writes there.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ import socket
 import stat
 import tempfile
 import threading
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -280,7 +280,7 @@ def _delete(path: Path) -> None:
 def _may_run(path: Path, pid: int, place: str | None) -> bool:
     if place not in {None, _place()}:  # another machine's, or of before this one's start
         try:
-            return time.time() - path.lstat().st_mtime < _STALE_S
+            return _now_in(path.parent) - path.lstat().st_mtime < _STALE_S
         except OSError:
             return True
     if pid == os.getpid():
@@ -293,6 +293,13 @@ def _may_run(path: Path, pid: int, place: str | None) -> bool:
     except (PermissionError, OverflowError):
         return True
     return True
+
+
+def _now_in(folder: Path) -> float:
+    """Return the time by the clock that stamps the files of a folder, perhaps a server's, s."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        os.write(file.fileno(), b"0")
+        return os.fstat(file.fileno()).st_mtime
 
 
 def write_text(path: Path, text: str) -> None:

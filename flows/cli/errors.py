@@ -112,7 +112,9 @@ def failure(error: Exception) -> Failure:
         place = os.fsdecode(error.filename)
         return Failure(f"{place}: {os.strerror(error.errno or 0).lower()}", console.FAILED, place)
     if isinstance(error, OSError) and error.filename:
-        error = disk_error(Path(os.fsdecode(error.filename)), error) or error
+        # of a copy the second file is the one that is written
+        place = os.fsdecode(error.filename2 or error.filename)
+        error = disk_error(Path(place), error) or error
     elif isinstance(error, OSError) and (fault := disk_fault(error)):
         return Failure(f"a file cannot be written: its disk {fault}", console.FAILED)
     if isinstance(error, StoreError):

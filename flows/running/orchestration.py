@@ -52,6 +52,7 @@ _DEFAULTS = {
 NO_RESULTS: Any = Path(os.devnull)
 """A flow's `result_storage`. Without one, Prefect asks the server for it, by a client of its own
 that has no limit and stays open."""
+_LOGGING = "PREFECT_LOGGING_SETTINGS_PATH"
 _CERTIFICATES = ("SSL_CERT_FILE", "PREFECT_API_SSL_CERT_FILE")
 _PROXY = re.compile("(all|https?|no)_proxy", re.IGNORECASE)
 _LOOPBACK = ("127.0.0.1", "localhost")
@@ -115,7 +116,7 @@ def check_connections() -> None:
     Prefect makes one for whatever it does, and the first one while it is imported.
 
     Raises:
-        InputError: one of the variables cannot be used.
+        InputError: one of the variables cannot be used, or its file cannot be read.
     """
     proxies = [
         name
@@ -131,6 +132,9 @@ def check_connections() -> None:
         if path := os.environ.get(name):
             with _checked(name):
                 ssl.create_default_context(cafile=path)
+    if os.path.exists(path := os.environ.get(_LOGGING) or ""):  # else Prefect uses its own
+        with _checked(_LOGGING):
+            Path(path).read_text()
 
 
 @contextmanager

@@ -25,11 +25,13 @@ from zoneinfo import ZoneInfo, available_timezones
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from sliplab.protocols import InputError
+from sliplab.protocols.shown import did_you_mean, one_of
 from sliplab.protocols.yaml_file import (
     KeyedError,
     StrictModel,
     parse_leniently,
     read_text,
+    rule,
     validate,
 )
 
@@ -37,11 +39,13 @@ DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _CLOCK = r"([01]\d|2[0-3]):([0-5]\d)"
 _UNTIL = re.compile(rf"(?:({'|'.join(DAYS)}) )?{_CLOCK}", re.ASCII)
 _FROM = re.compile(_CLOCK, re.ASCII)
+_NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
 
 
 def _zone(name: str) -> str:
     if name not in available_timezones():  # not: links of this computer such as posixrules
-        raise ValueError("is not a time zone; write one like Europe/Rome or UTC")
+        hint = did_you_mean(name, available_timezones())
+        raise ValueError(f"is not a time zone; write one like Europe/Rome or UTC{hint}")
     return name
 
 
@@ -57,6 +61,27 @@ def _from(text: str) -> str:
     return text
 
 
+def _name(text: str) -> str:
+    if not _NAME.fullmatch(text):
+        raise ValueError("must be letters a-z, digits, blanks, - and _")
+    return text
+
+
+Name = Annotated[str, AfterValidator(_name)]
+_FIELDS = (
+    "five fields, minute, hour, day of the month, month and day of the week, such as "
+    '"0 22 * * mon-thu"'
+)
+
+
+def _five(text: str) -> str:
+    fields = text.split()
+    if len(fields) != 5 or not text.isascii():
+        raise ValueError(f"must have {_FIELDS}")
+    return " ".join(fields)
+
+
+Cron = Annotated[str, AfterValidator(_five)]
 Zone = Annotated[str, AfterValidator(_zone)]
 Until = Annotated[str, AfterValidator(_until)]
 From = Annotated[str, AfterValidator(_from)]
@@ -200,7 +225,6 @@ SCHEDULED: dict[FlowName, type[Parameters]] = {
 
 
 Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
-_NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
 
 
 class Timing(StrictModel):
@@ -208,11 +232,16 @@ class Timing(StrictModel):
 
     model_config = ConfigDict(populate_by_name=True)
 
-    name: str
+    name: Name
     days: list[Day] | None = Field(default=None, min_length=1)
     from_: From | None = Field(default=None, alias="from")
-    cron: str | None = None
+    cron: Cron | None = None
     active: bool = True
+
+    @rule
+    def _has_a_time(self) -> Timing:
+        _cron(self)
+        return self
 
 
 _TIMING = {*Timing.model_fields, "flow", "timezone"}
@@ -287,18 +316,12 @@ def load_schedules(path: Path) -> list[Scheduled]:
 def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     flow = data.get("flow")
     if not isinstance(flow, str) or flow not in _MODELS:
-        raise InputError(path, "flow", flow, f"must be one of {', '.join(get_args(FlowName))}")
+        raise InputError(path, "flow", flow, one_of(flow, get_args(FlowName)))
     if "timezone" in data:
         raise InputError(
             path, "timezone", data["timezone"], "applies to the whole file; give it once at the top"
         )
     model: Any = validate(_MODELS[flow], data, path)
-    try:
-        cron = _cron(model)
-    except KeyedError as error:
-        raise InputError(path, error.key, error.value, str(error)) from None
-    if not _NAME.fullmatch(model.name):
-        raise InputError(path, "name", model.name, "must be letters a-z, digits, blanks, - and _")
     parameters = model.model_dump(mode="json", exclude=_TIMING, exclude_unset=True)
     if issubclass(SCHEDULED[flow], OnRig):
         parameters["timezone"] = timezone
@@ -306,35 +329,26 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
         parameters["protocol"] = _protocol(path, model.protocol, model.enable)
         _check_campaign(path, model.campaign)
     return Scheduled(
-        name=model.name, flow=flow, cron=cron, timezone=timezone, active=model.active,
+        name=model.name, flow=flow, cron=_cron(model), timezone=timezone, active=model.active,
         parameters=parameters,
     )  # fmt: skip
-
-
-_FIELDS = (
-    "five fields, minute, hour, day of the month, month and day of the week, such as "
-    '"0 22 * * mon-thu"'
-)
 
 
 def _cron(model: Any) -> str:
     """The cron line.
 
     Raises:
-        KeyedError: it does not exist, or two ways of saying it, or it has not five fields.
+        KeyedError: it does not exist, or there are two ways of saying it.
     """
     if model.cron is None:
         if model.days is None or model.from_ is None:
             missing = "days" if model.days is None else "from"
-            raise KeyedError(missing, None, "is missing; give days and from, or else cron")
+            raise KeyedError(f".{missing}", None, "is missing; give days and from, or else cron")
         return cron_of(model.days, model.from_)
     for key, value in (("days", model.days), ("from", model.from_)):
         if value is not None:
-            raise KeyedError(key, value, "cannot be combined with cron")
-    fields = model.cron.split()
-    if len(fields) != 5 or not model.cron.isascii():
-        raise KeyedError("cron", model.cron, f"must have {_FIELDS}")
-    return " ".join(fields)
+            raise KeyedError(f".{key}", value, "cannot be combined with cron")
+    return str(model.cron)
 
 
 def upcoming_runs(
@@ -354,31 +368,40 @@ def upcoming_runs(
     Raises:
         InputError: a cron line is wrong or has no run, or a window ends at the time it begins.
     """
+    found = []
+    faults: list[InputError] = []
+    for number, item in enumerate(schedules):
+        try:
+            found.append(_runs_of(item, count, after))
+        except KeyedError as error:
+            key = f"schedules[{number}]{error.key}"
+            faults.append(InputError(path, key, error.value, str(error)))
+    if faults:
+        raise InputError.joined(faults)
+    return found
+
+
+def _runs_of(item: Scheduled, count: int, after: datetime | None) -> list[datetime]:
+    """Return the next runs of a schedule. Raises KeyedError as `upcoming_runs`."""
     from prefect.server.schemas.schedules import CronSchedule
 
-    found = []
-    for number, item in enumerate(schedules):
-        key = f"schedules[{number}]"
-        try:
-            schedule = CronSchedule(cron=item.cron, timezone=item.timezone)
-        except ValueError:
-            raise InputError(path, f"{key}.cron", item.cron, f"must have {_FIELDS}") from None
-        try:
-            runs = asyncio.run(schedule.get_dates(count, after))
-        except ValueError:  # it looks 50 years ahead
-            raise InputError(
-                path, f"{key}.cron", item.cron, "never runs: no month has such a day"
-            ) from None
-        until = item.parameters.get("until")
-        if until is not None and any(_ends_as_it_begins(run, until) for run in runs):
-            raise InputError(
-                path, f"{key}.until", until,
-                "is when the window begins, which would last a whole day or week; give another "
-                "time",
-            )  # fmt: skip
-        zone = ZoneInfo(item.timezone)
-        found.append([datetime.fromtimestamp(run.timestamp(), zone) for run in runs])
-    return found
+    try:
+        schedule = CronSchedule(cron=item.cron, timezone=item.timezone)
+    except ValueError:
+        raise KeyedError(".cron", item.cron, f"must have {_FIELDS}") from None
+    try:
+        runs = asyncio.run(schedule.get_dates(count, after))
+    except ValueError:  # it looks 50 years ahead
+        raise KeyedError(".cron", item.cron, "never runs: no month has such a day") from None
+    until = item.parameters.get("until")
+    if until is not None and any(_ends_as_it_begins(run, until) for run in runs):
+        raise KeyedError(
+            ".until",
+            until,
+            "is when the window begins, which would last a whole day or week; give another time",
+        )
+    zone = ZoneInfo(item.timezone)
+    return [datetime.fromtimestamp(run.timestamp(), zone) for run in runs]
 
 
 def _ends_as_it_begins(begin: datetime, until: str) -> bool:

@@ -34,6 +34,8 @@ _DRIFT = 5e-4
 """Largest difference of the rates of two clocks, as a share."""
 _OUTWARD_MM = 0.01
 """Depth by which a motion goes outwards: there contact may end, and an ideal sensor reads zero."""
+_SAME_N = 1e-6
+"""Largest difference of normal forces that are the same, N: a mounting rounds."""
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_ns": (), "host_ns": (), "force_n": (3,), "torque_nm": (3,),
 }  # fmt: skip
@@ -54,8 +56,9 @@ class ForceWatch:
     A force that is not finite is a fault. Where a decision hangs on the readings (there is a limit,
     or a press ends at a force) so is a sensor without a newer sample for `SILENT_S`; a sample that
     was on its way for longer than the fastest one by as much is no news. So are forces that stay
-    exactly the same while the arm moves `BLIND_MM` in contact, and not outwards. Clear of the
-    plate an ideal simulated sensor is constant; in contact none is.
+    exactly the same while the arm moves `BLIND_MM` in contact, and not outwards, and a normal force
+    that is while it goes so much deeper: a single axis may be dead. Clear of the plate an ideal
+    simulated sensor is constant; in contact none is.
 
     Args:
         limit_n: largest force on the plate, in any direction; None for no limit.
@@ -96,9 +99,11 @@ class ForceWatch:
         self._normal_n: _F64 = np.empty(0)
         self._first_n: _F64 | None = None
         self._last: _F64 | None = None
+        self._last_normal_n: float | None = None
         self._fresh_ns: int | None = None
         self._soonest_ns = np.inf
         self._changed_at: tuple[Pose, float] | None = None
+        self._pressed_at: tuple[float, float] | None = None
         self._sensor.start()
 
     @property
@@ -143,8 +148,13 @@ class ForceWatch:
             depth_mm: in contact, with what the fingers add; negative clear of the plate.
 
         Raises:
-            RigError: the readings have not changed at all.
+            RigError: the readings have not changed at all, or the normal force has not.
         """
+        self._follow_motion(pose, depth_mm)
+        self._follow_depth(depth_mm)
+
+    def _follow_motion(self, pose: Pose, depth_mm: float) -> None:
+        """Raise RigError if the arm moved in contact, and the readings have not changed at all."""
         before = self._changed_at
         if before is None or depth_mm <= 0 or depth_mm < before[1] - _OUTWARD_MM:
             self._changed_at = pose, depth_mm
@@ -155,15 +165,31 @@ class ForceWatch:
         if self.needed and moved_mm > BLIND_MM:
             raise _unusable(f"reads exactly the same since the arm moved {moved_mm:.1f} mm")
 
+    def _follow_depth(self, depth_mm: float) -> None:
+        """Raise RigError if the arm went deeper in contact and the normal force did not change."""
+        before = self._pressed_at
+        if before is None or depth_mm <= 0 or depth_mm < before[0]:
+            if self._last_normal_n is not None:
+                self._pressed_at = depth_mm, self._last_normal_n
+            return
+        deeper_mm = depth_mm - before[0]
+        if self.needed and deeper_mm > BLIND_MM:
+            raise _unusable(f"reads the same normal force since the arm went {deeper_mm:.1f} mm in")
+
     def _check_shape(self, chunk: WrenchChunk) -> None:
-        """Raise RigError if a chunk does not hold one force for each time."""
+        """Raise RigError if a chunk does not hold one force for each time, as numbers."""
         if not isinstance(chunk, WrenchChunk):
             raise _unusable(f"returned {type(chunk).__name__}, not a WrenchChunk")
         count = len(chunk)
         for name, shape in _SHAPES.items():
-            found = np.shape(getattr(chunk, name))
-            if found != (count, *shape):
-                raise _unusable(f"returned {name} of the shape {found}, not {(count, *shape)}")
+            values = getattr(chunk, name)
+            if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
+                kind = getattr(values, "dtype", type(values).__name__)
+                raise _unusable(f"returned {name} as {kind}, not as an array of numbers")
+            if values.shape != (count, *shape):
+                raise _unusable(
+                    f"returned {name} of the shape {values.shape}, not {(count, *shape)}"
+                )
 
     def _check_limit(self, forces: _F64) -> None:
         """Raise ForceLimitError if one of the forces on the plate, (n, 3), is above the limit."""
@@ -211,7 +237,9 @@ class ForceWatch:
         """Keep what the line is laid through: samples newer than all before them."""
         if self._last is None or (chunk.force_n != self._last).any():
             self._changed_at = None
-        self._last = chunk.force_n[-1].copy()
+        if self._pressed_at and (np.abs(normal_n - self._pressed_at[1]) > _SAME_N).any():
+            self._pressed_at = None
+        self._last, self._last_normal_n = chunk.force_n[-1].copy(), float(normal_n[-1])
         t_ns, host_ns = chunk.t_ns, chunk.host_ns
         floor = self._t_ns[-1:] if len(self._t_ns) else np.array([np.iinfo(np.int64).min])
         newer = t_ns > np.maximum.accumulate(np.concatenate([floor, t_ns[:-1]]))

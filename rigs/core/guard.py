@@ -126,6 +126,12 @@ class Guard:
             default=math.inf,
         )
 
+    @property
+    def turn_deg_s(self) -> float:
+        """Largest speed of a turn on the spot, by that of the sensor's rim."""
+        own = self._plate_limits
+        return math.degrees(own.speed_mm_s / own.rim_mm) if own and own.rim_mm else math.inf
+
     def check(self, begin: Pose, path: Sequence[Segment]) -> None:
         """Check a path that starts at `begin` against the arm's limits.
 

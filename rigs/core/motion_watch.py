@@ -16,7 +16,7 @@ END_MM, END_DEG = 1.0, 1.0
 STUCK_S, STUCK_MM = 3.0, 0.5
 """Time, and motion at the commanded speed, in which the pose must change. A driver that knows its
 pose only between pieces of a move updates it every two seconds at worst."""
-SPEED_S, SPEED_SHARE, SPEED_MM = 0.2, 0.2, 1.0
+SPEED_S, SPEED_SHARE, SPEED_MM, SPEED_DEG = 0.2, 0.2, 1.0, 1.0
 """Shortest time over which a speed is measured, and by how much it may be above the limit: poses
 are noisy, and may be some packets old."""
 
@@ -95,13 +95,17 @@ class MotionWatch:
         self._check_speed(pose, asked_ns)
 
     def _check_speed(self, pose: Pose, asked_ns: int) -> None:
-        """Hold the mean speed since an earlier pose against the limit."""
+        """Hold the mean speed since an earlier pose, of a turn on the spot too, to its limit."""
         limit, (past_ns, past) = self._guard.speed_mm_s, self._past
         seconds = (self._now_ns() - past_ns) * 1e-9
         if pose == past or seconds < SPEED_S:
             return  # the time at which a pose was first seen counts
         gone_mm = distance_mm(past, pose)
+        where = "the arm was stopped on its way, where its poses show"
         if not gone_mm <= (1.0 + SPEED_SHARE) * limit * seconds + SPEED_MM:
-            where = "the arm was stopped on its way, where its poses show"
             raise SpeedError("speed", gone_mm / seconds, limit, "mm/s", where)
+        if self._segment.turn_deg_s is not None:
+            turn_deg, most = angle_deg(past, pose), self._guard.turn_deg_s
+            if not turn_deg <= (1.0 + SPEED_SHARE) * most * seconds + SPEED_DEG:
+                raise SpeedError("turn", turn_deg / seconds, most, "deg/s", where)
         self._past = asked_ns, pose

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 from sliplab.rigs.core.capabilities import Arm, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import CLOCK_BACK_S, Kind
@@ -49,15 +51,15 @@ def _declaration(bench: ArmBench) -> None:
 def _path(bench: ArmBench) -> None:
     bench.connect()
     before_ns = bench.now_ns()
-    path = [bench.to(SHORT_MM), bench.to(-SHORT_MM)]
+    path = [bench.to(SHORT_MM), bench.to(-SHORT_MM), bench.to(SHORT_MM)]
     bench.start(*path)
-    progress = bench.end(4 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
+    progress = bench.end(6 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
     _check_arrived(bench, path[-1].to)
     if len(progress.finished) != len(path):
         raise Seen(f"{len(progress.finished)} of {len(path)} segments were reported finished")
     after_ns = bench.now_ns()
     _check_spans(progress.finished, before_ns, after_ns)
-    bench.start(bench.to(SHORT_MM))
+    bench.start(bench.to(-SHORT_MM))
     progress = bench.end(2 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
     if len(progress.finished) != 1:
         raise Seen(f"{len(progress.finished)} segments of the next path, of one, were finished")
@@ -135,6 +137,7 @@ def _limits(bench: ArmBench) -> None:
         ("outside the box", [beyond]),
         ("below the box", [below]),
         ("whose second segment lies outside the box", [near, beyond]),
+        ("that leaves the box and returns", [beyond, near]),
         ("faster than speed_mm_s", [fast]),
         ("to a place that is no number", [nowhere]),
         ("without a segment", []),
@@ -176,7 +179,7 @@ def _stop_at_rest(bench: ArmBench) -> None:
 @RULES.add(
     "stop while moving",
     "stop returns in time with the arm at rest, the rest of the path is not followed nor reported "
-    "finished, and the next path can start",
+    "finished, and the next path can start; each path can be stopped, also right after its start",
 )
 def _stop_moving(bench: ArmBench) -> None:
     bench.connect()
@@ -192,6 +195,12 @@ def _stop_moving(bench: ArmBench) -> None:
     target = bench.to(-SHORT_MM)
     bench.arrive(target)
     _check_arrived(bench, target.to)
+    for way_mm, what in ((bench.long_mm, "the second path"), (-bench.long_mm, "a path at once")):
+        bench.start(bench.to(way_mm))
+        if what == "the second path":
+            bench.until(bench.moving, bench.bounds.call_s)
+        bench.call(f"stop of {what}", bench.arm.stop)
+        bench.check_at_rest(QUIET_S)
 
 
 @RULES.add(
@@ -207,12 +216,42 @@ def _protective(bench: ArmBench) -> None:
     state = bench.state()  # one that only loses its connection is lost
     if state.healthy or state is ArmState.EMERGENCY_STOP:
         raise Seen(f"in a protective stop its state was {state}")
+    with suppress(RigError):
+        if (said := bench.call("progress", bench.arm.progress).state).healthy:
+            raise Seen(f"in a protective stop the state of its progress was {said}")
     for _ in range(2):
         bench.stop()
     bench.until(lambda: not bench.moving(), bench.bounds.call_s)
     if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
         raise Seen("start took a path during a protective stop")
     bench.check_at_rest(QUIET_S)
+
+
+def _ended_by(bench: ArmBench, kind: Kind) -> None:
+    bench.connect()
+    bench.inject(kind)
+    if bench.host_clock:  # a controller that is only asked says nothing until a path starts
+        if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
+            _check_aborted(bench)
+        bench.check_at_rest(QUIET_S)
+        return
+    _check_noticed(bench)
+    if (state := bench.state()).healthy or state is ArmState.PROTECTIVE_STOP:
+        raise Seen(f"after the fault '{kind.value}' its state was {state}")
+    if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
+        raise Seen(f"start took a path after the fault '{kind.value}'")
+    bench.check_at_rest(QUIET_S)
+
+
+for _name, _kind in (
+    ("emergency stop", Kind.EMERGENCY_STOP),
+    ("power off", Kind.POWER_OFF),
+):
+    RULES.add(
+        _name,
+        "its state is neither ready nor that of a protective stop, and no path starts until a "
+        "person has cleared it",
+    )(partial(_ended_by, kind=_kind))
 
 
 @RULES.add(

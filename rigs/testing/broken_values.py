@@ -234,6 +234,63 @@ class ClockStands(ExampleArm):
         return self.first_ns
 
 
+class StopsOnce(ExampleArm):
+    """Only the first stop of a moving arm is sent."""
+
+    stopped = False
+
+    def _halt(self) -> None:
+        if not self.stopped:
+            super()._halt()
+        self.stopped, self._may_move = True, False
+
+
+class MovesAfterStop(ExampleArm):
+    """A move that is on its way to the controller is sent after the stop."""
+
+    def _follow_path(self, run: Any) -> None:
+        time.sleep(0.08)
+        run.cancelled = False
+        super()._follow_path(run)
+
+
+class ArmHostTimeOfRead(ExampleArm):
+    """Poses have the host's time at which they were read."""
+
+    def read_poses(self) -> PoseChunk:
+        """Return the poses since the last call."""
+        chunk = super().read_poses()
+        return replace(chunk, host_ns=np.full(len(chunk), time.monotonic_ns()))
+
+
+class LastSegmentOnly(ExampleArm):
+    """Only the last segment of a path is held against the limits."""
+
+    def start(self, path: Any) -> None:
+        """Start a path whose last segment lies within the limits."""
+        last, check = path[-1:], self._guard.check
+        self._guard.check = lambda begin, path: check(begin, last)  # type: ignore[method-assign]
+        try:
+            super().start(path)
+        finally:
+            self._guard.check = check  # type: ignore[method-assign]
+
+
+def averaged(chunk: PoseChunk) -> PoseChunk:
+    """Set all places to their mean."""
+    return replace(chunk, xyz_mm=np.broadcast_to(chunk.xyz_mm.mean(axis=0), chunk.xyz_mm.shape))
+
+
+def always_ready(progress: Progress) -> Progress:
+    """Take an arm for ready, whatever its state is."""
+    return replace(progress, state=ArmState.READY)
+
+
+def taken_for_ready(*states: ArmState) -> Callable[[ArmState], ArmState]:
+    """Return a change that takes some states for ready."""
+    return lambda state: ArmState.READY if state in states else state
+
+
 def without_tilt(self: ExampleArm, path: Any) -> tuple[Any]:
     """Lift the limit of a turn."""
     limits = self._guard._limits
@@ -265,6 +322,31 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         moves(lambda self, v: [*v[:6], 10 * v[6]]), (SPEED,), "followed at .* instead of 40 mm/s",
     ),
     "SpeedIgnored": (moves(lambda self, v: [*v[:6], 50.0]), (SPEED,), "followed at 50.0 mm/s"),
+    "SlowMovesTooFast": (
+        moves(lambda self, v: [*v[:6], max(v[6], 10.0)]), (SPEED,), "10.0 mm/s instead of 2 mm/s",
+    ),
+    "StopsOnce": (StopsOnce, ("stop while moving",), "still moving when the call"),
+    "MovesAfterStop": (MovesAfterStop, ("stop while moving",), "still moving when the call|moved"),
+    "DropsThirdSegment": (
+        takes(ExampleArm, "start", lambda self, path: (path[:2],)), ("path",), "before the end",
+    ),
+    "LastSegmentOnly": (LastSegmentOnly, ("limits",), "that leaves the box and returns"),
+    "EmergencyIsReady": (
+        reports(ExampleArm, taken_for_ready(ArmState.EMERGENCY_STOP), "state"),
+        ("emergency stop",), "no call reported it",
+    ),
+    "OffIsReady": (
+        reports(ExampleArm, taken_for_ready(ArmState.NOT_RUNNING), "state"),
+        ("power off",), "no call reported it",
+    ),
+    "ProgressAlwaysReady": (
+        reports(ExampleArm, always_ready, "progress"), (CALLS, "protective stop"),
+        "the state of its progress was",
+    ),
+    "PosesAveraged": (
+        reports(ExampleArm, averaged, "read_poses"), (POSES,), "read_poses returned",
+    ),
+    "ArmHostTimeOfRead": (ArmHostTimeOfRead, (HOST,), "of all poses of a read was the same"),
     "TurnsTwiceTooFast": (moves(turns_twice), ("turn",), "followed at 40.0 deg/s instead of 20"),
     "CommandsRadians": (
         moves(lambda self, v: [*v[:3], *np.radians(v[3:6]), v[6]]), (TURN,), "orientation was",
@@ -274,7 +356,7 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         reports(ExampleArm, host_spans, "progress"), (SPEED,), "segment 1 was reported to begin",
     ),
     "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
-    "KeepsFinished": (KeepsFinished, ("path",), "3 segments of the next path, of one"),
+    "KeepsFinished": (KeepsFinished, ("path",), "4 segments of the next path, of one"),
     "ReadyWhileMoving": (
         reports(ExampleArm, ready, "state"), (CALLS,), "its state was ArmState.READY",
     ),
@@ -323,7 +405,7 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     ),
     "HostTimeStands": (
         reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"), (HOST,),
-        "host_ns (was|of the newest)",
+        "host_ns (was|of)",
     ),
     "CommandedPose": (CommandedPose, (POSES,), "and not there in the"),
     "PoseLate": (PoseLate, (POSES,), "and not there in the"),
@@ -334,6 +416,10 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     ),
     "ArmCounterWraps": (
         takes(ExampleArm, "_take", lambda self, line: (counted(line),)), (WRAPS,), "fell back",
+    ),
+    "PulsesLate": (
+        reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns + 60_000_000), "read_pulses"),
+        ("sync input",), "or more from its rising edge",
     ),
     "NoPulses": (
         reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns[:0]), "read_pulses"), ("sync input",),
@@ -442,6 +528,18 @@ class StartOfExposure(FakedExampleFrames):
         return replace(found, t_ns=found.t_ns - self.mid_exposure_ns)
 
 
+class BufferReused(ExampleForce):
+    """Each read writes into the arrays of the one before."""
+
+    forces = np.empty((10_000, 3))
+
+    def read(self) -> Any:
+        """Forces and torques since the last call."""
+        chunk = super().read()
+        self.forces[: len(chunk)] = chunk.force_n
+        return replace(chunk, force_n=self.forces[: len(chunk)])
+
+
 class ZeroHides(ExampleForce):
     """After zero every load is zero."""
 
@@ -548,6 +646,10 @@ FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "FrameCounterWraps": (
         _read(FakedExampleFrames, wrapped("t_ns", 1000)), (WRAPS,), "came after",
     ),
+    "FrameNumberOf16Bits": (
+        _read(FakedExampleFrames, lambda c: replace(c, number=c.number % 2**16)),
+        ("lost frames",), "number came otherwise",
+    ),
     "NumbersOfItsOwn": (NumbersOfItsOwn, ("lost frames",), "number came otherwise"),
     "RegionStays": (RegionStays, ("another region",), "frames of"),
 }  # fmt: skip
@@ -560,6 +662,7 @@ FORCE: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "ForceAxesSwapped": (
         _read(ExampleForce, scaled(force_n=[2, 1, 0])), DATA, "force_n came otherwise",
     ),
+    "BufferReused": (BufferReused, DATA, "a read changed the arrays"),
     "OneLoad": (_read(ExampleForce, first_load), DATA, "force_n came otherwise"),
     "ForceHostTimeIsZero": (_read(ExampleForce, at_host(lambda: 0)), (HOST,), "host_ns was 0"),
     "ForceCounterWraps": (
@@ -663,6 +766,15 @@ class StopOpens(ExampleGripper):
         self.move(self.range.opening_mm[1], self.range.speed_mm_s[1], self.range.force_n[0])
 
 
+class StopWaitsForAnswer(ExampleGripper):
+    """Stop is sent only once the answer to another call has come."""
+
+    def stop(self) -> None:
+        """Stop."""
+        with self._asking:
+            super().stop()
+
+
 def percent(self: ExampleGripper, line: str) -> tuple[str]:
     """Send the force of a move in percent of the largest one."""
     word, *values = line.split()
@@ -691,6 +803,9 @@ GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
     "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it said"),
     "StopOpens": (StopOpens, ("stop of the fingers",), "the fingers opened to 80 mm after"),
+    "StopWaitsForAnswer": (
+        StopWaitsForAnswer, ("silent gripper",), "it waited for the answer to another call",
+    ),
     "OpensOnConnect": (OpensOnConnect, ("fingers stay",), "the fingers went from"),
 }  # fmt: skip
 

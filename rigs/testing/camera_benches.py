@@ -15,6 +15,8 @@ from sliplab.rigs.testing.rule import Bounds, NotTried, Seen
 from sliplab.rigs.testing.stream_bench import StreamBench
 from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk
 
+FRAME_NS = 10_000_000
+"""Period of frames, ns."""
 SIZE = 64, 48
 """Columns and rows of the fakes' cameras."""
 PX_PER_MM = 10.0
@@ -154,6 +156,7 @@ class FrameBench(StreamBench):
         if self._by_arrival:
             raise NotTried("a camera whose frames are timed by their arrival does not number them")
         self._number += count
+        self.times(count, FRAME_NS)
 
     def check_sync(self) -> None:
         """Raise Seen if levels of the sync line came otherwise; NotTried: none was reported."""
@@ -230,7 +233,7 @@ class FrameBench(StreamBench):
             self.on_frames(chunk)
 
     def _chunk(self, count: int) -> FrameChunk:
-        t_ns, (width, height) = self.times(count, 10_000_000), self.shape
+        t_ns, (width, height) = self.times(count, FRAME_NS), self.shape
         number = self._number + np.arange(count, dtype=np.int64)
         self._number += count
         noise = np.random.default_rng(self._number)

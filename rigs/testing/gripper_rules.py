@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -21,6 +22,8 @@ MIDDLE_OF_RANGE = 0.3
 """Speed and force of a move, as a share of their range."""
 LAG_S = 0.1
 """Longest delay of a reported opening, s."""
+ASKED_S = 0.1
+"""Time for a call to send its question, s."""
 AT_ONCE_S = 0.25
 """Longest duration of a call that does not wait for a motion, s."""
 
@@ -199,13 +202,24 @@ def _fault(bench: GripperBench) -> None:
         raise Seen(f"state did not report it within {bench.bounds.news_s:g} s")
 
 
-@RULES.add("silent gripper", "a gripper that falls silent is reported; stop and close return")
+@RULES.add(
+    "silent gripper",
+    "a gripper that falls silent is reported; stop and close return, also while a call waits for "
+    "its answer",
+)
 def _silent(bench: GripperBench) -> None:
     bench.connect()
     bench.fake.silence()
-    if bench.refusal("state", bench.device.state) is None:
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(bench.device.state)
+        bench.wait(ASKED_S)
+        waited, began = not waiting.done(), time.monotonic()
+        bench.refusal("stop", bench.device.stop)
+        took_s = time.monotonic() - began
+        if waited and waiting.done() and took_s > AT_ONCE_S:
+            raise Seen(f"stop took {took_s:.2f} s: it waited for the answer to another call")
+    if bench.refusal("state", waiting.result) is None:
         raise Seen("state returned though nothing answers")
-    bench.refusal("stop", bench.device.stop)
     bench.refusal("close", bench.close_device)
 
 

@@ -7,6 +7,8 @@ clock of the controller.
 from __future__ import annotations
 
 import itertools
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,8 @@ LONG_MM, SHORT_SHARE, SLOW_SHARE = 40.0, 0.2, 0.4
 """Length of the first segment, and of length and speed of the second one as shares of it."""
 WAYS = (0.6, -0.64, 0.48), (-0.48, 0.6, 0.64)
 """Directions of two segments; no two axes have the same share."""
+SLOW_MM, SLOW_MM_S = 3.0, 2.0
+"""Way and speed of a slow move, as in a trial."""
 TURN_DEG, TURN_DEG_S = 30.0, 20.0
 OFF_LINE_MM, OFF_SPOT_MM, ORIENTED_DEG = 0.2, 0.1, 0.2
 LAG_S = 0.25
@@ -79,6 +83,11 @@ def _speed(bench: ArmBench) -> None:
     begin, since = report.before, 0
     for number, segment in enumerate(path, 1):
         begin, since = _check_segment(report, course, number, begin, segment, since)
+    to = replace(path[1].to, xyz_mm=_moved(path[1].to.xyz_mm, WAYS[1], -SLOW_MM))
+    slow = Segment(to, min(SLOW_MM_S, bench.speed_mm_s))
+    report = follow(bench, slow)
+    course = true_course(bench, report.begin_s, report.end_s)
+    _check_segment(report, course, 1, report.before, slow, 0)
 
 
 @RULES.add(
@@ -146,6 +155,10 @@ def _poses(bench: ArmBench) -> None:
     _check_samples(bench, report)
     if not bench.host_clock:
         _check_kept(bench)
+    report = Report(bench.clock_s(), bench.place(), clock_offset_ns(bench))
+    bench.arrive(bench.to(0.0))
+    report.answers.append(ask(bench, "read_poses", bench.arm.read_poses))
+    _check_samples(bench, report)
     at_rest = ask(bench, "pose", bench.arm.pose).value
     if not distance_mm(at_rest, bench.place()) <= ARRIVED_MM:
         raise Seen(f"at rest at {_xyz(bench.place())} mm, pose returned {_xyz(at_rest)} mm")
@@ -177,6 +190,8 @@ def _calls(bench: ArmBench) -> None:
     for answer in report.of("progress"):
         if answer.moving and answer.value.done:
             raise Seen("progress was done while the arm moved")
+        if answer.moving and answer.value.state is not ArmState.MOVING:
+            raise Seen(f"while the arm moved the state of its progress was {answer.value.state}")
     if bench.state() is not ArmState.READY:
         raise Seen(f"after the path its state was {bench.state()}")
 
@@ -215,23 +230,29 @@ def _clock(bench: ArmBench) -> None:
 
 
 @RULES.add(
-    "host times", "host_ns of a pose is the host's monotonic clock when it was received, in ns"
+    "host times",
+    "host_ns of a pose is the host's monotonic clock when it was received, in ns; not when it was "
+    "read",
 )
 def _host_times(bench: ArmBench) -> None:
     bench.connect()
     bench.read_times()
     stall_ns = round(STALL_S * 1e9)
     ages_s: list[float] = []
+    apart = False
     for _ in range(ROUNDS):
         since_ns = bench.host_ns()
         bench.wait(QUIET_S)
-        arrivals = bench.read_times()[1]
+        times, arrivals = bench.read_times()
+        apart |= len(times) < 2 or times[0] == times[-1] or arrivals[0] != arrivals[-1]
         now_ns = bench.host_ns()
         check_arrivals(arrivals, since_ns - stall_ns, now_ns)
         if arrivals:
             ages_s.append((now_ns - arrivals[-1]) / 1e9)
     if not ages_s:
         raise Seen("read_poses returned no poses")
+    if not apart:
+        raise Seen("host_ns of all poses of a read was the same, though they came one by one")
     if np.median(ages_s) > LAG_S:
         raise Seen(f"host_ns of the newest pose was {np.median(ages_s):.2f} s old when it was read")
     bench.start(bench.to(0.25 * _long_mm(bench)))
@@ -274,6 +295,7 @@ def _sync_input(bench: ArmBench) -> None:
     numbers = range(int(begin_s / PULSE_EVERY_S) - 1, int(bench.clock_s() / PULSE_EVERY_S) + 1)
     edges_s = np.array([pulse_s(number) for number in numbers])
     seen: set[int] = set()
+    least_s = 0.0 if not pulses else math.inf
     for t_ns in pulses:
         at_s = (t_ns - offset_ns) / 1e9
         nearest = int(np.abs(edges_s + 0.5 * PULSE_S - at_s).argmin())
@@ -286,6 +308,9 @@ def _sync_input(bench: ArmBench) -> None:
         if nearest in seen:
             raise Seen(f"the pulse of {t_ns} ns was read twice")
         seen.add(nearest)
+        least_s = min(least_s, abs(at_s - edges_s[nearest]))
+    if least_s > EDGE_S:
+        raise Seen(f"each pulse was reported {least_s:.3f} s or more from its rising edge")
     if len(seen) < PULSES // 2:
         raise Seen(f"{len(seen)} of about {PULSES} pulses were reported")
 

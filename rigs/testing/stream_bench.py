@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -44,6 +45,8 @@ class StreamBench(Bench):
         self.came: list[Any] = []
         self._next_ns = FIRST_NS
         self._mark: int | None = None
+        self._last: tuple[Any, dict[str, Any]] | None = None
+        """The last chunk that was read, and a copy of its arrays."""
 
     # -- the fake, by kind -----------------------------------------------------------------
 
@@ -108,7 +111,13 @@ class StreamBench(Bench):
     def read(self) -> list[int]:
         """Return the times that came since the last call, in the unit of the chunk."""
         chunk = self.call("read", self.take)
+        if self._last is not None and not all(
+            np.array_equal(values, self._last[1][name])
+            for name, values in vars(self._last[0]).items()
+        ):
+            raise Seen("a read changed the arrays of the chunk that was read before it")
         if len(chunk):
+            self._last = chunk, copy.deepcopy(vars(chunk))
             self.came.append(chunk)
         times: list[int] = getattr(chunk, self.clock_field).tolist()
         return times

@@ -31,6 +31,8 @@ OTHER_SIZE = 40, 56
 AT_ONCE_S = 0.25
 """Longest duration of a read, s: it does not wait for data."""
 READS = 5
+LOST_FRAMES = 3, 200, 30_000, 30_000, 30_000
+"""Gaps in the numbers of frames, which pass the wraps of counters of 8 and 16 bits."""
 WRAP_S = 0.015
 """Time before a wrap at which batches of 10 ms begin, s."""
 HOST_WAIT_S, HOST_LATE_S = 0.3, 0.2
@@ -351,15 +353,20 @@ def _another_region(bench: FrameBench) -> None:
     bench.check_content()
 
 
-@FRAME_RULES.add("lost frames", "a frame that is lost leaves a gap in the numbers")
+@FRAME_RULES.add(
+    "lost frames",
+    "a frame that is lost leaves a gap in the numbers, which go on where a counter of 8 or 16 bits "
+    "wraps",
+)
 def _lost(bench: FrameBench) -> None:
     bench.connect()
     bench.start()
     bench.gather()
-    bench.lose(3)
-    bench.came.clear()
-    bench.gather()
-    bench.check_content()
+    for count in LOST_FRAMES:
+        bench.lose(count)
+        bench.came.clear()
+        bench.gather()
+        bench.check_content()
 
 
 @FRAME_RULES.add(

@@ -213,11 +213,15 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
     def chunks() -> Iterator[EventChunk]:
         found, wrong = read_columns(folder, name, part.format, columns)
         t_us = (times_ns(found["t"], unit) + 500) // 1000
-        resolution = resolution_us(found["t"], TIME_UNITS[unit] / 1000)
+        resolution = resolution_us(
+            found["t"], TIME_UNITS[unit] / 1000, whole_us=1e6 if unit == "s" else 0.0
+        )
         x = _places(found["x"])
         y = _places(found["y"]) if "y" in found else np.zeros(len(x), np.int64)
         p = np.ones(len(x), np.int8)
         if "p" in found:
+            if not positive:
+                _check_polarities(found["p"])
             p[:] = np.isin(found["p"], positive) if positive else found["p"] > 0
             p[np.isnan(found["p"])] = UNKNOWN
         valid = t_us >= 0
@@ -232,6 +236,18 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
             yield chunk
 
     return EventSource(chunks, lambda: size)
+
+
+def _check_polarities(values: Any) -> None:
+    """Check that integers on one side of 0 are not two polarities, such as 1 and 2."""
+    if values.dtype.kind not in "iu" or not len(values):
+        return
+    low, high = int(values.min()), int(values.max())
+    if low < high and (low > 0) == (high > 0):
+        raise FormatError(
+            f"holds polarities from {low} to {high}, {'all' if low > 0 else 'none'} above 0; "
+            "`positive` says which of them are ON"
+        )
 
 
 def _places(values: Any) -> Any:

@@ -123,7 +123,7 @@ def _triggers(file: RowFile, rows: Callable[[str], Rows]) -> Triggers | None:
 
 def _dsec_events(columns: Mapping[str, Rows], offset: int, low: int, high: int) -> EventChunk:
     x, y, p, t = (columns[key].read(low, high) for key in "xypt")
-    return event_chunk(x, y, p, _integers(t) + offset)
+    return event_chunk(x, y, _polarities(p), _integers(t) + offset)
 
 
 def _dsec_trial(
@@ -191,7 +191,8 @@ def _lab_events(
 ) -> tuple[I64, I64, Any, I64, float]:
     """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
     xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
-    return _pixels(xs), _pixels(ys), _polarities(ps), rounded_us(ts, 1e6), resolution_us(ts, 1e6)
+    step_us = resolution_us(ts, 1e6, whole_us=1e6)
+    return _pixels(xs), _pixels(ys), _polarities(ps), rounded_us(ts, 1e6), step_us
 
 
 def _polarities(values: Any) -> Any:

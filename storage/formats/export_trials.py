@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, sync_folder, write_json
 from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, Aedat4Writer, Stream
 from sliplab.storage.formats.dsec import write_dsec
@@ -53,6 +54,8 @@ def export_trials(
         try:
             with replacing(path) as temporary:
                 counts = _WRITERS[kind](recording, temporary, stream)
+        except StoreError:  # a damaged trial, some of which are ValueErrors, too
+            raise
         except ValueError as error:
             raise InputError("--format", "", kind, f"trial {recording.trial_id} {error}") from None
         listed.append(_listed(recording, path.name, counts))

@@ -343,15 +343,16 @@ def some_rows(chunk: ChunkT, good: Any) -> ChunkT:
     return replace(chunk, **arrays)
 
 
-def resolution_us(times: Any, per_unit: float) -> float:
+def resolution_us(times: Any, per_unit: float, whole_us: float = 0.0) -> float:
     """Return the step from the latest time to the next one that its type can tell, us.
 
     Args:
         per_unit: microseconds of one unit of the times.
+        whole_us: what integers count as: slow readings may be stamped with whole seconds.
     """
     found = np.asarray(times)
     if found.dtype.kind != "f":
-        return 0.0
+        return whole_us
     finite = np.abs(found[np.isfinite(found)])
     return float(np.spacing(finite.max())) * per_unit if len(finite) else 0.0
 

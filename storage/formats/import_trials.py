@@ -140,7 +140,7 @@ def import_trials(
     failed: list[Json] = []
     first_error: InputError | None = None
     label_error: InputError | None = None
-    labelled = False
+    labelled = misfit = False
     try:
         for trial in trials:
             on_trial(trial.name)
@@ -179,10 +179,12 @@ def import_trials(
                 left_out.append({**about, "left_out": dict(found.left_out)})
             warnings += [f"{trial.source}: {text}" for text in found.warnings]
             counts = {key: counts[key] + found.counts[key] for key in counts}
-        if label_error is not None and not labelled and fresh:
-            imported.clear()  # no label fits its trial
+        misfit = label_error is not None and not labelled and fresh  # no label fits its trial
+        if misfit:
+            imported.clear()
     finally:
-        if fresh and not imported and campaign.folder.exists():
+        # a signal may have come between a trial's commit and its entry in the list
+        if fresh and campaign.folder.exists() and (misfit or not campaign.committed()):
             shutil.rmtree(campaign.folder)
     if first_error is not None and not imported and not skipped:
         raise label_error or first_error
@@ -308,8 +310,8 @@ class _Content:
             self._fail(
                 f"{stream}_time_resolution_us", resolution, MOST_RESOLUTION_US,
                 f"the times of {stream} have steps of {resolution:,.6g} us, for their type is too "
-                "short for such large numbers; times of 64 bits, or counted from the recording's "
-                "start, would be right",
+                "short for such large numbers or has no fractions; floats of 64 bits, or times "
+                "counted from the recording's start, would be right",
             )  # fmt: skip
         if ends[0] == ends[1]:
             self._fail(f"{stream}_times", "one time", None, f"all {rows:,} {what} have one time")
@@ -605,7 +607,9 @@ def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) 
     content.leave_out(NO_TIME.format(what), int((~good).sum()))
     values = [getattr(chunk, each.name) for each in fields(chunk)]
     numbers = [value for value in values if getattr(value, "dtype", None) == np.float64]
-    finite = np.all([np.isfinite(v.reshape(len(chunk), -1)).all(axis=1) for v in numbers], axis=0)
+    finite = np.ones(len(chunk), np.bool_)
+    for value in numbers:
+        finite &= np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
     content.leave_out(f"{what} with a value that is not a number", int((good & ~finite).sum()))
     good &= finite
     content.check_majority(name, int(good.sum()))

@@ -295,10 +295,10 @@ def _of_kind(path: Path, kind: str) -> list[Wanted]:
             raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
         return _named([(pair.stem, kind, pair) for pair in found])
     wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
-    if not wanted:
+    lab = [pair for pair in pairs(files) if kind == "lab-hdf5" and pair.stream is not None]
+    if not (wanted or lab):
         endings = " or ".join(READERS[kind][0])
         raise InputError(path, "", None, f"holds no {kind} file; such files end in {endings}")
-    lab = [pair for pair in pairs(files) if kind == "lab-hdf5" and pair.stream is not None]
     taken = {pair.stream for pair in lab}
     recordings: list[Wanted] = [(_stem(file), kind, file) for file in wanted if file not in taken]
     return _named([*recordings, *((pair.stem, kind, pair) for pair in lab)])

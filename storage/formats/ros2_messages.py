@@ -188,6 +188,7 @@ class EventPacket:
     t_ns: int
     width: int
     height: int
+    seq: int
     time_base: int
     encoding: str
     big_endian: bool
@@ -197,10 +198,9 @@ class EventPacket:
     def parse(fields: Fields) -> EventPacket:
         """Read one. Raises FormatError where it is damaged."""
         height, width = fields.number("I"), fields.number("I")
-        fields.number("Q")
-        time_base, encoding = fields.number("Q"), fields.text()
-        big = fields.number("B") != 0
-        return EventPacket(fields.t_ns, width, height, time_base, encoding, big, fields.block())
+        seq, time_base, encoding = fields.number("Q"), fields.number("Q"), fields.text()
+        big, data = fields.number("B") != 0, fields.block()
+        return EventPacket(fields.t_ns, width, height, seq, time_base, encoding, big, data)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,8 @@ _WORDS = {MONO: "u8", _LIBCAER: "u4", _LIBCAER_CMP: "u2", _EVT3: "u2"}
 ENCODINGS = tuple(_WORDS)
 _EVT3_HIGH, _NO_ROW = 0x8, (1 << 11) - 1
 """Type of a word with the high part of a time, and a row that no camera has."""
+_LATE = 2
+"""Packets by which one may come late; of more its driver was started again."""
 _ROOM = 12
 """Events that a word of 16 bits may hold."""
 _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
@@ -56,6 +58,10 @@ _ROS2_EVENT = np.dtype(
 """An event but the first, whose column and row stand two bytes later: CDR aligns each field."""
 _TIME_HIGH, _TIME_LOW, _ADDR_X, _ADDR_Y, _BASE_Y, _VECT_8 = range(6)
 _LOWS, _HIGHS, _DRIVER_HIGHS = 1 << 12, 1 << 12, 1 << 4
+
+
+class _OutOfOrder(FormatError):
+    """A packet comes twice, or behind a later one."""
 
 
 class EventDecoder:
@@ -75,6 +81,7 @@ class EventDecoder:
         self._evt3 = new_state(0)
         self._lost = False
         self._offset_us: int | None = None
+        self._last: tuple[int, bytes] | None = None
         self.size: tuple[int, int] | None = None
         self.encoding = ""
         self.edges = np.empty((0, 3), np.int64)
@@ -88,6 +95,8 @@ class EventDecoder:
         self.edges = self.edges[:0]
         try:
             return self._events(fields)
+        except _OutOfOrder:
+            raise
         except FormatError:
             self._lost = True
             raise
@@ -129,7 +138,24 @@ class EventDecoder:
             return _unpack_libcaer(packet, words)
         if encoding == _LIBCAER_CMP:
             return _unpack_libcaer_cmp(packet, words)
+        self._follow(packet)
         return self._unpack_evt3(packet, words)
+
+    def _follow(self, packet: EventPacket) -> None:
+        """Note a lost packet: what follows it counts on the time and row that it had.
+
+        Raises:
+            _OutOfOrder: it comes twice, or behind a later one.
+        """
+        data = bytes(packet.data)
+        if self._last is not None:
+            number, before = self._last
+            if packet.seq == number and data == before and data:
+                raise _OutOfOrder(f"holds packet {number} twice")
+            if number - _LATE <= packet.seq < number:
+                raise _OutOfOrder(f"holds packet {packet.seq} behind packet {number}")
+            self._lost |= packet.seq not in {number, number + 1}
+        self._last = packet.seq, data
 
     def _unpack_evt3(self, packet: EventPacket, words: npt.NDArray[np.uint16]) -> EventChunk:
         """Decode words of EVT 3.0, whose clock begins at the stamp of the first message."""

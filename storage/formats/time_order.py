@@ -8,6 +8,9 @@ A clock that restarted within the recording gives two sequences, whose times ove
 would fit together, but were not recorded so. Such a place shows as many rows in a row that are left
 out and whose times join those of the rows that stay. Then the part before and the part after the
 restart are compared, and the longer one is taken whole.
+
+Rows whose times are exactly those of rows before, such as of a packet that was sent twice, are no
+restart: they are left out first.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ _NEAR_US, _FEW_FALLS, _MIXED_SHARE = 100_000, 10, 0.9
 they are faults."""
 _RESTART_SHARE = 0.01
 """Share of the rows from which on those that are left out in a row may be a restart."""
+_REPEATED, _MOST_FALLS = 8, 1000
+"""Rows that make a repetition, and steps back up to which repetitions are looked for."""
 
 
 def falls(times: I64) -> bool:
@@ -64,6 +69,13 @@ def in_order(times: I64) -> Mask:
         return np.ones(len(times), np.bool_)
     if len(times) > MOST_ROWS:
         return _longest_run(times)
+    found = ~_repeated(times)
+    found[found] = _consistent(times[found])
+    return found
+
+
+def _consistent(times: I64) -> Mask:
+    """Return the longest consistent part of times that repeat none."""
     kept: Mask = _longest(np.ascontiguousarray(times, np.int64))
     at = _restart(times, kept)
     if at is None:
@@ -71,6 +83,27 @@ def in_order(times: I64) -> Mask:
     parts = [in_order(times[:at]), in_order(times[at:])]
     parts[int(parts[0].sum() >= parts[1].sum())][:] = False
     return np.concatenate(parts)
+
+
+def _repeated(times: I64) -> Mask:
+    """Return which rows repeat the times of rows before, as those of a packet sent twice do."""
+    found = np.zeros(len(times), np.bool_)
+    starts = np.flatnonzero(times[1:] < times[:-1]) + 1
+    if len(starts) > _MOST_FALLS:
+        return found
+    latest = np.maximum.accumulate(times)
+    for start, end in zip(starts, [*starts[1:], len(times)], strict=True):
+        run = times[start:end]
+        run = run[: np.searchsorted(run, latest[start - 1], "right")]
+        first = int(np.searchsorted(latest[:start], run[0]))
+        if first == 0 and run[-1] == latest[start - 1]:
+            continue  # all of it again: a restart
+        before = times[first:start][~found[first:start]]
+        same = before[(before > run[0]) & (before <= run[-1])]
+        again = run[run > run[0]][: len(same)]  # rows of the next packet may have the last time
+        if len(same) >= _REPEATED and np.array_equal(again, same):
+            found[start : start + int((run == run[0]).sum()) + len(again)] = True
+    return found
 
 
 def _longest_run(times: I64) -> Mask:

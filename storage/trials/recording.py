@@ -411,12 +411,20 @@ class Recording:
 
         Raises:
             ValueError: the trial has none.
+            StoreError: there are not as many as frames.
         """
         if not self.has_tracks:
             raise ValueError(f"{self.folder}: contains no tracks")
         with self.open() as reader:
             plate = reader.column("tracks/plate") if reader.has("tracks/plate") else None
             markers = reader.column("tracks/markers")
+            frames = reader.counts()["frames/t"]
+        for what, rows in (("markers", markers), ("plate", plate)):
+            if rows is not None and len(rows) != frames:
+                raise self._damaged(
+                    f"{self.folder / DATA}: tracks/{what} has {len(rows)} rows, and there are "
+                    f"{frames} frames"
+                )
         return Tracks(
             markers.astype(np.float64), None if plate is None else plate.astype(np.float64)
         )

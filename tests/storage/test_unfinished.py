@@ -140,6 +140,17 @@ def test_sweep_leaves_what_may_be_of_a_living_program(tmp_path: Path) -> None:
     assert names(tmp_path) == {*kept, "b", "y", f".link.{here}.{dead}.tmp"}
 
 
+def test_sweep_counts_the_age_by_the_clock_of_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock of a server may be days behind this machine's."""
+    (tmp_path / ".a.sliplab-0123abcd.1.tmp").write_text("")
+    here = time.time
+    monkeypatch.setattr(time, "time", lambda: here() + 3 * files._STALE_S)
+    write_text(tmp_path / "b", "b")
+    assert names(tmp_path) == {".a.sliplab-0123abcd.1.tmp", "b"}
+
+
 def test_sweep_deletes_no_file_of_another_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

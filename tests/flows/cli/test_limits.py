@@ -70,6 +70,7 @@ def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -
         (RuntimeError("can't start new thread"), "no more processes or threads can be started"),
         (OSError(errno.EFBIG, "File too large"), "its disk does not allow a larger file"),
         (OSError(errno.ENOSPC, "No space left on device"), "its disk is full"),
+        (OSError(errno.ENOSPC, "", "/a/from", None, "/tmp/to"), "/tmp/to: its disk is full"),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("hidden", [False, True])

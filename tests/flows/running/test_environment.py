@@ -123,6 +123,7 @@ def test_run_that_the_server_ends_before_its_work_raises(
         ("no_proxy", "[::1"),
         ("SSL_CERT_FILE", "/none.pem"),
         ("PREFECT_API_SSL_CERT_FILE", __file__),
+        ("PREFECT_LOGGING_SETTINGS_PATH", "/"),
     ],
 )
 def test_unusable_connection_setting_is_named(

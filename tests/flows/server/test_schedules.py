@@ -106,6 +106,30 @@ def test_a_value_is_shown_as_it_was_written(tmp_path: Path) -> None:
         load_schedules(path)
 
 
+def test_all_faults_of_all_schedules_are_named_with_the_nearest_names(tmp_path: Path) -> None:
+    night = {**NIGHT, "name": "Nights!", "days": ["mon", "thuu"], "trials": 0}
+    report = {"name": "Report!", "flow": "reprt", "cron": "0 22 * * *"}
+    both = {"name": "Both!", "flow": "label", "cron": "0 22 * * * *"}
+    with pytest.raises(InputError) as caught:
+        load_schedules(write(tmp_path, night, report, both))
+    for said in (
+        "schedules[0].name = Nights!", "schedules[0].days[1] = thuu", "; did you mean 'thu'?",
+        "schedules[0].trials = 0", "schedules[1].flow = reprt", "; did you mean 'report'?",
+        "schedules[2].name = Both!", "schedules[2].cron = 0 22 * * * *: must have five fields",
+    ):  # fmt: skip
+        assert said in caught.value.message
+    with pytest.raises(InputError, match=r"is not a time zone; .*; did you mean 'Europe/Rome'\?"):
+        load_schedules(write(tmp_path, NIGHT, timezone="Europe/rome"))
+
+
+def test_all_cron_lines_without_a_run_are_named(tmp_path: Path) -> None:
+    path = write(tmp_path, weekly("0 3 30 2 *"), {**weekly("61 3 * * *"), "name": "other"})
+    with pytest.raises(InputError) as caught:
+        upcoming_runs(path, load_schedules(path), 2)
+    keys = [fault.key for fault in caught.value.faults]
+    assert keys == ["schedules[0].cron", "schedules[1].cron"]
+
+
 def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text((ROOT / "protocols/pilot.yaml").read_text()[:-10])
     with pytest.raises(InputError) as caught:

@@ -15,7 +15,14 @@ import pytest
 from sliplab.protocols.program import Dwell, Move, Position, Program, Twist
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.arm_settings import Limits
-from sliplab.rigs.core.capabilities import ArmFault, GripperState, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import (
+    ArmFault,
+    GripperState,
+    Mounting,
+    Pose,
+    RigError,
+    Segment,
+)
 from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
 from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
 from sliplab.rigs.core.plate_frame import turned_about_z
@@ -297,6 +304,12 @@ def breaks(rig: Rig, how: str, broken: Callable[[], bool] = lambda: True) -> lis
             force[-1, 1] = np.nan
         elif how == "stuck":
             force[:] = kept[0].force_n[0]
+        elif how == "stuck normal":
+            force[:, 2] = kept[0].force_n[0, 2]
+        elif how == "list":
+            return replace(chunk, force_n=force.tolist())
+        elif how == "objects":
+            return replace(chunk, force_n=force.astype(object))
         else:
             force[:] = {"nan": np.nan, "inf": -np.inf, "zeros": 0.0}[how]
         return replace(chunk, force_n=force)
@@ -338,6 +351,29 @@ def test_sensor_that_dies_in_mid_slide_stops_the_arm(
     # at 3 mm/s, within its silence or a millimetre
     assert x_mm[0] < 1.0 + max(3.0 * (SILENT_S + 0.1), 1.2)
     assert rig.position().depth_mm < 0.0  # a dead sensor does not keep the arm in contact
+
+
+@pytest.mark.parametrize("motion", [trial, watched_trial, warm_up, circles, lone_move])
+@pytest.mark.parametrize("mounting", [Mounting(), Mounting(rotvec_deg=(180.0, 0.0, 0.0))])
+def test_sensor_whose_normal_axis_is_dead_stops_a_press(
+    motion: Callable[[Rig], None], mounting: Mounting
+) -> None:
+    """Its other two axes are noisy, and show what acts on them."""
+    rig = make_rig(limit_n=30.0)
+    rig.force.mounting = mounting  # type: ignore[union-attr]
+    breaks(rig, "stuck normal")
+    deepest = depths(rig)
+    with pytest.raises(RigError, match=r"force sensor: reads the same normal force since the arm"):
+        motion(rig)
+    assert max(deepest) < 1.2
+
+
+@pytest.mark.parametrize("how", ["list", "objects"])
+def test_forces_that_are_no_array_of_numbers_name_the_sensor(how: str) -> None:
+    rig = make_rig(limit_n=30.0)
+    breaks(rig, how)
+    with pytest.raises(RigError, match=r"force sensor: returned force_n as .*no.* array of number"):
+        lone_move(rig)
 
 
 def test_force_samples_that_lag_more_and_more_stop_the_arm() -> None:
@@ -530,6 +566,17 @@ def test_arm_faster_than_the_limit_is_stopped_by_its_poses() -> None:
     rig.arm.start = lambda path: start([replace(path[0], speed_mm_s=60.0)])  # type: ignore[method-assign]
     with pytest.raises(SpeedError, match=r"speed 60 mm/s is beyond its limit 10 mm/s"):
         rig.move(Move("home", Position(0.0, 0.0, -50.0), 10.0), rig.position())
+
+
+def test_turn_faster_than_the_limit_is_stopped_by_its_poses() -> None:
+    rig = plain_rig()
+    rig.move(Move("home", HOME, 10.0), rig.position())
+    rig.guard = Guard(None, replace_limits(rig, speed_mm_s=5.0))
+    start = rig.arm.start
+    rig.arm.start = lambda path: start([replace(path[0], turn_deg_s=100.0)])  # type: ignore[method-assign]
+    limit = f"{rig.guard.turn_deg_s:.4g}"
+    with pytest.raises(SpeedError, match=rf"turn 100 deg/s is beyond its limit {limit} deg/s"):
+        rig.twist(Twist("twist", replace(HOME, twist_deg=90.0), 20.0), HOME)
 
 
 def replace_limits(rig: Rig, **change: float) -> Any:

@@ -230,6 +230,15 @@ def test_times_in_each_unit_become_the_nearest_microsecond(tmp_path: Path) -> No
         assert events.t_us.tolist() == [0, 0, 1, 1, 2, 1_000_000], unit
 
 
+@pytest.mark.parametrize("times", ["0 10 20", "0.0 10.0 20.5"])
+def test_events_at_whole_seconds_fail_a_gate(tmp_path: Path, times: str) -> None:
+    """They are rather microseconds whose unit was stated wrongly."""
+    folder = folder_of(tmp_path)
+    (folder / "events.csv").write_text("".join(f"{t},1,2,1\n" for t in times.split()))
+    recording = imported({**BASE, "streams": {"events": {**EVENTS, "unit": "s"}}}, tmp_path)
+    assert recording.record.quality.passed == ("." in times)
+
+
 def test_rows_out_of_order_are_sorted_and_polarities_are_those_named(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     (folder / "events.csv").write_text("9,1,1,1\n4,2,2,2\n4,3,3,3\n0,4,4,4\n")
@@ -255,6 +264,8 @@ def test_rows_out_of_order_are_sorted_and_polarities_are_those_named(tmp_path: P
         ("time,x,y,p\n1,2,3,1\n1,2\n", "no number in column y: row 3"),
         ("time,x,y,p\n1,2.5,3,1\n", "holds .* 1 events outside of the sensor, and 0 that"),
         ("time,x,y,p\n1,2,-3,1\n", "holds .* 1 events outside of the sensor, and 0 that"),
+        ("time,x,y,p\n1,2,3,1\n2,2,3,2\n", "polarities from 1 to 2, all above 0; `positive` says"),
+        ("time,x,y,p\n1,2,3,-1\n2,2,3,0\n", "polarities from -1 to 0, none above 0; `positive`"),
         ("time,x,y,p\n-1,2,3,1\n", "holds 1 events without a valid time, and 0 that"),
         ("", "has no column time"),
         ("time,x,y,p\n", "contains no event: its length is unknown"),

@@ -93,6 +93,22 @@ def test_trials_without_a_file_of_any_stream_are_skipped(tmp_path: Path) -> None
     assert campaign.committed() == {"slip0", "hold1"}
 
 
+def test_a_table_without_rows_costs_its_trial_only(tmp_path: Path) -> None:
+    _data(tmp_path / "set")
+    (tmp_path / "set" / "slip" / "trial2.csv").write_text("Time (s),S1,S2\n")
+    (tmp_path / "a.yaml").write_text(json.dumps(PRESSURES))
+    done = here(
+        "import", "--adapter", tmp_path / "a.yaml", tmp_path / "set", "--store", tmp_path / "s",
+        "--json",
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    result = json.loads(done.stdout)
+    assert len(result["imported"]) == 7
+    ((trial, reason),) = [(one["trial"], one["reason"]) for one in result["failed"]]
+    assert trial == "slip-trial2"
+    assert "trial2.csv: streams.scalars.sensor1: contains no event" in reason
+
+
 def test_counts_of_a_table_of_readings_say_what_to_write(tmp_path: Path) -> None:
     _data(tmp_path / "set")
     counts = {"format": "counts", "axes": ["step", "taxel"], "step_ms": 127}

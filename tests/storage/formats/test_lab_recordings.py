@@ -118,6 +118,20 @@ def test_a_column_of_polarities_counts_more_than_the_name(
     assert any("although its name says ON" in text for text in _warnings(found)) == noted
 
 
+@pytest.mark.parametrize("name", [f"{STEM}_events_stream", f"{STEM}_events_stream.h5"])
+@pytest.mark.parametrize("data", [b"", b"garbage"])
+def test_a_stream_without_a_header_leaves_the_pickles(
+    tmp_path: Path, name: str, data: bytes
+) -> None:
+    """It may be the only one of the folder, so that no file says what format it is."""
+    _pickle(tmp_path / f"{STEM}_events_on", ON)
+    _pickle(tmp_path / f"{STEM}_events_off", OFF)
+    (tmp_path / name).write_bytes(data)
+    (found,), _ = _take(tmp_path, tmp_path)
+    assert len(found.events()) == 7
+    assert f"{name} is not imported" in _warnings(found)[0]
+
+
 def test_a_damaged_stream_leaves_the_pickles(tmp_path: Path) -> None:
     events = _run(tmp_path / "run")
     _pickle(events / f"{STEM}_events_on", ON)

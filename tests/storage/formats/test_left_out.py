@@ -21,6 +21,7 @@ import pytest
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.storage.files import safe_name
+from sliplab.storage.formats import import_trials as import_module
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.formats.flatbuffers import events_buffer
 from sliplab.storage.formats.foreign import Triggers
@@ -28,6 +29,7 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import kind_of, name_of, trials_in
 from sliplab.storage.streams import EventChunk, Json
 from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.checksums import CHECKSUMS, sha256
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import failed_gates, verify
@@ -92,6 +94,65 @@ def test_events_of_the_run_before_are_left_out(tmp_path: Path, salvage: bool) ->
     assert found.record.lost is None
     assert found.record.imported is not None
     assert found.record.imported.warnings == (f"20 {BACK} left out",)
+
+
+def test_a_packet_twice_costs_no_other_events(tmp_path: Path) -> None:
+    times = np.arange(COUNT) * 10
+    _aedat4(tmp_path / "a.aedat4", times[:200], times[200:300], times[200:300], times[300:])
+    found = _one(tmp_path / "store", tmp_path / "a.aedat4")
+    np.testing.assert_array_equal(found.events().t_us, times)
+    assert _dropped(found) == {BACK: 100}
+
+
+def test_whole_seconds_fail_a_gate(tmp_path: Path) -> None:
+    """Microseconds as integers where the layout has seconds."""
+    _lab(tmp_path / "a.h5", np.arange(COUNT) * 10)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    assert not found.record.quality.passed
+    assert set(found.record.quality.gates) == {"events_time_resolution_us"}
+
+
+def test_polarities_of_bytes_are_read(tmp_path: Path) -> None:
+    p = (np.arange(COUNT) % 2 * 255).astype(np.uint8)
+    _dsec(tmp_path / "a.h5", np.arange(COUNT) * 10, p=p)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    assert found.events().p.tolist() == (p // 255).tolist()
+
+
+def test_a_trial_committed_before_a_signal_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _dsec(tmp_path / "a.h5", np.arange(COUNT) * 10)
+    take = import_module._take
+
+    def taken(*args: Any) -> Any:
+        take(*args)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(import_module, "_take", taken)
+    store = Store.create(tmp_path / "store")
+    with pytest.raises(KeyboardInterrupt):
+        _take(store, tmp_path / "a.h5")
+    assert store.campaign("theirs").committed() == {"a"}
+
+
+def test_a_damaged_trial_is_a_failure_of_its_export(tmp_path: Path) -> None:
+    _dsec(tmp_path / "a.h5", np.arange(COUNT) * 10)
+    found = _one(tmp_path / "store", tmp_path / "a.h5")
+    data = found.folder / "data.h5"
+    data.chmod(0o644)
+    with h5py.File(data, "r+") as file:
+        del file["events/t"]
+        file["events/t"] = [b"text"] * COUNT
+    sums = json.loads((found.folder / CHECKSUMS).read_text())
+    sums["data.h5"] = {"sha256": sha256(data), "bytes": data.stat().st_size}
+    (found.folder / CHECKSUMS).write_text(json.dumps(sums))
+    done = here(
+        "export", tmp_path / "store", "theirs", "--format", "dsec", "--output", tmp_path / "out"
+    )
+    assert done.returncode == 1
+    assert "events/t does not contain numbers" in done.stderr
+    assert "--format" not in done.stderr
 
 
 def test_events_behind_a_restart_of_the_clock_are_left_out(tmp_path: Path) -> None:

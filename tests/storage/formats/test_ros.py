@@ -471,6 +471,58 @@ def test_packets_of_evt3_of_a_run_before_are_left_out(tmp_path: Path) -> None:
     assert "9 events " in result["warnings"][0]
 
 
+def _rows(chunk: EventChunk) -> list[tuple[int, ...]]:
+    return list(zip(*(c.tolist() for c in vars(chunk).values()), strict=True))
+
+
+def _numbered(encoding: str, sent: EventChunk) -> list[ros.Message]:
+    made = ros.packets(ROS2, encoding, sent)
+    for number, (_, _, one) in enumerate(made):
+        one.seq = number
+    return made
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_packet_that_comes_twice_is_taken_once(tmp_path: Path, encoding: str) -> None:
+    sent = ros.sent()
+    made = _numbered(encoding, sent)
+    ros.write_mcap(tmp_path / "a.mcap", [*made[:4], made[3], made[3], *made[4:]])
+    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    assert_events(found, sent)
+    assert result["warnings"]
+
+
+def test_packets_of_evt3_behind_a_lost_one_have_no_times_of_it(tmp_path: Path) -> None:
+    sent = ros.sent()
+    made = _numbered("evt3", sent)
+    ros.write_mcap(tmp_path / "a.mcap", [*made[:3], *made[5:]])
+    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    rows = _rows(found.events())
+    assert 1250 < len(rows) < 1500
+    assert set(rows) <= set(_rows(sent))
+
+
+def test_a_late_packet_of_evt3_is_left_out(tmp_path: Path) -> None:
+    sent = ros.sent()
+    made = _numbered("evt3", sent)
+    ros.write_mcap(tmp_path / "a.mcap", [*made[:3], made[4], made[3], *made[5:]])
+    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    rows = _rows(found.events())
+    assert 1500 < len(rows) < 1750
+    assert set(rows) <= set(_rows(sent))
+    assert "the first one holds packet 3 behind packet 4" in result["warnings"][0]
+
+
+def test_a_driver_of_evt3_that_starts_again_counts_its_packets_from_0(tmp_path: Path) -> None:
+    sent = ros.sent()
+    made = _numbered("evt3", sent)
+    for number, (_, _, one) in enumerate(made[4:]):
+        one.seq = number
+    ros.write_mcap(tmp_path / "a.mcap", made)
+    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    assert 1750 < len(found.events()) <= 2000
+
+
 def test_any_bytes_give_events_or_an_error() -> None:
     rng = np.random.default_rng(5)
     for number in range(300):

@@ -10,6 +10,7 @@ from sliplab.storage.formats.time_order import falls, in_order
 
 ROWS = np.arange(2000, dtype=np.int64) * 10
 LATE = 10**12
+TIES = ROWS // 30
 
 CASES = {
     "rows of the run before, at the start": (np.r_[ROWS[:20] + LATE, ROWS], slice(20, None)),
@@ -28,6 +29,22 @@ CASES = {
     ),
     "a restart in the first half": (np.r_[ROWS[:900], ROWS], slice(900, None)),
     "a restart in the second half": (np.r_[ROWS, ROWS[:900]], slice(0, 2000)),
+    "a packet twice": (
+        np.r_[ROWS[:900], ROWS[700:900], ROWS[900:]],
+        [*range(900), *range(1100, 2200)],
+    ),
+    "a packet three times": (
+        np.r_[ROWS[:900], ROWS[700:900], ROWS[700:900], ROWS[900:]],
+        [*range(900), *range(1300, 2400)],
+    ),
+    "a packet again later": (
+        np.r_[ROWS[:900], ROWS[300:500], ROWS[900:]],
+        [*range(900), *range(1100, 2200)],
+    ),
+    "a packet of equal times twice": (
+        np.r_[TIES[:900], TIES[701:900], TIES[900:]],
+        [*range(900), *range(1099, 2199)],
+    ),
     "two restarts": (np.r_[ROWS[:500], ROWS, ROWS[:900]], slice(500, 2500)),
 }
 

@@ -7,6 +7,7 @@ import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 import pytest
 
+from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import FrameChunk
@@ -105,6 +106,14 @@ def test_what_is_not_there_is_said(tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
     with pytest.raises(ValueError, match="contains no tracks"):
         Recording(commit(where, "a")).tracks()
+
+
+@pytest.mark.parametrize("name", ["tracks/markers", "tracks/plate"])
+def test_tracks_that_are_not_as_many_as_frames_are_damage(tmp_path: Path, name: str) -> None:
+    recording = Recording(take(campaign(tmp_path / "s"), "t", [tracks(20, True)]))
+    _damage(recording.folder, name, 19)
+    with pytest.raises(StoreError, match=f"{name} has 19 rows, and there are 20 frames"):
+        recording.tracks()
 
 
 def _damage(folder: Path, name: str, rows: int) -> None:
