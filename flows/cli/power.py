@@ -53,6 +53,8 @@ def power(
         float | None,
         typer.Option(
             "--between",
+            min=0,
+            max=100,
             help="Deviation between sessions, as a share of that between trials; default: the "
             "pilot's, or 0.3 where it is of one session.",
         ),
@@ -61,6 +63,8 @@ def power(
         float,
         typer.Option(
             "--drift",
+            min=0,
+            max=100,
             help="From the first trial to the last, as a share of the deviation between trials.",
         ),
     ] = 0.0,

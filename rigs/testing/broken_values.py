@@ -249,7 +249,7 @@ class MovesAfterStop(ExampleArm):
     """A move that is on its way to the controller is sent after the stop."""
 
     def _follow_path(self, run: Any) -> None:
-        time.sleep(0.08)
+        threading.Event().wait(0.08)
         run.cancelled = False
         super()._follow_path(run)
 

@@ -38,6 +38,9 @@ class StreamBench(Bench):
     device: Any = None
     fake: Any = None
 
+    _last: tuple[Any, dict[str, Any]] | None = None
+    """The last chunk that was read, and a copy of its arrays."""
+
     def __init__(self, driver: Driver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(bounds)
         self.driver, self.settings = driver, settings
@@ -45,8 +48,6 @@ class StreamBench(Bench):
         self.came: list[Any] = []
         self._next_ns = FIRST_NS
         self._mark: int | None = None
-        self._last: tuple[Any, dict[str, Any]] | None = None
-        """The last chunk that was read, and a copy of its arrays."""
 
     # -- the fake, by kind -----------------------------------------------------------------
 

@@ -218,6 +218,12 @@ class _Imported:
         campaign.update(info, text, text.replace("protocol", "rig file"))
 
 
+def _counted(count: int, reason: str) -> str:
+    """Return a count before a reason that begins with what is counted, such as ``events``."""
+    what, space, why = reason.partition(" ")
+    return f"{count:,} {what.removesuffix('s') if count == 1 else what}{space}{why}"
+
+
 @dataclass
 class _Content:
     """What was read of a trial.
@@ -345,7 +351,9 @@ class _Content:
 
     def all_warnings(self, trial: ForeignTrial) -> list[str]:
         """Return all warnings about a trial."""
-        left_out = [f"{count:,} {reason} left out" for reason, count in self.left_out.items()]
+        left_out = [
+            f"{_counted(count, reason)} left out" for reason, count in self.left_out.items()
+        ]
         return [*_loss_warnings(trial.lost), *trial.notes(), *left_out, *self.warnings]
 
 

@@ -156,7 +156,7 @@ def test_sessions_are_drawn_and_printed(ran: Ran, protocol: Path, tmp_path: Path
     [
         (("--between", 0.5), "--between", "0.5"),
         (("--sessions", 3, "--between", "nan"), "--between", "nan"),
-        (("--drift", -1), "--drift", "-1.0"),
+        (("--drift", -1), "--drift", "-1"),
     ],
 )
 def test_wrong_sessions_name_option_and_value(

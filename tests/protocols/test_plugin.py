@@ -51,7 +51,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Write packages that are found beside those that are installed."""
 
     def install(name: str, declared: str) -> None:
-        monkeypatch.delitem(sys.modules, name, raising=False)
+        monkeypatch.setitem(sys.modules, name, None)  # forgotten again at the end
+        del sys.modules[name]
         (tmp_path / f"{name}.py").write_text(declared)
         info = tmp_path / f"{name}-1.0.dist-info"
         info.mkdir()
@@ -91,11 +92,11 @@ def test_packages_of_others_declare_the_same(installed: Any) -> None:
 def test_one_that_is_broken_is_named_and_harms_no_other(
     installed: Any, declared: str, said: str
 ) -> None:
-    installed("lab_broken", declared)
+    installed("lab_unusable", declared)
     found = plugins()
     assert "bench" in found.found
     (fault,) = found.faults
-    assert fault.startswith("the plug-in lab_broken cannot be used: ")
+    assert fault.startswith("the plug-in lab_unusable cannot be used: ")
     assert said in fault
 
 

@@ -140,8 +140,7 @@ def test_pull_names_trials_that_are_neither_listed_nor_withdrawn(
     assert (done.there, done.withdrawn) == (2, 0)
     assert len(done.problems) == 1
     assert (
-        f"neither listed nor marked as withdrawn, and are left as they are: {TRIALS[1]}"
-        in (done.problems[0])
+        f"neither listed nor marked as withdrawn, left unchanged: {TRIALS[1]}" in (done.problems[0])
     )
     assert back.committed() == set(TRIALS)
 
