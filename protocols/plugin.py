@@ -1,12 +1,13 @@
 """What plug-ins add: commands, documents, and functions at named places of the core.
 
-A plug-in is a package with a `Plugin`, which its distribution names in the group `sliplab.plugins`:
+A plug-in is a package with a `Plugin`. Those that ship are the packages in `sliplab.plugins`, each
+with its `PLUGIN`. Other distributions name theirs in the group of entry points `sliplab.plugins`:
 
     [project.entry-points."sliplab.plugins"]
     my_subject = "my_package:PLUGIN"
 
-Those that ship are in `sliplab.plugins`. A declaration imports nothing; what it names is imported
-when it is used. A plug-in that cannot be imported does not affect others.
+A declaration imports nothing; what it names is imported when it is used. A plug-in that cannot be
+imported does not affect others.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
+from pkgutil import iter_modules
 from typing import Any
 
 from sliplab.protocols.plugins import PluginError, import_foreign
@@ -86,13 +89,21 @@ def plugins() -> Plugins:
     """Return the plug-ins that are installed; their declarations are imported."""
     found: dict[str, Plugin] = {}
     faults = []
-    for point in sorted(entry_points(group=GROUP), key=lambda each: (each.name, each.value)):
+    for name, place in _places():
         try:
-            plugin = import_foreign(point.value)
+            plugin = import_foreign(place)
             if not isinstance(plugin, Plugin):
-                raise PluginError(f"{point.value} is a {type(plugin).__name__}, not a Plugin")
+                raise PluginError(f"{place} is a {type(plugin).__name__}, not a Plugin")
         except PluginError as error:
-            faults.append(f"the plug-in {point.name} cannot be used: {error}")
+            faults.append(f"the plug-in {name} cannot be used: {error}")
         else:
-            found.setdefault(point.name, plugin)
+            found.setdefault(name, plugin)  # another package cannot replace one that ships
     return Plugins(found, tuple(faults))
+
+
+def _places() -> list[tuple[str, str]]:
+    """Return names and places, those that ship first: by their folders, so a checkout is enough."""
+    folders = iter_modules(import_module(GROUP).__path__)
+    shipped = [(each.name, f"{GROUP}.{each.name}:PLUGIN") for each in folders]
+    others = [(point.name, point.value) for point in entry_points(group=GROUP)]
+    return sorted(shipped) + sorted(others)
