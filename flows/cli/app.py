@@ -99,9 +99,10 @@ _added: set[str] = set()
 
 
 def command_line(words: Sequence[str] = ()) -> typer.Typer:
-    """Return the command line with the plug-ins' commands that the given words may name.
+    """Return the command line with the commands of plug-ins, where the given words may name one.
 
-    A command of the core loads no plug-in. Without a command, such as for the help, all are there.
+    A command of the core loads no plug-in. All are added at once, so that their order is always the
+    same.
 
     Raises:
         InputError: the command of a plug-in that cannot be imported.
@@ -109,9 +110,8 @@ def command_line(words: Sequence[str] = ()) -> typer.Typer:
     word = next((word for word in words if not word.startswith("-")), None)
     if word in _CORE and word not in GROUPS:
         return app
-    commands = plugins().commands()
-    for each in [word] if word in commands else sorted(commands):
-        for place in commands[each]:
+    for each, places in sorted(plugins().commands().items()):
+        for place in places:
             _add(each, place, needed=each == word)
     return app
 
