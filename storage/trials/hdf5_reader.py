@@ -270,19 +270,25 @@ class RowFile:
         if not isinstance(data, h5py.h5d.DatasetID):
             raise NotOurs(f"{self.path}: {name} is no column")
         kept = data.get_create_plist()
-        if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
+        layout = kept.get_layout()
+        if layout == h5py.h5d.VIRTUAL or kept.get_external_count():
             raise NotOurs(f"{self.path}: {name} points outside the file")
         if not _plain(data, _NUMBERS):
             raise NotOurs(f"{self.path}: {name} does not contain numbers")
-        stated = data.dtype.itemsize * math.prod(data.shape)
+        rows = Rows(data, f"{self.path}: {name}")
+        value = rows.dtype.itemsize
+        stated = value * math.prod(rows.shape)
         if stated > _LARGE and (stored := _stored_bytes(data, kept)) < stated:
             raise NotOurs(f"{self.path}: {name} has {stored} of its {stated} bytes")
-        chunk = kept.get_chunk() if kept.get_layout() == h5py.h5d.CHUNKED else ()
-        if max(_LARGE, 2 * stated) < data.dtype.itemsize * math.prod(chunk):
-            raise NotOurs(f"{self.path}: {name} is stored in pieces of {chunk} for {data.shape}")
-        filters = [kept.get_filter(number) for number in range(kept.get_nfilters())]
-        packing = [(kind, options) for kind, _, options, _ in filters]
-        return Rows(data, f"{self.path}: {name}", chunk, packing)
+        if layout == h5py.h5d.CHUNKED:
+            chunk = kept.get_chunk()
+            if max(_LARGE, 2 * stated) < value * math.prod(chunk):
+                raise NotOurs(
+                    f"{self.path}: {name} is stored in pieces of {chunk} for {rows.shape}"
+                )
+            filters = [kept.get_filter(number) for number in range(kept.get_nfilters())]
+            rows.pack(chunk, [(kind, options) for kind, _, options, _ in filters])
+        return rows
 
     def _place(self, name: str) -> bytes:
         """Return the full path of something in the file itself.
@@ -380,23 +386,28 @@ def _kind_of(name: str) -> Kind | None:
 class Rows:
     """One column: a dataset whose first axis is read in ranges.
 
-    Args:
-        chunk: values in each direction that are stored together; empty if it is stored in a row.
-        filters: what its chunks are packed with.
-
     Attributes:
         shape: all of it, rows first; () for a single value.
         dtype: of its values.
     """
 
-    def __init__(
-        self, data: Any, name: str, chunk: tuple[int, ...] = (), filters: Sequence[Filter] = ()
-    ) -> None:
+    def __init__(self, data: Any, name: str) -> None:
         self._data, self._name = data, name
-        self._chunk = chunk if filters else ()
-        self._filters, self._fine = filters, set[tuple[int, ...]]()
+        self._chunk: tuple[int, ...] = ()
+        self._filters: Sequence[Filter] = ()
+        self._fine = set[tuple[int, ...]]()
         self.shape: tuple[int, ...] = data.shape
         self.dtype = data.dtype
+
+    def pack(self, chunk: tuple[int, ...], filters: Sequence[Filter]) -> None:
+        """State how it is stored, so that each chunk's length is checked before it is read.
+
+        Args:
+            chunk: values in each direction that are stored together.
+            filters: what chunks are packed with; without any they have the right length.
+        """
+        if filters:
+            self._chunk, self._filters = chunk, filters
 
     def fits(self, kind: Kind) -> bool:
         """Return whether type and shape are of a kind; of ``integer`` any integers are."""
