@@ -40,6 +40,9 @@ class _Finder(MetaPathFinder):
 
 
 def install() -> None:
-    """Look for modules that are nowhere else among those that have moved."""
+    """Look for modules among those that have moved, first.
+
+    Python's own finder would find them again by the new package's path, as other modules.
+    """
     if not any(isinstance(each, _Finder) for each in sys.meta_path):
-        sys.meta_path.append(_Finder())
+        sys.meta_path.insert(0, _Finder())
