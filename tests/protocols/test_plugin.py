@@ -27,7 +27,7 @@ print(json.dumps([name for name in sys.modules if name.startswith("sliplab.plugi
 
 
 def loaded(*words: str) -> list[str]:
-    """Run a command in a process of its own; return the modules of plug-ins that it loads."""
+    """Run a command in a new process; return the modules of plug-ins that it loads."""
     done = subprocess.run(
         [sys.executable, "-c", LOADED, json.dumps(words)],
         cwd=ROOT, capture_output=True, text=True, check=True,
@@ -48,7 +48,7 @@ def test_a_command_of_the_core_loads_no_plug_in(tmp_path: Path) -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Write packages that are found beside those that are installed."""
+    """Return a function that installs a package for one test."""
 
     def install(name: str, declared: str) -> None:
         monkeypatch.setitem(sys.modules, name, None)  # forgotten again at the end
@@ -81,7 +81,7 @@ def test_packages_of_others_declare_the_same(installed: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("declared", "said"),
+    ("declared", "reason"),
     [
         ("raise OSError('no camera')", "OSError: no camera"),
         ("import sys; sys.exit(3)", "exit code 3"),
@@ -90,14 +90,14 @@ def test_packages_of_others_declare_the_same(installed: Any) -> None:
     ],
 )
 def test_one_that_is_broken_is_named_and_harms_no_other(
-    installed: Any, declared: str, said: str
+    installed: Any, declared: str, reason: str
 ) -> None:
     installed("lab_unusable", declared)
     found = plugins()
     assert "bench" in found.found
     (fault,) = found.faults
     assert fault.startswith("the plug-in lab_unusable cannot be used: ")
-    assert said in fault
+    assert reason in fault
 
 
 def test_names_from_before_a_move_still_work() -> None:

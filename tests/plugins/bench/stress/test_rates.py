@@ -32,6 +32,6 @@ def test_false_alarms_under_nuisances_are_those_of_the_networks_rule() -> None:
     found = stress_alarms(record, "own")
     assert {name: it.value for name, it in found.items()} == {"nuisances": 168.0, "none": 2.0}
     assert stress_alarms(record, "preset: paper") == stress_alarms(None, "own") == {}
-    said = alarm_words(QUIET | found)
-    assert "80.0 (9.7 to 289.0) in quiet holding (2 in 0.025 h of 3 trials; below 24" in said
-    assert "168 (90 to 260) under nuisances" in said
+    text = alarm_words(QUIET | found)
+    assert "80.0 (9.7 to 289.0) in quiet holding (2 in 0.025 h of 3 trials; below 24" in text
+    assert "168 (90 to 260) under nuisances" in text
