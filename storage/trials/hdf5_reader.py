@@ -483,14 +483,24 @@ class Rows:
         for at in product(range(low // step * step, high, step), *others):
             if at in self._fine:
                 continue
-            if self._data.get_chunk_info_by_coord(at).byte_offset is not None:
-                mask, data = self._data.read_direct_chunk(at)
-                found = unpacked_bytes(self._filters, mask, data, full)
+            if (kept := self._kept_chunk(at)) is not None:
+                found = unpacked_bytes(self._filters, *kept, full)
                 if found is not None and found < full:
                     raise NotOurs(
                         f"{self._name} has a chunk of {found} bytes, not {full}, at row {at[0]}"
                     )
             self._fine.add(at)
+
+    def _kept_chunk(self, at: tuple[int, ...]) -> tuple[int, bytes] | None:
+        """Return the filters that a chunk went past, and its bytes; None where nothing is kept."""
+        try:
+            mask, data = self._data.read_direct_chunk(at)
+        except _HDF5_ERRORS:
+            # asked only now: HDF5 goes through all chunks to answer it
+            if self._data.get_chunk_info_by_coord(at).byte_offset is None:
+                return None
+            raise
+        return mask, data
 
     def added(self, low: int, high: int, amount: int) -> I64:
         """Read rows low to high of a column of integers, as int64, with `amount` added to each.
