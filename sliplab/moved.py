@@ -10,6 +10,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MOVED = {
+    "sliplab.rigs.testing": "sliplab.plugins.driver_kit",
     "sliplab.analysis.bench": "sliplab.plugins.bench",
 }
 """Old names of packages, and what they are now."""

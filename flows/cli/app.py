@@ -13,7 +13,6 @@ from sliplab.flows.cli import (
     control,
     detect,
     exchange,
-    new,
     power,
     publish,
     reflex,
@@ -75,7 +74,6 @@ for part in (
     detect.app,
     reflex.app,
     schema.app,
-    new.app,
 ):
     app.add_typer(part)
 

@@ -1,6 +1,6 @@
 """The USB camera's driver: OpenCV in its process, on streams; settings on a pretended camera.
 
-What a rig needs of it is tried by the rules of conformance (tests/rigs/testing/test_built_in.py).
+What a rig needs of it is tried by the rules of conformance: tests/plugins/driver_kit.
 """
 
 from __future__ import annotations

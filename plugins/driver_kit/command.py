@@ -1,0 +1,58 @@
+"""`sliplab new driver`: a package of one's own, to start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sliplab.flows.cli.common import JsonOption, finish
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
+
+app = typer.Typer()
+new_app = typer.Typer(
+    help="Write a package to start from.",
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(new_app, name="new")
+
+
+@new_app.callback()
+def new() -> None:
+    """Write a package to start from."""
+
+
+@new_app.command("driver")
+def driver(
+    name: Annotated[
+        str, typer.Argument(help="Name of the driver, as rig files will write it: my_arm.")
+    ],
+    kind: Annotated[
+        str,
+        typer.Option("--kind", help="Kind of device: arm, events, frames, sync, force or gripper."),
+    ] = "arm",
+    into: Annotated[
+        Path, typer.Option("--into", help="Folder in which the package's own folder is made.")
+    ] = Path(),
+    as_json: JsonOption = False,
+) -> None:
+    """Write a package with a driver that works on its fake, and a test of SlipLab's rules."""
+    from sliplab.plugins.driver_kit.new_package import KINDS, name_fault, write_package
+
+    if kind not in KINDS:
+        raise InputError("--kind", "", kind, one_of(kind, KINDS))
+    if fault := name_fault(name):
+        raise InputError("NAME", "", name, fault)
+    folder = into / name.replace("_", "-")
+    if folder.exists():
+        raise InputError("FOLDER", "", folder, "exists already and is not overwritten")
+    try:
+        written = write_package(folder, name, kind)
+    except OSError as error:
+        text = f"cannot be written: {error.strerror}"
+        raise InputError("FOLDER", "", folder, text) from None
+    result = {"driver": name, "kind": kind, "folder": str(folder), "files": written}
+    finish(result, f"new driver {name}", as_json)

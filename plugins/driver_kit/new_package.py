@@ -1,0 +1,178 @@
+"""A new package: an example driver under another name, with a rig file, a test and a page."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+from sliplab.rigs.core.registry import listed
+
+KINDS = {
+    "arm": "arm", "events": "event_camera", "frames": "frame_camera", "sync": "sync_box",
+    "force": "force_sensor", "gripper": "gripper",
+}  # fmt: skip
+"""Key of the device in a rig file, by the example that a new driver starts from."""
+_EXAMPLES = "sliplab.plugins.driver_kit.examples"
+_OWN_IMPORT = r"^from {package}\S* import (?:\([^)]*\)|[^\n(]*)\n"
+
+PYPROJECT = Template("""\
+[build-system]
+requires = ["setuptools>=77"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "$project"
+version = "0.1.0"
+description = "A driver for SlipLab."
+requires-python = ">=3.11"
+dependencies = ["sliplab"]
+
+[project.optional-dependencies]
+dev = ["pytest>=9"]
+
+[project.entry-points."sliplab.drivers"]
+$name = "$name:DRIVER"
+
+[tool.setuptools]
+packages = ["$name"]
+""")
+
+README = Template("""\
+# $name
+
+A driver for SlipLab. It runs as it stands, on a fake of a device that does not exist.
+
+```sh
+pip install -e .[dev]
+pytest                       # the rules that SlipLab holds a driver of this kind to
+sliplab rigs --drivers       # lists $name
+sliplab rigs rig.yaml        # reads the rig file that uses it
+```
+
+| file | change it to |
+| --- | --- |
+| `$name/__init__.py` | your device's settings, and how it is looked for |
+| `$name/driver.py` | how your device is spoken to: its protocol, or its maker's library |
+| `$name/fake.py` | what your device answers, so that all of it is tested without one |
+
+`rig.yaml` is a loopback rig with its fake; the rig file of a real rig has the same section of
+`devices:`, with the settings of your device.
+
+Write down here what was never tried on the device itself.
+""")
+
+RIG = Template("""\
+# The loopback rig with $name, on its fake: all that it stores is simulated.
+extends: loopback
+name: $project-loopback
+devices:
+  $key: {driver: $name$device}
+$more""")
+_IN_RIG = {
+    "arm": (
+        ", host: 127.0.0.1, limits: {frame: plate, low_mm: [-20, -20, -70],\n"
+        "    high_mm: [20, 20, 4.4], depth_mm: 4.4, speed_mm_s: 100}",
+        "mock: {arm: {start_xyz_mm: [397, 0, 300]}}   # within the limits\n",
+    ),
+    "force": (
+        "",
+        "timing: {force: {grade: host time, delay: {shortest_us: 0, longest_us: 400000}}}\n"
+        "mock: {force: {}}   # what its fake shows\n",
+    ),
+    "gripper": (
+        ", opening_mm: 40",
+        "mock: {gripper: {opening_mm: 40}}   # the fingers that its fake moves\n",
+    ),
+}
+"""What a rig file needs besides the name of the driver, in the device's section and below it."""
+
+TEST = Template('''\
+"""$name keeps the rules that SlipLab holds a driver of its kind to, on its fake."""
+
+from $name import DRIVER, $settings
+from sliplab.testing import conformance$more
+
+test_driver = conformance(DRIVER, $settings($arguments))
+''')
+_ARGUMENTS = {
+    "arm": (
+        '\n    host="127.0.0.1", port=free_port(),\n'
+        '    limits={"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)},\n'
+    ),
+    "gripper": "opening_mm=40",
+}
+"""What the settings of the test need."""
+
+
+def name_fault(name: str) -> str:
+    """Return what is wrong with the name of a new driver; empty if nothing is."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        return "must be lower-case letters, digits and underscores, a letter first"
+    if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in {"sliplab", "tests"}:
+        return "is a name that Python or SlipLab uses; choose another one"
+    if name in listed():
+        return f"is already the name of a driver of {listed()[name].package}; choose another one"
+    return ""
+
+
+def package_files(name: str, kind: str) -> dict[str, str]:
+    """Return the text of each file of a new package, by its path.
+
+    Args:
+        name: of the driver and its package.
+        kind: one of `KINDS`.
+    """
+    class_name = "".join(part.capitalize() for part in name.split("_"))
+    example = f"Example{kind.capitalize()}"
+    device, rest = _IN_RIG.get(kind, ("", ""))
+    words = {
+        "name": name, "project": name.replace("_", "-"), "key": KINDS[kind],
+        "settings": f"{class_name}Settings",
+        "more": ", free_port" if kind == "arm" else "",
+        "arguments": _ARGUMENTS.get(kind, ""),
+    }  # fmt: skip
+    found = {
+        "pyproject.toml": PYPROJECT.substitute(words),
+        "README.md": README.substitute(words),
+        "rig.yaml": RIG.substitute(words, device=device, more=rest),
+        f"tests/test_{name}.py": TEST.substitute(words),
+    }
+    for module in ("__init__", "driver", "fake"):
+        text = (files(_EXAMPLES) / kind / f"{module}.py").read_text()
+        text = text.replace(f"{_EXAMPLES}.{kind}", name)
+        text = text.replace(example, class_name).replace(f"example_{kind}", name)
+        text = re.sub(r"(?:the e|E)xample (?:arm|event camera|frame camera|sync box|"
+                      r"force sensor|gripper)", name, text)  # fmt: skip
+        found[f"{name}/{module}.py"] = _own_imports_last(text, name)
+    return found
+
+
+def _own_imports_last(text: str, package: str) -> str:
+    """Move a module's imports of its own package behind those of others."""
+    pattern = re.compile(_OWN_IMPORT.format(package=package), re.MULTILINE)
+    own = "".join(pattern.findall(text))
+    rest = pattern.sub("", text)
+    others = list(re.finditer(_OWN_IMPORT.format(package="sliplab"), rest, re.MULTILINE))
+    if not own or not others:
+        return text
+    end = others[-1].end()
+    return f"{rest[:end]}\n{own}{rest[end:]}"
+
+
+def write_package(folder: Path, name: str, kind: str) -> list[str]:
+    """Write a new package into a folder that does not exist yet; return its files.
+
+    Raises:
+        FileExistsError: the folder exists.
+        OSError: it cannot be written.
+    """
+    folder.mkdir(parents=True)
+    texts = package_files(name, kind)
+    for path, text in texts.items():
+        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).write_text(text)
+    return sorted(texts)

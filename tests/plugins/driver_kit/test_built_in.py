@@ -1,0 +1,125 @@
+"""Every driver that ships keeps the rules of its kind, on its own fake."""
+
+from __future__ import annotations
+
+import pytest
+
+from sliplab.plugins.driver_kit.conformance import Case, cases
+from sliplab.plugins.driver_kit.rule import Bounds
+from sliplab.rigs.core.driver import Driver
+from sliplab.rigs.core.registry import BUILT_IN, Listed, load_driver
+from sliplab.rigs.devices import (
+    abb,
+    ati_net_ft,
+    basler,
+    dvxplorer,
+    robotiq_2f,
+    sync_box,
+    ur,
+    uvc,
+)
+from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
+from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
+from sliplab.rigs.devices.basler.settings import BaslerSettings
+from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
+from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
+from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
+from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
+from sliplab.rigs.devices.uvc.settings import UvcSettings
+from tests.plugins.driver_kit.trying import LIMITS, each_apart, free_udp_port, try_all
+from tests.rigs.waiting import own_address
+
+pytestmark = pytest.mark.realtime
+NO_CLOCK = "this server reports no time"
+UR_BOUNDS = Bounds(connect_s=25.0, call_s=12.0)
+"""As its docstrings promise."""
+
+
+def ur_settings() -> UrSettings:
+    return UrSettings(host=own_address(), frequency_hz=125, limits=LIMITS)
+
+
+def abb_settings() -> AbbSettings:
+    return AbbSettings(
+        host=own_address(), rws_port=8080, egm_bind="127.0.0.1", egm_port=free_udp_port(),
+        limits=LIMITS, tool={"tcp_mm": (0, 0, 120), "mass_kg": 0.4},
+    )  # fmt: skip
+
+
+def abb_cases() -> list[Case]:
+    return cases(abb.DRIVER, abb_settings())
+
+
+def socket_cases() -> list[Case]:
+    settings = AbbSocketSettings(host=own_address(), limits=LIMITS)
+    return cases(abb.SOCKET_DRIVER, settings, Bounds(call_s=10.0))
+
+
+def ur_cases() -> list[Case]:
+    return cases(ur.DRIVER, ur_settings(), UR_BOUNDS)
+
+
+def wrench_cases() -> list[Case]:
+    arm = ur.DRIVER, ur_settings()
+    return cases(ur.WRENCH_DRIVER, UrWrenchSettings(), UR_BOUNDS, arm=arm)
+
+
+def ati_cases() -> list[Case]:
+    return cases(ati_net_ft.DRIVER, AtiNetFtSettings(host=own_address()))
+
+
+def dvxplorer_cases() -> list[Case]:
+    return cases(dvxplorer.DRIVER, DvxplorerSettings())
+
+
+def sync_cases() -> list[Case]:
+    settings = SyncBoxSettings(port="/dev/null", boot_s=0.5, silence_s=0.3)
+    return cases(sync_box.DRIVER, settings)
+
+
+def basler_cases() -> list[Case]:
+    settings = BaslerSettings(trigger="hardware", trigger_line="Line1", sync_line=2, stall_s=0.4)
+    return cases(basler.DRIVER, settings)
+
+
+def uvc_cases() -> list[Case]:
+    settings = UvcSettings(device="/dev/null", width_px=128, height_px=96, stall_s=0.4)
+    return cases(uvc.DRIVER, settings)
+
+
+def gripper_cases() -> list[Case]:
+    settings = Robotiq2fSettings(host="127.0.0.1", opening_mm=40.0, answer_s=0.5)
+    return cases(robotiq_2f.DRIVER, settings)
+
+
+LATE, SYNC, WRAPS = "late answer", "sync input", "counter wraps"
+DEVICES = {
+    # not simulated: requests of their own connection, registers, and HTTP
+    "abb": (abb_cases, {LATE, SYNC}),
+    "abb_socket": (socket_cases, {"clock falls back", SYNC}),  # it reports no time
+    "ur": (ur_cases, {LATE}),
+    "ur_wrench": (wrench_cases, {"overload", WRAPS}),  # the controller's own stop, and its clock
+    "ati_net_ft": (ati_cases, set()),
+    "robotiq_2f": (gripper_cases, set()),
+    "dvxplorer": (dvxplorer_cases, set()),
+    "sync_box": (sync_cases, set()),
+    "basler": (basler_cases, set()),
+    # it has neither clock nor frame numbers nor a line
+    "uvc": (uvc_cases, {"times fall back", WRAPS, "lost frames", "level of the sync line"}),
+}
+ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_a_driver_that_ships_keeps_every_rule(name: str) -> None:
+    make, not_simulated = DEVICES[name]
+    at_once = {"at_once": 1} if name in ONE_AT_A_TIME else {}
+    broken, not_tried = try_all(each_apart(make), **at_once)
+    assert not broken, "\n".join(broken.values())
+    assert set(not_tried) == not_simulated, not_tried
+
+
+def test_no_driver_that_ships_is_left_out() -> None:
+    assert set(DEVICES) == set(BUILT_IN)
+    found: list[Driver] = [load_driver(Listed(*item, "sliplab")) for item in BUILT_IN.items()]
+    assert {make()[0].driver for make, _ in DEVICES.values()} == {driver.name for driver in found}
