@@ -1,4 +1,4 @@
-"""What plug-ins add: commands, documents, and functions at named places of the core.
+"""What plug-ins add: commands, documents, drivers, and functions at named places of the core.
 
 A plug-in is a package with a `Plugin`. Those that ship are the packages in `sliplab.plugins`, each
 with its `PLUGIN`. Other distributions name theirs in the group of entry points `sliplab.plugins`:
@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pkgutil import iter_modules
 from typing import Any
 
@@ -34,12 +34,15 @@ class Plugin:
             extend, such as ``calibrate``.
         documents: by kind, models of the JSON documents that it writes
             (`storage.schema.document.Document`), each with the title of its schema.
+        drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only
+            drivers names them in the group of entry points `sliplab.drivers` instead.
         hooks: functions that the core calls, by the name of the place; docs/architecture.md lists
             the places.
     """
 
     commands: Mapping[str, str] = field(default_factory=dict)
     documents: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    drivers: Mapping[str, str] = field(default_factory=dict)
     hooks: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -49,10 +52,12 @@ class Plugins:
 
     Attributes:
         found: by name, sorted.
+        packages: the distribution of each, and its version, by name.
         faults: why a plug-in cannot be used, one line each.
     """
 
     found: Mapping[str, Plugin]
+    packages: Mapping[str, str]
     faults: tuple[str, ...]
 
     def commands(self) -> dict[str, list[str]]:
@@ -88,8 +93,9 @@ class Plugins:
 def plugins() -> Plugins:
     """Return the plug-ins that are installed; their declarations are imported."""
     found: dict[str, Plugin] = {}
+    packages: dict[str, str] = {}
     faults = []
-    for name, place in _places():
+    for name, place, package in _places():
         try:
             plugin = import_foreign(place)
             if not isinstance(plugin, Plugin):
@@ -98,12 +104,21 @@ def plugins() -> Plugins:
             faults.append(f"the plug-in {name} cannot be used: {error}")
         else:
             found.setdefault(name, plugin)  # another package cannot replace one that ships
-    return Plugins(found, tuple(faults))
+            packages.setdefault(name, package)
+    return Plugins(found, packages, tuple(faults))
 
 
-def _places() -> list[tuple[str, str]]:
-    """Return names and places, those that ship first: by their folders, so a checkout is enough."""
+def package_of(point: EntryPoint) -> str:
+    """Return the distribution of an entry point, and its version."""
+    return "" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+
+
+def _places() -> list[tuple[str, str, str]]:
+    """Return names, places and distributions of plug-ins, first of those that ship.
+
+    Those are found by their folders, so a checkout is enough.
+    """
     folders = iter_modules(import_module(GROUP).__path__)
-    shipped = [(each.name, f"{GROUP}.{each.name}:PLUGIN") for each in folders]
-    others = [(point.name, point.value) for point in entry_points(group=GROUP)]
+    shipped = [(each.name, f"{GROUP}.{each.name}:PLUGIN", "sliplab") for each in folders]
+    others = [(each.name, each.value, package_of(each)) for each in entry_points(group=GROUP)]
     return sorted(shipped) + sorted(others)

@@ -1,6 +1,6 @@
-"""Registry of drivers: those shipped with SlipLab, and those of other packages.
+"""Registry of drivers: those shipped with SlipLab, those of plug-ins and of other packages.
 
-A package provides drivers by entry points of the group `sliplab.drivers`:
+A package with drivers only provides drivers by entry points of the group `sliplab.drivers`:
 
     [project.entry-points."sliplab.drivers"]
     my_arm = "my_package.my_arm:DRIVER"
@@ -14,9 +14,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
+from sliplab.protocols.plugin import package_of, plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import one_of
 from sliplab.rigs.core.driver import Driver
@@ -26,7 +27,6 @@ GROUP = "sliplab.drivers"
 BUILT_IN = {
     "ur": "sliplab.rigs.devices.ur:DRIVER",
     "abb": "sliplab.rigs.devices.abb:DRIVER",
-    "abb_socket": "sliplab.rigs.devices.abb:SOCKET_DRIVER",
     "dvxplorer": "sliplab.rigs.devices.dvxplorer:DRIVER",
     "basler": "sliplab.rigs.devices.basler:DRIVER",
     "uvc": "sliplab.rigs.devices.uvc:DRIVER",
@@ -55,23 +55,28 @@ class Listed:
 @cache
 def listed() -> dict[str, Listed]:
     """Return every installed driver by name, those that ship first."""
-    found = {name: Listed(name, place, "sliplab") for name, place in BUILT_IN.items()}
-    for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, _package(point))):
+    found = _built_in()
+    for subject, plugin in plugins().found.items():
+        for name, place in plugin.drivers.items():
+            found.setdefault(name, Listed(name, place, plugins().packages[subject]))
+    for point in sorted(
+        entry_points(group=GROUP), key=lambda point: (point.name, package_of(point))
+    ):
         if point.name not in found:  # another package cannot replace a shipped driver
-            found[point.name] = Listed(point.name, point.value, _package(point))
+            found[point.name] = Listed(point.name, point.value, package_of(point))
     return found
 
 
-def _package(point: EntryPoint) -> str:
-    return "" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+def _built_in() -> dict[str, Listed]:
+    return {name: Listed(name, place, "sliplab") for name, place in BUILT_IN.items()}
 
 
 def taken() -> list[str]:
     """Return a message for every entry point whose name is already taken."""
     known = listed()
     return [
-        f"{point.name} of {_package(point)} is not used: {known[point.name].package} has a driver "
-        "of that name"
+        f"{point.name} of {package_of(point)} is not used: {known[point.name].package} has a "
+        "driver of that name"
         for point in entry_points(group=GROUP)
         if known[point.name].place != point.value
     ]
@@ -83,10 +88,10 @@ def find_driver(name: str, kind: type[DriverT]) -> DriverT:
     Raises:
         DriverError: no package provides it, it cannot be imported, or it is of another kind.
     """
-    known = listed()
-    if name not in known:
+    known = _built_in().get(name) or listed().get(name)  # plug-ins are not looked for in vain
+    if known is None:
         raise DriverError(_unknown(name, kind))
-    driver = load_driver(known[name])
+    driver = load_driver(known)
     if not isinstance(driver, kind):
         raise DriverError(f"is the driver of a kind of {driver.kind}, not of {kind.kind}")
     return driver

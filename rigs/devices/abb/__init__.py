@@ -1,4 +1,4 @@
-"""ABB arms on an IRC5 controller: motion programs with EGM poses, or a RAPID socket server."""
+"""ABB arms on an IRC5 controller: motion programs with EGM poses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from sliplab.rigs.core.driver import ArmDriver, ArmScene
 from sliplab.rigs.core.network import answers, arm_lock
-from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
+from sliplab.rigs.devices.abb.settings import AbbSettings
 
 if TYPE_CHECKING:
     from sliplab.rigs.core.capabilities import Arm
@@ -32,18 +32,6 @@ def _fake(settings: AbbSettings, scene: ArmScene) -> FakeController:
     )
 
 
-def _build_socket(settings: AbbSocketSettings) -> Arm:
-    from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
-
-    return AbbSocketArm(settings)
-
-
-def _fake_socket(settings: AbbSocketSettings, scene: ArmScene) -> FakeController:
-    from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
-
-    return FakeRapidServer(settings.host, settings.port, motion=scene.motion, clock=scene.clock)
-
-
 LIBRARIES = ("abb_motion_program_exec", "abb_robot_client")
 
 DRIVER = ArmDriver(
@@ -56,15 +44,4 @@ DRIVER = ArmDriver(
     locks=arm_lock,
     build=_build,
     fake=_fake,
-)
-SOCKET_DRIVER = ArmDriver(
-    name="abb_socket",
-    title="ABB, RAPID",
-    settings=AbbSocketSettings,
-    ping=lambda settings: answers(settings.host, settings.port),
-    address=lambda settings: settings.host,
-    locks=arm_lock,
-    build=_build_socket,
-    twists=False,  # it rests between the pieces of a turn, whose zones are too small
-    fake=_fake_socket,
 )

@@ -1,8 +1,8 @@
-"""Settings of the two ABB drivers, as rig files give them; cheap to import."""
+"""Settings of the ABB driver, as rig files give them; cheap to import."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -11,7 +11,7 @@ from sliplab.rigs.core.arm_settings import BaseArmSettings, Port
 
 
 class AbbSettings(BaseArmSettings):
-    """An ABB arm on an IRC5 controller, driven by motion programs (option a, the default)."""
+    """An ABB arm on an IRC5 controller, driven by motion programs."""
 
     driver: Literal["abb"] = "abb"
     rws_port: Port = 80
@@ -29,13 +29,3 @@ class AbbSettings(BaseArmSettings):
     """Silence of this host after which the controller stops the arm, by the module
     `sliplab_watchdog.mod` (`docs/arms.md`), which is then required. null: no such module is loaded,
     and a path runs to its end when this host or the network fails."""
-
-
-class AbbSocketSettings(BaseArmSettings):
-    """An ABB arm behind the small RAPID socket server that some labs run (option b)."""
-
-    host_clock: ClassVar[bool] = True
-    driver: Literal["abb_socket"] = "abb_socket"
-    port: Port = 5000
-    segment_s: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Longest duration of one move request; a stop waits for it to end."""

@@ -11,8 +11,9 @@ import pytest
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import describe_campaign
+from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
+from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from sliplab.plugins.abb_socket import device as abb_socket
+from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.plugins.driver_kit.conformance import Case, cases
 from sliplab.plugins.driver_kit.rule import Bounds
 from sliplab.rigs.core.driver import Driver
@@ -18,7 +20,7 @@ from sliplab.rigs.devices import (
     ur,
     uvc,
 )
-from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
+from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
@@ -52,7 +54,7 @@ def abb_cases() -> list[Case]:
 
 def socket_cases() -> list[Case]:
     settings = AbbSocketSettings(host=own_address(), limits=LIMITS)
-    return cases(abb.SOCKET_DRIVER, settings, Bounds(call_s=10.0))
+    return cases(abb_socket.DRIVER, settings, Bounds(call_s=10.0))
 
 
 def ur_cases() -> list[Case]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from sliplab.plugins.abb_socket.driver import AbbSocketArm
+from sliplab.plugins.abb_socket.fake import INFO, FakeRapidServer
+from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
-from sliplab.rigs.devices.abb.fake_socket import INFO, FakeRapidServer
-from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
-from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
+from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.ur.fake import VERSION
 from tests.rigs.devices.conftest import MakeArm, MakeRobot
 from tests.rigs.waiting import own_address

@@ -13,6 +13,7 @@ import asyncio
 import struct
 from collections.abc import Sequence
 
+from sliplab.plugins.abb_socket.wire import ARGUMENTS, Command
 from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
 from sliplab.rigs.core.fakes import (
@@ -23,7 +24,6 @@ from sliplab.rigs.core.fakes import (
     Stage,
 )
 from sliplab.rigs.core.pose import distance_mm, from_quaternion, quaternion
-from sliplab.rigs.devices.abb.rapid_socket import ARGUMENTS, Command
 
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
 ACCELERATION_MM_S2 = 500.0

@@ -16,6 +16,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
+from sliplab.plugins.abb_socket.settings import AbbSocketSettings
+from sliplab.plugins.abb_socket.wire import Command, RapidError, RapidSocket, socket_health
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -27,8 +29,6 @@ from sliplab.rigs.core.capabilities import (
 from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
 from sliplab.rigs.core.pose_stream import PoseCheck, PoseJumpError, Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
-from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket, socket_health
-from sliplab.rigs.devices.abb.settings import AbbSocketSettings
 from sliplab.storage.streams import PoseChunk
 
 T = TypeVar("T")

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.abb_socket import device as abb_socket
+from sliplab.plugins.abb_socket import driver
+from sliplab.plugins.abb_socket.driver import AbbSocketArm
+from sliplab.plugins.abb_socket.fake import FakeRapidServer
+from sliplab.plugins.abb_socket.settings import AbbSocketSettings
+from sliplab.plugins.abb_socket.wire import Command, RapidError, RapidSocket
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
-from sliplab.rigs.devices import abb
-from sliplab.rigs.devices.abb import socket_driver as driver
-from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
-from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket
-from sliplab.rigs.devices.abb.settings import AbbSocketSettings
-from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
 from tests.rigs.devices.conftest import closed, mm_after_kill, reconnect
 from tests.rigs.waiting import own_address, until
 
@@ -91,7 +91,7 @@ def test_a_slide_in_pieces_is_at_its_speed_where_they_run_into_each_other(
 
 def test_it_is_an_arm_that_sets_its_tool(pair: MakePair) -> None:
     arm, robot = pair()
-    assert isinstance(abb.SOCKET_DRIVER.build(settings("127.0.0.1")), Arm)
+    assert isinstance(abb_socket.DRIVER.build(settings("127.0.0.1")), Arm)
     assert arm.state() is ArmState.READY
     assert distance_mm(arm.pose(), HOME) < 1e-3
     assert robot.tool.xyz_mm == (0, 0, 120)
@@ -193,8 +193,8 @@ def test_a_stop_that_nobody_can_confirm_is_a_fault(
 
 KILLED = """
 import sys, threading
-from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
-from sliplab.rigs.devices.abb.settings import AbbSocketSettings
+from sliplab.plugins.abb_socket.driver import AbbSocketArm
+from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.rigs.core.capabilities import Pose, Segment
 arm = AbbSocketArm(AbbSocketSettings.model_validate_json(sys.argv[1]))
 arm.connect()
