@@ -32,12 +32,13 @@ from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import (
     AlarmRate,
+    ExperimentLatency,
     ExperimentScores,
+    Latencies,
     SeedTimes,
     TrialLatency,
     TrialScore,
 )
-from sliplab.storage.schema.export import ExperimentLatency, Latencies
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.schema.sweeps import HoldoutScores
 from sliplab.storage.trials.recording import Recording

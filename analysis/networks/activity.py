@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED, reset_states
-from sliplab.storage.schema.export import WindowCost
+from sliplab.storage.schema.evaluation import WindowCost
 
 
 @dataclass(frozen=True)

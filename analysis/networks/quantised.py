@@ -33,11 +33,12 @@ from sliplab.analysis.networks.network import (
     parameters,
     set_weights,
 )
-from sliplab.analysis.networks.speck import STATE_BITS, WEIGHT_BITS
 from sliplab.analysis.networks.training import Fitted
 from sliplab.storage.kernels import njit
-from sliplab.storage.schema.export import CountChange
+from sliplab.storage.schema.evaluation import CountChange
 
+WEIGHT_BITS, STATE_BITS = 8, 16
+"""Of the chip (`plugins/deploy/speck.py` has its limits)."""
 LOWEST = np.float32(-(1 << STATE_BITS - 1))
 HIGHEST = np.float32((1 << STATE_BITS - 1) - 1)
 """Range of a potential of the chip; it saturates there."""

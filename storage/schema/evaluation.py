@@ -605,3 +605,42 @@ class LabelCheck(Document):
     trials: Int
     simulated: Bool
     rules_ms: RuleErrors
+
+
+class ExperimentLatency(Part):
+    """Latencies over the test trials of an experiment."""
+
+    trials: Int
+    """Trials with both onsets."""
+    latency_ms: LatencyByOnset
+
+
+Latencies = dict[str, ExperimentLatency]
+"""By experiment."""
+
+
+class CountChange(Part):
+    """Change of spike counts by quantisation."""
+
+    windows: Int
+    equal_counts: Number
+    """Share of windows with equal counts."""
+    equal_class: Number
+    """Share with the same class: the same unique winner, or none."""
+    equal_class_by_margin: Number
+    mean_change: Number
+    """Of a count."""
+    largest_change: Int
+
+
+class WindowCost(Part):
+    """Means over windows, by layer; the last of each sum is `all`."""
+
+    windows: Int
+    events_a_window: Number
+    rates: dict[str, Number]
+    """Spikes per neuron and step."""
+    synaptic_operations: dict[str, Number]
+    dense_multiply_adds: dict[str, Int]
+    """Without looking at zeros."""
+    share_of_dense: Number

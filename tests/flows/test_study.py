@@ -413,10 +413,10 @@ def test_the_model_goes_out_as_what_it_is(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
-    from sliplab.analysis.evaluation.export import ExportFailed
-    from sliplab.analysis.networks import onnx_file
     from sliplab.flows.detecting.request import load_model
-    from sliplab.flows.export_model import export_model
+    from sliplab.plugins.deploy import onnx_file
+    from sliplab.plugins.deploy.export import ExportFailed
+    from sliplab.plugins.deploy.run import export_model
 
     store = store_of(ran)
     model = store.folder / "models" / "seed0.pt"

@@ -190,7 +190,7 @@ def test_the_chip_vendors_package_is_never_imported() -> None:
     """It would try to install things when it is imported."""
     code = (
         "import sys\n"
-        "import sliplab.analysis.detectors.live, sliplab.analysis.networks.onnx_file\n"
+        "import sliplab.analysis.detectors.live, sliplab.plugins.deploy.onnx_file\n"
         "import sliplab.analysis.networks.quantised, sliplab.analysis.networks.training\n"
         "from sliplab.analysis.networks.network import build\n"
         "from sliplab.protocols.settings import Network, Windows\n"

@@ -8,9 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
-from sliplab.analysis.evaluation.export import CHECKED, ExportFigures, export_files
 from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.running import console
+from sliplab.plugins.deploy.export import CHECKED, ExportFigures, export_files
 from sliplab.storage.files import make_folder, write_bytes, write_text
 from sliplab.storage.trials.store import Store
 

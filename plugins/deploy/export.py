@@ -22,7 +22,6 @@ from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.activity import activity
-from sliplab.analysis.networks.model_card import SplitResult, card_markdown, model_card
 from sliplab.analysis.networks.models import (
     comparison_models,
     rules_of,
@@ -37,24 +36,23 @@ from sliplab.analysis.networks.quantised import (
     quantise,
     quantised_net,
 )
-from sliplab.analysis.networks.speck import speck_fit, speck_markdown
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
-from sliplab.protocols.errors import InputError
-from sliplab.storage.files import json_text, sha256
-from sliplab.storage.schema.evaluation import Accuracy
-from sliplab.storage.schema.export import (
+from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
+from sliplab.plugins.deploy.document import (
     CardCampaign,
     CardData,
-    CountChange,
-    Latencies,
     ModelCard,
     ModelFile,
     Quantisation,
     QuantisedLayer,
     SpeckDescription,
 )
+from sliplab.plugins.deploy.speck import speck_fit, speck_markdown
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import json_text, sha256
+from sliplab.storage.schema.evaluation import Accuracy, CountChange, Latencies
 from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -128,7 +126,7 @@ def _first_set(samples: dict[str, SampleSet]) -> SampleSet:
 
 def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[bytes, int]:
     """Return the ONNX file, and the number of windows on which it was verified."""
-    from sliplab.analysis.networks.onnx_file import OnnxDiffers, check_onnx, to_onnx
+    from sliplab.plugins.deploy.onnx_file import OnnxDiffers, check_onnx, to_onnx
 
     windows = source.fitted.windows
     about = {

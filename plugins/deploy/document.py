@@ -8,7 +8,13 @@ from pydantic import PlainSerializer
 
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
-from sliplab.storage.schema.evaluation import Accuracy, Classification, LatencyByOnset
+from sliplab.storage.schema.evaluation import (
+    Accuracy,
+    Classification,
+    CountChange,
+    Latencies,
+    WindowCost,
+)
 
 _whole = PlainSerializer(lambda settings: settings.model_dump(mode="json"))
 """All settings, the defaults too."""
@@ -19,18 +25,6 @@ class ModelFile(Part):
 
     file: str
     sha256: str
-
-
-class ExperimentLatency(Part):
-    """Latencies over the test trials of an experiment."""
-
-    trials: Int
-    """Trials with both onsets."""
-    latency_ms: LatencyByOnset
-
-
-Latencies = dict[str, ExperimentLatency]
-"""By experiment."""
 
 
 class PlacedLayer(Part):
@@ -103,20 +97,6 @@ class QuantisedLayer(Part):
     """Share of the potentials that were cut off."""
 
 
-class CountChange(Part):
-    """Change of spike counts by quantisation."""
-
-    windows: Int
-    equal_counts: Number
-    """Share of windows with equal counts."""
-    equal_class: Number
-    """Share with the same class: the same unique winner, or none."""
-    equal_class_by_margin: Number
-    mean_change: Number
-    """Of a count."""
-    largest_change: Int
-
-
 class Quantisation(Part):
     """Effects of 8-bit weights; accuracies by `real` and `whole`."""
 
@@ -178,19 +158,6 @@ class SplitFigures(Classification):
 
     trials: Int
     samples: Int
-
-
-class WindowCost(Part):
-    """Means over windows, by layer; the last of each sum is `all`."""
-
-    windows: Int
-    events_a_window: Number
-    rates: dict[str, Number]
-    """Spikes per neuron and step."""
-    synaptic_operations: dict[str, Number]
-    dense_multiply_adds: dict[str, Int]
-    """Without looking at zeros."""
-    share_of_dense: Number
 
 
 class ModelCard(Document):

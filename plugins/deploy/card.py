@@ -11,15 +11,9 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.classification import CLASSES, score
 from sliplab.analysis.networks.activity import Activity
 from sliplab.analysis.networks.training import Fitted
+from sliplab.plugins.deploy.document import CardData, CardModel, ModelCard, ModelFile, SplitFigures
 from sliplab.protocols.shown import plural
-from sliplab.storage.schema.export import (
-    CardData,
-    CardModel,
-    Latencies,
-    ModelCard,
-    ModelFile,
-    SplitFigures,
-)
+from sliplab.storage.schema.evaluation import Latencies
 
 FORMAT = "sliplab-model-card-1"
 FEW_TRIALS = 10

@@ -16,15 +16,16 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.networks.model_card import latency_table, percent, table
-from sliplab.protocols.settings import Network, Windows
-from sliplab.storage.schema.export import (
+from sliplab.analysis.networks.quantised import STATE_BITS, WEIGHT_BITS
+from sliplab.plugins.deploy.card import latency_table, percent, table
+from sliplab.plugins.deploy.document import (
     ChipCore,
     ChipFit,
     ChipLimits,
     PlacedLayer,
     SpeckDescription,
 )
+from sliplab.protocols.settings import Network, Windows
 
 KI = 1024
 
@@ -56,7 +57,6 @@ STRIDES = (1, 2, 4, 8)
 MOST_PADDING = 7
 DESTINATIONS = 2
 """Cores that one core may send to."""
-WEIGHT_BITS, STATE_BITS = 8, 16
 
 
 @dataclass(frozen=True)

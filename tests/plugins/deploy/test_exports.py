@@ -15,7 +15,6 @@ from sinabs.utils import validate_memory_mapping_speck
 from torch import nn
 
 from sliplab.analysis.networks.activity import activity
-from sliplab.analysis.networks.model_card import SplitResult, card_markdown, model_card
 from sliplab.analysis.networks.network import (
     BIASED,
     SPIKING,
@@ -26,12 +25,13 @@ from sliplab.analysis.networks.network import (
     spike_counts,
     weights,
 )
-from sliplab.analysis.networks.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from sliplab.analysis.networks.quantised import LOWEST, chip_run, compare, quantise, quantised_net
-from sliplab.analysis.networks.speck import CORES, KI, speck_fit
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
+from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
+from sliplab.plugins.deploy.document import CardCampaign, CardData, ModelFile
+from sliplab.plugins.deploy.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
+from sliplab.plugins.deploy.speck import CORES, KI, speck_fit
 from sliplab.protocols.settings import Network, Training, Windows
-from sliplab.storage.schema.export import CardCampaign, CardData, ModelFile
 from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
