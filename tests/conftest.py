@@ -9,6 +9,7 @@ import gc
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,17 @@ def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Any:
     from tests.flows.conftest import run_small_study
 
     return run_small_study(tmp_path_factory.mktemp("study"), rig_path)
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Test networks are too small to share: beside other work, waiting threads cost the most."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
