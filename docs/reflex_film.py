@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 
 from sliplab.analysis.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, STYLE
-from sliplab.storage.schema.reflex import ReflexStudy, ReflexTrial
+from sliplab.plugins.reflex.document import ReflexStudy, ReflexTrial
 
 FPS = 20
 SLOWER = 2.0

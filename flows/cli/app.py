@@ -15,7 +15,6 @@ from sliplab.flows.cli import (
     exchange,
     power,
     publish,
-    reflex,
     register,
     review,
     rigs,
@@ -72,7 +71,6 @@ for part in (
     publish.app,
     review.app,
     detect.app,
-    reflex.app,
     schema.app,
 ):
     app.add_typer(part)

@@ -32,7 +32,6 @@ BUILT_IN = {
     "uvc": "sliplab.rigs.devices.uvc:DRIVER",
     "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
     "ati_net_ft": "sliplab.rigs.devices.ati_net_ft:DRIVER",
-    "robotiq_2f": "sliplab.rigs.devices.robotiq_2f:DRIVER",
     "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
 }
 

@@ -157,6 +157,7 @@ class RowFile:
         self.path = path
         self._own: FileContent | None = None
         self._opened: dict[str, Rows] = {}
+        self._own_parts = set[bytes]()
         if content is not None:
             self._file = _open_content(content)
             return
@@ -273,9 +274,9 @@ class RowFile:
         layout = kept.get_layout()
         if layout == h5py.h5d.VIRTUAL or kept.get_external_count():
             raise NotOurs(f"{self.path}: {name} points outside the file")
-        if not _plain(data, _NUMBERS):
+        if (dtype := _plain(data, _NUMBERS)) is None:
             raise NotOurs(f"{self.path}: {name} does not contain numbers")
-        rows = Rows(data, f"{self.path}: {name}")
+        rows = Rows(data, f"{self.path}: {name}", dtype)
         value = rows.dtype.itemsize
         stated = value * math.prod(rows.shape)
         if stated > _LARGE and (stored := _stored_bytes(data, kept)) < stated:
@@ -300,12 +301,15 @@ class RowFile:
         at = b""
         for part in name.encode().split(b"/"):
             at += b"/" + part
+            if at in self._own_parts:
+                continue
             with _faults(f"{self.path}: {name}"):  # its group may be something else
                 there = self._file.links.exists(at)
             if not there:
                 raise NoColumn(f"{self.path}: has no {name}")
             if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
                 raise NotOurs(f"{self.path}: {name} points outside the file")
+            self._own_parts.add(at)
         return at
 
 
@@ -316,14 +320,15 @@ def _open_content(content: Any) -> Any:
     return h5py.h5f.open(repr(content).encode(), h5py.h5f.ACC_RDONLY, fapl=access)
 
 
-def _plain(found: Any, kinds: str) -> bool:
-    """Return whether a dataset or an attribute consists of values of these kinds of type."""
+def _plain(found: Any, kinds: str) -> np.dtype[Any] | None:
+    """Return the type of a dataset's or an attribute's values; None where it is of no such kind."""
     try:
-        return found.get_space().get_simple_extent_type() != h5py.h5s.NULL and (
-            found.dtype.kind in kinds
-        )
+        dtype: np.dtype[Any] = found.dtype
     except TypeError:  # one that numpy has no type for
-        return False
+        return None
+    if dtype.kind not in kinds or found.get_space().get_simple_extent_type() == h5py.h5s.NULL:
+        return None
+    return dtype
 
 
 def _stored_bytes(data: Any, kept: Any) -> int:
@@ -342,11 +347,12 @@ def _attribute(of: Any, name: str) -> Array | None:
     if not h5py.h5a.exists(of, name.encode()):
         return None
     found = h5py.h5a.open(of, name.encode())
-    if not _plain(found, _ATTRIBUTES) or math.prod(found.shape) > _FEW:
+    dtype = _plain(found, _ATTRIBUTES)
+    if dtype is None or math.prod(found.shape) > _FEW:
         raise ValueError(f"attribute '{name}' is not a few plain values")
-    if found.dtype.itemsize > _MOST_TEXT:
+    if dtype.itemsize > _MOST_TEXT:
         raise ValueError(f"attribute '{name}' is longer than {_MOST_TEXT} bytes")
-    values = np.empty(found.shape, found.dtype)
+    values = np.empty(found.shape, dtype)
     found.read(values)
     return values
 
@@ -391,13 +397,13 @@ class Rows:
         dtype: of its values.
     """
 
-    def __init__(self, data: Any, name: str) -> None:
+    def __init__(self, data: Any, name: str, dtype: np.dtype[Any]) -> None:
         self._data, self._name = data, name
         self._chunk: tuple[int, ...] = ()
         self._filters: Sequence[Filter] = ()
         self._fine = set[tuple[int, ...]]()
         self.shape: tuple[int, ...] = data.shape
-        self.dtype = data.dtype
+        self.dtype = dtype
 
     def pack(self, chunk: tuple[int, ...], filters: Sequence[Filter]) -> None:
         """State how it is stored, so that each chunk's length is checked before it is read.

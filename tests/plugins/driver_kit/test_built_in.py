@@ -8,23 +8,15 @@ from sliplab.plugins.abb_socket import device as abb_socket
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.plugins.driver_kit.conformance import Case, cases
 from sliplab.plugins.driver_kit.rule import Bounds
+from sliplab.plugins.reflex import robotiq_2f
+from sliplab.plugins.reflex.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.registry import BUILT_IN, Listed, load_driver
-from sliplab.rigs.devices import (
-    abb,
-    ati_net_ft,
-    basler,
-    dvxplorer,
-    robotiq_2f,
-    sync_box,
-    ur,
-    uvc,
-)
+from sliplab.rigs.devices import abb, ati_net_ft, basler, dvxplorer, sync_box, ur, uvc
 from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
 from sliplab.rigs.devices.uvc.settings import UvcSettings

@@ -10,10 +10,10 @@ import pytest
 from sliplab.plugins.driver_kit.examples.gripper import DRIVER, ExampleGripperSettings
 from sliplab.plugins.driver_kit.examples.gripper.driver import ExampleGripper
 from sliplab.plugins.driver_kit.examples.gripper.fake import FakeExampleGripper
+from sliplab.plugins.reflex.robotiq_2f.fake import ElasticObject
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import GripperScene
 from sliplab.rigs.core.finger_motion import FingerMotion
-from sliplab.rigs.devices.robotiq_2f.fake import ElasticObject
 
 MS = 1_000_000
 SETTINGS = ExampleGripperSettings(opening_mm=40)

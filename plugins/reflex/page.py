@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from sliplab.analysis.report.figures import reflex as figures
+from pathlib import Path
+
 from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
-from sliplab.storage.schema.reflex import ReflexRow, ReflexStudy, ReflexTrial
+from sliplab.plugins.reflex import plot as figures
+from sliplab.plugins.reflex.document import ReflexRow, ReflexStudy, ReflexTrial
 
 COLUMNS = (
     "reflex", "trials", "dropped", "drops prevented (95 %)", "too early", "missed",
@@ -68,7 +70,7 @@ def render(study: ReflexStudy) -> str:
     reacting = [row for row in study.rows if row.reaction is not None]
     shown = example(study)
     return render_page(
-        "reflex.html",
+        Path(__file__).with_name("page.html"),
         simulated=simulated,
         study=study,
         count=len({it.trial for it in trials}),

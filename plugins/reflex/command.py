@@ -59,8 +59,8 @@ def reflex(
 
         open_store(model)
         prepare_store(model)  # before anything imports Prefect
-    from sliplab.analysis.report.reflex import COLUMNS, cells
-    from sliplab.flows.reflex import measure_reflexes, request
+    from sliplab.plugins.reflex.page import COLUMNS, cells
+    from sliplab.plugins.reflex.study import measure_reflexes, request
 
     study = measure_reflexes(
         request(model, rig, out, protocol, reflexes or (), trials, detectors or ())

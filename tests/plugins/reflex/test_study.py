@@ -12,10 +12,10 @@ import yaml
 
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.live import counting_of
-from sliplab.analysis.evaluation.reflexes import reflex_rows
-from sliplab.flows import reflex as study
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome
+from sliplab.plugins.reflex import study
+from sliplab.plugins.reflex.rows import reflex_rows
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
 from tests.command_line import here

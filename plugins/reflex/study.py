@@ -19,13 +19,14 @@ import numpy.typing as npt
 
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.live import Counting, counting_of
-from sliplab.analysis.evaluation.reflexes import dropped, extra_force_n, reflex_rows
-from sliplab.analysis.report import reflex as page
 from sliplab.analysis.sweeps.runner import ResultFile, Sweep
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request, make_reflex
 from sliplab.flows.running import console
 from sliplab.flows.store_detectors import detectors_of
+from sliplab.plugins.reflex import page
+from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
+from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
@@ -35,7 +36,6 @@ from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.files import write_json, write_text
-from sliplab.storage.schema.reflex import ReactionParts, ReflexStudy, ReflexTrial
 from sliplab.storage.streams import Json
 
 NAME = "reflex"

@@ -12,12 +12,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sliplab.plugins.reflex.robotiq_2f import protocol
+from sliplab.plugins.reflex.robotiq_2f.settings import Model
 from sliplab.rigs.core.driver import GripperScene
 from sliplab.rigs.core.fakes import LOOPBACK
 from sliplab.rigs.core.finger_motion import FingerMotion
 from sliplab.rigs.core.gripper_range import GripperRange
-from sliplab.rigs.devices.robotiq_2f import protocol
-from sliplab.rigs.devices.robotiq_2f.settings import Model
 
 OVERCURRENT = 14
 END_S = 2.0

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import pytest
 
+from sliplab.plugins.reflex.robotiq_2f import DRIVER, protocol
+from sliplab.plugins.reflex.robotiq_2f.driver import Robotiq2f
+from sliplab.plugins.reflex.robotiq_2f.fake import ElasticObject, FakeRobotiq
+from sliplab.plugins.reflex.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.core.capabilities import Gripper, RigError
 from sliplab.rigs.core.driver import GripperScene
 from sliplab.rigs.core.finger_motion import FingerMotion
-from sliplab.rigs.devices.robotiq_2f import DRIVER, protocol
-from sliplab.rigs.devices.robotiq_2f.driver import Robotiq2f
-from sliplab.rigs.devices.robotiq_2f.fake import ElasticObject, FakeRobotiq
-from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
 from tests.rigs.waiting import until
 
 MS = 1_000_000

@@ -18,7 +18,7 @@ from sliplab.analysis.report.figures.style import (
     WIDTH,
     svg_text,
 )
-from sliplab.storage.schema.reflex import ReflexRow, ReflexTrial
+from sliplab.plugins.reflex.document import ReflexRow, ReflexTrial
 
 PART_COLOURS = {
     "window": BLUE, "sensor": ORANGE, "network": GREEN, "command": PURPLE, "actuator": RED,

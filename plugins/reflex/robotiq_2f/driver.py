@@ -17,11 +17,11 @@ import re
 import socket
 import threading
 
+from sliplab.plugins.reflex.robotiq_2f import protocol
+from sliplab.plugins.reflex.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.core.capabilities import DeviceHealth, GripperState, RigError
 from sliplab.rigs.core.gripper_check import check_move
 from sliplab.rigs.core.network import BoundedSocket
-from sliplab.rigs.devices.robotiq_2f import protocol
-from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
 
 DEVICE = "gripper"
 MOST_BYTES = 4096

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.storage.schema.reflex import ReactionParts, ReflexRow, ReflexTrial
+from sliplab.plugins.reflex.document import ReactionParts, ReflexRow, ReflexTrial
 
 PARTS = ("window", "sensor", "network", "command", "actuator")
 SLIDING_MM_S = 0.1

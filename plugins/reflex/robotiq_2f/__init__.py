@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sliplab.plugins.reflex.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.core.driver import FakeGripper, GripperDriver, GripperScene
 from sliplab.rigs.core.network import answers
-from sliplab.rigs.devices.robotiq_2f.settings import Robotiq2fSettings
 
 if TYPE_CHECKING:
     from sliplab.rigs.core.capabilities import Gripper
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 def _build(settings: Robotiq2fSettings) -> Gripper:
-    from sliplab.rigs.devices.robotiq_2f.driver import Robotiq2f
+    from sliplab.plugins.reflex.robotiq_2f.driver import Robotiq2f
 
     return Robotiq2f(settings)
 
 
 def _range(settings: Robotiq2fSettings) -> GripperRange:
-    from sliplab.rigs.devices.robotiq_2f.protocol import range_of
+    from sliplab.plugins.reflex.robotiq_2f.protocol import range_of
 
     return range_of(settings.model)
 
@@ -31,7 +31,7 @@ def _locks(settings: Robotiq2fSettings) -> dict[str, str]:
 
 
 def _fake(settings: Robotiq2fSettings, scene: GripperScene) -> FakeGripper:
-    from sliplab.rigs.devices.robotiq_2f.fake import FakeRobotiq
+    from sliplab.plugins.reflex.robotiq_2f.fake import FakeRobotiq
 
     return FakeRobotiq(settings.model, scene)
 

@@ -14,8 +14,8 @@ import math
 import re
 from collections.abc import Mapping
 
+from sliplab.plugins.reflex.robotiq_2f.settings import Model
 from sliplab.rigs.core.gripper_range import GripperRange
-from sliplab.rigs.devices.robotiq_2f.settings import Model
 
 COUNTS = 255
 RANGES: Mapping[str, GripperRange] = {

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.evaluation.reflexes import dropped, extra_force_n, reflex_rows
-from sliplab.analysis.report.reflex import render
-from sliplab.storage.schema.reflex import ReactionParts, ReflexStudy, ReflexTrial
+from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
+from sliplab.plugins.reflex.page import render
+from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
 
 T_MS = np.arange(0.0, 1000.0).tolist()
 
