@@ -14,7 +14,6 @@ from sliplab.flows.cli import (
     detect,
     exchange,
     new,
-    power,
     publish,
     reflex,
     register,
@@ -62,7 +61,6 @@ def options(
 for part in (
     collect.app,
     register.app,
-    power.app,
     steps.app,
     sweeps.app,
     study.app,
