@@ -118,9 +118,9 @@ class RunRequest:
         if claims is None or self.claims != "use":
             return None
         end = CampaignEnd.of(campaign.folder)
-        return (
-            end if end is not None and end.ended and end.section == section_hash(claims) else None
-        )
+        if end is None or not end.ended or end.section != section_hash(claims):
+            return None
+        return end
 
     def end_reason(self, campaign: Campaign) -> str:
         """Return why a collection ended that nothing interrupted."""
