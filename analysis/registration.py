@@ -17,7 +17,7 @@ from sliplab.protocols.shown import plural
 from sliplab.protocols.yaml_file import parse_yaml, read_text, without_secrets
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
-from sliplab.storage.schema.claims import STOPPING, StoppingRecord
+from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.schema.registration import Registration
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.control import skipped
@@ -167,11 +167,11 @@ def _trial_deviations(
         )
     missing = len(planned - committed)
     if missing:
-        ended = _verdict(item) in ("settled", "most")
+        end = CampaignEnd.of(item.campaign.folder)
         yield Deviation(
             "fewer trials than registered", plural(len(planned), "trial"),
             f"{len(planned) - missing}"
-            + ("; the campaign was ended by its claims" if ended else ""),
+            + ("; the campaign was ended by its claims" if end is not None and end.ended else ""),
         )  # fmt: skip
 
 
@@ -210,18 +210,6 @@ def _by(by: Mapping[str, Any]) -> str:
     return f"by {by.get('who') or 'unknown'}, {by.get('when') or 'at an unknown time'}{why}"
 
 
-def _record(item: Collected) -> StoppingRecord | None:
-    try:
-        return StoppingRecord.load(item.campaign.folder / STOPPING)
-    except FileNotFoundError:
-        return None
-
-
-def _verdict(item: Collected) -> str:
-    record = _record(item)
-    return "" if record is None else record.verdict
-
-
 def _stopping_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
     """Yield sessions that overruled the claims, and another network that judged them."""
     sessions = []
@@ -232,12 +220,12 @@ def _stopping_deviations(item: Collected, registration: Registration) -> Iterato
             raise StoreError(str(error)) from None
         if session.get("no_stopping"):
             sessions.append(str(session.get("began")))
-    if sessions or _verdict(item) == "overruled":
+    end = CampaignEnd.of(item.campaign.folder)
+    if sessions or (end is not None and end.verdict == "overruled"):
         when = f"; sessions of {', '.join(sessions)}" if sessions else ""
         yield Deviation("stopping overruled", _NONE, f"collected with --no-stopping{when}")
-    record = _record(item)
-    if record is not None and record.model != registration.judging_model:
-        models = (registration.judging_model, record.model)
+    if end is not None and end.model != registration.judging_model:
+        models = (registration.judging_model, end.model)
         yield Deviation("network that judges the claims", *map(_hash, models))
 
 

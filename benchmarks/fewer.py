@@ -31,9 +31,10 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import SEED, Figures
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
-from sliplab.analysis.claims.evidence import Grid
-from sliplab.analysis.claims.simulated import course
 from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.plugins.claims.document import ClaimState
+from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.simulated import course
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol
@@ -42,7 +43,6 @@ from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.slides import run_slide
-from sliplab.storage.schema.claims import ClaimState
 
 F64 = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[1]

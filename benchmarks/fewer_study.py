@@ -38,12 +38,12 @@ from benchmarks.fewer import (
     quantile,
 )
 from sliplab.analysis.campaigns import collected
-from sliplab.analysis.claims.evidence import Grid
-from sliplab.analysis.claims.expectation import coded, expectation
-from sliplab.analysis.claims.power import SHARES, Drawing
-from sliplab.analysis.claims.resampling import Pilot, shared_axes
-from sliplab.analysis.claims.trial_figures import Judge, trial_figures
 from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.expectation import coded, expectation
+from sliplab.plugins.claims.power.drawing import SHARES, Drawing
+from sliplab.plugins.claims.power.resampling import Pilot, shared_axes
+from sliplab.plugins.claims.trial_figures import Judge, trial_figures
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES
 from sliplab.protocols.hashing import hash_integer

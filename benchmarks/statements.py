@@ -32,9 +32,9 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.interval_coverage import Coverage, alarm_rates, medians_by_world
 from benchmarks.measure import SEED, Figures
-from sliplab.analysis.claims.evidence import Grid
-from sliplab.analysis.claims.simulated import course
 from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.simulated import course
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol

@@ -81,7 +81,7 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
                 trials = session.more()[:room] if room != 0 else []
                 progress.add(trials)
         left_out = session.left_out
-        if session.claims is not None:
+        if session.rounds is not None:
             left_out = len(pending_trials(request.plan, collector.campaign))
         return {
             **request.counts(collector.campaign),

@@ -1,4 +1,4 @@
-"""What plug-ins add: commands, documents, drivers, and functions at named places of the core.
+"""What plug-ins add to the core, each by its declaration.
 
 A plug-in is a package with a `Plugin`. Those that ship are the packages in `sliplab.plugins`, each
 with its `PLUGIN`. Other distributions name theirs in the group of entry points `sliplab.plugins`:
@@ -36,6 +36,7 @@ class Plugin:
             (`storage.schema.document.Document`), each with the title of its schema.
         drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only
             drivers names them in the group of entry points `sliplab.drivers` instead.
+        sections: sections of the report by name (`analysis.report.plugin_sections.ReportSection`).
         hooks: functions that the core calls, by the name of the place; docs/architecture.md lists
             the places.
     """
@@ -43,6 +44,7 @@ class Plugin:
     commands: Mapping[str, str] = field(default_factory=dict)
     documents: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     drivers: Mapping[str, str] = field(default_factory=dict)
+    sections: Mapping[str, str] = field(default_factory=dict)
     hooks: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -77,6 +79,23 @@ class Plugins:
         for plugin in self.found.values():
             kinds = {**plugin.documents, **kinds}
         return kinds
+
+    def sections(self) -> dict[str, str]:
+        """Return places of the report's sections by name; the first plug-in of a name has it."""
+        named: dict[str, str] = {}
+        for plugin in self.found.values():
+            named |= {name: it for name, it in plugin.sections.items() if name not in named}
+        return named
+
+    def hook(self, name: str) -> Any:
+        """Import and return the function of a place that one plug-in fills: the first that does.
+
+        Raises:
+            PluginError: none does, or it cannot be imported.
+        """
+        for function in self.hooks(name):
+            return function
+        raise PluginError(f"no plug-in fills the place {name}")
 
     def hooks(self, name: str) -> Iterator[Any]:
         """Import and yield the functions of a place, in the order of the plug-ins' names.

@@ -15,7 +15,6 @@ from sliplab.analysis.labels import label_errors
 from sliplab.analysis.labels.reviewed import Labels as KeptLabels
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.campaign import collected_section, quality_section, references_of
-from sliplab.analysis.report.claims import claims_key, claims_section
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.marker_network import (
@@ -32,6 +31,7 @@ from sliplab.analysis.report.page import (
     number,
     render_page,
 )
+from sliplab.analysis.report.plugin_sections import plugin_sections, sections_key
 from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.analysis.report.sources import VERSION, report_key
 from sliplab.analysis.report.summary import (
@@ -113,7 +113,7 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
     if is_evaluated(store, campaigns):
         inputs.append([report_key(store, campaigns)])
     plans = [[item.planned.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
-    besides = [*claims_key(campaigns), *registration_key(store, campaigns)]
+    besides = [*sections_key(store, campaigns), *registration_key(store, campaigns)]
     return make_key("report, one camera", VERSION, [inputs, plans, *besides], None)
 
 
@@ -268,7 +268,7 @@ def one_camera_sections(
         left_out_section(summary),
         collected_section(campaigns, summary),
         registration_section(store, campaigns),
-        claims_section(campaigns, simulated=simulated),
+        *plugin_sections(store, campaigns, simulated=simulated),
         quality_section(campaigns, summary.references, simulated=simulated),
     ]
     if judged is not None:

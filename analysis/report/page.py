@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup
 
 from sliplab.storage.files import make_folder, safe_name, write_text
@@ -79,8 +79,8 @@ class Number:
 class Content:
     """Base of the values that a section shows."""
 
-    template: ClassVar[str]
-    """The section's file in `templates/sections`."""
+    template: ClassVar[str | Path]
+    """The section's file in `templates/sections` by name, or a plug-in's file."""
 
     def all_figures(self) -> Iterable[Figure]:
         """Every figure among the values."""
@@ -88,6 +88,15 @@ class Content:
             value = getattr(self, item.name)
             values = value if isinstance(value, list | tuple) else [value]
             yield from (found for found in values if isinstance(found, Figure))
+
+
+@dataclass(frozen=True)
+class Rendered(Content):
+    """A section that is HTML already."""
+
+    title: str
+    html: Markup
+    figures: Sequence[Figure]
 
 
 @lru_cache(maxsize=1)
@@ -114,17 +123,21 @@ def render_page(
         template: a file of `templates` by name, or a plug-in's file.
     """
     rendered = [render_section(section, simulated=simulated) for section in sections]
-    environment = _environment()
-    if isinstance(template, Path):
-        page = environment.from_string(template.read_text(encoding="utf-8"))
-    else:
-        page = environment.get_template(template)
-    return page.render(sections=rendered, simulated=simulated, **values)
+    return _template(template).render(sections=rendered, simulated=simulated, **values)
+
+
+def _template(file: str | Path) -> Template:
+    if isinstance(file, Path):
+        return _environment().from_string(file.read_text(encoding="utf-8"))
+    return _environment().get_template(file)
 
 
 def render_section(content: Content, *, simulated: bool) -> tuple[str, Markup]:
     """Render one section: its title, and its HTML."""
-    template = _environment().get_template(f"sections/{content.template}")
+    if isinstance(content, Rendered):
+        return content.title, content.html
+    file = content.template
+    template = _template(file if isinstance(file, Path) else f"sections/{file}")
     module: Any = template.make_module({"v": content, "simulated": simulated})
     return module.title, Markup(str(module))
 

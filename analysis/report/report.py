@@ -15,7 +15,6 @@ from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report import clocks, windows
 from sliplab.analysis.report.campaign import collected_section, quality_section
-from sliplab.analysis.report.claims import claims_section
 from sliplab.analysis.report.detectors import detector_section
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.holdout import holdout_section
@@ -31,6 +30,7 @@ from sliplab.analysis.report.page import (
     render_page,
 )
 from sliplab.analysis.report.paper import paper_section
+from sliplab.analysis.report.plugin_sections import plugin_sections
 from sliplab.analysis.report.programs import (
     FILES,
     command,
@@ -145,7 +145,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         holdout,
         collected_section(campaigns, summary),
         registration_section(store, list(campaigns)),
-        claims_section(campaigns, simulated=simulated),
+        *plugin_sections(store, campaigns, simulated=simulated),
         quality_section(campaigns, summary.references, simulated=simulated),
         trial,
         force_section(store, campaigns, seen, simulated=simulated),

@@ -15,8 +15,8 @@ from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks.models import training_settings
-from sliplab.analysis.report.claims import claims_key
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
+from sliplab.analysis.report.plugin_sections import sections_key
 from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.report.registration import registration_key
 from sliplab.protocols.settings import AnalysisSettings
@@ -99,7 +99,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
         Derived.of(store, label_errors.CHECK).key(label_errors.CHECK),
         # commands in the page name the store's folder
         str(store.folder.resolve()),
-        *claims_key(campaigns),
+        *sections_key(store, campaigns),
         *registration_key(store, campaigns),
     ]
     return make_key(STEP, VERSION, inputs, None)

@@ -13,7 +13,6 @@ from sliplab.flows.cli import (
     control,
     detect,
     exchange,
-    power,
     publish,
     register,
     review,
@@ -60,7 +59,6 @@ def options(
 for part in (
     collect.app,
     register.app,
-    power.app,
     steps.app,
     sweeps.app,
     study.app,

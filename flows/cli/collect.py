@@ -52,19 +52,19 @@ def plan(
         check_plan(rig_file, found, str(rig))
         needed = round(plan_bytes(rig_file, found))
         scene = plan_view.scene_of(rig_file, found)
-    power = None
+    claims = None
     if pilot is not None:
         from sliplab.storage.remote.mirror import open_store
 
         opened = open_store(pilot)
         prepare_store(pilot)  # before anything imports Prefect
-        from sliplab.flows.power import of_plan
+        from sliplab.protocols.plugin import plugins
 
-        power = of_plan(found, opened)
+        claims = plugins().hook("forecast")(found, opened)
     if as_json:
-        console.print_json(plan_view.plan_json(found, needed, scene, power))
+        console.print_json(plan_view.plan_json(found, needed, scene, claims))
     else:
-        plan_view.print_plan(found, needed, scene, power)
+        plan_view.print_plan(found, needed, scene, claims)
 
 
 @app.command()

@@ -17,9 +17,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
+from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
-from sliplab.flows.collecting.claims import ClaimWatch
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -27,6 +27,7 @@ from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.plugin import plugins
 from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
@@ -57,13 +58,23 @@ from sliplab.storage.versions import RECORDING, installed_versions
 interruptible(Rig.run_trial)
 
 
+class Rounds(Protocol):
+    """Decides between two rounds of trials which are next: what the hook `more_trials` opens."""
+
+    def next_trials(self) -> list[Trial]:
+        """Return the trials to take next; none at the end."""
+
+    def committed(self, trial: Trial) -> None:
+        """Take note of a trial that was just committed."""
+
+
 @dataclass(frozen=True)
 class CollectionSession:
     """An open session at the rig: the objects that run it and the trials to take.
 
     Attributes:
-        claims: of the protocol, if they are looked at.
-        trials: pending trials that the run request asks for; with claims, the first of them.
+        rounds: of a protocol with claims, if they are looked at.
+        trials: pending trials that the run request asks for; with rounds, those of the first.
         left_out: number of pending trials that it does not ask for.
     """
 
@@ -71,11 +82,11 @@ class CollectionSession:
     supervisor: CollectionSupervisor
     trials: list[Trial]
     left_out: int = 0
-    claims: ClaimWatch | None = None
+    rounds: Rounds | None = None
 
     def more(self) -> list[Trial]:
         """Return what is to be taken after all that was: asked for again, or the next round."""
-        return self.supervisor.more() or ([] if self.claims is None else self.claims.next_trials())
+        return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
 
 @contextmanager
@@ -95,7 +106,7 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         # the rig is closed before anybody waits for figures
         with (
             held(run_request.rig, store.folder),
-            _claim_watch(run_request, store, campaign) as claims,
+            _opened_rounds(run_request, store, campaign) as rounds,
         ):
             rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
@@ -108,23 +119,23 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
             try:
                 trials = run_request.due_trials(campaign)
                 left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
-                if claims is not None:
-                    trials = claims.next_trials()[: run_request.most]
-                    collector.on_commit = claims.committed
-                yield CollectionSession(collector, supervisor, trials, left_out, claims)
+                if rounds is not None:
+                    trials = rounds.next_trials()[: run_request.most]
+                    collector.on_commit = rounds.committed
+                yield CollectionSession(collector, supervisor, trials, left_out, rounds)
             finally:
                 rig.close()
 
 
 @contextmanager
-def _claim_watch(
+def _opened_rounds(
     run_request: RunRequest, store: Store, campaign: Campaign
-) -> Iterator[ClaimWatch | None]:
+) -> Iterator[Rounds | None]:
     if not run_request.has_claims:
         yield None
         return
-    with ClaimWatch(run_request, store, campaign).opened() as claims:
-        yield claims
+    with plugins().hook("more_trials")(run_request, store, campaign) as rounds:
+        yield rounds
 
 
 def refresh(run_request: RunRequest) -> Campaign:
@@ -135,9 +146,9 @@ def refresh(run_request: RunRequest) -> Campaign:
     store = Store.create(run_request.store)
     with store_lock(store):
         campaign = _recover(store, run_request)
-        with _claim_watch(run_request, store, campaign) as claims:
-            if claims is not None:
-                claims.next_trials()
+        with _opened_rounds(run_request, store, campaign) as rounds:
+            if rounds is not None:
+                rounds.next_trials()
         return campaign
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypedDict
 
@@ -13,7 +13,6 @@ from sliplab.protocols.shown import plural
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
     from sliplab.rigs.levels import Choice, SlipExpected
     from sliplab.rigs.rig_file import RigFile
-    from sliplab.storage.schema.power import PowerRecord
     from sliplab.storage.streams import Json
 
 MOST_STRETCHES = 8
@@ -71,6 +70,23 @@ class PlanJson(TypedDict):
 
 
 @dataclass(frozen=True)
+class Forecast:
+    """What a pilot foretells of a plan's claims: a table with lines below it, and all as data."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    lines: Sequence[str]
+    data: Json
+
+    def print(self) -> None:
+        """Print it."""
+        console.print_table(self.title, self.columns, self.rows, spare=0)
+        for line in self.lines:
+            console.say(line)
+
+
+@dataclass(frozen=True)
 class Scene:
     """A simulated rig's level of physics for a plan, and the slip to expect.
 
@@ -110,13 +126,13 @@ def scene_of(rig: RigFile, plan: Plan) -> Scene | None:
 
 
 def plan_json(
-    found: Plan, needed: int | None, scene: Scene | None, power: PowerRecord | None
+    found: Plan, needed: int | None, scene: Scene | None, claims: Forecast | None
 ) -> PlanJson:
     """Return the plan as one JSON object.
 
     Args:
         needed: its bytes; None without a rig.
-        power: what a pilot foretells of its claims; None without one.
+        claims: what a pilot foretells of them; None without one.
     """
     rows: list[TrialRow] = [
         {
@@ -144,7 +160,7 @@ def plan_json(
         "scene": scene.as_json() if scene else None,
         "stretches": found.stretches(),
         "warnings": found.warnings(),
-        "claims": power.to_json() if power else None,
+        "claims": claims.data if claims else None,
     }
 
 
@@ -175,7 +191,7 @@ def _claims(found: Plan) -> Iterator[str]:
 
 
 def print_plan(
-    found: Plan, needed: int | None, scene: Scene | None, power: PowerRecord | None
+    found: Plan, needed: int | None, scene: Scene | None, claims: Forecast | None
 ) -> None:
     """Print the plan as tables; arguments as of `plan_json`."""
     factors = list(found.protocol.collection.all_factors)
@@ -214,20 +230,7 @@ def print_plan(
         console.print_pairs("The simulated scene", scene.as_pairs())
     for line in _claims(found):
         console.say(line)
-    if power is not None:
-        print_power(power)
+    if claims is not None:
+        claims.print()
     for warning in found.warnings():
         console.say(f"note: {warning}")
-
-
-def print_power(power: PowerRecord) -> None:
-    """Print after how many trials, and hours at the rig, claims are expected to be called."""
-    from sliplab.analysis.report.power import COLUMNS, rows, sentence
-
-    kind = "simulated pilot" if power.simulated else "pilot"
-    title = f"claims of {power.protocol}, by {plural(power.pilot_trials, 'trial')} of a {kind}"
-    console.print_table(title, COLUMNS, rows(power), spare=0)
-    for note in power.notes:
-        console.say(f"note: {note}")
-    for text in sentence(power):
-        console.say(text)

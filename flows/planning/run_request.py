@@ -19,6 +19,7 @@ from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences
+from sliplab.protocols.plugin import plugins
 from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import (
     KeyedError,
@@ -30,7 +31,7 @@ from sliplab.protocols.yaml_file import (
 )
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from sliplab.storage.schema.claims import STOPPING, ChoiceRecord, StoppingRecord
+from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
@@ -106,34 +107,28 @@ class RunRequest:
 
     def _begun(self, campaign: Campaign) -> set[str] | None:
         """Return the trials that a campaign had begun when its claims ended it; else None."""
-        record, collection = self._ended_by_claims(campaign), self.plan.protocol.collection
-        if record is None or collection.stopping is None:
+        if self._ended_by_claims(campaign) is None:
             return None
-        if collection.adaptive is not None:
-            batches = ChoiceRecord.of(campaign.folder).batches
-            return {item.trial for batch in batches for item in batch.trials}
-        repetitions = len(record.looks) * collection.stopping.repetitions
-        return {t.id for t in self.plan if t.role == "measured" and t.repetition <= repetitions}
+        begun: set[str] = plugins().hook("begun_trials")(self.plan, campaign.folder)
+        return begun
 
-    def _ended_by_claims(self, campaign: Campaign) -> StoppingRecord | None:
-        """Return the looks of a campaign that its claims ended; else None."""
+    def _ended_by_claims(self, campaign: Campaign) -> CampaignEnd | None:
+        """Return how its claims ended a campaign; None where they did not."""
         claims = self.plan.protocol.collection.stopping
         if claims is None or self.claims != "use":
             return None
-        try:
-            record = StoppingRecord.load(campaign.folder / STOPPING)
-        except FileNotFoundError:
+        end = CampaignEnd.of(campaign.folder)
+        if end is None or not end.ended or end.section != section_hash(claims):
             return None
-        ended = record.section == section_hash(claims) and record.verdict in ("settled", "most")
-        return record if ended else None
+        return end
 
     def end_reason(self, campaign: Campaign) -> str:
         """Return why a collection ended that nothing interrupted."""
         if replace(self, most=None).due_trials(campaign):
             return f"as many trials as --trials {self.most} allows"
-        claims, record = self.plan.protocol.collection.stopping, self._ended_by_claims(campaign)
-        if record is not None and claims is not None:
-            if record.verdict == "settled":
+        claims, end = self.plan.protocol.collection.stopping, self._ended_by_claims(campaign)
+        if end is not None and claims is not None:
+            if end.verdict == "settled":
                 return "all claims are settled"
             return f"another round would exceed collection.stopping.most = {claims.most}"
         if pending_trials(self.plan, campaign):

@@ -29,7 +29,6 @@ from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
-from sliplab.storage.schema.power import PowerRecord
 from sliplab.storage.schema.summary import Summary
 from sliplab.storage.schema.trial import TrialRecord
 
@@ -50,7 +49,6 @@ DOCUMENTS: dict[str, tuple[type[Document], str]] = {
         ClassSummary,
         "The summary of a report of SlipLab on recordings of classes",
     ),
-    "power": (PowerRecord, "Trials that claims need, by SlipLab"),
 }
 """Documents of a store, with the titles of their schemas; plug-ins have further ones."""
 _DIALECT = "http://json-schema.org/draft-07/schema#"

@@ -25,7 +25,7 @@ from typing import Any, Literal
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.files import json_text, read_json, safe_name
 from sliplab.storage.remote.objects import SMALL_BYTES, Remote, RemoteError, RemoteMissing
-from sliplab.storage.schema.claims import CHOICES, STOPPING
+from sliplab.storage.schema.campaign_end import CHOICES, STOPPING
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
     DATA,

@@ -16,7 +16,7 @@ from sliplab.flows.register import register
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
 from sliplab.storage.files import json_text, read_json, write_json
-from sliplab.storage.schema.claims import STOPPING, StoppingRecord
+from sliplab.storage.schema.campaign_end import STOPPING, CampaignEnd
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.control import again, skip
 from sliplab.storage.trials.registration import registrations
@@ -204,7 +204,7 @@ def test_trials_outside_the_registered_plan_and_missing_ones_are_counted(
 
 def test_end_by_claims_is_said_of_missing_trials(tmp_path: Path, protocol: Json) -> None:
     where = begun(tmp_path, protocol)
-    done = StoppingRecord(simulated=True, section="", model=None, verdict="settled")
+    done = CampaignEnd(simulated=True, section="", model=None, verdict="settled")
     write_json(where.folder / STOPPING, done.to_json())
     assert "ended by its claims" in found(where)[-1].found
 
@@ -269,14 +269,14 @@ def test_overruled_stopping_is_listed_even_if_the_record_has_changed(
     assert "2026-01-02" in named(where)["stopping overruled"].found
     os.unlink(where.folder / "bench" / "0001.json")
     for verdict, listed in (("overruled", True), ("settled", False)):
-        done = StoppingRecord(simulated=True, section="", model=None, verdict=verdict)
+        done = CampaignEnd(simulated=True, section="", model=None, verdict=verdict)
         write_json(where.folder / STOPPING, done.to_json())
         assert ("stopping overruled" in named(where)) == listed
 
 
 def test_another_judging_network_is_listed(tmp_path: Path, protocol: Json) -> None:
     where = begun(tmp_path, protocol)
-    done = StoppingRecord(simulated=True, section="", model="ab" * 32, verdict="open")
+    done = CampaignEnd(simulated=True, section="", model="ab" * 32, verdict="open")
     write_json(where.folder / STOPPING, done.to_json())
     assert named(where)["network that judges the claims"][1:] == ("–", f"SHA-256 {'ab' * 8}")
 

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -24,8 +25,12 @@ from sliplab.flows.study_ledger import LEFT_OUT
 from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store, StoreError
+from tests.analysis.report.test_plugin_sections import install
 from tests.conftest import ROOT
 from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
+from tests.protocols.test_plugin import installed
+
+__all__ = ["installed"]  # a fixture
 
 pytestmark = pytest.mark.programs
 
@@ -144,6 +149,17 @@ def test_a_study_with_one_camera_runs_to_its_report(
         assert summary.labels.error_ms.incipient.max_abs < 25
         assert "Top: frames a second." in page
     assert "spiking network and its detectors" in page or camera == "events"
+
+
+def test_sections_of_other_packages_stand_in_the_report(
+    installed: Any, taken: Take, tmp_path: Path
+) -> None:
+    store = taken("frames")
+    install(installed, tmp_path, "lab_rubs")
+    assert report(store, collected(store))["done"] == 1
+    assert report(store, collected(store))["done"] == 0
+    assert "<p>7 rubs, simulated</p>" in (store.folder / "report" / "index.html").read_text()
+    assert (store.folder / "report" / "figures" / "rubs-force.svg").exists()
 
 
 @pytest.mark.long

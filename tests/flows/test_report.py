@@ -40,10 +40,13 @@ from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.evaluation import Seeds, SeedScores, SeedTimes, TrialScore
 from sliplab.storage.schema.summary import ReferenceTrial, Summary, TrialOutcome
 from sliplab.storage.trials.store import Store, StoreError
+from tests.analysis.report.test_plugin_sections import install
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write
+from tests.protocols.test_plugin import installed
 
+__all__ = ["installed"]  # a fixture
 Json = dict[str, Any]
 UNITLESS = {
     "trial", "name", "row", "class", "detector", "stride", "true class", "tightest gate", "windows",
@@ -178,6 +181,25 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
     for line in csv.DictReader(lines):
         late = known[line["trial"]].latency_incipient_ms
         assert line["incipient latency (ms)"] == ("" if late is None else str(late))
+
+
+def test_sections_of_other_packages_stand_in_the_report(
+    installed: Any, store: Store, tmp_path: Path
+) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    other = Store.open(tmp_path / "store")
+    install(installed, tmp_path, "lab_rubs")
+    install(installed, tmp_path, "lab_bad", ('"rubs"', '"bad"'), ("return Rubs()", "return 1 / 0"))
+    assert report(other, collected(other))["done"] == 1
+    assert report(other, collected(other))["done"] == 0
+    text = page(other)
+    titles = re.findall(r'<li><a href="#s\d+">([^<]+)</a>', text)
+    place = titles.index("Quality and retakes over the campaigns, and wear")
+    assert titles[place - 2 : place] == ["Rubs", "Sections that could not be made"]
+    assert "<p>7 rubs, simulated</p>" in text
+    assert "<p>bad: ZeroDivisionError: division by zero</p>" in text
+    data = other.folder / "report" / "data" / "rubs-force.csv"
+    assert data.read_text().splitlines() == ["force (N),simulated", "1,yes", "2,yes"]
 
 
 def test_every_address_in_the_page_is_beside_it(store: Store) -> None:

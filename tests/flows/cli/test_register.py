@@ -16,10 +16,10 @@ from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.trials.registration import add_registration, registration_problems
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer, here
-from tests.flows.collecting.test_claims import RIG, SURE, in_a_thread
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write
 from tests.flows.older import older_store
+from tests.plugins.claims.test_rounds import RIG, SURE, in_a_thread
 from tests.storage.trials.test_registration import CONTENT
 
 __all__ = ["in_a_thread"]

@@ -25,9 +25,10 @@ from sliplab.flows.server import deployments, serve
 from sliplab.flows.server.deployments import until_of
 from sliplab.flows.server.schedules import Ask, Chain, Collect, OnRig, Scheduled
 from sliplab.flows.server.service import Service
+from sliplab.plugins.claims.document import StoppingRecord
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.schema.claims import STOPPING, StoppingRecord
+from sliplab.storage.schema.campaign_end import STOPPING
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import Store

@@ -1,1 +1,0 @@
-"""Claims about a campaign: what its trials show of them so far, and which trial tells most next."""

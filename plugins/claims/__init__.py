@@ -1,0 +1,22 @@
+"""Claims about a campaign: what its trials show of them so far, and which trial tells most next."""
+
+from __future__ import annotations
+
+from sliplab.protocols.plugin import Plugin
+
+_CLAIMS = "sliplab.plugins.claims"
+PLUGIN = Plugin(
+    commands={"power": f"{_CLAIMS}.power.command:app"},
+    documents={
+        "power": (
+            f"{_CLAIMS}.power.document:PowerRecord",
+            "Trials that claims need, by SlipLab",
+        ),
+    },
+    sections={"claims": f"{_CLAIMS}.section:SECTION"},
+    hooks={
+        "more_trials": f"{_CLAIMS}.rounds:ClaimWatch",
+        "begun_trials": f"{_CLAIMS}.document:begun_trials",
+        "forecast": f"{_CLAIMS}.power.command:forecast",
+    },
+)
