@@ -1,4 +1,4 @@
-"""A study before it begins: the searches that it can have, and how long each step is to take.
+"""A study before it begins: how long each step is to take.
 
 Seconds are expected from nothing, on two cores, where trials are simulated; trials of a real rig
 take what is planned.
@@ -6,13 +6,14 @@ take what is planned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.evaluation import holdout as held_out
 from sliplab.analysis.labels.label_errors import CHECK
-from sliplab.analysis.sweeps import holdout as held_out
 from sliplab.protocols import Plan
-from sliplab.protocols.errors import InputError
+from sliplab.storage.trials.store import Store
 
 COLLECT_S = {"tracks": 0.3, "video": 5.0}
 """Of a simulated trial, by the camera's source. Likewise:"""
@@ -22,11 +23,6 @@ SAMPLES_PER_S = 1500.0
 EVALUATE_S = 0.045
 START_S = 4.0
 """Fixed time of a step: processes, kernels, pages."""
-BASELINE_S = 0.0105
-"""Time of all ordinary networks and trees, per training window."""
-LEVEL_S = 0.0004
-"""Time of a level that is left out, per window and epoch."""
-SKIN_S, GUESS_S, SCENE_S, SEARCH_S = 25.0, 40.0, 120.0, 6000.0
 
 
 @dataclass(frozen=True)
@@ -65,11 +61,13 @@ class Search:
         name: of the step.
         unit: noun in plural that its work is counted in.
         seconds: expected from nothing.
+        run: does what is missing of a store's campaigns, and returns how much that was.
     """
 
     name: str
     unit: str
     seconds: float
+    run: Callable[[Store, list[Collected]], int]
 
 
 @dataclass(frozen=True)
@@ -127,36 +125,3 @@ class StudyPlan:
         training = settings.training
         networks = len(training.seeds) + (settings.comparison_settings() is not None)
         return self.training_windows * training.epochs * networks / SAMPLES_PER_S
-
-    def searches(self, skins: int, parameters: int) -> list[Search]:
-        """Return the searches that the study can have: most need slides, two a simulated scene.
-
-        Args:
-            skins: other skins that the network is tested on.
-            parameters: assumed parameters of the scene that are varied.
-
-        Raises:
-            InputError: none; there is no kinematic protocol and nothing is simulated.
-        """
-        slides, windows = self.slides, self.training_windows
-        simulated = all(item.simulated for item in self.campaigns)
-        found = []
-        if slides:
-            found.append(Search("baselines", "methods", BASELINE_S * windows))
-            protocol = slides[0].plan.protocol
-            epochs = protocol.analysis.training.epochs
-            factors = len(protocol.collection.all_factors)
-            seconds = LEVEL_S * windows * epochs * factors + SKIN_S * skins
-            found.append(Search("generalisation", "results", seconds))
-        if simulated:
-            found.append(Search("guesses", "settings", GUESS_S * (1 + 2 * parameters)))
-        if slides and simulated:
-            found.append(Search("scene search", "searches", SCENE_S))
-        if slides:
-            found.append(Search("detector search", "trainings", SEARCH_S))
-        if not found:
-            raise InputError(
-                "--searches", "", True,
-                "needs a kinematic protocol, or a simulated rig",
-            )  # fmt: skip
-        return found

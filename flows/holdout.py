@@ -14,13 +14,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.sweeps.holdout import NAME, STEP, Holdout
+from sliplab.analysis.evaluation.holdout import NAME, STEP, Holdout
 from sliplab.analysis.sweeps.runner import Task, sample_trials, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
 from sliplab.flows.steps import StepDone
-from sliplab.storage.schema.sweeps import HoldoutResult
+from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 

@@ -8,31 +8,19 @@ faults.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.sweeps.scene_error import Seen
-from sliplab.analysis.sweeps.scene_tradeoff import (
-    ClosedForm,
-    Compared,
-    Families,
-    Variant,
-    compare_variants,
-    variants,
-)
 from sliplab.protocols import Plan, Trial
-from sliplab.protocols.program import ACTING, Move
+from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
-from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
-from sliplab.rigs.mock.settings import Clocks, skin_of
+from sliplab.rigs.mock.settings import Clocks
 from sliplab.rigs.rig_file import RigFile
-from sliplab.rigs.scene.onsets import retraction_onsets
 from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 
 MOTION = frozenset(ACTING)
@@ -41,6 +29,30 @@ PERFECT = Clocks(
     pulse_jitter_us=0, frame_jitter_us=0,
 )  # fmt: skip
 _SMALL_PX = 32
+
+
+Onsets = tuple[int | None, int | None]
+"""First of all papillae, and the centre's; ns after the start of the motion, None: never."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Events and onsets of one run, on a time line that begins with its slide or retraction.
+
+    Attributes:
+        events: times in µs of that line, negative in the hold; None where nothing was simulated.
+        size_px: columns and rows of the event camera.
+        begin_us, end_us: the recorded part.
+        slips: when tips began to slide.
+        markers: when markers were seen to have slipped: incipient and gross onset.
+    """
+
+    events: EventChunk | None
+    size_px: tuple[int, int]
+    begin_us: int
+    end_us: int
+    slips: Onsets
+    markers: Onsets | None
 
 
 def changed(rig: RigFile, values: Mapping[str, Any]) -> RigFile:
@@ -157,70 +169,3 @@ def _ready(rig: RigFile, plan: Plan, trial: Trial) -> Rig:
 def _run(built: Rig, plan: Plan, trial: Trial, seed: int, sink: Memory) -> TrialRun:
     rate_hz = plan.protocol.collection.recording.sync_rate
     return built.run_trial(plan.program(trial), sink, seed, None, rate_hz)
-
-
-def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:
-    """Return first slip and the centre's (or the plate's fall) at level L0.
-
-    None if there is no closed form: a retraction that also goes sideways.
-    """
-    start = perf_counter()
-    slides = slides_of(replace(plan, trials=(trial,)))
-    if slides:
-        onsets = expected_onsets(rig.scene, slides, HIGHEST)[0]
-    else:
-        mass_kg, steps = plan.mass_kg(trial), plan.program(trial).steps
-        moves = [step for step in steps if isinstance(step, Move)]
-        pressed = next(step.to for step in moves if step.phase == "press")
-        pulled = next((step for step in moves if step.phase == "retract"), None)
-        if mass_kg is None or pulled is None or pulled.to.x_mm != pressed.x_mm:
-            return None
-        onsets = np.array(
-            retraction_onsets(
-                skin_of(rig.scene), rig.scene.scene.friction.kinetic, mass_kg, pressed.depth_mm,
-                pulled.speed_mm_s, rig.scene.scene.plate.gravity_m_s2,
-            )
-        )  # fmt: skip
-    seconds = perf_counter() - start
-    first, last = (round(float(t) * 1e9) if np.isfinite(t) else None for t in onsets)
-    return ClosedForm((first, last), seconds)
-
-
-@dataclass(frozen=True)
-class VariantJob:
-    """One trial whose variants are timed and compared."""
-
-    rig: RigFile
-    plan: Plan
-    trial: Trial
-    families: Families
-
-
-def compare_trial(job: VariantJob, advance: Callable[[], None] | None = None) -> Compared:
-    """Run every variant of a trial once and compare it with the reference.
-
-    What two runs differ by is the same on any machine, so this may go to a Dask cluster.
-
-    Args:
-        advance: called after each run.
-    """
-
-    def seen(variant: Variant) -> Seen:
-        rig, seed = ideal(changed(job.rig, variant.change)), variant.seed(job.trial)
-        found = run(rig, job.plan, job.trial, seed)
-        if advance is not None:
-            advance()
-        return found
-
-    return compare_variants(seen, job.families, job.plan.protocol.analysis, job.trial.seed)
-
-
-def wall_seconds(job: VariantJob, rounds: int, advance: Callable[[], None]) -> dict[Variant, float]:
-    """Return seconds of each variant: the fastest of some rounds, which other work rarely meets."""
-    found = dict.fromkeys(variants(job.families), math.inf)
-    for _ in range(rounds):
-        for variant in found:
-            rig, seed = changed(job.rig, variant.change), variant.seed(job.trial)
-            found[variant] = min(found[variant], timed(rig, job.plan, job.trial, seed))
-            advance()
-    return found

@@ -2,9 +2,8 @@
 evaluate a hold-out campaign, run searches on request, report. Run again it resumes
 where it stopped, and a step with nothing to do says so.
 
-The searches take hours and run on request only: other methods on the same windows, other skins
-and levels left out, the sensitivity to the scene's assumed numbers, and speed against error of the
-scene and of the detector. Each keeps what it made, and the report shows those that are there.
+Searches take hours and run on request only: other methods on the same windows, and those of
+plug-ins. Each keeps what it made, and the report shows those that are there.
 """
 
 from __future__ import annotations
@@ -18,18 +17,12 @@ from sliplab.analysis.campaigns import (
     collected,
     missing_stream,
 )
+from sliplab.analysis.evaluation.holdout import STEP
 from sliplab.analysis.labels.label_errors import CHECK
 from sliplab.analysis.report.one_camera import reason_against
-from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.study_plan import PlannedCampaign, Search, StudyPlan
-from sliplab.analysis.sweeps.detector_grid import Axes
-from sliplab.analysis.sweeps.detector_search import SearchSize
-from sliplab.analysis.sweeps.holdout import STEP
-from sliplab.analysis.sweeps.sensitivity import in_all
 from sliplab.flows.collect import CollectResult, collect
 from sliplab.flows.evaluate import evaluate
-from sliplab.flows.generalise import SKINS, measure_generalisation
-from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
 from sliplab.flows.holdout import measure_holdout
 from sliplab.flows.label import check_labels, check_required, label
 from sliplab.flows.planning.run_request import RunRequest
@@ -37,14 +30,14 @@ from sliplab.flows.report import report
 from sliplab.flows.steps import StepDone
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.sync import sync
-from sliplab.flows.tradeoff_detector import tradeoff_detector
-from sliplab.flows.tradeoff_scene import search_scene
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
 from sliplab.storage.trials.store import Store
 
-SCENE_TRIALS = 4
-SIZE, AXES = SearchSize(), Axes()
+BASELINE_S = 0.0105
+"""Time of all ordinary networks and trees, per training window, s."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +91,14 @@ def study(
     run("evaluate", "evaluations", lambda: evaluate(store, campaigns))
     if holdout:
         run(STEP, "evaluations", lambda: measure_holdout(store, campaigns, holdout).to_json())
-    names = in_all(GUESSES, [each.rig.mock for each in run_requests])
     for each in more:
-        run(each.name, each.unit, partial(run_search, each.name, store, campaigns, names))
+        run(each.name, each.unit, partial(_search, each, store, campaigns))
     run("report", "pages", lambda: report(store, campaigns))
     return Outcome(taken, steps, ledger.rows())
+
+
+def _search(search: Search, store: Store, campaigns: list[Collected]) -> StepDone:
+    return {"step": search.name, "done": search.run(store, campaigns)}
 
 
 def study_plan(run_requests: Sequence[RunRequest]) -> StudyPlan:
@@ -117,32 +113,28 @@ def study_plan(run_requests: Sequence[RunRequest]) -> StudyPlan:
 
 
 def searches(run_requests: Sequence[RunRequest]) -> list[Search]:
-    """Return the searches that a study can have.
+    """Return the searches that a study can have: the core's own, and those of plug-ins.
 
     Raises:
         InputError: none; there is no kinematic protocol and nothing is simulated.
+        PluginError: one of a plug-in cannot be imported.
     """
-    names = in_all(GUESSES, [each.rig.mock for each in run_requests])
-    return study_plan(run_requests).searches(SKINS, len(names))
+    planned = study_plan(run_requests)
+    found = [_baselines(planned)]
+    found += [search(planned, run_requests) for search in plugins().searches()]
+    can = [search for search in found if search is not None]
+    if not can:
+        raise InputError("--searches", "", True, "needs a kinematic protocol, or a simulated rig")
+    return can
 
 
-def run_search(
-    name: str, store: Store, campaigns: list[Collected], names: Sequence[str]
-) -> StepDone:
-    """Do what is missing of a search; ``done`` of the result counts it.
-
-    Args:
-        names: assumed parameters of the scene.
-    """
-    if name == "baselines":
-        return window_baselines(store, campaigns)
-    if name == "generalisation":
-        done = measure_generalisation(store, campaigns).made
-    elif name == "guesses":
-        done = measure_guesses(store, campaigns, names, TRIALS).measured
-    elif name == "scene search":
-        done = search_scene(store, campaigns, SCENE_TRIALS)
-    else:
-        folder = (store.folder / FILES["detector"]).parent
-        done = tradeoff_detector(store, campaigns, folder, SIZE, AXES)["made"]
-    return {"step": name, "done": done}
+def _baselines(planned: StudyPlan) -> Search | None:
+    if not planned.slides:
+        return None
+    seconds = BASELINE_S * planned.training_windows
+    return Search(
+        "baselines",
+        "methods",
+        seconds,
+        lambda store, campaigns: window_baselines(store, campaigns)["done"],
+    )

@@ -37,6 +37,8 @@ class Plugin:
         drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only
             drivers names them in the group of entry points `sliplab.drivers` instead.
         sections: sections of the report by name (`analysis.report.plugin_sections.ReportSection`).
+        searches: by name, functions that return a search of a study (`analysis.study_plan.Search`)
+            or None, given the study's plan and its run requests.
         hooks: functions that the core calls, by the name of the place; docs/architecture.md lists
             the places.
     """
@@ -45,6 +47,7 @@ class Plugin:
     documents: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     drivers: Mapping[str, str] = field(default_factory=dict)
     sections: Mapping[str, str] = field(default_factory=dict)
+    searches: Mapping[str, str] = field(default_factory=dict)
     hooks: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -86,6 +89,15 @@ class Plugins:
         for plugin in self.found.values():
             named |= {name: it for name, it in plugin.sections.items() if name not in named}
         return named
+
+    def searches(self) -> Iterator[Any]:
+        """Import and yield the functions that return searches, in the order of the plug-ins' names.
+
+        Raises:
+            PluginError: one of them cannot be imported.
+        """
+        for plugin in self.found.values():
+            yield from map(import_foreign, plugin.searches.values())
 
     def hook(self, name: str) -> Any:
         """Import and return the function of a place that one plug-in fills: the first that does.

@@ -39,8 +39,8 @@ from sliplab.storage.schema.evaluation import (
     TrialLatency,
     TrialScore,
 )
+from sliplab.storage.schema.holdout import HoldoutScores
 from sliplab.storage.schema.label import TrialLabel
-from sliplab.storage.schema.sweeps import HoldoutScores
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 

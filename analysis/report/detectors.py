@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import pandas as pd
 
-from sliplab.analysis.report.figures.tradeoffs import latency_over_rate
+from sliplab.analysis.report.figures.detectors import latency_over_rate
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import (

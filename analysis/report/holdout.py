@@ -14,13 +14,13 @@ from sliplab.analysis.report.page import Content, Table, percent, with_interval
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import AlarmRate, LatencyByOnset, Share
+from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.schema.summary import (
     Holdout,
     HoldoutWindows,
     Kinematic,
     TrialIntervals,
 )
-from sliplab.storage.schema.sweeps import HoldoutResult
 
 COLUMNS = ("figure", "hold-out", "n")
 _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}

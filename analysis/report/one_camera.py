@@ -31,7 +31,7 @@ from sliplab.analysis.report.page import (
     number,
     render_page,
 )
-from sliplab.analysis.report.plugin_sections import plugin_sections, sections_key
+from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
 from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.analysis.report.sources import VERSION, report_key
 from sliplab.analysis.report.summary import (
@@ -268,7 +268,7 @@ def one_camera_sections(
         left_out_section(summary),
         collected_section(campaigns, summary),
         registration_section(store, campaigns),
-        *plugin_sections(store, campaigns, simulated=simulated),
+        *plugin_sections(ReportData(store, campaigns, simulated, summary)),
         quality_section(campaigns, summary.references, simulated=simulated),
     ]
     if judged is not None:

@@ -12,11 +12,19 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, select_autoescape
+from jinja2 import (
+    ChoiceLoader,
+    Environment,
+    FileSystemLoader,
+    PrefixLoader,
+    StrictUndefined,
+    Template,
+    select_autoescape,
+)
 from markupsafe import Markup
 
 from sliplab.storage.files import make_folder, safe_name, write_text
@@ -99,10 +107,13 @@ class Rendered(Content):
     figures: Sequence[Figure]
 
 
-@lru_cache(maxsize=1)
-def _environment() -> Environment:
+@cache
+def _environment(folder: Path | None = None) -> Environment:
+    """Return an environment with the templates here and, as ``own/NAME``, those of a plug-in."""
+    here = FileSystemLoader(Path(__file__).parent / "templates")
+    own = PrefixLoader({} if folder is None else {"own": FileSystemLoader(folder)})
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=ChoiceLoader([here, own]),
         autoescape=select_autoescape(),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -120,7 +131,8 @@ def render_page(
     Everything in it is escaped but the figures' SVG.
 
     Args:
-        template: a file of `templates` by name, or a plug-in's file.
+        template: a file of `templates` by name, or a plug-in's file, which includes others of its
+            folder as ``own/NAME``.
     """
     rendered = [render_section(section, simulated=simulated) for section in sections]
     return _template(template).render(sections=rendered, simulated=simulated, **values)
@@ -128,7 +140,7 @@ def render_page(
 
 def _template(file: str | Path) -> Template:
     if isinstance(file, Path):
-        return _environment().from_string(file.read_text(encoding="utf-8"))
+        return _environment(file.parent).get_template(f"own/{file.name}")
     return _environment().get_template(file)
 
 

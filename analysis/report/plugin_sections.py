@@ -12,7 +12,27 @@ from sliplab.protocols.hashing import hash_data
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.storage.files import safe_name
+from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.trials.store import Store
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """What a section is made of.
+
+    Attributes:
+        summary: the report's figures; None where only the key of a section is asked for.
+    """
+
+    store: Store
+    campaigns: Sequence[Collected]
+    simulated: bool
+    summary: Summary | OneCameraSummary | None = None
+
+    @property
+    def collected_here(self) -> bool:
+        """Whether some of the campaigns are none of imported recordings."""
+        return any(item.recorded is None for item in self.campaigns)
 
 
 @dataclass(frozen=True)
@@ -20,14 +40,16 @@ class ReportSection:
     """A section of a plug-in, which `protocols.plugin.Plugin.sections` names.
 
     Attributes:
-        make: returns what is shown of a store's campaigns, given whether they are simulated; None
-            where there is nothing to show. Names of its figures begin with the section's.
+        make: returns what is shown; None where there is nothing to show. Names of its figures begin
+            with the section's.
         key: returns what the section is made of, as plain data: the report is made again where it
             has changed. Left out: the section itself, made whenever a report is asked for.
+        last: it stands among the results of longer studies, not behind the registrations.
     """
 
-    make: Callable[[Store, Sequence[Collected], bool], Content | None]
+    make: Callable[[ReportData], Content | None]
     key: Callable[[Store, Sequence[Collected]], Sequence[Any]] | None = None
+    last: bool = False
 
 
 @dataclass(frozen=True)
@@ -38,14 +60,17 @@ class LostSections(Content):
     faults: Sequence[str]
 
 
-def plugin_sections(
-    store: Store, campaigns: Sequence[Collected], *, simulated: bool
-) -> Iterator[Content]:
-    """Make the sections of plug-ins, in the order of the plug-ins' names; then what is lost."""
+def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content]:
+    """Make the sections of plug-ins, in the order of the plug-ins' names; then what is lost.
+
+    Args:
+        last: those that stand among the results of longer studies.
+    """
     faults = []
     for name, place in plugins().sections().items():
         try:
-            made = _rendered(name, place, store, campaigns, simulated)
+            section = _section(place)
+            made = _rendered(name, section, data) if section.last == last else None
         except (Exception, SystemExit) as error:  # another package's code: whatever it raises
             faults.append(_fault(name, error))
         else:
@@ -58,14 +83,15 @@ def plugin_sections(
 def sections_key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
     """Return what the sections of plug-ins depend on besides; empty where they show nothing."""
     found: list[Any] = []
+    data = ReportData(store, campaigns, store.simulated)
     for name, place in plugins().sections().items():
         try:
-            key = _section(place).key
-            if key is not None:
-                parts = list(key(store, campaigns))
+            section = _section(place)
+            if section.key is not None:
+                parts = list(section.key(store, campaigns))
                 hash_data(parts)  # plain data
                 found += parts
-            elif made := _rendered(name, place, store, campaigns, store.simulated):
+            elif made := _rendered(name, section, data):
                 found.append([made.title, made.html])
         except (Exception, SystemExit) as error:  # as above
             found.append(_fault(name, error))
@@ -79,16 +105,14 @@ def _section(place: str) -> ReportSection:
     return section
 
 
-def _rendered(
-    name: str, place: str, store: Store, campaigns: Sequence[Collected], simulated: bool
-) -> Rendered | None:
+def _rendered(name: str, section: ReportSection, data: ReportData) -> Rendered | None:
     """Return a section as HTML; None where it shows nothing."""
-    content = _section(place).make(store, campaigns, simulated)
+    content = section.make(data)
     if content is None:
         return None
-    title, html = render_section(content, simulated=simulated)
+    title, html = render_section(content, simulated=data.simulated)
     figures = [figure for figure in content.all_figures() if figure.name]
-    _check(figures, name, simulated)
+    _check(figures, name, data.simulated)
     return Rendered(str(title), html, figures)
 
 

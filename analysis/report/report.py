@@ -30,16 +30,9 @@ from sliplab.analysis.report.page import (
     render_page,
 )
 from sliplab.analysis.report.paper import paper_section
-from sliplab.analysis.report.plugin_sections import plugin_sections
-from sliplab.analysis.report.programs import (
-    FILES,
-    command,
-    skin_section,
-    tradeoff_section,
-)
+from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections
+from sliplab.analysis.report.programs import HOLDOUT
 from sliplab.analysis.report.registration import registration_section
-from sliplab.analysis.report.seeds import seed_words
-from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.sources import Sources
 from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.report.trial import Example, choose_example, output_section, trial_section
@@ -118,7 +111,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
     Raises:
         StoreError: another program's result is of another shape.
     """
-    store, campaigns, programs = sources.store, sources.campaigns, sources.programs
+    store, campaigns = sources.store, sources.campaigns
     simulated, kinematic = summary.simulated, summary.kinematic
     rows = sources.evaluation.trials
     trial, outputs, seen = None, None, None
@@ -128,24 +121,16 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         trial = trial_section(store, example, simulated=simulated)
         rule = sources.evaluation.detection[example.item.name]
         outputs = output_section(example, counts, rule, simulated=simulated)
-    holdout, sensitivity, skins = None, None, None
-    collected_here = any(item.recorded is None for item in campaigns)
-    if collected_here:
-        skins = skin_section(
-            programs.get("generalisation"), command(store, "generalisation"),
-            kinematic.accuracy.strict, seed_words(kinematic.seeds), simulated=simulated,
-        )  # fmt: skip
-    if simulated and collected_here:
-        how = command(store, "holdout")
-        holdout = holdout_section(summary.holdout, kinematic, how, FILES["holdout"])
-        found = programs.get("guesses")
-        sensitivity = sensitivity_section(found, command(store, "guesses"))
+    holdout = None
+    data = ReportData(store, campaigns, simulated, summary)
+    if simulated and data.collected_here:
+        holdout = holdout_section(summary.holdout, kinematic, HOLDOUT.command(store), HOLDOUT.file)
     sections: list[Content | None] = [
         paper_section(summary),
         holdout,
         collected_section(campaigns, summary),
         registration_section(store, list(campaigns)),
-        *plugin_sections(store, campaigns, simulated=simulated),
+        *plugin_sections(data),
         quality_section(campaigns, summary.references, simulated=simulated),
         trial,
         force_section(store, campaigns, seen, simulated=simulated),
@@ -165,9 +150,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
             campaigns, summary.sync, page=(store.folder / "report" / clocks.PAGE).exists(),
             simulated=simulated,
         ),
-        skins,
-        sensitivity,
-        tradeoff_section(store, programs) if collected_here else None,
+        *plugin_sections(data, last=True),
         _provenance(summary),
     ]  # fmt: skip
     return [section for section in sections if section is not None]

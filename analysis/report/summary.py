@@ -17,7 +17,7 @@ from sliplab.analysis.report.alarms import OWN, false_alarms
 from sliplab.analysis.report.campaign import references_of
 from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
-from sliplab.analysis.report.programs import parse_program
+from sliplab.analysis.report.programs import HOLDOUT
 from sliplab.analysis.report.sources import Sources
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
@@ -28,6 +28,7 @@ from sliplab.storage.schema.evaluation import (
     TrainedBaseline,
     WindowIntervals,
 )
+from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.schema.summary import (
     Difference,
     Hashes,
@@ -37,7 +38,6 @@ from sliplab.storage.schema.summary import (
     Summary,
     Sync,
 )
-from sliplab.storage.schema.sweeps import HoldoutResult
 from sliplab.storage.streams import Json
 from sliplab.storage.versions import FIGURES, installed_versions
 
@@ -78,7 +78,7 @@ def make_summary(sources: Sources) -> Summary:
     )  # fmt: skip
     holdout = None
     if "holdout" in sources.programs:
-        kept = parse_program("holdout", HoldoutResult, sources.programs["holdout"])
+        kept = HOLDOUT.parse(HoldoutResult, sources.programs["holdout"])
         holdout = holdout_part(kept)
     return Summary.model_validate({
         "simulated": sources.store.simulated,

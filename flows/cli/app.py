@@ -21,7 +21,6 @@ from sliplab.flows.cli import (
     steps,
     store,
     study,
-    sweeps,
 )
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
@@ -60,7 +59,6 @@ for part in (
     collect.app,
     register.app,
     steps.app,
-    sweeps.app,
     study.app,
     store.app,
     rigs.app,

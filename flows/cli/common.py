@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sliplab.flows.running import console
-from sliplab.flows.steps import run_step
+from sliplab.flows.steps import prepare_store, run_step
 
 if TYPE_CHECKING:
+    from sliplab.analysis.campaigns import Collected
     from sliplab.storage.trials.store import Store
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
@@ -116,3 +117,15 @@ def new_store(place: Path) -> Iterator[Store]:
             if existed:
                 place.mkdir()
         raise
+
+
+def opened_campaigns(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:
+    """Return a store and its campaigns, before anything imports Prefect."""
+    from sliplab.analysis.campaigns import collected
+    from sliplab.storage.remote.mirror import open_store
+
+    store = open_store(folder)
+    prepare_store(folder)
+    # what is made anew from a protocol leaves imported campaigns out, unless somebody names them
+    found = collected(store, names)
+    return store, [item for item in found if names or item.recorded is None] or found

@@ -1,4 +1,4 @@
-"""`sliplab study` and `demo`: the whole pipeline from a rig to the report."""
+"""`sliplab study`, `demo` and `holdout`: the whole pipeline from a rig to the report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption
+from sliplab.flows.cli.common import (
+    CampaignOption,
+    JsonOption,
+    RigOption,
+    StoreArgument,
+    opened_campaigns,
+)
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.flows.study_defaults import HELD_OUT, LABELS_CHECKED, NETWORKS, study_protocols
@@ -145,6 +151,36 @@ def _chain(
     simulated = " (simulated)" if summary.simulated else ""
     console.print_table(f"Results{simulated}", ["figure", "value", "note"], _results(summary))
     console.show(f"Report{simulated}: {page.resolve()}")
+
+
+@app.command()
+def holdout(
+    folder: StoreArgument,
+    trials: Annotated[
+        int,
+        typer.Option(
+            "--trials", min=2, max=1_000_000, help="Number of trials, spread over the conditions."
+        ),
+    ] = HELD_OUT,
+    again: Annotated[
+        bool,
+        typer.Option("--again", help="Evaluate even if this version of SlipLab already has."),
+    ] = False,
+    campaign: CampaignOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Evaluate the network once on a hold-out campaign: another simulated skin and seed."""
+    store, campaigns = opened_campaigns(folder, campaign)
+    from sliplab.analysis.report.holdout import COLUMNS, holdout_part, holdout_rows
+    from sliplab.flows.holdout import measure_holdout
+
+    done = measure_holdout(store, campaigns, trials, again)
+    if as_json:
+        console.print_json(done.to_json())
+        return
+    rows = holdout_rows(holdout_part(done.result))
+    console.print_table("hold-out, simulated", COLUMNS, rows)
+    console.say(f"stored in {done.file} with all earlier evaluations; the next report shows it")
 
 
 def _note_seeds(run_requests: Sequence[RunRequest]) -> None:

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.page import Content, Figure, Table
-from sliplab.analysis.report.plugin_sections import ReportSection
+from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.plugins.claims import plot as figures
 from sliplab.plugins.claims.document import Look, StoppingRecord
 from sliplab.plugins.claims.shown import verdict_text
@@ -68,12 +68,10 @@ def claims_key(store: Store, campaigns: Sequence[Collected]) -> list[str]:
     return [hash_data(each.to_json()) for each in found if each is not None]
 
 
-def claims_section(
-    store: Store, campaigns: Sequence[Collected], simulated: bool
-) -> ClaimsSection | None:
+def claims_section(data: ReportData) -> ClaimsSection | None:
     """Show the claims of each campaign that has looked at some; None where none has."""
     found = []
-    for item in campaigns:
+    for item in data.campaigns:
         record = StoppingRecord.of(item.campaign.folder)
         stopping = None if item.recorded is not None else item.plan.protocol.collection.stopping
         if record is None or stopping is None or not record.looks:
@@ -88,7 +86,7 @@ def claims_section(
                 record.target,
                 (item.campaign.folder / CHOICES).exists(),
                 Table(COLUMNS, [_row(record.looks, k) for k in range(len(stopping.claims))]),
-                _figure(item.name, record.looks, simulated),
+                _figure(item.name, record.looks, data.simulated),
             )
         )
     return ClaimsSection(found) if found else None

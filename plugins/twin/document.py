@@ -6,7 +6,7 @@ from typing import Literal
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 from sliplab.storage.schema.evaluation import Experiments
-from sliplab.storage.schema.sweeps import HoldoutScores
+from sliplab.storage.schema.holdout import HoldoutScores
 
 
 class ParameterFit(Part):

@@ -1,4 +1,4 @@
-"""A study's expected seconds by step, and the searches that it can have."""
+"""A study's expected seconds by step."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from sliplab.analysis.evaluation import holdout
 from sliplab.analysis.labels.label_errors import CHECK
 from sliplab.analysis.study_plan import PlannedCampaign, StudyPlan
-from sliplab.analysis.sweeps import holdout
 from sliplab.protocols import load_plan
-from sliplab.protocols.errors import InputError
 from sliplab.protocols.shipped import shipped_protocols
 
 FILES = shipped_protocols()
@@ -48,14 +47,6 @@ def test_a_real_rig_takes_what_is_planned() -> None:
     assert seconds["collect pilot"] == pytest.approx(4.0 + real.plan.total_seconds)
 
 
-def test_only_slides_are_trained_on_and_only_a_scene_has_parameters() -> None:
+def test_only_slides_are_trained_on() -> None:
     assert StudyPlan([FALLS]).training_windows == 0
     assert StudyPlan([FALLS]).expected(0)["train"] == 4.0
-    guesses, *others = StudyPlan([FALLS]).searches(5, 12)
-    assert (guesses.name, guesses.seconds, others) == ("guesses", 40.0 * 25, [])
-    names = [each.name for each in StudyPlan([SLIDES, FALLS]).searches(5, 12)]
-    assert names == ["baselines", "generalisation", "guesses", "scene search", "detector search"]
-    real = replace(FALLS, simulated=False)
-    assert "guesses" not in [each.name for each in StudyPlan([SLIDES, real]).searches(5, 0)]
-    with pytest.raises(InputError, match=r"--searches.*needs a kinematic protocol"):
-        StudyPlan([real]).searches(5, 0)

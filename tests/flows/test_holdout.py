@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation import holdout as figures
 from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.evaluation.holdout import Holdout
 from sliplab.analysis.report.holdout import holdout_part, holdout_rows
-from sliplab.analysis.report.programs import parse_program
-from sliplab.analysis.sweeps import holdout as figures
-from sliplab.analysis.sweeps.holdout import Holdout
-from sliplab.flows import generalise, holdout
+from sliplab.analysis.report.programs import HOLDOUT
+from sliplab.flows import holdout
 from sliplab.flows.holdout import (
     PROTOCOL_SEED,
     SKIN_SEED,
@@ -25,8 +25,9 @@ from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
+from sliplab.plugins.studies.generalise import run as generalise
 from sliplab.storage.files import json_text, read_json, write_json
-from sliplab.storage.schema.sweeps import HoldoutResult
+from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import shape_of, summary_json
@@ -157,7 +158,7 @@ def test_the_file_has_these_keys(store: Store) -> None:
 
 def test_a_file_of_another_shape_is_named(store: Store) -> None:
     with pytest.raises(StoreError, match=r"holdout/results\.json"):
-        parse_program("holdout", HoldoutResult, {"rows": []})
+        HOLDOUT.parse(HoldoutResult, {"rows": []})
 
 
 def test_real_slides_need_a_campaign_of_their_own(

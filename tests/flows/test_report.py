@@ -16,7 +16,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.report import campaign, programs
+from sliplab.analysis.report import campaign
 from sliplab.analysis.report.against import Change, compare
 from sliplab.analysis.report.outcomes import (
     MOST_FAILURES,
@@ -28,14 +28,17 @@ from sliplab.analysis.report.outcomes import (
     trial_outcome,
 )
 from sliplab.analysis.report.page import render_section, write_figures
-from sliplab.analysis.report.programs import FILES
-from sliplab.analysis.report.tradeoff_scene import ERRORS
-from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import read_summary, report
 from sliplab.flows.study import Outcome
+from sliplab.plugins.studies.generalise.section import RESULT as GENERALISATION
+from sliplab.plugins.studies.generalise.section import skin_section
+from sliplab.plugins.studies.results import RESULTS
+from sliplab.plugins.studies.scene.page import ERRORS
+from sliplab.plugins.studies.scene.windows import PHASES
+from sliplab.plugins.studies.section import tradeoff_section
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.evaluation import Seeds, SeedScores, SeedTimes, TrialScore
 from sliplab.storage.schema.summary import ReferenceTrial, Summary, TrialOutcome
@@ -275,7 +278,7 @@ def scene() -> Json:
 
 
 def detector() -> Json:
-    """Numbers of the shape that `analysis.report.programs` reads."""
+    """Numbers of the shape that the report's section on trade-offs reads."""
     rows = [
         {"length_ms": 30, "step_ms": 1, "pool_px": 20, "width": 1.0, "precision": "as trained",
          "stride_ms": 30, "smoothing": 4, "margin": 2.0, "front": paper, "paper": paper,
@@ -305,8 +308,9 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
         },
         "detector": detector(),
     }
+    files = {"generalisation": GENERALISATION, **RESULTS}
     for name, data in found.items():
-        path = other.folder / FILES[name]
+        path = other.folder / files[name].file
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, data)
     assert report(other, collected(other))["done"] == 1
@@ -329,19 +333,19 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     assert [line["strict accuracy (%)"] for line in lines] == ["91.0", "91.0"]
     assert (data / "tradeoff-scene.csv").exists()
 
-    path = other.folder / FILES["detector"]
+    path = other.folder / RESULTS["detector"].file
     path.write_text("{")
-    with pytest.raises(StoreError, match=r"delete .*detector_tradeoff\.json"):
-        report(other, collected(other))
+    assert report(other, collected(other))["done"] == 1
+    assert re.search(r"tradeoff: .*delete .*detector_tradeoff\.json", page(other))
     with pytest.raises(StoreError, match=r"report/detector_tradeoff\.json: is not of the shape"):
-        programs.tradeoff_section(other, {"detector": {"rows": [{}]}})
+        tradeoff_section(other, {"detector": {"rows": [{}]}})
     path.unlink()
-    write_json(other.folder / FILES["scene"], {"variants": []})
-    with pytest.raises(StoreError, match=r"derived/tradeoff/tradeoff\.json: is not of the shape"):
-        report(other, collected(other))
+    write_json(other.folder / RESULTS["scene"].file, {"variants": []})
+    assert report(other, collected(other))["done"] == 1
+    assert re.search(r"derived/tradeoff/tradeoff\.json: is not of the shape", page(other))
     with pytest.raises(StoreError, match=r"results\.json: is not of the shape"):
-        programs.skin_section({}, "sliplab generalise", 0.9, simulated=True)
-    absent = programs.tradeoff_section(other, {})
+        skin_section({}, "sliplab generalise", 0.9, simulated=True)
+    absent = tradeoff_section(other, {})
     assert absent.missing[0][1].startswith("sliplab tradeoff --scene PROTOCOL --out ")
     write_figures(other.folder / "report", [absent], simulated=True)
     assert list(data.iterdir()) == []  # an older report's figures go

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from sliplab.analysis.detectors.detectors import RULE
 from sliplab.analysis.report.alarms import DISTURBED, UNDISTURBED
-from sliplab.analysis.report.programs import parse_program
+from sliplab.analysis.report.programs import STRESS
 from sliplab.plugins.bench.stress.document import StressRecord
 from sliplab.plugins.bench.stress.judging import ALL
 from sliplab.storage.schema.evaluation import AlarmRate
@@ -21,7 +21,7 @@ def report_alarms(programs: Mapping[str, Json], network: str) -> dict[str, Alarm
     """
     if "stress" not in programs:
         return {}
-    return stress_alarms(parse_program("stress", StressRecord, programs["stress"]), network)
+    return stress_alarms(STRESS.parse(StressRecord, programs["stress"]), network)
 
 
 def stress_alarms(record: StressRecord | None, network: str) -> dict[str, AlarmRate]:

@@ -17,12 +17,12 @@ from sliplab.analysis.report.figures.intervals import (
     differences,
     shares,
 )
-from sliplab.analysis.report.figures.tradeoffs import Panel as Pair
-from sliplab.analysis.report.figures.tradeoffs import Point, cost_and_error
 from sliplab.analysis.report.outcomes import FailureSection
 from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
-from sliplab.analysis.report.programs import SkinSection
 from sliplab.analysis.report.trial import TrialSection
+from sliplab.plugins.studies.generalise.section import SkinSection
+from sliplab.plugins.studies.plot import Panel as Pair
+from sliplab.plugins.studies.plot import Point, cost_and_error
 
 EVIL = "<img src=x onerror=alert(1)>"
 SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"

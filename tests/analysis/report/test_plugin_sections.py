@@ -8,7 +8,12 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.report.page import Rendered
-from sliplab.analysis.report.plugin_sections import LostSections, plugin_sections, sections_key
+from sliplab.analysis.report.plugin_sections import (
+    LostSections,
+    ReportData,
+    plugin_sections,
+    sections_key,
+)
 from sliplab.storage.trials.store import Store
 from tests.protocols.test_plugin import installed
 
@@ -29,7 +34,7 @@ class Rubs(Content):
     figures: tuple = (Figure("<svg></svg>", "rubs-force", {"force (N)": [1, 2]}),)
     template = Path(__file__).with_suffix(".html")
 
-def make(store, campaigns, simulated):
+def make(data):
     return Rubs()
 
 SECTION = ReportSection(make)
@@ -50,7 +55,7 @@ def install(installed: Any, folder: Path, name: str, *changes: tuple[str, str]) 
 def test_a_section_of_another_package_is_shown(installed: Any, tmp_path: Path) -> None:
     install(installed, tmp_path, "lab_rubs")
     store = Store.create(tmp_path / "store")
-    (section,) = plugin_sections(store, [], simulated=True)
+    (section,) = plugin_sections(ReportData(store, [], True))
     assert isinstance(section, Rendered)
     assert (section.title, [figure.name for figure in section.figures]) == ("Rubs", ["rubs-force"])
     assert "<p>7 rubs, simulated</p>" in section.html
@@ -69,7 +74,7 @@ def test_a_key_stands_for_the_section(installed: Any, tmp_path: Path) -> None:
 def test_nothing_is_shown_where_there_is_nothing(installed: Any, tmp_path: Path) -> None:
     install(installed, tmp_path, "lab_still", ("return Rubs()", "return None"))
     store = Store.create(tmp_path / "store")
-    assert list(plugin_sections(store, [], simulated=False)) == []
+    assert list(plugin_sections(ReportData(store, [], False))) == []
     assert sections_key(store, []) == []
 
 
@@ -96,7 +101,7 @@ def test_one_that_fails_is_a_line(
     install(installed, tmp_path, "lab_broken", (before, after))
     install(installed, tmp_path, "lab_other", ('"rubs"', '"more"'), ("rubs-", "more-"))
     store = Store.create(tmp_path / "store")
-    *shown, last = plugin_sections(store, [], simulated=True)
+    *shown, last = plugin_sections(ReportData(store, [], True))
     assert [section.title for section in shown if isinstance(section, Rendered)] == ["Rubs"]
     assert isinstance(last, LostSections)
     (line,) = last.faults

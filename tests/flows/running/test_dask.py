@@ -23,8 +23,8 @@ from sliplab.flows.label import label
 from sliplab.flows.running import cluster as clusters
 from sliplab.flows.running import parallel_map, stopping
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
-from sliplab.flows.tradeoff_scene import everywhere
 from sliplab.flows.train import train
+from sliplab.plugins.studies.scene.run import everywhere
 from sliplab.protocols.errors import InputError
 from sliplab.storage.remote.mirror import open_mirror
 from sliplab.storage.remote.objects import Remote

@@ -1,0 +1,19 @@
+"""Studies of a network and its scene: levels left out, assumed parameters, speed against error."""
+
+from __future__ import annotations
+
+from sliplab.protocols.plugin import Plugin
+
+_STUDIES = "sliplab.plugins.studies"
+PLUGIN = Plugin(
+    commands=dict.fromkeys(("tradeoff", "generalise", "guesses"), f"{_STUDIES}.command:app"),
+    sections={
+        "skins": f"{_STUDIES}.generalise.section:SECTION",
+        "guesses": f"{_STUDIES}.guesses.section:SECTION",
+        "tradeoff": f"{_STUDIES}.section:SECTION",
+    },
+    searches={
+        name: f"{_STUDIES}.searches:{name}"
+        for name in ("generalisation", "guesses", "scene", "detector")
+    },
+)

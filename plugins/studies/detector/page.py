@@ -1,0 +1,282 @@
+"""Page of the detector's search: tables and plots, made from its numbers alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
+from sliplab.plugins.studies.detector.rows import (
+    FACTORS,
+    LOOSE,
+    MOST_MISSED,
+    OBJECTIVES,
+    Row,
+    mean,
+    short_list,
+)
+from sliplab.plugins.studies.plot import (
+    Bar,
+    Panel,
+    Point,
+    factor_lines,
+    front_panels,
+)
+
+MOST_ROWS = 40
+"""Most rows of the front on the page; the table as CSV has all."""
+COLUMNS = (
+    "network", "precision", "stride (ms)", "windows", "margin (spikes)", "strict (%)",
+    "mean latency (ms)", "95 % (ms)", "false early (%)", "missed or late (%)", "µs a window",
+    "in a batch", "operations a window (1000)", "operations/s (million)",
+)  # fmt: skip
+TERMINAL = ("", "network", "stride", "rule", "strict", "latency", "early", "missed or late")
+_LATENCY, _OPERATIONS = "mean incipient latency (ms)", "synaptic operations/s (million)"
+_TIME = "computing time (ms a second, one thread)"
+PANELS = (
+    Panel("mean_ms", "strict", _LATENCY, "strict accuracy (%)"),
+    Panel("mean_ms", "false_early_either", _LATENCY, "false early trials (%)"),
+    Panel("synaptic_operations_per_s", "strict", _OPERATIONS, "strict accuracy (%)", True),
+    Panel("synaptic_operations_per_s", "mean_ms", _OPERATIONS, _LATENCY, True),
+    Panel("us_per_s", "p95_ms", _TIME, "95th percentile latency (ms)", True),
+    Panel("us_per_s", "lost_either", _TIME, "missed or late trials (%)", True),
+)
+DRAWN = {
+    **dict.fromkeys(("strict", "false_early_either", "lost_either"), 100.0),
+    "us_per_s": 1e-3,
+    "synaptic_operations_per_s": 1e-6,
+}
+"""Factors on figures in the plots."""
+
+Result = Mapping[str, Any]
+
+
+def render(result: Result) -> str:
+    """Return the page as text; everything in it is escaped but the figures' SVG."""
+    rows, simulated, trials = rows_of(result), result["simulated"], result["trials"]
+    values = {
+        **result,
+        "loose": LOOSE,
+        "most_missed": MOST_MISSED,
+        "not_tried": Table(("left out", "why"), [[*each] for each in result["left_out"].items()]),
+        "warned": Table(
+            ("network", "warning"), [[run, "; ".join(of)] for run, of in result["warnings"].items()]
+        ),
+        "detectors": distinct(rows),
+    }
+    if rows:
+        budgets = [[percent(budget, 0), *cells(row)] for budget, row in short_list(rows)]
+        front = [row for row in values["detectors"] if row.front]
+        comparisons = [(rows[item["row"]], item) for item in result["comparisons"]]
+        values |= {
+            "short_list": Table(("budget", *COLUMNS), budgets),
+            "front": _front(rows, leads=bool(trials["falling"])),
+            "on_front": len(front),
+            "on_both": sum(row.front_validation for row in front),
+            "most": MOST_ROWS,
+            "points": _points(rows, simulated),
+            "seeds": max(len(row.seeds) for row in rows),
+            "lines": _lines(comparisons, simulated),
+            "factors": _factors(comparisons),
+            "cross": _cross(rows),
+            "pairs": _pairs(result["pairs"]),
+        }
+    return render_page(Path(__file__).with_name("page.html"), **values)
+
+
+def rows_of(result: Result) -> list[Row]:
+    """Return the rows of a result."""
+    return [Row.of_json(row) for row in result["rows"]]
+
+
+def _front(rows: Sequence[Row], *, leads: bool) -> Table:
+    shown, columns = ordered_front(rows, MOST_ROWS), list(COLUMNS)
+    table = [cells(row) for row in shown]
+    if leads:
+        columns.append("shortest lead (ms)")
+        found = [number(mean((row.falling or {})["lead_min_ms"]), 0) for row in shown]
+        table = [[*each, lead] for each, lead in zip(table, found, strict=True)]
+    return Table(columns, table)
+
+
+def _points(rows: Sequence[Row], simulated: bool) -> Figure:
+    def values(row: Row) -> dict[str, float | None]:
+        found = {name: row.objective(name) for name in OBJECTIVES}
+        return {k: None if v is None else DRAWN.get(k, 1.0) * v for k, v in found.items()}
+
+    points = [Point(values(row), row.front, row.paper) for row in rows]
+    return Figure(front_panels(points, PANELS, simulated=simulated))
+
+
+Comparisons = Sequence[tuple[Row, Mapping[str, Any]]]
+"""Rows on the lines through the paper's setting, as `comparisons` of `detector_rows` has them."""
+
+
+def _level(item: Mapping[str, Any]) -> str:
+    value = item["value"]
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
+    bars: dict[str, list[Bar]] = {}
+    for row, item in comparisons:
+        ranges = {
+            "strict": seed_range(row.test["strict"], 100),
+            "mean_ms": seed_range(row.test["mean_ms"], 1),
+        }
+        bar = Bar(_level(item), item["paper"], ranges)
+        bars.setdefault(FACTORS[item["factor"]], []).append(bar)
+    figures = {"strict": "strict accuracy (%)", "mean_ms": "mean latency (ms)"}
+    return Figure(factor_lines(bars, figures, simulated=simulated))
+
+
+def _factors(comparisons: Comparisons) -> Table:
+    points = (100, "points")
+    compared = {"strict": points, "mean_ms": (1, "ms"), "false_early_either": points}
+    table = []
+    for row, item in comparisons:
+        found = item["difference"]
+        shown = ["paper's" if item["paper"] else "–"] * 3
+        if found is not None and not item["paper"]:
+            shown = [format_difference(found[name], *how) for name, how in compared.items()]
+        means = [spread(row.test["strict"], 100, 1), spread(row.test["mean_ms"], 1, 0)]
+        table.append([f"{FACTORS[item['factor']]}: {_level(item)}", *means, *shown])
+    columns = ("factor", "strict (%)", "mean latency (ms)", "strict, difference",
+               "latency, difference", "false early, difference")  # fmt: skip
+    return Table(columns, table)
+
+
+def _cross(rows: Sequence[Row]) -> Table:
+    """Window length by pooling."""
+    there = {
+        (row.setting.length_ms, row.setting.pool_px): [
+            f"{hundred(mean(row.test['strict']))} %",
+            f"{number(mean(row.test['mean_ms']), 0)} ms",
+            f"{scaled(mean(row.work['synaptic_operations_per_s']), 1e6)} M/s",
+        ]
+        for row in rows
+        if row.precision == "trained" and row.rule == "chosen"
+        and row.stride_ms == row.setting.length_ms
+        and (row.setting.step_ms, row.setting.width) == (1, 1)
+    }  # fmt: skip
+    lengths, pools = (sorted({key[k] for key in there}) for k in (0, 1))
+    table = [
+        [f"{length} ms", *(", ".join(there.get((length, pool), ["–"])) for pool in pools)]
+        for length in lengths
+    ]
+    return Table(["window", *(f"cells of {pool} px" for pool in pools)], table)
+
+
+def _pairs(pairs: Sequence[Mapping[str, Any]]) -> Table:
+    found = {
+        (pair["smoothing"], pair["margin"]): f"{number(pair['mean_ms'], 0)} ms, "
+        f"{hundred(pair['false_early_either'], 0)} / {hundred(pair['lost_either'], 0)} %"
+        for pair in pairs
+    }
+    smoothings, margins = (sorted({key[k] for key in found}) for k in (0, 1))
+    table = [[f"{s}", *(found[s, margin] for margin in margins)] for s in smoothings]
+    return Table(["windows", *(f"margin {margin:g}" for margin in margins)], table)
+
+
+def distinct(rows: Sequence[Row]) -> list[Row]:
+    """Return each detector once: two rules may have chosen the same pair."""
+    found: dict[Any, Row] = {}
+    for row in rows:
+        found.setdefault(row.detector, row)
+    return list(found.values())
+
+
+def ordered_front(rows: Sequence[Row], most: int | None = None) -> list[Row]:
+    """Return the paper's row, then the front by mean latency: at most so many of it."""
+
+    def late(row: Row) -> tuple[bool, float]:
+        value = row.objective("mean_ms")
+        return value is None, value or 0
+
+    front = [row for row in distinct(rows) if row.front and not row.paper]
+    return [*(row for row in rows if row.paper), *sorted(front, key=late)[:most]]
+
+
+def short_table(result: Result) -> tuple[Sequence[str], list[list[str]]]:
+    """Return the paper's row and the short list for a terminal: columns and rows; means only."""
+    rows = rows_of(result)
+    listed = [("paper's", row) for row in rows if row.paper]
+    listed += [(percent(budget, 0), row) for budget, row in short_list(rows)]
+    table = []
+    for name, row in listed:
+        setting, test = row.setting, row.test
+        network = f"{setting.length_ms}/{setting.step_ms}/{setting.pool_px}/{setting.width:g}"
+        table.append(
+            [
+                name,
+                network + (", 8 bit" if row.precision == "8 bit" else ""),
+                f"{row.stride_ms} ms",
+                f"{row.smoothing}, {row.margin:g}",
+                percent(mean(test["strict"])),
+                number(mean(test["mean_ms"]), 0, "ms"),
+                percent(mean(test["false_early_either"])),
+                percent(mean(test["lost_either"])),
+            ]
+        )
+    return TERMINAL, table
+
+
+def cells(row: Row) -> list[str]:
+    """Return a row as text under `COLUMNS`."""
+    setting, test, work = row.setting, row.test, row.work
+    name = f"{setting.length_ms}/{setting.step_ms} ms, {setting.pool_px} px, ×{setting.width:g}"
+    both = row.front and row.front_validation
+    return [
+        f"{'★ ' if row.paper else ''}{name}{' ✓' if both else ''}",
+        row.precision,
+        str(row.stride_ms),
+        str(row.smoothing),
+        f"{row.margin:g}",
+        spread(test["strict"], 100, 1),
+        spread(test["mean_ms"], 1, 0),
+        number(mean(test["p95_ms"]), 0),
+        f"{hundred(mean(test['false_early_either']))} "
+        f"({hundred(mean(test['false_early']), 0)}, {hundred(mean(test['false_early_gross']), 0)})",
+        hundred(mean(test["lost_either"])),
+        number(mean(work["us_single"]), 0),
+        number(mean(work["us_batched"]), 0),
+        scaled(mean(work["synaptic_operations"]), 1e3),
+        scaled(mean(work["synaptic_operations_per_s"]), 1e6),
+    ]
+
+
+def seed_range(values: Sequence[float | None], scale: float) -> tuple[float, float, float] | None:
+    """Return mean, lowest and highest over seeds; None without any."""
+    there = [scale * value for value in values if value is not None]
+    return (sum(there) / len(there), min(there), max(there)) if there else None
+
+
+def spread(values: Sequence[float | None], scale: float, digits: int) -> str:
+    """Return mean, lowest and highest as text; of one seed its value."""
+    found = seed_range(values, scale)
+    if found is None:
+        return "–"
+    text = f"{found[0]:.{digits}f}"
+    return text if len(values) < 2 else f"{text} ({found[1]:.{digits}f} to {found[2]:.{digits}f})"
+
+
+def format_difference(difference: Mapping[str, Any], scale: float, unit: str) -> str:
+    """Return a difference, its interval, and its significance over seeds, as text."""
+    if difference["mean"] is None:
+        return "–"
+    text = f"{scale * difference['mean']:+.1f}".replace("-", "−")
+    if difference["told"] is None:
+        return f"{text} {unit}"
+    half = scale * (difference["high"] - difference["mean"])
+    return f"{text} ± {half:.1f} {unit}{', more than seeds' if difference['told'] else ''}"
+
+
+def hundred(value: float | None, digits: int = 1) -> str:
+    """Return a share in percent, without the sign."""
+    return "–" if value is None else f"{100 * value:.{digits}f}"
+
+
+def scaled(value: float | None, by: float) -> str:
+    """Return three digits in units of `by`."""
+    return "–" if value is None else f"{value / by:.3g}"

@@ -1,0 +1,113 @@
+"""`sliplab tradeoff --detector`: what a detector's speed costs in errors, over a store's trials.
+
+A search is kept run by run, so it may be stopped and gone on with, and made larger later.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.flows.running import console
+from sliplab.plugins.studies.detector import page
+from sliplab.plugins.studies.detector.grid import Axes, make_grid
+from sliplab.plugins.studies.detector.rows import Row, plan, search_result, table
+from sliplab.plugins.studies.detector.search import STEP, DetectorSearch, SearchSize, search_trials
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import write_json, write_text
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
+
+PAGE, NUMBERS, TABLE = (f"detector_tradeoff.{kind}" for kind in ("html", "json", "csv"))
+
+
+def detector_search(
+    store: Store,
+    campaigns: list[Collected],
+    size: SearchSize,
+    axes: Axes,
+    full: bool = False,
+    reviewed: bool = False,
+) -> DetectorSearch:
+    """Return the search that is requested; nothing is computed yet.
+
+    Args:
+        full: every value of the factors with every other.
+        reviewed: people's decisions are applied to the labels.
+
+    Raises:
+        InputError: a value that no network can have.
+        StoreError: trials or labels are missing.
+    """
+    trials = search_trials(Labels(store, reviewed), campaigns, size)
+    grid = make_grid(axes, trials.settings.windows, trials.settings.network, full)
+    return DetectorSearch(trials, grid, size, Derived.of(store, STEP))
+
+
+def tradeoff_detector(
+    store: Store,
+    campaigns: list[Collected],
+    folder: Path,
+    size: SearchSize,
+    axes: Axes,
+    full: bool = False,
+    reviewed: bool = False,
+    minutes: float | None = None,
+    dry_run: bool = False,
+) -> dict[str, Any]:
+    """Make what is missing, and write page, numbers and table into `folder`.
+
+    Args:
+        full: every value of the factors with every other.
+        reviewed: people's decisions are applied to the labels.
+        minutes: no run is started after so many; the page is of the kept ones then.
+        dry_run: only say what there is to do, and how long it would take.
+
+    Returns:
+        the numbers and how many runs were ``made`` for them, or what there is to do and
+        `estimated_s`.
+
+    Raises:
+        InputError: a value that no network can have, or a `folder` that is not a folder.
+        StoreError: trials or labels are missing.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("--out", "", str(folder), "must be a folder")
+    search = detector_search(store, campaigns, size, axes, full, reviewed)
+    settings = search.grid.settings
+    for title, why in search.grid.left_out.items():
+        console.say(f"left out: {title}: {why}")
+    to_do = plan(search, store.simulated)
+    message = (
+        f"{to_do['runs']} trainings ({len(settings)} settings, {size.seeds} seeds), "
+        f"{to_do['kept']} of them kept"
+    )
+    made = 0
+    if minutes == 0 and not dry_run:
+        console.say(message)
+    else:
+        with console.bar("estimate (runs)", to_do["pending"]) as bar:
+            expected = search.sweep.expected(bar.advance)
+        seconds = sum(sum(parts.values()) for parts in expected.values())
+        console.say(f"{message}; the others take about {console.duration(seconds)}")
+        if dry_run:
+            return {**to_do, "estimated_s": round(seconds, 1)}
+        began = time.monotonic()
+        with console.bar("trade-off (s, estimated)", round(seconds)) as bar:
+            made = search.sweep.run(
+                bar.advance,
+                expected,
+                over=lambda: minutes is not None and time.monotonic() - began >= 60 * minutes,
+            )
+    with console.bar("judge (settings)", len(settings)) as bar:
+        result = search_result(search, full, store.simulated, bar.advance)
+    rows = [Row.of_json(row) for row in result["rows"]]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / NUMBERS, result)
+    text = table(rows, store.simulated).to_csv(index=False, lineterminator="\n")
+    write_text(folder / TABLE, text)
+    write_text(folder / PAGE, page.render(result))
+    return {**result, "made": made}

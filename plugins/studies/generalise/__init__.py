@@ -1,0 +1,1 @@
+"""Levels left out of training, and other skins."""

@@ -1,0 +1,121 @@
+"""`sliplab generalise`: accuracy on levels left out of training and on other simulated skins.
+
+For a level of a factor a network is trained without its trials and tested on them. For other
+skins, which differ by the scatter of their making (`mock.scene.skin.seed`), some of the same trials
+are taken on each and the store's own network is tested on them. After a stop a collection resumes
+at its last trial.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.models import Model, choose_model, wanted_models
+from sliplab.analysis.sweeps.runner import Task, task_sweep
+from sliplab.flows.other_rig import other_request, retake
+from sliplab.flows.running import console
+from sliplab.plugins.studies.document import NotTrained, UnseenScores
+from sliplab.plugins.studies.generalise.results import (
+    STEP,
+    Generalisation,
+    all_samples,
+    score_windows,
+)
+from sliplab.protocols.errors import InputError
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
+
+SKIN_SEEDS = 101
+"""Seed of the first other skin."""
+SKINS, TRIALS = 5, 36
+"""Other skins, and trials on each, unless others are requested."""
+
+
+@dataclass(frozen=True)
+class Generalised:
+    """The results that were requested, by name.
+
+    Attributes:
+        made: how many of them were measured now.
+        file: that keeps them.
+    """
+
+    simulated: bool
+    made: int
+    results: dict[str, UnseenScores | NotTrained]
+    file: Path
+
+    def to_json(self) -> Json:
+        """Return plain data for the command line."""
+        results = {name: found.to_json() for name, found in self.results.items()}
+        return {
+            "step": STEP,
+            "simulated": self.simulated,
+            "made": self.made,
+            "results": results,
+            "file": str(self.file),
+        }
+
+
+def measure_generalisation(
+    store: Store,
+    campaigns: list[Collected],
+    factors: Sequence[str] = (),
+    levels: Sequence[str] = (),
+    every: bool = False,
+    skins: int | None = None,
+    trials: int = TRIALS,
+    epochs: int | None = None,
+) -> Generalised:
+    """Measure what is missing of what is requested.
+
+    Args:
+        factors: these; all by default.
+        levels: these levels of them.
+        every: all levels; by default, the lowest of each factor.
+        skins: how many others; by default `SKINS` where trials are simulated, else none.
+        trials: on each other skin.
+        epochs: of each training, instead of the protocol's.
+
+    Raises:
+        InputError: no such factor or level, or other skins of a real rig.
+    """
+    work = Generalisation(store, campaigns, epochs)
+    chosen = work.choose(factors, levels, every)
+    tasks = [work.without(factor, level, console.say) for factor, level in chosen]
+    count = skins if skins is not None else SKINS if store.simulated else 0
+    if count:
+        if not store.simulated:
+            raise InputError("--skins", "", 1, "must be 0: only simulated rigs have other skins")
+        model = choose_model(wanted_models(store, work.campaigns))
+        tasks += [skin_task(work, model, SKIN_SEEDS + number, trials) for number in range(count)]
+    sweep = task_sweep(tasks, work.results)
+    made = sweep.run(begin=lambda number, count, task: console.say(f"{task.name} ..."))
+    kept = work.results.load().results if tasks else {}
+    results = {task.name: kept[task.name] for task in tasks}
+    return Generalised(store.simulated, made, results, work.results.path)
+
+
+def skin_task(work: Generalisation, model: Model, seed: int, trials: int) -> Task:
+    """Return the task that tests the store's network on another skin of the same design."""
+    name = f"skin {seed}"
+    key = work.key(name, [work.campaigns[0].info["rig_hash"], trials, model.key])
+    return Task(name, key, partial(_touch, work, model, seed, trials))
+
+
+def _touch(work: Generalisation, model: Model, seed: int, trials: int) -> UnseenScores:
+    """Take some of the same trials on another skin, judge them, and let them go."""
+    item, folder = work.campaigns[0], work.folder / f"skin{seed}"
+    taken = Store.create(folder / "store").campaign(item.name).committed()
+    change = {"mock": {"scene": {"skin": {"seed": seed}}}}
+    request = other_request(item, change, folder, most=max(0, trials - len(taken)))
+    samples, _ = all_samples(*retake([request]))
+    counts = training.predict_counts(model_file.load(model.path), samples.windows)
+    shutil.rmtree(folder)
+    return score_windows(counts, samples.y, samples.trial)

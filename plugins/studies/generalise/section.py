@@ -1,0 +1,87 @@
+"""Levels and skins that the network never saw, in the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.report.figures.intervals import Share, shares
+from sliplab.analysis.report.page import Content, Figure, Table, percent
+from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
+from sliplab.analysis.report.programs import CommandResult
+from sliplab.analysis.report.seeds import seed_words
+from sliplab.analysis.report.windows import share_data
+from sliplab.plugins.studies.document import GeneralisationResults, NotTrained
+from sliplab.storage.schema.summary import Summary
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
+
+RESULT = CommandResult("derived/generalisation/results.json", "sliplab generalise {store}")
+
+
+@dataclass(frozen=True)
+class SkinSection(Content):
+    """The network on skins and levels that it never saw, or how to measure it."""
+
+    template: ClassVar[Path] = Path(__file__).with_name("section.html")
+    command: str
+    figure: Figure | None = None
+    table: Table | None = None
+    seeds: str = ""
+
+
+def skin_section(
+    found: Json | None, command: str, strict: float | None, seeds: str = "", *, simulated: bool
+) -> SkinSection:
+    """Show the results of `sliplab generalise`.
+
+    Args:
+        strict: accuracy of the network on its own skin. seeds: that were trained there, in words.
+
+    Raises:
+        StoreError: they are of another shape.
+    """
+    if found is None:
+        return SkinSection(command)
+    groups: dict[str, list[Share]] = {}
+    rows = []
+    results = RESULT.parse(GeneralisationResults, found).results.items()
+    for name, row in sorted(results, key=lambda each: each[0].startswith("skin ")):
+        if isinstance(row, NotTrained):
+            rows.append([name, row.why, "", "", "", ""])
+            continue
+        group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
+        item = Share(name, row.share, row.low, row.high)
+        groups.setdefault(group, []).append(item)
+        span = "–" if item.low is None else f"{percent(item.low)} to {percent(item.high)}"
+        rows.append([name, str(row.trials), str(row.n), percent(item.value), span,
+                     percent(row.seen)])  # fmt: skip
+    figure = None
+    if groups:
+        drawn = [item for of in groups.values() for item in of]
+        line = None if strict is None else (strict, "this network, its own skin")
+        svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
+        figure = Figure(svg, name="skins", data=share_data(drawn))
+    columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
+    return SkinSection(command, figure, Table(columns, rows), seeds)
+
+
+def _make(data: ReportData) -> SkinSection | None:
+    if not isinstance(data.summary, Summary) or not data.collected_here:
+        return None
+    kinematic = data.summary.kinematic
+    return skin_section(
+        RESULT.read(data.store), RESULT.command(data.store), kinematic.accuracy.strict,
+        seed_words(kinematic.seeds), simulated=data.simulated,
+    )  # fmt: skip
+
+
+def _key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
+    return [RESULT.read(store)]
+
+
+SECTION = ReportSection(_make, _key, last=True)
+"""Skins and levels in the report."""

@@ -1,0 +1,1 @@
+"""Figures of a study with each assumed parameter of the scene lowered and raised."""

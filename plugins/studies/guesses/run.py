@@ -1,0 +1,122 @@
+"""`sliplab guesses`: sensitivity of a study's figures to assumed parameters of the scene.
+
+Some of a study's test trials are repeated on the same simulated rig with one parameter 20 %
+lower, then 20 % higher. They are relabelled and evaluated by the study's own network and detection
+settings. Each setting is a small store, deleted once its figures are kept; so the sweep may be
+stopped anywhere, and resumes.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.sweeps.runner import Sweep, Task, task_sweep
+from sliplab.flows.other_rig import other_request, retake
+from sliplab.flows.running import console
+from sliplab.plugins.studies.document import SettingScores
+from sliplab.plugins.studies.guesses.results import Figures, StudySensitivity, figures
+from sliplab.plugins.studies.parameters import NAMES, Setting, in_all, lower_and_higher
+from sliplab.protocols.errors import InputError
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
+
+TRIALS = 20
+GUESSES = tuple(NAMES)
+"""Assumed parameters that are varied by default."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The settings that were requested, by name.
+
+    Attributes:
+        trials: their number, by campaign.
+        measured: how many settings were measured now.
+        file: that keeps them.
+    """
+
+    trials: dict[str, int]
+    measured: int
+    settings: dict[str, Figures]
+    file: str
+
+    def to_json(self) -> Json:
+        """Return plain data for the command line."""
+        return {"simulated": True, **asdict(self)}
+
+
+def measure_guesses(
+    store: Store, campaigns: list[Collected], guesses: Sequence[str], trials: int
+) -> Measured:
+    """Measure what is missing; return the figures of all settings that were requested.
+
+    Args:
+        guesses: dotted names of assumed parameters.
+        trials: of each campaign, test trials spread over its conditions.
+
+    Raises:
+        StoreError: not simulated, or not evaluated yet.
+        InputError: there is no such parameter, or it is switched off.
+    """
+    work = StudySensitivity(store, campaigns, trials)
+    sweep = guess_sweep(work, guesses)
+    measured = sweep.run(
+        begin=lambda number, count, task: console.say(f"[{number}/{count}] {task.name} (simulated)")
+    )
+    kept = work.results.load().settings
+    return Measured(
+        {name: len(ids) for name, ids in work.trials.items()},
+        measured,
+        {task.name: figures(kept[task.name]) for task in sweep.points},
+        str(work.results.path),
+    )
+
+
+def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
+    """Return the sweep of the scene as it is, and of each parameter lower and higher.
+
+    Raises:
+        InputError: there is no such parameter, or it is switched off.
+    """
+    rigs = ((item, item.campaign.folder / "rig.yaml") for item in work.campaigns)
+    scenes = {item.name: load_rig_file(path, stored=True)[0].scene for item, path in rigs}
+    there = in_all(guesses, list(scenes.values()))
+    for name in guesses:
+        if name not in there:
+            known = ", ".join(GUESSES)
+            raise InputError(
+                "GUESS", "", name,
+                f"must be a non-zero parameter of the scene, such as {known}",
+            )  # fmt: skip
+    settings = (Setting(), *lower_and_higher(guesses))
+    tasks = [
+        Task(setting.name, work.key(setting), partial(measure_setting, work, setting, scenes))
+        for setting in settings
+    ]
+    return task_sweep(tasks, work.results)
+
+
+def measure_setting(
+    work: StudySensitivity, setting: Setting, scenes: Mapping[str, MockSettings]
+) -> SettingScores:
+    """Take, label and judge the trials at one setting, and let them go.
+
+    Args:
+        scenes: settings of the simulated rig of each campaign.
+    """
+    folder = work.folder / work.key(setting)[:12]
+    run_requests = []
+    for item in work.campaigns:
+        change = setting.change(scenes[item.name])
+        run_request = other_request(item, {"mock": change} if change else {}, folder)
+        run_requests.append(replace(run_request, only=frozenset(work.trials[item.name])))
+    value = setting.value(scenes[work.campaigns[0].name])
+    scores = work.score(setting, value, *retake(run_requests))
+    shutil.rmtree(folder)
+    return scores

@@ -1,0 +1,256 @@
+"""Figures of trade-offs: cost against error, and single factors of a search."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from sliplab.analysis.report.figures.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    STYLE,
+    WIDTH,
+    svg_text,
+)
+
+
+@dataclass(frozen=True)
+class Point:
+    """A detector.
+
+    Attributes:
+        values: its figures by name; None where it has none.
+        front: whether it is on the front; paper: whether it is the paper's.
+    """
+
+    values: Mapping[str, float | None]
+    front: bool
+    paper: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Two figures against each other, by name, and what their axes are called."""
+
+    x: str
+    y: str
+    x_name: str
+    y_name: str
+    log_x: bool = False
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A value of a factor: mean, lowest and highest over seeds of each figure by name."""
+
+    value: str
+    paper: bool
+    spread: Mapping[str, tuple[float, float, float] | None]
+
+
+def cost_and_error(points: Sequence[Point], panels: Sequence[Panel], *, simulated: bool) -> str:
+    """Draw errors over costs, a panel for each pair side by side, as SVG.
+
+    Args:
+        panels: `Panel.x` is a cost; a point without a cost above 0, or without the error, is left
+            out.
+    """
+    with plt.rc_context(STYLE):
+        figure, grid = plt.subplots(1, len(panels), figsize=(WIDTH, 3.2), squeeze=False)
+        for axes, panel in zip(grid[0], panels, strict=True):
+            drawn = [
+                (point, point.values[panel.x], point.values[panel.y])
+                for point in points
+                if point.values[panel.x] and point.values[panel.y] is not None
+            ]
+            for on, colour, name in ((False, GREY, "others"), (True, BLUE, "Pareto front")):
+                there = [(x, y) for point, x, y in drawn if point.front == on]
+                axes.plot(
+                    [x for x, _ in there], [y for _, y in there], "o",
+                    color=colour, ms=3 + on, mew=0, alpha=0.4 + 0.5 * on, label=name,
+                )  # fmt: skip
+            for point, x, y in drawn:
+                if point.paper:
+                    axes.plot(x, y, "*", color=RED, ms=12, zorder=3)
+            axes.plot([], [], "*", color=RED, ms=10, label="paper's settings")
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.set_xlabel(panel.x_name)
+            axes.set_ylabel(panel.y_name)
+        figure.legend(
+            *grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8
+        )
+        return svg_text(figure, simulated)
+
+
+def front_panels(points: Sequence[Point], panels: Sequence[Panel], *, simulated: bool) -> str:
+    """A scatter for each panel, two a row: the front above all others, the paper's point marked.
+
+    A point without one of the two figures is not drawn.
+    """
+    with plt.rc_context(STYLE):
+        rows = -(-len(panels) // 2)
+        figure, grid = plt.subplots(rows, 2, figsize=(8.4, 2.9 * rows + 0.4), squeeze=False)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+        for axes, panel in zip(grid.flat, panels, strict=False):
+            _points(axes, points, panel)
+            axes.set(xlabel=panel.x_name, ylabel=panel.y_name)
+            if panel.log_x:
+                axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.xaxis.set_major_formatter("{x:g}")
+                axes.xaxis.set_minor_locator(NullLocator())
+            axes.margins(0.06)
+        handles, names = grid.flat[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+def _points(axes: Any, points: Sequence[Point], panel: Panel) -> None:
+    kinds = (
+        ("another is nowhere worse and somewhere better", False, GREY, "o", 3, 1, 0.5),
+        ("on the front", True, BLUE, "o", 4.5, 2, 0.85),
+    )
+    drawn = [
+        (point, point.values[panel.x], point.values[panel.y])
+        for point in points
+        if point.values[panel.x] is not None and point.values[panel.y] is not None
+    ]
+    for name, front, colour, mark, size, above, alpha in kinds:
+        ours = [(x, y) for point, x, y in drawn if point.front == front]
+        axes.plot(
+            [x for x, _ in ours], [y for _, y in ours], mark, ms=size, mew=0,
+            color=colour, alpha=alpha, zorder=above, label=name,
+        )  # fmt: skip
+    ours = [(x, y) for point, x, y in drawn if point.paper]
+    axes.plot(
+        [x for x, _ in ours], [y for _, y in ours], "*", ms=13, mec="black", mew=0.7,
+        color=ORANGE, zorder=3, label="the paper's",
+    )  # fmt: skip
+
+
+def factor_lines(
+    factors: Mapping[str, Sequence[Bar]], figures: Mapping[str, str], *, simulated: bool
+) -> str:
+    """A column for each factor, a row for each figure: mean over seeds, lowest to highest.
+
+    Args:
+        factors: title to values in order.
+        figures: name in `Bar.spread` to the name of the axis.
+    """
+    with plt.rc_context(STYLE):
+        widths = [max(2, len(bars)) for bars in factors.values()]
+        figure, grid = plt.subplots(
+            len(figures), len(factors), figsize=(9.6, 1.9 * len(figures) + 0.5), sharey="row",
+            squeeze=False, width_ratios=widths,
+        )  # fmt: skip
+        for row, (key, name) in zip(grid, figures.items(), strict=True):
+            row[0].set_ylabel(name)
+            for axes, bars in zip(row, factors.values(), strict=True):
+                _line(axes, bars, key)
+        for axes, title in zip(grid[-1], factors, strict=True):
+            axes.set_xlabel(title, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+def _line(axes: Any, bars: Sequence[Bar], key: str) -> None:
+    there = [(k, bar, bar.spread[key]) for k, bar in enumerate(bars)]
+    known = [(k, bar, spread) for k, bar, spread in there if spread is not None]
+    axes.plot([k for k, _, _ in known], [s[0] for _, _, s in known], lw=0.8, color=BLUE, alpha=0.5)
+    for k, bar, (mean, low, high) in known:
+        axes.plot([k, k], [low, high], lw=1.6, color=BLUE)
+        colour, mark, size = (ORANGE, "*", 11) if bar.paper else (BLUE, "o", 4)
+        edge = "black" if bar.paper else BLUE
+        axes.plot([k], [mean], mark, ms=size, color=colour, mec=edge, mew=0.6)
+    turned = 40 if any(len(bar.value) > 3 for bar in bars) else 0
+    axes.set_xticks(
+        range(len(bars)), [bar.value for bar in bars], fontsize=7, rotation=turned,
+        ha="right" if turned else "center",
+    )  # fmt: skip
+    axes.set_xlim(-0.6, len(bars) - 0.4)
+
+
+def cost_against_error(
+    series: Mapping[str, Sequence[tuple[str, float, Mapping[str, float | None]]]],
+    errors: Mapping[str, str],
+    lines: Mapping[str, Mapping[str, float | None]],
+    cost_name: str,
+    *,
+    simulated: bool,
+) -> str:
+    """One panel for each kind of error over cost, both logarithmic, two panels a row.
+
+    Args:
+        series: by name, at most three: points in order, each with its label, cost and errors by
+            key. An error of None is not drawn, one of 0 as a hollow mark below all others.
+        errors: key to the name of its axis, one panel each.
+        lines: by name, errors by key that are drawn as level lines.
+    """
+    with plt.rc_context(STYLE):
+        rows = -(-len(errors) // 2)
+        figure, grid = plt.subplots(
+            rows, 2, figsize=(7.6, 2.5 * rows + 0.4), squeeze=False, sharex=True
+        )
+        for axes in grid.flat[len(errors) :]:
+            axes.set_visible(False)
+        for axes, (key, name) in zip(grid.flat, errors.items(), strict=False):
+            drawn = [value[key] for points in series.values() for _, _, value in points]
+            drawn += [value.get(key) for value in lines.values()]
+            floor = 0.3 * min((value for value in drawn if value), default=1.0)
+            axes.set(xscale="log", yscale="log", ylabel=name)
+            axes.margins(0.16)
+            for style, (title, points) in zip(_SERIES, series.items(), strict=False):
+                _cost_points(axes, points, key, floor, *style, title)
+            for (title, value), dashes in zip(lines.items(), ("--", ":", "-."), strict=False):
+                axes.axhline(value.get(key) or np.nan, color=GREY, lw=1, ls=dashes, label=title)
+            axes.xaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_locator(NullLocator())
+        for axes in grid[-1]:
+            axes.set_xlabel(cost_name)
+        handles, titles = grid.flat[0].get_legend_handles_labels()
+        figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+_SERIES = (
+    (BLUE, "o", (-6, -3), "right"),
+    (ORANGE, "s", (0, 6), "center"),
+    (GREEN, "^", (0, -11), "center"),
+)
+"""Colour, mark, and where the label stands."""
+
+
+def _cost_points(
+    axes: Any,
+    points: Sequence[tuple[str, float, Mapping[str, float | None]]],
+    key: str,
+    floor: float,
+    colour: str,
+    marker: str,
+    offset: tuple[int, int],
+    side: str,
+    title: str,
+) -> None:
+    """One series of `cost_against_error` in one panel."""
+    there = [(text, cost, value[key]) for text, cost, value in points if value[key] is not None]
+    heights = [value or floor for _, _, value in there]
+    axes.plot([cost for _, cost, _ in there], heights, lw=0.8, color=colour, alpha=0.5)
+    for (text, cost, value), height in zip(there, heights, strict=True):
+        axes.plot([cost], [height], marker, ms=4.5, mec=colour, mfc=colour if value else "white")
+        axes.annotate(
+            text, (cost, height), fontsize=7, color=colour, ha=side, xytext=offset,
+            textcoords="offset points",
+        )  # fmt: skip
+    axes.plot([], [], marker, ms=4.5, color=colour, label=title)

@@ -1,0 +1,1 @@
+"""Speed against error of the simulated scene."""

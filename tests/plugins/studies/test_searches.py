@@ -1,0 +1,95 @@
+"""Searches on top of a study: each done once, gone on with, and shown in the report."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from sliplab.analysis.evaluation import baselines as window_baselines
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.study import Outcome, searches, study, study_plan
+from sliplab.plugins.studies import searches as planned_searches
+from sliplab.plugins.studies.detector.grid import Axes
+from sliplab.plugins.studies.detector.search import SearchSize
+from sliplab.plugins.studies.generalise.run import measure_generalisation
+from sliplab.plugins.studies.generalise.section import RESULT as GENERALISATION
+from sliplab.plugins.studies.guesses.section import RESULT as GUESSES
+from sliplab.plugins.studies.results import RESULTS
+from sliplab.protocols.errors import InputError
+from sliplab.storage.trials.store import Store
+
+pytestmark = pytest.mark.programs
+
+NAMES = ["baselines", "generalisation", "guesses", "scene search", "detector search"]
+
+
+def test_what_a_study_can_have(ran: tuple[list[RunRequest], Outcome]) -> None:
+    slides, falls = ran[0]
+    assert [each.name for each in searches([slides, falls])] == NAMES
+    assert [each.name for each in searches([falls])] == ["guesses"]
+    real = slides.rig.model_copy(update={"driver": "devices"})
+    assert not real.simulated
+    slides, falls = (replace(run_request, rig=real) for run_request in (slides, falls))
+    assert [each.name for each in searches([slides, falls])] == [
+        "baselines", "generalisation", "detector search",
+    ]  # fmt: skip
+    with pytest.raises(InputError, match=r"--searches.*needs a kinematic protocol"):
+        searches([falls])
+
+
+def test_they_stand_before_the_report_with_their_own_time(
+    ran: tuple[list[RunRequest], Outcome],
+) -> None:
+    run_requests, _ = ran
+    planned = study_plan(run_requests)
+    plain, more = planned.expected(0), planned.expected(0, searches(run_requests))
+    assert list(more)[-7:] == ["evaluate", *NAMES, "report"]
+    assert sum(more.values()) - sum(plain.values()) > 3600
+
+
+@pytest.mark.long
+def test_each_is_done_once_and_reported(
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(ran[0][0].store, tmp_path / "store")
+    run_requests = [replace(run_request, store=tmp_path / "store") for run_request in ran[0]]
+    monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1})
+    few = partial(measure_generalisation, factors=("direction",), skins=1, trials=3, epochs=1)
+    monkeypatch.setattr(planned_searches, "measure_generalisation", few)
+    monkeypatch.setattr(planned_searches, "GUESSES", ("event_camera.contrast",))
+    monkeypatch.setattr(planned_searches, "SCENE_TRIALS", 1)
+    size = SearchSize(samples=40, epochs=1, trials=2, seeds=1, stride_ms=15)
+    monkeypatch.setattr(planned_searches, "SIZE", size)
+    axes = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(1.0,))
+    monkeypatch.setattr(planned_searches, "AXES", axes)
+
+    outcome = study(run_requests, more=searches(run_requests))
+    done = {step["step"]: step["done"] for step in outcome.steps}
+    assert done == {
+        "sync": 0, "label": 0, "train": 0, "evaluate": 0, "baselines": 1,
+        "generalisation": 2, "guesses": 3, "scene search": 1, "detector search": 2,
+        "report": 1,
+    }  # fmt: skip
+    store = Store.open(run_requests[0].store)
+    for result in (GENERALISATION, GUESSES, RESULTS["scene"], RESULTS["detector"]):
+        assert result.read(store) is not None
+    page = (run_requests[0].store / "report" / "index.html").read_text()
+    for whose in ("scene", "detector"):
+        assert f"The whole of the {whose}&#39;s search" in page
+
+    again = study(run_requests, more=searches(run_requests))
+    assert not any(step["done"] for step in again.steps)
+    assert {row.name: row.note for row in outcome.rows}["scene search"] == "1 search"
+    notes = {row.name: (row.state, row.note) for row in again.rows}
+    assert all(notes[name] == ("done", "nothing to do") for name in NAMES)
+
+    monkeypatch.setattr(planned_searches, "SCENE_TRIALS", 2)
+    third = {
+        step["step"]: step["done"]
+        for step in study(run_requests, more=searches(run_requests)).steps
+    }
+    assert third["scene search"] == 1
