@@ -140,6 +140,7 @@ def render_page(
 
 def _template(file: str | Path) -> Template:
     if isinstance(file, Path):
+        file.stat()  # names the whole path of a missing file
         return _environment(file.parent).get_template(f"own/{file.name}")
     return _environment().get_template(file)
 

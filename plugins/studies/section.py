@@ -265,7 +265,7 @@ def _make(data: ReportData) -> TradeoffSection | None:
 
 
 def _key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
-    return [_found(store)]
+    return list(_found(store).items())
 
 
 SECTION = ReportSection(_make, _key, last=True)

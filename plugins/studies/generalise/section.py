@@ -80,7 +80,8 @@ def _make(data: ReportData) -> SkinSection | None:
 
 
 def _key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
-    return [RESULT.read(store)]
+    found = RESULT.read(store)
+    return [] if found is None else [found]
 
 
 SECTION = ReportSection(_make, _key, last=True)

@@ -12,11 +12,12 @@ import pytest
 
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.running import stopping
-from sliplab.flows.scene_runs import changed, closed_form, ideal, run
+from sliplab.flows.scene_runs import changed, ideal, run
 from sliplab.plugins.studies import parameters as sensitivity
 from sliplab.plugins.studies.scene import run as tradeoff
 from sliplab.plugins.studies.scene import sensitivity as scene_sensitivity
 from sliplab.plugins.studies.scene.page import render, sensitivity_markdown
+from sliplab.plugins.studies.scene.running import closed_form
 from sliplab.plugins.studies.scene.variants import Variant
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
