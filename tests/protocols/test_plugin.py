@@ -69,9 +69,9 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
         (info / "entry_points.txt").write_text(f"[{plugin.GROUP}]\n{name} = {name}:PLUGIN\n")
+        plugins.cache_clear()
 
     monkeypatch.syspath_prepend(str(tmp_path))
-    plugins.cache_clear()
     yield install
     plugins.cache_clear()
 
