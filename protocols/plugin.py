@@ -34,12 +34,14 @@ class Plugin:
             extend, such as ``calibrate``.
         documents: by kind, models of the JSON documents that it writes
             (`storage.schema.document.Document`), each with the title of its schema.
+        formats: formats of recordings (`storage.formats.format.Format`) by name.
         hooks: functions that the core calls, by the name of the place; docs/architecture.md lists
             the places.
     """
 
     commands: Mapping[str, str] = field(default_factory=dict)
     documents: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    formats: Mapping[str, str] = field(default_factory=dict)
     hooks: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -72,6 +74,13 @@ class Plugins:
         for plugin in self.found.values():
             kinds = {**plugin.documents, **kinds}
         return kinds
+
+    def formats(self) -> dict[str, str]:
+        """Return places of formats by name. The first plug-in that declares a name has it."""
+        places: dict[str, str] = {}
+        for plugin in self.found.values():
+            places |= {name: each for name, each in plugin.formats.items() if name not in places}
+        return places
 
     def hooks(self, name: str) -> Iterator[Any]:
         """Import and yield the functions of a place, in the order of the plug-ins' names.
