@@ -19,10 +19,10 @@ from sliplab.storage.formats.format import Format, Layout
 from sliplab.storage.formats.writers import export_aedat4, export_dsec
 from sliplab.storage.trials.superblock import SIGNATURE
 
-AEDAT4, DSEC, LAB_HDF5 = "aedat4", "dsec", "lab-hdf5"
+DSEC, LAB_HDF5 = "dsec", "lab-hdf5"
 _HDF5 = (".h5", ".hdf5")
 CORE = {
-    AEDAT4: Format(
+    "aedat4": Format(
         suffixes=(".aedat4",),
         sniff=lambda path, head: head.startswith(LINE),
         read=read_aedat4,
