@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.measure import Figures, Seconds, machine, one_core, rate, ratio
 from benchmarks.slides import many_events
 from sliplab.storage.formats.aedat4 import EVENTS, Aedat4Writer, Stream
-from sliplab.storage.formats.recognition import READERS
+from sliplab.storage.formats.known import known_format
 from sliplab.storage.streams import EventChunk
 
 SIZE = (640, 480)
@@ -124,7 +124,9 @@ def _ours(file: Path, form: str) -> EventChunk:
     types = {"x": np.uint16, "y": np.uint16, "p": np.uint8, "t_us": np.int64}
     columns = {name: np.empty(most, dtype) for name, dtype in types.items()}
     count = 0
-    for chunk in READERS[kind][1](file, "trial").events():
+    read = known_format(kind).read
+    assert read is not None
+    for chunk in read(file, "trial").events():
         for name, column in columns.items():
             column[count : count + len(chunk)] = getattr(chunk, name)
         count += len(chunk)

@@ -34,6 +34,7 @@ from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import import_foreign
 from sliplab.storage.trials.store import Store
 
 BASELINE_S = 0.0105
@@ -121,7 +122,8 @@ def searches(run_requests: Sequence[RunRequest]) -> list[Search]:
     """
     planned = study_plan(run_requests)
     found = [_baselines(planned)]
-    found += [search(planned, run_requests) for search in plugins().searches()]
+    places = plugins().declared("searches").values()
+    found += [import_foreign(place)(planned, run_requests) for place in places]
     can = [search for search in found if search is not None]
     if not can:
         raise InputError("--searches", "", True, "needs a kinematic protocol, or a simulated rig")

@@ -118,6 +118,8 @@ EventFormat = Literal[
     "counts", "csv", "numpy", "aedat4", "dsec", "lab-hdf5", "raw", "es", "mcap", "rosbag",
     "lab-pickles",
 ]  # fmt: skip
+SEVERAL_FILES = frozenset({"lab-pickles"})
+"""Formats of events of which a trial may have more than one file."""
 _COUNTS = ("axes", "step_ms", "polarity_order")
 _TABLES = ("columns", "unit", "positive")
 

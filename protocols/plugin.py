@@ -39,6 +39,7 @@ class Plugin:
         sections: sections of the report by name (`analysis.report.plugin_sections.ReportSection`).
         searches: by name, functions that return a search of a study (`analysis.study_plan.Search`)
             or None, given the study's plan and its run requests.
+        formats: formats of recordings (`storage.formats.format.Format`) by name.
         hooks: functions that the core calls, by the name of the place; docs/architecture.md lists
             the places.
     """
@@ -48,6 +49,7 @@ class Plugin:
     drivers: Mapping[str, str] = field(default_factory=dict)
     sections: Mapping[str, str] = field(default_factory=dict)
     searches: Mapping[str, str] = field(default_factory=dict)
+    formats: Mapping[str, str] = field(default_factory=dict)
     hooks: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -73,31 +75,17 @@ class Plugins:
                 words.setdefault(word, []).append(place)
         return words
 
-    def documents(self) -> dict[str, tuple[str, str]]:
-        """Return places of documents' models, with titles, by kind.
+    def declared(self, what: str) -> dict[str, Any]:
+        """Return what plug-ins declare, by name; the first plug-in that declares a name has it.
 
-        The first plug-in of a kind has it.
+        Args:
+            what: ``documents``, ``drivers``, ``formats``, ``sections`` or ``searches``.
         """
-        kinds: dict[str, tuple[str, str]] = {}
+        places: dict[str, Any] = {}
         for plugin in self.found.values():
-            kinds = {**plugin.documents, **kinds}
-        return kinds
-
-    def sections(self) -> dict[str, str]:
-        """Return places of the report's sections by name; the first plug-in of a name has it."""
-        named: dict[str, str] = {}
-        for plugin in self.found.values():
-            named |= {name: it for name, it in plugin.sections.items() if name not in named}
-        return named
-
-    def searches(self) -> Iterator[Any]:
-        """Import and yield the functions that return searches, in the order of the plug-ins' names.
-
-        Raises:
-            PluginError: one of them cannot be imported.
-        """
-        for plugin in self.found.values():
-            yield from map(import_foreign, plugin.searches.values())
+            for name, place in getattr(plugin, what).items():
+                places.setdefault(name, place)
+        return places
 
     def hook(self, name: str) -> Any:
         """Import and return the function of a place that one plug-in fills: the first that does.

@@ -67,7 +67,7 @@ def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content
         last: those that stand among the results of longer studies.
     """
     faults = []
-    for name, place in plugins().sections().items():
+    for name, place in plugins().declared("sections").items():
         try:
             section = _section(place)
             made = _rendered(name, section, data) if section.last == last else None
@@ -84,7 +84,7 @@ def sections_key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
     """Return what the sections of plug-ins depend on besides; empty where they show nothing."""
     found: list[Any] = []
     data = ReportData(store, campaigns, store.simulated)
-    for name, place in plugins().sections().items():
+    for name, place in plugins().declared("sections").items():
         try:
             section = _section(place)
             if section.key is not None:

@@ -80,14 +80,14 @@ def import_(
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
     from sliplab.storage.formats.import_trials import import_trials
-    from sliplab.storage.formats.published_import import of_one_campaign
-    from sliplab.storage.formats.recognition import KINDS, kind_of, skipped_in, trials_in
+    from sliplab.storage.formats.known import format_names
+    from sliplab.storage.formats.recognition import entered, kind_of, skipped_in, trials_in
     from sliplab.storage.trials.store import StoreError
 
-    where = of_one_campaign(Path(kind_or_path) if path is None else path)
+    where = entered(Path(kind_or_path) if path is None else path)
     kind = kind_of(where) if path is None else kind_or_path
-    if path is not None and kind not in KINDS:
-        raise InputError("KIND", "", kind, one_of(kind, KINDS))
+    if path is not None and kind not in format_names():
+        raise InputError("KIND", "", kind, one_of(kind, format_names()))
     try:
         safe_name(name)
     except StoreError as error:
@@ -132,7 +132,8 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Export trials in formats of other programs, or their labels as a table."""
-    from sliplab.storage.formats.export_trials import SUFFIXES, export_trials, label_table
+    from sliplab.storage.formats.export_trials import export_trials, label_table
+    from sliplab.storage.formats.known import export_formats, format_names, known_format
     from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import write_table
     from sliplab.storage.trials.registration import copy_registrations
@@ -156,13 +157,8 @@ def export(
         write_table(table, output)
         finish({"labels": len(table), "output": str(output)}, f"labels of {what}", as_json)
         return
-    if form not in SUFFIXES:
-        raise InputError(
-            "--format",
-            "",
-            form,
-            one_of(form, SUFFIXES),
-        )
+    if form not in format_names() or known_format(form).export is None:
+        raise InputError("--format", "", form, one_of(form, export_formats()))
     recordings = [campaign.recording(name) for name in names]
     for recording in recordings:
         if stream not in recording.streams("events") and stream != "events":

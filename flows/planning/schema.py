@@ -72,14 +72,14 @@ class _Described(GenerateJsonSchema):
 
 def kinds() -> tuple[str, ...]:
     """Return the kinds of files and documents that have a schema."""
-    return (*FILES, *DOCUMENTS, *plugins().documents())
+    return (*FILES, *DOCUMENTS, *plugins().declared("documents"))
 
 
 def document_model(kind: str) -> tuple[type[Document], str]:
     """Return the model of a document and the title of its schema."""
     if kind in DOCUMENTS:
         return DOCUMENTS[kind]
-    place, title = plugins().documents()[kind]
+    place, title = plugins().declared("documents")[kind]
     return import_foreign(place), title
 
 

@@ -29,10 +29,10 @@ from sliplab.storage.formats.foreign import (
     event_chunk,
     resolution_us,
 )
-from sliplab.storage.formats.lab_pickles import pairs, read_pair
+from sliplab.storage.formats.known import known_format
 from sliplab.storage.formats.numpy_files import MAGIC, array_of
 from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
-from sliplab.storage.formats.recognition import LAB_PICKLES, read_file
+from sliplab.storage.formats.recognition import read_file
 from sliplab.storage.formats.tables import read_columns, times_ns
 from sliplab.storage.formats.time_order import is_unordered
 from sliplab.storage.streams import (
@@ -190,11 +190,9 @@ def read_events(
         return read_counts(array_of(data), part)
     if part.format in {"csv", "numpy"}:
         return _event_table(folder, names[0], part)
-    if part.format == LAB_PICKLES:
-        found = pairs(list(paths))
-        if len(found) != 1:
-            raise FormatError(f"are files of {len(found)} trials of the lab's names, not of one")
-        foreign = read_pair(found[0], found[0].stem)
+    read_files = known_format(part.format).read_files
+    if read_files is not None:
+        foreign = read_files(paths, "trial")
     else:
         if len(paths) != 1:
             raise FormatError(f"are {len(paths)} files for one trial")

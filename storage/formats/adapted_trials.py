@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.protocols.adapter import Adapter
-from sliplab.protocols.adapter_parts import BUILT_IN, FieldRule
+from sliplab.protocols.adapter_parts import BUILT_IN, SEVERAL_FILES, FieldRule
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
 from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
@@ -20,7 +20,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
-from sliplab.storage.formats.recognition import LAB_PICKLES, unique_names
+from sliplab.storage.formats.recognition import unique_names
 from sliplab.storage.formats.tables import Row, read_rows
 
 EVENTS, FRAMES, FRAME_TIMES, POSES = "events", "frames", "frames.times", "poses"
@@ -368,7 +368,7 @@ class _Finding:
         wanted: dict[str, tuple[str | None, bool]] = {}
         streams = self._adapter.streams
         if streams.events is not None:
-            wanted[EVENTS] = (streams.events.files, streams.events.format == LAB_PICKLES)
+            wanted[EVENTS] = (streams.events.files, streams.events.format in SEVERAL_FILES)
         if streams.frames is not None:
             wanted[FRAMES] = (streams.frames.files, streams.frames.format == "images")
             if streams.frames.times is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.time_order import in_order
-from sliplab.storage.schema.trial import DeviceRecord, Given, Lost, Step
+from sliplab.storage.schema.trial import Counts, DeviceRecord, Given, Lost, Step
 from sliplab.storage.streams import (
     I64,
     U8,
@@ -26,7 +26,7 @@ from sliplab.storage.streams import (
     StreamChunk,
     WrenchChunk,
 )
-from sliplab.storage.trials.store import Campaign
+from sliplab.storage.trials.store import Campaign, Store
 
 OUTSIDE = "events outside of the sensor"
 UNKNOWN_POLARITY = "events with an unknown polarity"
@@ -138,6 +138,23 @@ class ForeignCampaign(Protocol):
         """
 
 
+class Restorable(Protocol):
+    """A trial of a store that can be committed to another store as it was."""
+
+    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
+        """Commit the trial with its label and clocks.
+
+        Args:
+            about: what its provenance keeps of the import.
+
+        Returns:
+            Rows of its streams.
+
+        Raises:
+            FormatError: it is damaged.
+        """
+
+
 @dataclass(frozen=True)
 class Seen:
     """First and last time of what was read of a trial, each on its own clock; None without any.
@@ -188,6 +205,7 @@ class ForeignTrial:
         salvage: returns what stands whole in its file, if that turns out to be damaged; raises
             FormatError where that is nothing.
         campaign: the one that it is of; None for one of its own.
+        original: a trial of a store with all that belongs to it; it is committed as it was.
         clocks: those that are known, by device and stream. experiment: see the record.
         geometry: further keys of the record's geometry.
         whole: what follows from all that was read; a trial with it may be without events. Raises
@@ -219,6 +237,7 @@ class ForeignTrial:
     notes: Callable[[], tuple[str, ...]] = tuple
     cameras: Mapping[str, Callable[[], Iterator[FrameChunk]]] = field(default_factory=dict)
     campaign: ForeignCampaign | None = None
+    original: Restorable | None = None
     clocks: Mapping[str, DeviceRecord] = field(default_factory=dict)
     experiment: str = "imported"
     geometry: Json = field(default_factory=dict)

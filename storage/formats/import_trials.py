@@ -47,7 +47,6 @@ from sliplab.storage.formats.foreign import (
     refusal,
     some_rows,
 )
-from sliplab.storage.formats.original import StoredTrial
 from sliplab.storage.formats.time_order import Mask, falls, in_order
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
@@ -399,7 +398,7 @@ def _take_whole(
 @uninterrupted
 def _take(store: Store, campaign: Campaign, trial: ForeignTrial, kind: str) -> _Content:
     """Commit one trial; return what was read."""
-    if isinstance(trial, StoredTrial) and trial.original is not None:
+    if trial.original is not None:
         about = {"imported": now(), "from": trial.source}
         with as_damage():
             rows = trial.original.restore(store, campaign, safe_name(trial.name), about)

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
-from importlib import util
 from pathlib import Path
 
 from slugify import slugify
@@ -21,20 +20,7 @@ from slugify import slugify
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, safe_name
-from sliplab.storage.formats.aedat4 import LINE, read_aedat4, salvage_aedat4
-from sliplab.storage.formats.dsec import (
-    is_lab_hdf5,
-    read_dsec,
-    read_lab_hdf5,
-    salvage_dsec,
-    salvage_lab_hdf5,
-)
-from sliplab.storage.formats.event_stream import (
-    EVENT_STREAM,
-    check_faery,
-    read_es,
-    salvage_es,
-)
+from sliplab.storage.formats.dsec import is_lab_hdf5
 from sliplab.storage.formats.foreign import (
     EXPORT_FORMAT,
     EXPORT_MANIFEST,
@@ -47,69 +33,38 @@ from sliplab.storage.formats.foreign import (
     read_head,
     refusal,
 )
-from sliplab.storage.formats.lab_pickles import Pair, is_stream, pairs, read_pair, unnamed
-from sliplab.storage.formats.lab_recordings import (
-    EVENTS_FOLDER,
-    check_polarity,
-    compare,
-    described,
-    is_of_run,
-    run_folder,
-    with_run,
-)
-from sliplab.storage.formats.lerobot_import import is_lerobot, read_lerobot
-from sliplab.storage.formats.mcap_import import MAGIC, read_mcap, salvage_mcap
-from sliplab.storage.formats.prophesee import (
-    is_prophesee,
-    read_prophesee,
-    salvage_prophesee,
-)
-from sliplab.storage.formats.published_import import publication_at, read_publication
-from sliplab.storage.formats.ros_bags import (
-    BAG,
-    SQLITE,
-    is_bag_folder,
-    read_bag,
-    salvage_bag,
+from sliplab.storage.formats.format import Files
+from sliplab.storage.formats.known import (
+    CORE,
+    DSEC,
+    LAB_HDF5,
+    format_names,
+    known_format,
+    known_formats,
+    layouts,
+    unusable_formats,
 )
 from sliplab.storage.formats.unread import unread
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import REGISTRATIONS
-from sliplab.storage.trials.superblock import SIGNATURE
 
-Reader = Callable[[Path, str], ForeignTrial]
-READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
-    "aedat4": ((".aedat4",), read_aedat4),
-    "dsec": ((".h5", ".hdf5"), read_dsec),
-    "lab-hdf5": ((".h5", ".hdf5"), read_lab_hdf5),
-    "raw": ((".raw", ".dat"), read_prophesee),
-    "es": ((".es",), read_es),
-    "mcap": ((".mcap",), read_mcap),
-    "rosbag": ((".bag", ".db3"), read_bag),
-}
-SALVAGE: dict[str, Reader] = {
-    "aedat4": salvage_aedat4,
-    "dsec": salvage_dsec,
-    "lab-hdf5": salvage_lab_hdf5,
-    "raw": salvage_prophesee,
-    "es": salvage_es,
-    "mcap": salvage_mcap,
-    "rosbag": salvage_bag,
-}
-"""Readers of what stands whole before the damage in a file, by format."""
-LAB_PICKLES = "lab-pickles"
-DATA_SETS: dict[str, Callable[[Path], Iterator[ForeignTrial]]] = {
-    "croissant": read_publication,
-    "lerobot": read_lerobot,
-}
-"""Readers of folders that are one data set, by format."""
-KINDS = (*READERS, LAB_PICKLES, *DATA_SETS)
 MIXED = "mixed"
 """Files of several formats in one folder."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 _RESERVED = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?")
 """Names that no file has on Windows."""
 _LONGEST_NAME, _HASH = 200, 8
+
+
+def entered(path: Path) -> Path:
+    """Return the folder to be imported in place of a path; mostly the path itself.
+
+    Raises:
+        InputError: it holds several, of which one must be named.
+    """
+    for layout in layouts():
+        path = layout.enter(path)
+    return path
 
 
 def kind_of(path: Path) -> str:
@@ -125,18 +80,18 @@ def kind_of(path: Path) -> str:
         said = [(file, what) for file in _files(path) if (what := unread(file)) is not None]
         if said:
             raise InputError(said[0][0], "", None, said[0][1])
-        raise InputError(
-            path, "", None, f"contains no known file format; name one of {', '.join(KINDS)}"
-        )
-    kinds = {kind for _, kind, _ in found}
+        text = f"contains no known file format; name one of {', '.join(format_names())}"
+        raise InputError(path, "", None, "; ".join([text, *unusable_formats()]))
+    kinds = {files.kind for _, files in found}
     return kinds.pop() if len(kinds) == 1 else MIXED
 
 
 def _data_set(path: Path) -> str | None:
     """Return the format of a folder that is one data set; None for any other path."""
-    if publication_at(path) is not None:
-        return "croissant"
-    return "lerobot" if is_lerobot(path) else None
+    if not path.is_dir():
+        return None
+    sets = ((name, each) for name, each in known_formats() if each.read_all is not None)
+    return next((name for name, each in sets if each.sniff(path, b"")), None)
 
 
 def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[ForeignTrial]:
@@ -151,65 +106,43 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
         InputError: it does not exist, a file is damaged, or faery is missing.
         ModuleNotFoundError: the extra `publish` is missing, for MCAP files.
     """
-    if kind in DATA_SETS:
+    how = None if kind == MIXED else known_format(kind)
+    if how is not None and how.read_all is not None:
         if not path.is_dir():
             raise InputError(path, "", None, f"is no folder; {kind} is a folder of files")
-        yield from DATA_SETS[kind](path)
+        yield from how.read_all(path)
         return
-    manifest = None
-    if kind != LAB_PICKLES and path.is_dir():
-        manifest = _read_manifest(path)
+    manifest = _manifest_of(path, kind)
     if manifest is not None:
         for item in manifest["trials"]:
             file, fault = path / item["file"], None
             of = kind
             if file.is_symlink() or not file.is_file():
                 fault = "is missing or not a regular file"
-            elif (of := (_kind(file) or "") if kind == MIXED else kind) not in READERS:
-                fault = f"is of no known format ({', '.join(READERS)})"
+            elif kind == MIXED and not (of := _kind(file) or ""):
+                readers = [name for name, each in known_formats() if each.read is not None]
+                fault = f"is of no known format ({', '.join(readers)})"
             if fault is not None:
                 yield broken(item["trial"], item["file"], InputError(file, "", None, fault))
                 continue
             found = _read(of, file, item["trial"], salvage)
             yield _as_exported(found, item, manifest["simulated"])
         return
+    laid_out = layouts()
     wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)
-    _check_libraries(wanted)
-    run = run_folder(path)
-    files: dict[str, list[str]] = {}
-    for name, _, file in wanted:
-        files.setdefault(name, []).append(file.name if isinstance(file, Path) else str(file))
-    yield from (_several(path, name, files[name]) for name in files if len(files[name]) > 1)
-    for name, of, file in wanted:
-        if len(files[name]) > 1:
-            continue
-        stem = file.stem if isinstance(file, Pair) else _stem(file)
-        if isinstance(file, Pair):
-            found = _read_lab(of, file, name, salvage)
-        else:
-            found = check_polarity(_read(of, file, name, salvage), stem)
-        yield with_run(found, stem, run)
-
-
-def _read_lab(kind: str, pair: Pair, name: str, salvage: bool) -> ForeignTrial:
-    """Return a recording of the lab: of its stream, or else of its pickles."""
-    note = ""
-    try:
-        if pair.stream is not None:
-            try:
-                found = read_file(kind, pair.stream, name, salvage)
-                return described(compare(found, pair), pair.stem)
-            except FormatError as error:
-                if pair.on is None and pair.off is None:
-                    raise FormatError(str(error), pair.stream) from None
-                note = f"{pair.stream.name} is not imported: {error}"
-        found = replace(read_pair(pair, name), kind=LAB_PICKLES)
-    except (FormatError, InputError) as error:
-        if isinstance(error, FormatError):
-            first = next(path for path in (pair.stream, pair.on, pair.off) if path is not None)
-            error = refusal(error.file or first, error)
-        return broken(name, str(pair), error)
-    return replace(found, notes=lambda: (*((note,) if note else ()), *found.notes()))
+    for _, each in wanted:
+        if (check := known_format(each.kind).check) is not None:
+            check(each.files[0])
+    alike: dict[str, list[str]] = {}
+    for name, each in wanted:
+        alike.setdefault(name, []).append(str(each))
+    yield from (_several(path, name, alike[name]) for name in alike if len(alike[name]) > 1)
+    for name, each in wanted:
+        if len(alike[name]) == 1:
+            found = each.read(name, salvage)
+            for layout in laid_out:
+                found = layout.complete(found, each, path)
+            yield found
 
 
 def skipped_in(path: Path, kind: str) -> list[Skipped]:
@@ -218,24 +151,26 @@ def skipped_in(path: Path, kind: str) -> list[Skipped]:
     Raises:
         InputError: as `trials_in`.
     """
-    if not path.is_dir() or kind in DATA_SETS or is_bag_folder(path):
+    if not path.is_dir() or _is_recording(path):
         return []
-    manifest = _read_manifest(path) if kind != LAB_PICKLES else None
+    if kind != MIXED and known_format(kind).read_all is not None:
+        return []
+    manifest = _manifest_of(path, kind)
     taken: set[str | None] = {EXPORT_MANIFEST}
     if manifest is not None:
         taken.add(REGISTRATIONS)
         taken |= {item["file"] for item in manifest["trials"]}
         other = f"is not in {EXPORT_MANIFEST}"
     else:
-        for _, _, file in _sort(path) if kind == MIXED else _of_kind(path, kind):
-            taken |= file.names() if isinstance(file, Pair) else {file.name}
-        known = ", ".join(KINDS)
+        for _, files in _sort(path) if kind == MIXED else _of_kind(path, kind):
+            taken |= {file.name for file in files.files}
+        known = ", ".join(format_names())
         other = f"is of no known format ({known})" if kind == MIXED else f"is no {kind} file"
-    run = run_folder(path)
     entries = sorted(path.iterdir())
-    if run == path:
-        entries = [entry for entry in entries if not is_of_run(run, entry)]
-        entries += sorted((run / EVENTS_FOLDER).iterdir())
+    if (folder := _folder(path)) != path:
+        laid_out = layouts()
+        entries = [entry for entry in entries if not any(one.owns(entry) for one in laid_out)]
+        entries += sorted(folder.iterdir())
     return [
         Skipped(entry.relative_to(path).as_posix(), _reason(entry, other))
         for entry in entries
@@ -253,33 +188,30 @@ def _reason(entry: Path, other: str) -> str:
     return unread(entry) or other
 
 
-Wanted = tuple[str, str, "Path | Pair"]
-"""Name of a trial, its format, and its file or files."""
+Wanted = tuple[str, Files]
+"""Name of a trial, and its files."""
 
 
 def _sort(path: Path) -> list[Wanted]:
     """Return what is known in a file or folder, each with its own format, by name."""
     kinds = {file: _kind(file) for file in _files(path)}
-    lab = pairs([file for file, kind in kinds.items() if kind is None or _is_stream(file, kind)])
-    taken = {pair.stream for pair in lab}
-    found: list[Wanted] = [
-        (_stem(file), kind, file)
+    joined = [each for layout in layouts() for each in layout.join(kinds, None, path)]
+    taken = {file for each in joined for file in each.files}
+    found = [
+        _single(file, kind)
         for file, kind in kinds.items()
         if kind is not None and file not in taken
     ]
-    found += [(pair.stem, LAB_PICKLES if pair.stream is None else "lab-hdf5", pair) for pair in lab]
-    found = found or [(pair.stem, LAB_PICKLES, pair) for pair in unnamed(list(kinds))]
-    return sorted(_named(found), key=lambda item: item[0])
+    return sorted(_named([*found, *joined]), key=lambda item: item[0])
 
 
-def _named(found: list[Wanted]) -> list[Wanted]:
-    """Return recordings with the names of their trials in place of those of their files."""
-    names = unique_names([stem for stem, _, _ in found])
-    return [(name, kind, file) for name, (_, kind, file) in zip(names, found, strict=True)]
+def _single(file: Path, kind: str) -> Files:
+    return Files(_stem(file), kind, (file,), partial(_read, kind, file))
 
 
-def _is_stream(file: Path, kind: str | None) -> bool:
-    return kind in {"lab-hdf5", "dsec"} and is_stream(file)
+def _named(found: list[Files]) -> list[Wanted]:
+    """Return recordings with the names of their trials."""
+    return list(zip(unique_names([files.stem for files in found]), found, strict=True))
 
 
 def _of_kind(path: Path, kind: str) -> list[Wanted]:
@@ -288,29 +220,18 @@ def _of_kind(path: Path, kind: str) -> list[Wanted]:
     Raises:
         InputError: that is nothing.
     """
-    files = _files(path)
-    if kind == LAB_PICKLES:
-        found = pairs([file for file in files if not is_stream(file)]) or unnamed(files)
-        if not found:
-            raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
-        return _named([(pair.stem, kind, pair) for pair in found])
-    wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
-    lab = [pair for pair in pairs(files) if kind == "lab-hdf5" and pair.stream is not None]
-    if not (wanted or lab):
-        endings = " or ".join(READERS[kind][0])
+    how, files = known_format(kind), _files(path)
+    wanted: list[Path] = []
+    if how.read is not None:
+        wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
+    joined = [
+        each for layout in layouts() for each in layout.join(dict.fromkeys(files), kind, path)
+    ]
+    if not (wanted or joined):
+        endings = " or ".join(how.suffixes)
         raise InputError(path, "", None, f"holds no {kind} file; such files end in {endings}")
-    taken = {pair.stream for pair in lab}
-    recordings: list[Wanted] = [(_stem(file), kind, file) for file in wanted if file not in taken]
-    return _named([*recordings, *((pair.stem, kind, pair) for pair in lab)])
-
-
-def _check_libraries(wanted: list[Wanted]) -> None:
-    """Check that the libraries for these files are installed."""
-    for _, kind, file in wanted:
-        if kind == "es" and isinstance(file, Path):
-            check_faery(file)
-        if isinstance(file, Path) and (needed := _needs(kind, file)) is not None:
-            raise ModuleNotFoundError(f"No module named {needed!r}", name=needed)
+    taken = {file for each in joined for file in each.files}
+    return _named([*(_single(file, kind) for file in wanted if file not in taken), *joined])
 
 
 def _several(path: Path, name: str, files: Sequence[str]) -> ForeignTrial:
@@ -324,14 +245,6 @@ def _several(path: Path, name: str, files: Sequence[str]) -> ForeignTrial:
         "rename the others, or import one format alone: sliplab import KIND PATH",
     )  # fmt: skip
     return broken(name, ", ".join(files), error)
-
-
-def _needs(kind: str, file: Path) -> str | None:
-    """Return the module that a file needs and that is not installed."""
-    needed = "mcap" if kind == "mcap" else None
-    if kind == "rosbag" and file.is_file() and read_head(file).startswith(BAG):
-        needed = "rosbags"
-    return needed if needed is not None and util.find_spec(needed) is None else None
 
 
 def name_of(stem: str) -> str:
@@ -387,10 +300,12 @@ def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     """
     if (what := unread(file)) is not None:
         raise FormatError(what)
-    _, reader = READERS[kind]
-    again = partial(SALVAGE[kind], file, name) if kind in SALVAGE else None
+    how = known_format(kind)
+    if how.read is None:
+        raise FormatError(f"is not a file of {kind}")
+    again = None if how.salvage is None else partial(how.salvage, file, name)
     try:
-        return replace(reader(file, name), kind=kind, salvage=again)
+        return replace(how.read(file, name), kind=kind, salvage=again)
     except Damage as error:
         if again is None:
             raise
@@ -406,21 +321,21 @@ def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
 
 def _stem(file: Path) -> str:
     """Return a file's name without its ending; a name without one may have dots in it."""
-    known = {ending for endings, _ in READERS.values() for ending in endings}
-    return file.stem if file.suffix.lower() in known else file.name
+    suffix = file.suffix.lower()
+    known = any(suffix in each.suffixes for _, each in known_formats())
+    return file.stem if known else file.name
 
 
 def _files(path: Path) -> list[Path]:
-    """List plain files, and folders of one recording of ROS 2 each.
+    """List plain files, and folders that are one recording each.
 
     Links are left out, for they may lead anywhere.
     """
-    if path.is_dir() and not is_bag_folder(path):
-        folder = path if (run := run_folder(path)) is None else run / EVENTS_FOLDER
+    if path.is_dir() and not _is_recording(path):
         found = sorted(
             file
-            for file in folder.iterdir()
-            if (file.is_file() or is_bag_folder(file)) and not file.is_symlink()
+            for file in _folder(path).iterdir()
+            if (file.is_file() or _is_recording(file)) and not file.is_symlink()
         )
     elif path.is_dir() or path.is_file():
         found = [path]
@@ -431,33 +346,47 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
+def _is_recording(path: Path) -> bool:
+    """Return whether a path is a folder that is one recording."""
+    return path.is_dir() and bool(_recognised(path))
+
+
+def _folder(path: Path) -> Path:
+    """Return the folder of the recordings' files."""
+    found = (layout.folder(path) for layout in layouts())
+    return next((folder for folder in found if folder is not None), path)
+
+
+def _recognised(path: Path) -> tuple[str, ...]:
+    """Return the formats that a file or folder is of, by its content."""
+    head = b"" if path.is_dir() else read_head(path)
+    found = tuple(name for name, each in CORE.items() if each.sniff(path, head))
+    if found:
+        return found  # plug-ins are not asked
+    readers = ((name, each) for name, each in known_formats() if each.read is not None)
+    return tuple(name for name, each in readers if each.sniff(path, head))
+
+
 def _possible(file: Path) -> tuple[str, ...]:
-    """Return the formats that a file may have: by its first bytes, else by its name's ending."""
-    if file.is_dir():
-        return ("rosbag",)
-    head = read_head(file)
-    if head.startswith(LINE):
-        return ("aedat4",)
-    if head.startswith(MAGIC):
-        return ("mcap",)
-    if head.startswith((SQLITE, BAG)):
-        return ("rosbag",)
-    if head.startswith(SIGNATURE):
-        return ("dsec", "lab-hdf5")
-    if head.startswith(EVENT_STREAM):
-        return ("es",)
-    if is_prophesee(head):
-        return ("raw",)
+    """Return the formats that a file may have: by its content, else by its name's ending."""
     suffix = file.suffix.lower()
-    return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
+    return _recognised(file) or tuple(
+        name for name, each in known_formats() if suffix in each.suffixes
+    )
 
 
 def _kind(file: Path) -> str | None:
     kinds = () if unread(file) is not None else _possible(file)
-    if "dsec" in kinds:
+    if DSEC in kinds:
         with suppress(FormatError):  # its reader finds the same fault
-            return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
+            return LAB_HDF5 if is_lab_hdf5(file) else DSEC
     return kinds[0] if kinds else None
+
+
+def _manifest_of(path: Path, kind: str) -> Json | None:
+    """Return the manifest of a folder whose files are of a format; None if there is none."""
+    single = kind == MIXED or known_format(kind).read is not None
+    return _read_manifest(path) if single and path.is_dir() else None
 
 
 def _read_manifest(folder: Path) -> Json | None:

@@ -168,7 +168,7 @@ def read_recording(recording: Any) -> None:
 
 def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
     """A pickle of the lab's kind."""
-    from sliplab.storage.formats import pickles
+    from sliplab.plugins.formats.lab import pickles
 
     _read_pickles_here()
     pickles.parse_pickle(data, name)
@@ -176,7 +176,7 @@ def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
 
 def _read_pickles_here() -> None:
     """Read pickles without the child process: the worker watches and limits this one."""
-    from sliplab.storage.formats import pickle_child, pickles
+    from sliplab.plugins.formats.lab import pickle_child, pickles
 
     pickles.in_child = lambda data, seconds: pickle_child.answer(data)
 
@@ -248,7 +248,7 @@ def _made_mcap(folder: Path) -> dict[str, bytes]:
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 
-    from sliplab.storage.formats.mcap_trials import write_mcap
+    from sliplab.plugins.formats.ros.mcap_writer import write_mcap
     from sliplab.storage.trials.store import Store
 
     store = Store.open(folder / "small-store")

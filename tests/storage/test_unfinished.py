@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.plugins.publish.publication import staged
 from sliplab.storage import files
 from sliplab.storage.files import replacing, scratch_folder, temporary_path, write_bytes, write_text
-from sliplab.storage.formats.publication import staged
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import push
 from sliplab.storage.trials.store import Store

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sliplab.storage.formats import lab_pickles
+from sliplab.plugins.formats.lab import events as lab_pickles
 from tests.storage.formats.files import SMALL
 
 

@@ -11,7 +11,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from sliplab.storage.formats import ros2_messages as ros2
+from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.formats.flatbuffers import events_buffer
 from sliplab.storage.formats.foreign import Triggers

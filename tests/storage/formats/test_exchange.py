@@ -18,9 +18,9 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
+from sliplab.plugins.formats.lab import events as lab
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
-from sliplab.storage.formats import lab_pickles as lab
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
 from sliplab.storage.formats.export_trials import export_trials, label_table
 from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
@@ -570,7 +570,7 @@ def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> Non
 def test_without_faery_its_files_are_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sliplab.storage.formats.event_stream.LIBRARY", "no_such_library")
+    monkeypatch.setattr("sliplab.plugins.formats.event_stream.LIBRARY", "no_such_library")
     (tmp_path / "a.es").write_bytes(b"Event Stream\2\0\0\1")
     with pytest.raises(InputError, match="pip install"):
         _import(tmp_path / "store", tmp_path / "a.es")

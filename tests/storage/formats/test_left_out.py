@@ -34,9 +34,9 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import failed_gates, verify
 from tests.command_line import here
+from tests.plugins.formats.test_lerobot import foreign
 from tests.storage.formats.adapters import SLIDES, bring, slides
 from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
-from tests.storage.formats.test_lerobot_import import foreign
 
 BACK = "events whose times run back"
 NO_TIME = "events without a valid time"

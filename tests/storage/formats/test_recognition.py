@@ -373,7 +373,7 @@ def test_two_files_of_one_name_and_nothing_else_are_refused(tmp_path: Path) -> N
 def test_a_missing_library_is_said_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sliplab.storage.formats.event_stream.LIBRARY", "no_such_library")
+    monkeypatch.setattr("sliplab.plugins.formats.event_stream.LIBRARY", "no_such_library")
     folder = tmp_path / "theirs"
     folder.mkdir()
     _aedat4(folder / "a.aedat4", _events([3, 4]))

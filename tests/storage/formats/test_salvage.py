@@ -312,7 +312,7 @@ def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
 
 def test_a_published_trial_that_is_cut_short_is_not_taken_for_a_recording(tmp_path: Path) -> None:
     """Its record is at the end: nobody would know that it was simulated."""
-    from sliplab.storage.formats.mcap_trials import write_mcap
+    from sliplab.plugins.formats.ros.mcap_writer import write_mcap
     from tests.storage.trial_files import campaign, commit
 
     where = campaign(tmp_path / "ours")

@@ -13,7 +13,8 @@ from scipy.io import savemat
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
-from sliplab.storage.formats.recognition import READERS, kind_of, skipped_in, trials_in
+from sliplab.storage.formats.known import known_formats
+from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
 from tests.storage.formats.recordings import all_events
 
 
@@ -89,7 +90,7 @@ def test_a_known_format_that_is_not_read_is_named_with_what_converts_it(
     assert says in caught.value.message
 
 
-@pytest.mark.parametrize("kind", READERS)
+@pytest.mark.parametrize("kind", [name for name, each in known_formats() if each.read])
 def test_a_stated_kind_does_not_mistake_it_for_another(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.aedat4"
     path.write_bytes(b"#!AER-DAT2.0\r\n" + bytes(80))

@@ -14,8 +14,8 @@ from pathlib import Path
 import h5py
 import pytest
 
-from sliplab.storage.formats.publication import About, Publication
-from sliplab.storage.formats.publish import publish
+from sliplab.plugins.publish.forms import publish
+from sliplab.plugins.publish.publication import About, Publication
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.pull import pull
 from sliplab.storage.remote.push import push

@@ -1,0 +1,3 @@
+"""Fixtures for the tests of formats."""
+
+from tests.storage.formats.conftest import small as small

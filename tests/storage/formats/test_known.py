@@ -1,0 +1,166 @@
+"""The table of formats: those of another lab's package stand in it beside the core's."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import Plugin, Plugins, plugins
+from sliplab.storage.formats import known
+from sliplab.storage.formats.export_trials import export_trials
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.known import export_formats, format_names, known_format, known_formats
+from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.protocols.test_plugin import loaded
+from tests.storage.formats.recordings import COUNT, write_aedat4
+
+TICKS = """
+from functools import partial
+from pathlib import Path
+import numpy as np
+from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError, event_chunk
+from sliplab.storage.formats.format import Files, Format, Layout
+
+MAGIC = b"ticks\\n"
+
+def read(path, name):
+    data = path.read_bytes()
+    if not data.startswith(MAGIC):
+        raise FormatError("is no file of ticks")
+    rows = np.frombuffer(data[len(MAGIC):], np.int64).reshape(-1, 4)
+    return ForeignTrial(name, path.name, lambda: iter([event_chunk(*rows.T)]), "start")
+
+def write(recording, path, stream):
+    with recording.open(stream) as reader:
+        found = reader.events()
+    rows = np.stack([found.x, found.y, found.p, found.t_us], axis=1).astype(np.int64)
+    path.write_bytes(MAGIC + rows.tobytes())
+    return {"events": len(found), "frames": 0, "triggers": 0}
+
+TICKS = Format((".tick",), lambda path, head: head.startswith(MAGIC), read, export=write)
+
+def both(files, name):
+    one, two = (read(file, name) for file in sorted(files))
+    def events():
+        yield from one.events()
+        yield from two.events()
+    return ForeignTrial(name, "two halves", events, "start")
+
+def join(files, kind, path):
+    halves = [file for file in files if file.suffix == ".half"]
+    return [Files("whole", "halves", tuple(halves), lambda name, salvage: both(halves, name))] * (
+        len(halves) == 2
+    )
+
+HALVES = Format(read_files=both)
+LAYOUT = Layout(join=join)
+"""
+
+
+def ticks(path: Path, first_us: int = 1000) -> None:
+    """Write ten events, 100 us apart."""
+    t_us = first_us + 100 * np.arange(10)
+    rows = np.stack([np.arange(10), np.arange(10), np.arange(10) % 2, t_us], axis=1)
+    path.write_bytes(b"ticks\n" + rows.astype(np.int64).tobytes())
+
+
+@pytest.fixture
+def declare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Plugin], None]:
+    """Return a function that puts a module and its declaration among the plug-ins."""
+
+    def put(text: str, declared: Plugin) -> None:
+        (tmp_path / "code").mkdir()
+        (tmp_path / "code" / "lab_ticks.py").write_text(text)
+        monkeypatch.syspath_prepend(str(tmp_path / "code"))
+        monkeypatch.setitem(sys.modules, "lab_ticks", None)  # forgotten again at the end
+        del sys.modules["lab_ticks"]
+        found = Plugins({**plugins().found, "lab_ticks": declared}, ())
+        monkeypatch.setattr(known, "plugins", lambda: found)
+        known._load.cache_clear()
+
+    return put
+
+
+def test_format_of_another_package_is_imported_and_exported(
+    declare: Callable[[str, Plugin], None], tmp_path: Path
+) -> None:
+    declare(TICKS, Plugin(formats={"ticks": "lab_ticks:TICKS"}))
+    assert format_names()[-1] == "ticks"
+    assert export_formats() == ["aedat4", "dsec", "ticks"]
+    folder = tmp_path / "in"
+    folder.mkdir()
+    ticks(folder / "a.tick")
+    ticks(folder / "b")  # known by its first bytes
+    (folder / "c.tick").write_bytes(b"other")  # known by its ending
+    assert kind_of(folder) == "ticks"
+    write_aedat4(folder / "d.aedat4")
+    assert kind_of(folder) == MIXED
+    assert skipped_in(folder, "ticks")[0].file == "d.aedat4"
+    store = Store.create(tmp_path / "store")
+    done = import_trials(store, "theirs", trials_in(folder, MIXED), folder, MIXED)
+    assert done["imported"] == ["a", "b", "d"]
+    assert done["events"] == 20 + COUNT
+    (failed,) = done["failed"]
+    assert "is no file of ticks" in failed["reason"]
+    assert verify(store) == []
+    recording = store.campaign("theirs").recording("a")
+    assert recording.record.imported is not None
+    assert recording.record.imported.format == "ticks"
+    export_trials([recording], tmp_path / "out", "ticks", "theirs")
+    assert (tmp_path / "out" / "a.tick").read_bytes() == (folder / "a.tick").read_bytes()
+    (again,) = trials_in(tmp_path / "out", kind_of(tmp_path / "out"))
+    assert sum(len(chunk) for chunk in again.events()) == 10
+
+
+def test_layout_of_another_package_joins_files(
+    declare: Callable[[str, Plugin], None], tmp_path: Path
+) -> None:
+    declare(
+        TICKS,
+        Plugin(formats={"halves": "lab_ticks:HALVES"}, hooks={"layout": "lab_ticks:LAYOUT"}),
+    )
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name, first_us in (("1.half", 1000), ("2.half", 3000)):
+        ticks(folder / name, first_us)
+    write_aedat4(folder / "d.aedat4")
+    assert kind_of(folder) == MIXED
+    one, two = trials_in(folder, MIXED)
+    assert (one.name, two.name) == ("d", "whole")
+    assert sum(len(chunk) for chunk in two.events()) == 20
+    assert skipped_in(folder, MIXED) == []
+
+
+def test_unusable_format_is_named_and_harms_no_other(
+    declare: Callable[[str, Plugin], None], tmp_path: Path
+) -> None:
+    declare("TICKS = 4", Plugin(formats={"ticks": "lab_ticks:TICKS", "none": "lab_none:NONE"}))
+    assert "ticks" not in dict(known_formats())
+    reason = "cannot be loaded: lab_ticks:TICKS is a int, not a Format"
+    with pytest.raises(InputError, match=reason):
+        known_format("ticks")
+    ticks(tmp_path / "a.tick")
+    with pytest.raises(InputError, match=f"no known file format.*; ticks {reason}; none cannot"):
+        kind_of(tmp_path / "a.tick")
+    write_aedat4(tmp_path / "d.aedat4")
+    assert kind_of(tmp_path / "d.aedat4") == "aedat4"
+
+
+def test_file_of_the_core_loads_no_other_format(tmp_path: Path) -> None:
+    write_aedat4(tmp_path / "a.aedat4")
+    found = loaded(
+        "import", str(tmp_path / "a.aedat4"), "--store", str(tmp_path / "store"), "--name", "a"
+    )
+    assert "sliplab.plugins.formats.lab.layout" in found  # a run's folder may lie around the file
+    for name in ("prophesee", "event_stream", "ros.mcap", "ros.bags", "lerobot"):
+        assert f"sliplab.plugins.formats.{name}" not in found
+    out = str(tmp_path / "out")
+    found = loaded("export", str(tmp_path / "store"), "a", "--format", "aedat4", "--output", out)
+    assert not [name for name in found if name.startswith("sliplab.plugins.formats.")]
