@@ -8,7 +8,7 @@ DONE := .venv/.installed
 # what one worker or program has compiled, the others need not
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-programs test-realtime test-long lint types imports docs bench clean
+.PHONY: setup demo test test-core test-programs test-realtime test-long lint types imports docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -21,8 +21,13 @@ $(DONE): pyproject.toml setup.py constraints.txt
 demo: $(DONE)
 	$(BIN)/sliplab demo
 
+QUICK := -n 2 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not programs and not long'
 test: $(DONE)
-	$(PYTEST) -n 2 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not programs and not long'
+	$(PYTEST) $(QUICK)
+
+# what a change of the core can break by itself
+test-core: $(DONE)
+	$(PYTEST) $(QUICK) --ignore tests/plugins --ignore tests/examples --ignore tests/benchmarks
 
 # whole programs, servers and clusters; they wait more than they compute
 test-programs: $(DONE)

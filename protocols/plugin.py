@@ -34,6 +34,8 @@ class Plugin:
             extend, such as ``calibrate``.
         documents: by kind, models of the JSON documents that it writes
             (`storage.schema.document.Document`), each with the title of its schema.
+        detectors: detectors of slip that the bench judges (`plugins.bench.interface.Detector`), by
+            name: classes or functions without arguments.
         drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only
             drivers names them in the group of entry points `sliplab.drivers` instead.
         sections: sections of the report by name (`analysis.report.plugin_sections.ReportSection`).
@@ -46,6 +48,7 @@ class Plugin:
 
     commands: Mapping[str, str] = field(default_factory=dict)
     documents: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    detectors: Mapping[str, str] = field(default_factory=dict)
     drivers: Mapping[str, str] = field(default_factory=dict)
     sections: Mapping[str, str] = field(default_factory=dict)
     searches: Mapping[str, str] = field(default_factory=dict)
@@ -79,7 +82,7 @@ class Plugins:
         """Return what plug-ins declare, by name; the first plug-in that declares a name has it.
 
         Args:
-            what: ``documents``, ``drivers``, ``formats``, ``sections`` or ``searches``.
+            what: an attribute of `Plugin` with one place a name, such as ``sections``.
         """
         places: dict[str, Any] = {}
         for plugin in self.found.values():

@@ -2,7 +2,7 @@
 
 A detector is named by
 
-- a name of `SHIPPED`, or of the entry point group `sliplab.detectors`;
+- a name of `SHIPPED`, of a plug-in, or of the entry point group `sliplab.detectors`;
 - ``module:attribute``, a class or function that takes no argument and returns a `Detector`;
 - the path of an ONNX file (`entries.onnx_model`);
 - ``run:COMMAND``, a program that speaks on its standard input and output (`entries.program`).
@@ -21,6 +21,7 @@ from pathlib import Path
 
 from sliplab.plugins.bench.interface import Detector
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, foreign_code
 from sliplab.protocols.shown import did_you_mean
 
@@ -49,7 +50,8 @@ _KEY = "DETECTOR"
 
 def known() -> dict[str, str]:
     """Return ``module:attribute`` by name; another package cannot replace a shipped detector."""
-    return {point.name: point.value for point in entry_points(group=GROUP)} | SHIPPED
+    pointed = {point.name: point.value for point in entry_points(group=GROUP)}
+    return pointed | plugins().declared("detectors") | SHIPPED
 
 
 def contents(name: str) -> list[str]:

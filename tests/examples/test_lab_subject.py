@@ -1,0 +1,94 @@
+"""A package with a command, a study, a section and a detector: all found by its declaration."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.campaigns import collected
+from sliplab.analysis.report.page import Rendered
+from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.study import Outcome, searches
+from sliplab.plugins.bench.registry import known, make_detector
+from sliplab.protocols.plugin import plugins
+from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.store import Store
+from tests.command_line import answer
+from tests.examples.conftest import EXAMPLES
+
+Ran = tuple[list[RunRequest], Outcome]
+
+
+@pytest.fixture
+def subject(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Install the package by what an installer writes, for one test."""
+    project = tomllib.loads((EXAMPLES / "lab-subject" / "pyproject.toml").read_text())["project"]
+    info = tmp_path / "site" / "lab_subject-0.1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lab-subject\nVersion: 0.1.0\n")
+    lines = [
+        line
+        for group, points in project["entry-points"].items()
+        for line in (f"[{group}]", *(f"{name} = {place}" for name, place in points.items()))
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    for folder in (info.parent, EXAMPLES / "lab-subject"):
+        monkeypatch.syspath_prepend(str(folder))
+    plugins.cache_clear()
+    yield
+    plugins.cache_clear()
+
+
+@pytest.mark.usefixtures("subject")
+def test_command_study_and_section(ran: Ran, tmp_path: Path) -> None:
+    shutil.copytree(ran[0][0].store, tmp_path / "store")
+    store = Store.open(tmp_path / "store")
+    campaigns = collected(store)
+    assert plugins().faults == ()
+    before = sections_key(store, campaigns)
+    shown = plugin_sections(ReportData(store, campaigns, True), last=True)
+    assert "Event rates" not in [each.title for each in shown if isinstance(each, Rendered)]
+
+    (search,) = [each for each in searches(ran[0]) if each.name == "rates"]
+    count = sum(len(item.trials) for item in campaigns)
+    assert search.run(store, campaigns) == count > 0
+    found = answer("rates", store.folder)
+    assert found["simulated"] is True
+    assert len(found["trials"]) == count
+    assert all(each["motion"] > each["hold"] > 0 for each in found["trials"].values())
+
+    assert sections_key(store, campaigns) != before  # the next report is made again
+    *_, last = plugin_sections(ReportData(store, campaigns, True), last=True)
+    assert isinstance(last, Rendered)
+    assert (last.title, "(simulated)" in last.html) == ("Event rates", True)
+    assert next(iter(found["trials"])) in last.html
+
+
+@pytest.mark.usefixtures("subject")
+def test_detector_is_the_same_in_any_pieces() -> None:
+    assert known()["lab_jump"] == "lab_rates.detector:Jump"
+    detector = make_detector("lab_jump")
+    rng = np.random.default_rng(1)
+    quiet, burst = rng.integers(0, 500_000, 500), rng.integers(500_000, 600_000, 2_000)
+    t_us = np.sort(np.concatenate([quiet, burst]))
+    zeros = np.zeros(len(t_us), np.uint16)
+    events = EventChunk(zeros, zeros, zeros.astype(np.uint8), t_us)
+    found = []
+    for cuts in ([600_000], [7_000, 10_000, 123_456, 500_001, 600_000]):
+        detector.begin(640, 480)
+        parts, at = [], 0
+        for cut in cuts:
+            end = int(np.searchsorted(t_us, cut))
+            piece = EventChunk(*(column[at:end] for column in (events.x, events.y, events.p, t_us)))
+            parts.append(detector.push(piece, cut))
+            at = end
+        found.append(np.concatenate([part.value for part in parts]))
+    np.testing.assert_array_equal(*found)
+    assert len(found[0]) == 60
+    assert found[0][50] > 10 > found[0][1:50].max()
