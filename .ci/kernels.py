@@ -22,9 +22,10 @@ def main() -> None:
     for protocol, rig_name in TRIALS:
         with tempfile.TemporaryDirectory() as folder:
             request = make_request(
-                ROOT / "protocols" / f"{protocol}.yaml", ROOT / "rigs" / f"{rig_name}.yaml",
+                ROOT / "protocols" / f"{protocol}.yaml",
+                ROOT / "rigs" / f"{rig_name}.yaml",
                 Path(folder) / "store",
-            )  # fmt: skip
+            )
             campaign = describe_campaign(Store.create(request.store), request)
             rig = build_rig(request.rig)
             rig.connect()

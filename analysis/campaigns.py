@@ -214,10 +214,12 @@ def of_classes(campaigns: list[Collected]) -> bool:
     found = {item.experiment == CLASSES: item.name for item in campaigns}
     if len(found) > 1:
         raise InputError(
-            "--campaign", "", None,
+            "--campaign",
+            "",
+            None,
             f"'{found[True]}' is of classes and '{found[False]}' of slip: they are analysed apart, "
             "so name one of them with --campaign",
-        )  # fmt: skip
+        )
     return True in found
 
 

@@ -243,9 +243,11 @@ def _scalar_record(about: StreamRecord, readings: ScalarChunk) -> StreamRecord:
         figures = {
             name: float(f"{value:.7g}")
             for name, value in (
-                ("mean", values.mean()), ("min", values.min()), ("max", values.max())
+                ("mean", values.mean()),
+                ("min", values.min()),
+                ("max", values.max()),
             )
-        }  # fmt: skip
+        }
     return about.model_copy(update={"rows": len(readings), "figures": figures})
 
 

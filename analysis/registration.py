@@ -134,9 +134,10 @@ def _rig_deviations(item: Collected, registration: Registration) -> Iterator[Dev
     if rig is None or rig.sha256 == item.info.get("rig_hash"):
         return
     yield Deviation(
-        "rig file", f"{rig.name}, {_hash(rig.sha256)}",
+        "rig file",
+        f"{rig.name}, {_hash(rig.sha256)}",
         f"{item.info.get('rig')}, {_hash(item.info.get('rig_hash'))}",
-    )  # fmt: skip
+    )
     texts = (rig.text, read_text(item.campaign.folder / RIG, "rig file"))
     old, new = (without_secrets(parse_yaml(text, RIG)) for text in texts)
     for change in differences(old, new, "rig"):
@@ -149,10 +150,11 @@ def _trial_deviations(
     """Yield trials that were taken before, are missing, or were not registered."""
     began = datetime.fromisoformat(registration.registered)
     early = [
-        trial.id for trial, recording in item.trials
+        trial.id
+        for trial, recording in item.trials
         if (when := item.campaign.provenance(recording).started) is not None
         and datetime.fromisoformat(when) < began
-    ]  # fmt: skip
+    ]
     taken = registration.taken
     if early or taken.committed or taken.attempts:
         found = f"registered {registration.after}"
@@ -169,10 +171,11 @@ def _trial_deviations(
     if missing:
         end = CampaignEnd.of(item.campaign.folder)
         yield Deviation(
-            "fewer trials than registered", plural(len(planned), "trial"),
+            "fewer trials than registered",
+            plural(len(planned), "trial"),
             f"{len(planned) - missing}"
             + ("; the campaign was ended by its claims" if end is not None and end.ended else ""),
-        )  # fmt: skip
+        )
 
 
 def _listed(names: Sequence[str], what: str) -> str:

@@ -16,9 +16,20 @@ from benchmarks.kept import PAGE, Result, as_line, keep, table
 from benchmarks.measure import SEED, Figures, machine, versions
 
 NAMES = (
-    "storage", "scene", "clocks", "clock_kinds", "labels", "labels_truth", "network", "live",
-    "orchestration", "acquisition", "scale", "fewer", "statements",
-)  # fmt: skip
+    "storage",
+    "scene",
+    "clocks",
+    "clock_kinds",
+    "labels",
+    "labels_truth",
+    "network",
+    "live",
+    "orchestration",
+    "acquisition",
+    "scale",
+    "fewer",
+    "statements",
+)
 LIMIT_S = 900
 
 

@@ -35,13 +35,28 @@ from sliplab.storage.streams import F64
 FAR = 3.0
 """A fit is wrong whose error is so many times the stated uncertainty."""
 KINDS = (
-    "good", "jump_1ms_at_end", "jump_1ms", "jump_20us_in_middle", "jump_20us", "jump_20us_at_end",
-    "jump_of_ticks", "kink_0.2ppm", "kink_1ppm", "kink_5ppm", "warming", "other_trial",
-    "other_trial_16_bits", "lost_30_on_both", "lost_30_and_jump_of_ticks",
-)  # fmt: skip
+    "good",
+    "jump_1ms_at_end",
+    "jump_1ms",
+    "jump_20us_in_middle",
+    "jump_20us",
+    "jump_20us_at_end",
+    "jump_of_ticks",
+    "kink_0.2ppm",
+    "kink_1ppm",
+    "kink_5ppm",
+    "warming",
+    "other_trial",
+    "other_trial_16_bits",
+    "lost_30_on_both",
+    "lost_30_and_jump_of_ticks",
+)
 HOPELESS = (
-    "jump_of_ticks", "other_trial", "other_trial_16_bits", "lost_30_and_jump_of_ticks",
-)  # fmt: skip
+    "jump_of_ticks",
+    "other_trial",
+    "other_trial_16_bits",
+    "lost_30_and_jump_of_ticks",
+)
 """Kinds of which any fit that is accepted is wrong."""
 END = 0.005
 """The share of a train that is its end."""
@@ -95,10 +110,14 @@ class Tally:
     def row(self) -> str:
         """One line of the table."""
         share, low, high = self.coverage
-        said = "" if self.kind in HOPELESS or not self.errors.size else (
-            f"{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f}) | "
-            f"{np.median(self.stated) / 1e3:.2f}"
-        )  # fmt: skip
+        said = (
+            ""
+            if self.kind in HOPELESS or not self.errors.size
+            else (
+                f"{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f}) | "
+                f"{np.median(self.stated) / 1e3:.2f}"
+            )
+        )
         return (
             f"| {self.kind.replace('_', ' ')} | {self.fit_ms.size:,} | {self.wrong} | "
             f"{self.wrong_anywhere} | {100 * self.refused:.2f} | {said or ' | '} | "

@@ -188,8 +188,10 @@ def by_nearest(made: Train) -> Line:
     px, py = x[near] * 1e-9, (y[nearest[near]] - x[near]) * 1e-3
     found = optimize.least_squares(
         lambda line: line[0] * px + line[1] - py,
-        (0.0, float(np.median(py))), loss="soft_l1", f_scale=10.0,
-    )  # fmt: skip
+        (0.0, float(np.median(py))),
+        loss="soft_l1",
+        f_scale=10.0,
+    )
     return _line(origin, float(found.x[0]) * 1e-6, float(found.x[1]) * 1e3)
 
 

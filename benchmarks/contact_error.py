@@ -58,10 +58,17 @@ def pressed(springs: Springs, depth: float) -> Tips:
     sensor = np.zeros((2, 5))
     sensor[:, 2] = depth
     advance(
-        springs.table, springs.friction, springs.law, tips.state,
-        np.array([0, 10**9, 6 * 10**9], np.int64), sensor, np.zeros(3),
-        np.empty((2, track_width(n))), np.empty((2, 0)), springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        np.array([0, 10**9, 6 * 10**9], np.int64),
+        sensor,
+        np.zeros(3),
+        np.empty((2, track_width(n))),
+        np.empty((2, 0)),
+        springs.spots,
+    )
     return tips
 
 
@@ -74,9 +81,17 @@ def slide(springs: Springs, way: Callable[[F64], F64], h_ms: float) -> tuple[F64
     track, load = np.empty((len(sensor), track_width(n))), np.empty((len(sensor), 3 * n))
     begun = time.process_time()
     advance(
-        springs.table, springs.friction, springs.law, tips.state, t_ns, sensor,
-        np.zeros(len(t_ns)), track, load, springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        t_ns,
+        sensor,
+        np.zeros(len(t_ns)),
+        track,
+        load,
+        springs.spots,
+    )
     taken = time.process_time() - begun
     stride = round(8.0 / h_ms)
     return load[stride - 1 :: stride], track[stride - 1 :: stride], taken
@@ -93,10 +108,21 @@ def fall(springs: Springs, h_ms: float) -> tuple[F64, float]:
     track, load = np.empty((len(sensor), track_width(n))), np.empty((len(sensor), 0))
     begun = time.process_time()
     done, _ = advance_free(
-        springs.table, springs.friction, springs.law, tips.state, t_ns, sensor, motion, MASS_KG,
-        np.minimum(t / 1.024, 1.0) * MASS_KG * 9.81, 0.001, -25.0, track, load,
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        t_ns,
+        sensor,
+        motion,
+        MASS_KG,
+        np.minimum(t / 1.024, 1.0) * MASS_KG * 9.81,
+        0.001,
+        -25.0,
+        track,
+        load,
         springs.spots,
-    )  # fmt: skip
+    )
     taken = time.process_time() - begun
     slips = track[:done, 3 * n : 4 * n]
     first = slips[np.argmax(track[:done, 2 * n : 3 * n] > 1e-6, axis=0), np.arange(n)]
@@ -115,9 +141,13 @@ def springs_of(
 ) -> Springs:
     """The mock rig's own numbers but for how rough friction is."""
     return make_springs(
-        skin, friction_knots(skin, 0.85, variation, correlation_mm, seed), level,
-        static_excess=0.03, strengthening=0.01, relaxation_share=0.2,
-    )  # fmt: skip
+        skin,
+        friction_knots(skin, 0.85, variation, correlation_mm, seed),
+        level,
+        static_excess=0.03,
+        strengthening=0.01,
+        relaxation_share=0.2,
+    )
 
 
 def main() -> None:

@@ -72,10 +72,17 @@ def emulate(emulator: Any, path: F64, optics: EventOptics, threshold: F64) -> Ev
     # as many threads as cores of the comparison: others would wait for each other on the one core
     torch.set_num_threads(1)
     device = emulator(
-        pos_thres=optics.threshold, neg_thres=optics.threshold, sigma_thres=0.0, cutoff_hz=0.0,
-        leak_rate_hz=0.0, shot_noise_rate_hz=0.0, refractory_period_s=optics.refractory_us * 1e-6,
-        output_width=optics.width, output_height=optics.height, device="cpu",
-    )  # fmt: skip
+        pos_thres=optics.threshold,
+        neg_thres=optics.threshold,
+        sigma_thres=0.0,
+        cutoff_hz=0.0,
+        leak_rate_hz=0.0,
+        shot_noise_rate_hz=0.0,
+        refractory_period_s=optics.refractory_us * 1e-6,
+        output_width=optics.width,
+        output_height=optics.height,
+        device="cpu",
+    )
     device.pos_thres = device.neg_thres = torch.tensor(threshold, dtype=torch.float32)
     picture = np.empty(threshold.shape)
     found = [np.empty((0, 4))]
@@ -87,9 +94,11 @@ def emulate(emulator: Any, path: F64, optics: EventOptics, threshold: F64) -> Ev
     t_s, x, y, p = np.concatenate(found).T
     order = np.argsort(t_s, kind="stable")
     return (
-        np.rint(t_s[order] * 1e9).astype(np.int64), x[order].astype(np.uint16),
-        y[order].astype(np.uint16), (p[order] > 0).astype(np.uint8),
-    )  # fmt: skip
+        np.rint(t_s[order] * 1e9).astype(np.int64),
+        x[order].astype(np.uint16),
+        y[order].astype(np.uint16),
+        (p[order] > 0).astype(np.uint8),
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -127,10 +127,14 @@ class Parquet:
         """Row group by row group."""
         table = self._arrow.table(self._columns)
         self._parquet.write_table(
-            table, self.path, row_group_size=EVENT_CHUNK, compression="zstd",
-            compression_level=1, use_dictionary=False,
+            table,
+            self.path,
+            row_group_size=EVENT_CHUNK,
+            compression="zstd",
+            compression_level=1,
+            use_dictionary=False,
             column_encoding={"t": "DELTA_BINARY_PACKED"},
-        )  # fmt: skip
+        )
 
     def read(self) -> list[np.ndarray[Any, Any]]:
         """All columns, as arrays."""

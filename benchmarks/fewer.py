@@ -78,11 +78,25 @@ CLAIMS = (
     Stated("p05 of duration at least itself", "slip_duration", "p05", "at_least", 1.0, False),
     Stated("median duration at most itself", "slip_duration", "median", "at_most", 1.0, False),
     Stated("p90 of first slip at most itself", "first_slip", "p90", "at_most", 1.0, False),
-    Stated("duration differs by half, slow and fast", "slip_duration", "median", "at_least", 0.5,
-           True, ("speed", 0.6, 1.6)),
-    Stated("duration differs by all, slow and fast", "slip_duration", "median", "at_least", 1.0,
-           False, ("speed", 0.6, 1.6)),
-)  # fmt: skip
+    Stated(
+        "duration differs by half, slow and fast",
+        "slip_duration",
+        "median",
+        "at_least",
+        0.5,
+        True,
+        ("speed", 0.6, 1.6),
+    ),
+    Stated(
+        "duration differs by all, slow and fast",
+        "slip_duration",
+        "median",
+        "at_least",
+        1.0,
+        False,
+        ("speed", 0.6, 1.6),
+    ),
+)
 QUANTILES = {"median": 0.5, "p05": 0.05, "p90": 0.9}
 
 
@@ -128,9 +142,10 @@ def claim_of(stated: Stated, true: float) -> dict[str, Any]:
     """Return a claim as a protocol has it; a false one by the least that there is."""
     nudge = {True: 0.0, False: 1e-3 if stated.kind == "at_least" else -1e-3}[stated.true]
     made: dict[str, Any] = {
-        "figure": stated.figure, "statistic": stated.statistic,
+        "figure": stated.figure,
+        "statistic": stated.statistic,
         stated.kind: f"{stated.share * true + nudge:.6f} ms",
-    }  # fmt: skip
+    }
     if stated.between is not None:
         name, *levels = stated.between
         made["between"] = {"factor": name, "levels": levels}
@@ -156,9 +171,10 @@ def plan_of(order: str, claims: Sequence[dict[str, Any]], setting: Setting) -> P
     source = ROOT / f"protocols/{setting.experiment}.yaml"
     data = parse_yaml(source.read_text(), source)
     data["collection"] |= {
-        "order": order, "seed": setting.seed,
+        "order": order,
+        "seed": setting.seed,
         "stopping": {"error": ERROR, "claims": list(claims)},
-    }  # fmt: skip
+    }
     if order == "shuffled":
         data["collection"]["stopping"]["block"] = BLOCK
     else:
@@ -252,18 +268,29 @@ def measure(worlds: int = 200, adaptive: int = 10, cores: int = 2) -> Figures:
     rows = rows_of(worlds, SEED, adaptive, BATCH, cores)
     found: Figures = {}
     for order in ORDERS:
-        calls = {stated: [row[order][k] for row in rows if order in row]
-                 for k, stated in enumerate(CLAIMS)}  # fmt: skip
+        calls = {
+            stated: [row[order][k] for row in rows if order in row]
+            for k, stated in enumerate(CLAIMS)
+        }
         found[f"{order}_worlds"] = float(len(calls[CLAIMS[0]]))
         found[f"{order}_worst_claim_wrong_percent"] = max(
             100.0 * float(np.mean([call is not None and call[1] for call in each]))
             for each in calls.values()
         )
-        true = [TRIALS if call is None else call[0]
-                for stated, each in calls.items() if stated.true for call in each]  # fmt: skip
+        true = [
+            TRIALS if call is None else call[0]
+            for stated, each in calls.items()
+            if stated.true
+            for call in each
+        ]
         found[f"{order}_true_trials_percent"] = 100.0 * float(np.median(true)) / TRIALS
-    both = [(row["shuffled"][k], row["adaptive"][k]) for row in rows if "adaptive" in row
-            for k, stated in enumerate(CLAIMS) if stated.true]  # fmt: skip
+    both = [
+        (row["shuffled"][k], row["adaptive"][k])
+        for row in rows
+        if "adaptive" in row
+        for k, stated in enumerate(CLAIMS)
+        if stated.true
+    ]
     ratios = [(TRIALS if b is None else b[0]) / (TRIALS if a is None else a[0]) for a, b in both]
     found["adaptive_over_shuffled"] = float(np.median(ratios))
     return found

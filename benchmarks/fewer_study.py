@@ -62,11 +62,15 @@ FACTOR = 1.3
 """By which a forecast may be off."""
 CLAIMS: dict[str, tuple[str, dict[str, Any]]] = {
     "accuracy known to 1 point": ("kinematic", {"figure": "accuracy", "within": "1 %"}),
-    "median latency known to 10 ms":
-        ("kinematic", {"figure": "latency_incipient", "within": "10 ms"}),
-    "lead at least 360 ms in 95 %":
-        ("gravity", {"figure": "lead", "statistic": "p05", "at_least": "360 ms"}),
-}  # fmt: skip
+    "median latency known to 10 ms": (
+        "kinematic",
+        {"figure": "latency_incipient", "within": "10 ms"},
+    ),
+    "lead at least 360 ms in 95 %": (
+        "gravity",
+        {"figure": "lead", "statistic": "p05", "at_least": "360 ms"},
+    ),
+}
 
 
 def write_figures(store: Path, model: Path) -> None:
@@ -79,9 +83,12 @@ def write_figures(store: Path, model: Path) -> None:
             found = trial_figures(recording, Judge(item.settings, model))
             levels = {name: str(level) for name, level in trial.condition}
             rows.append(
-                {"experiment": item.experiment, **levels,
-                 **{name: found.of(name) for name in FIGURES}}
-            )  # fmt: skip
+                {
+                    "experiment": item.experiment,
+                    **levels,
+                    **{name: found.of(name) for name in FIGURES},
+                }
+            )
     pd.DataFrame(rows).to_csv(sys.stdout, index=False, float_format="%.3f")
 
 
@@ -187,9 +194,10 @@ def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str,
                 drawing = Drawing(plan, pilot, seed)
                 foretold = [drawing.campaign(k).called[0] or total for k in range(draws)]
                 row[title][order] = [
-                    took[0], float(np.median(took[1:])),
+                    took[0],
+                    float(np.median(took[1:])),
                     *(float(n) for n in np.quantile(foretold, SHARES)),
-                ]  # fmt: skip
+                ]
     return row
 
 

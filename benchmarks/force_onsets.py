@@ -49,9 +49,17 @@ def _run(springs: Springs, tips: Tips, path: F64, step_s: float) -> tuple[F64, F
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     t_ns = np.rint(np.arange(steps + 1) * step_s * 1e9).astype(np.int64)
     advance(
-        springs.table, springs.friction, springs.law, tips.state, t_ns, sensor,
-        np.zeros(steps + 1), track, load, springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        t_ns,
+        sensor,
+        np.zeros(steps + 1),
+        track,
+        load,
+        springs.spots,
+    )
     return track, load.reshape(steps, n, 3).sum(axis=1)
 
 
@@ -81,9 +89,12 @@ def slide(depth_mm: float, speed_mm_s: float, seed: int) -> Onsets:
         np.nan if ns is None else 1e-6 * ns for ns in (by_force.incipient_ns, by_force.gross_ns)
     )
     return Onsets(
-        float(incipient), float(gross), float(np.nanmin(slips)), float(np.nanmin(crossed)),
+        float(incipient),
+        float(gross),
+        float(np.nanmin(slips)),
+        float(np.nanmin(crossed)),
         float(crossed[0]),
-    )  # fmt: skip
+    )
 
 
 def table() -> Iterator[list[str]]:

@@ -100,9 +100,10 @@ def row(candidate: Candidate, count: int) -> list[str]:
     trials = [trial for trial in plan if plan.mass_kg(trial) == heaviest]
     truths = [run(rig, plan, trial) for trial in trials[:: max(len(trials) // count, 1)]]
     held = np.array([truth["from_hold"]["hold_slip_mm"] for truth in truths]) * scale
-    first = np.array([
-        truth["from_hold"]["first_slip_ns"] - truth["reference_ns"] for truth in truths
-    ]) / 1e9  # fmt: skip
+    first = (
+        np.array([truth["from_hold"]["first_slip_ns"] - truth["reference_ns"] for truth in truths])
+        / 1e9
+    )
     apart = [truth["incipient_ns"] - truth["from_hold"]["incipient_ns"] for truth in truths]
     most = held.max(axis=1)
     return [
@@ -120,11 +121,15 @@ def row(candidate: Candidate, count: int) -> list[str]:
 def main(count: int = 20) -> None:
     """Print the table."""
     titles = (
-        "gravity trial, 0.245 kg (simulated)", "n", "slip > 2 px in the hold", "> 0.5 px",
-        "most (px)", "papillae > 0.5 px, median",
+        "gravity trial, 0.245 kg (simulated)",
+        "n",
+        "slip > 2 px in the hold",
+        "> 0.5 px",
+        "most (px)",
+        "papillae > 0.5 px, median",
         "first slip after the motion began, least / median (s)",
         "references apart, most (ms)",
-    )  # fmt: skip
+    )
     print("| " + " | ".join(titles) + " |")
     print("| --- |" + " --: |" * (len(titles) - 1))
     for candidate in CANDIDATES:

@@ -40,10 +40,15 @@ KEPT = 16
 DEFAULT: dict[str, Any] = {"blobColor": 255}
 """As shipped (thresholds 50 to 220 in steps of 10), but for bright blobs."""
 TUNED: dict[str, Any] = {
-    "blobColor": 255, "minThreshold": 112.0, "maxThreshold": 122.0, "thresholdStep": 10.0,
-    "minRepeatability": 1, "filterByInertia": False, "filterByConvexity": False,
+    "blobColor": 255,
+    "minThreshold": 112.0,
+    "maxThreshold": 122.0,
+    "thresholdStep": 10.0,
+    "minRepeatability": 1,
+    "filterByInertia": False,
+    "filterByConvexity": False,
     "filterByCircularity": False,
-}  # fmt: skip
+}
 PARAMETERS = {
     "default SimpleBlobDetector": DEFAULT,
     "tuned SimpleBlobDetector": TUNED,
@@ -78,9 +83,11 @@ def measure(frames: int = 600, runs: int = RUNS) -> Figures:
         **ratio("x_best_opencv", best, taken["ours"]),
     }
     for name, prefix in (
-        ("ours", ""), ("default", "blob_detector_"), ("tuned", "tuned_detector_"),
+        ("ours", ""),
+        ("default", "blob_detector_"),
+        ("tuned", "tuned_detector_"),
         ("components", "components_"),
-    ):  # fmt: skip
+    ):
         figures |= spread(f"{prefix}frame_ms", [value * 1e3 / frames for value in taken[name]])
     ours = track(clean, layout).xy
     pairs = list(zip(clean, truth, strict=True))
@@ -144,9 +151,12 @@ def _video(
     """A skin that slides 6 mm, and the true centres in pixels; a plate falls by a millimetre."""
     camera = FrameCamera()
     optics = FrameOptics(
-        px_per_mm=camera.px_per_mm, tip_radius_mm=camera.tip_radius_mm,
-        tip_level=camera.tip_level, ground_level=camera.ground_level, noise=noise,
-    )  # fmt: skip
+        px_per_mm=camera.px_per_mm,
+        tip_radius_mm=camera.tip_radius_mm,
+        tip_level=camera.tip_level,
+        ground_level=camera.ground_level,
+        noise=noise,
+    )
     view = PlateView(optics, side, side)
     layout = World(MockSettings(seed=SEED)).skin.layout_mm
     along = np.linspace(-3.0, 3.0, 600)[:frames, None, None]

@@ -71,13 +71,16 @@ def verdicts(trials: Sequence[Checked]) -> dict[str, dict[str, int]]:
 
 
 _COLUMNS = (
-    ("slips", "papilla slips", 0), ("centroid_rms_px", "centroids RMS (px)", 4),
+    ("slips", "papilla slips", 0),
+    ("centroid_rms_px", "centroids RMS (px)", 4),
     ("crossing_median_frames", "paper's rule: median (frames)", 2),
     ("crossing_p95_frames", "95 % (frames)", 2),
     ("paper_slip_median_ms", "paper's rule after the slip (ms)", 0),
-    ("slip_median_ms", "change point: median (ms)", 2), ("slip_p95_ms", "95 % (ms)", 2),
-    ("slip_width_ms", "interval's width (ms)", 2), ("coverage_95", "interval right", 3),
-)  # fmt: skip
+    ("slip_median_ms", "change point: median (ms)", 2),
+    ("slip_p95_ms", "95 % (ms)", 2),
+    ("slip_width_ms", "interval's width (ms)", 2),
+    ("coverage_95", "interval right", 3),
+)
 
 
 def tables(sets: Sequence[Sequence[Checked]]) -> str:

@@ -109,9 +109,14 @@ def check(job: tuple[RigFile, Plan, Trial, dict[str, Any], bool]) -> Checked:
     size = rig.frame_px(plan)
     assert size is not None
     label = label_places(
-        from_tracks(markers, plate, size), frame_ns, (0, int(frame_ns[-1])), Labelling(), centre=0,
-        exposure_ns=2 * rig.scene.frame_camera.exposure_us * 500, source="video",
-    )  # fmt: skip
+        from_tracks(markers, plate, size),
+        frame_ns,
+        (0, int(frame_ns[-1])),
+        Labelling(),
+        centre=0,
+        exposure_ns=2 * rig.scene.frame_camera.exposure_us * 500,
+        source="video",
+    )
     off = markers.xy - np.concatenate(true.places)
     speed = next(float(str(level)) for name, level in trial.condition if name == "speed")
     crossings, slips = (_since(truth, name) for name in ("per_papilla_ns", "slip_per_papilla_ns"))
@@ -168,10 +173,12 @@ def _hidden(truth: Json, draw: np.random.Generator) -> tuple[MarkerOccluded, ...
         at = max(hold_s + about / 1e9 + float(draw.uniform(-0.6, 0.2)), 0.1)
         faults.append(
             MarkerOccluded(
-                kind="marker_occluded", papilla=papilla, at_s=at,
+                kind="marker_occluded",
+                papilla=papilla,
+                at_s=at,
                 seconds=float(draw.uniform(0.1, 0.8)),
             )
-        )  # fmt: skip
+        )
     return tuple(faults)
 
 

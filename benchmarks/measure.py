@@ -18,11 +18,27 @@ from statistics import median
 SEED = 1
 RUNS = 5
 PACKAGES = (
-    "sliplab", "numpy", "scipy", "numba", "h5py", "hdf5plugin", "av",
-    "opencv-contrib-python-headless", "torch", "sinabs", "prefect",
-    "pypylon", "dv-processing", "bluesky", "pandas", "pyarrow",
-    "snntorch", "spikingjelly", "norse", "tonic",
-)  # fmt: skip
+    "sliplab",
+    "numpy",
+    "scipy",
+    "numba",
+    "h5py",
+    "hdf5plugin",
+    "av",
+    "opencv-contrib-python-headless",
+    "torch",
+    "sinabs",
+    "prefect",
+    "pypylon",
+    "dv-processing",
+    "bluesky",
+    "pandas",
+    "pyarrow",
+    "snntorch",
+    "spikingjelly",
+    "norse",
+    "tonic",
+)
 
 Figures = dict[str, float]
 Seconds = list[float]

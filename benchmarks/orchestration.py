@@ -50,9 +50,12 @@ class _Steps:
 
 
 def measure(
-    trials: int = 864, runs: int = RUNS, records: int = 100_000, starts: int = RUNS,
+    trials: int = 864,
+    runs: int = RUNS,
+    records: int = 100_000,
+    starts: int = RUNS,
     long: int = 10_000,
-) -> Figures:  # fmt: skip
+) -> Figures:
     """Everything in one go."""
     figures: Figures = {}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:

@@ -54,8 +54,9 @@ def ridge(unit: F64, rng: np.random.Generator) -> F64:
 def uneven(unit: F64, rng: np.random.Generator) -> F64:
     """Noise that grows twelvefold over the prior, and five statistics that say nothing."""
     noise = 0.08 * np.exp(1.25 * (unit[:, :1] + 1.0)) * [1.0, 0.3]
-    return np.column_stack([unit + noise * rng.normal(size=unit.shape),
-                            rng.normal(size=(len(unit), 5))])  # fmt: skip
+    return np.column_stack(
+        [unit + noise * rng.normal(size=unit.shape), rng.normal(size=(len(unit), 5))]
+    )
 
 
 def curved(unit: F64, rng: np.random.Generator) -> F64:
@@ -90,8 +91,14 @@ def many(unit: F64, rng: np.random.Generator) -> F64:
     return s
 
 
-TOYS = {"linear": (linear, 5), "ridge": (ridge, 2), "uneven": (uneven, 2),
-        "curved": (curved, 3), "crowded": (crowded, 8), "many": (many, 31)}  # fmt: skip
+TOYS = {
+    "linear": (linear, 5),
+    "ridge": (ridge, 2),
+    "uneven": (uneven, 2),
+    "curved": (curved, 3),
+    "crowded": (crowded, 8),
+    "many": (many, 31),
+}
 
 
 def drawn(name: str, k: int, seed: int) -> Bank:
@@ -100,16 +107,23 @@ def drawn(name: str, k: int, seed: int) -> Bank:
     rng = np.random.default_rng([SEED, seed])
     unit = rng.uniform(-1.0, 1.0, (k, p))
     s = toy(unit, rng)
-    return Bank(tuple(f"theta{j}" for j in range(p)), tuple(f"s{j}" for j in range(s.shape[1])),
-                unit * HALF, s, np.full(p, -HALF), np.full(p, HALF))  # fmt: skip
+    return Bank(
+        tuple(f"theta{j}" for j in range(p)),
+        tuple(f"s{j}" for j in range(s.shape[1])),
+        unit * HALF,
+        s,
+        np.full(p, -HALF),
+        np.full(p, HALF),
+    )
 
 
 def by_regression(bank: Bank, observed: F64) -> F64:
     fit = fitted(bank)
     median = np.nanmedian(bank.s, axis=0)
     found = [fit.at(np.where(np.isfinite(row), row, median)).estimates for row in observed]
-    return np.array([[[getattr(e, name) for e in row] for row in found]
-                     for name in ("low", "median", "high")])  # fmt: skip
+    return np.array(
+        [[[getattr(e, name) for e in row] for row in found] for name in ("low", "median", "high")]
+    )
 
 
 def by_rejection(bank: Bank, observed: F64) -> F64:
@@ -201,13 +215,20 @@ def main() -> None:
         names = tuple(map(str, kept["parameters"])), tuple(map(str, kept["statistics"]))
         bounds = kept["lower"], kept["upper"]
         k = len(kept["theta"]) - asked.hidden
-        bank, hidden = (Bank(*names, kept["theta"][part], kept["s"][part], *bounds)
-                        for part in (slice(None, k), slice(k, None)))  # fmt: skip
+        bank, hidden = (
+            Bank(*names, kept["theta"][part], kept["s"][part], *bounds)
+            for part in (slice(None, k), slice(k, None))
+        )
         compared(asked.bank.stem, [(bank, hidden)])
         return
     for name in asked.toys:
-        compared(name, [(drawn(name, asked.worlds, 2 * i), drawn(name, asked.hidden, 2 * i + 1))
-                        for i in range(asked.banks)])  # fmt: skip
+        compared(
+            name,
+            [
+                (drawn(name, asked.worlds, 2 * i), drawn(name, asked.hidden, 2 * i + 1))
+                for i in range(asked.banks)
+            ],
+        )
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def _events(runs: int, length_mm: float) -> Figures:
             runs,
             slow=lambda: sense("slow", sensor, slow),
             busy=lambda: sense("busy", sensor, busy),
-        )  # fmt: skip
+        )
         circuit = alternate(
             min(runs, 3),
             plain=lambda: sense("fast", silent, fast),
@@ -256,6 +256,9 @@ def _apart_us(a: tuple[EventChunk, I64], b: tuple[EventChunk, I64]) -> tuple[F64
 def _peak_mb(rig: str) -> float:
     found = subprocess.run(
         [sys.executable, "-m", "benchmarks.trials", rig],
-        capture_output=True, text=True, check=True, timeout=300,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
+    )
     return float(found.stdout.split()[-1])

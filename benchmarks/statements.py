@@ -210,9 +210,11 @@ class Statement:
         if self.between:
             of["between"] = {"factor": "speed", "levels": list(self.between)}
         bounds = [
-            ("at_least", true + nudge), ("at_most", true - nudge), ("at_most", true + half),
+            ("at_least", true + nudge),
+            ("at_most", true - nudge),
+            ("at_most", true + half),
             ("within", nudge),
-        ]  # fmt: skip
+        ]
         return [{**of, side: f"{at:.6f} {self.unit}"} for side, at in bounds]
 
 

@@ -62,9 +62,13 @@ THRESHOLD = EventCamera().threshold
 FAINT = 2.67
 """A light is seen by pixels whose threshold is so many standard deviations below the mean."""
 FIRST_STREAMS = {
-    "a tilted plate": ("frames",), "a sticky papilla": ("frames",), "a broken papilla": ("frames",),
-    "a light on the mains": ("events",), "a slow ramp": ("poses",), "a dirty spot": ("frames",),
-}  # fmt: skip
+    "a tilted plate": ("frames",),
+    "a sticky papilla": ("frames",),
+    "a broken papilla": ("frames",),
+    "a light on the mains": ("events",),
+    "a slow ramp": ("poses",),
+    "a dirty spot": ("frames",),
+}
 CLEAN, BANK = "clean", "bank"
 FIRST_KINDS = (BANK, CLEAN, *FIRST_STREAMS)
 """Those whose worlds have a seed of their own; worlds of later kinds are further clean ones."""

@@ -117,9 +117,12 @@ STEP_MS: dict[Onset, float] = {"paper": 10.0, "change_point": 0.0}
 
 
 def shipped(
-    name: str, folder: Path, repetitions: int | None = None, networks: int = 1,
+    name: str,
+    folder: Path,
+    repetitions: int | None = None,
+    networks: int = 1,
     split: Mapping[str, float] | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a shipped protocol as it is used here; the paper's network is left out.
 
     Args:
@@ -174,10 +177,12 @@ def hidden_rig(folder: Path, assumed: Path, seed: int, number: int) -> Path:
     prior = replace(prior_of(CLEAN, seed), rig=load_rig_file(assumed)[0])
     world = prior.world(number, pilot_slides()).rig
     data = {
-        "extends": str(assumed), "name": "hidden", "mock": world.scene.model_dump(mode="json"),
+        "extends": str(assumed),
+        "name": "hidden",
+        "mock": world.scene.model_dump(mode="json"),
         # a lab measures it
         "calibration": {"touch_depth": f"{touch_depth_mm(world):.3f} mm"},
-    }  # fmt: skip
+    }
     path = folder / "hidden.yaml"
     path.write_text(rig_yaml(data))
     return path
@@ -371,9 +376,13 @@ def beyond(spans: Mapping[str, Any]) -> dict[str, bool]:
 
 
 def world_row(
-    asked: argparse.Namespace, number: int, files: Sequence[Path], hidden_files: Sequence[Path],
-    assumed: Study, usual: Outcomes,
-) -> dict[str, Any]:  # fmt: skip
+    asked: argparse.Namespace,
+    number: int,
+    files: Sequence[Path],
+    hidden_files: Sequence[Path],
+    assumed: Study,
+    usual: Outcomes,
+) -> dict[str, Any]:
     """Do everything of one hidden world; return its figures.
 
     Args:

@@ -72,10 +72,13 @@ def draw(name: str, title: str, devices: MockDevices, film: Film, truth: dict[st
     start = box.to_device(truth["reference_ns"])
     fall = "gravity" in name
     moments = [
-        start - 500_000_000, start + (first - start) // 2, first + (gross - first) // 6,
-        first + (gross - first) // 2, gross - 30_000_000,
+        start - 500_000_000,
+        start + (first - start) // 2,
+        first + (gross - first) // 6,
+        first + (gross - first) // 2,
+        gross - 30_000_000,
         gross + (90_000_000 if fall else 700_000_000),
-    ]  # fmt: skip
+    ]
     labels = ["holding", "loading", "first slips", "half way", "just before gross", "gross slip"]
     figure, axes = plt.subplots(
         4, 6, figsize=(15, 11), height_ratios=[1, 0.78, 1, 0.62], layout="constrained"
@@ -139,9 +142,13 @@ def _picture(axis: Any, devices: MockDevices, film: Film, moment: int) -> None:
 
 
 def _rate(
-    axis: Any, devices: MockDevices, film: Film, start: int, moments: list[int],
+    axis: Any,
+    devices: MockDevices,
+    film: Film,
+    start: int,
+    moments: list[int],
     truth: dict[str, Any],
-) -> None:  # fmt: skip
+) -> None:
     clock, box = devices.world.clocks.event_camera, devices.sync.clock
     t_us = np.concatenate([chunk.t_us[chunk.p == 1] for chunk in film.events])
     t_s = (clock.to_device(t_us * 1000) - start) * 1e-9
@@ -154,8 +161,10 @@ def _rate(
         axis.axvline((moment - start) * 1e-9, color="#444444", lw=0.8, ls=":")
     axis.set(
         xlabel="time after the motion's start (s); blue line: first slip, red line: gross slip",
-        ylabel="positive events\n(1000 a second)", xlim=(edges[0], edges[-1]), ylim=(0, None),
-    )  # fmt: skip
+        ylabel="positive events\n(1000 a second)",
+        xlim=(edges[0], edges[-1]),
+        ylim=(0, None),
+    )
 
 
 def main() -> None:

@@ -118,9 +118,13 @@ def main() -> None:
     durations = [round(1e3 / FPS)] * len(frames)
     durations[-1] = round(1e3 * WAIT_S)
     frames[0].save(
-        asked.out, save_all=True, append_images=frames[1:], duration=durations, loop=0,
+        asked.out,
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
         optimize=True,
-    )  # fmt: skip
+    )
     size_kb = asked.out.stat().st_size / 1e3
     print(f"{asked.out}: {len(frames)} pictures, {size_kb:.0f} kB, simulated")
 

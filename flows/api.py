@@ -444,8 +444,10 @@ class Model:
 
         windows = list_events(
             EventChunk(events.x, events.y, events.p, events.t_ns // 1000),
-            np.asarray(start_ns) // 1000, self.fitted.windows, *size_px,
-        )  # fmt: skip
+            np.asarray(start_ns) // 1000,
+            self.fitted.windows,
+            *size_px,
+        )
         return training.predict_counts(self.fitted, windows)
 
 
@@ -529,9 +531,14 @@ def collect(
     if trials is not None and trials < 1:
         raise InputError("trials", "", trials, "must be 1 or more")
     run_request = make_request(
-        Path(protocol), Path(rig), Path(store), enable=tuple(enable), campaign=campaign,
-        most=trials, claims="overrule" if no_stopping else "use",
-    )  # fmt: skip
+        Path(protocol),
+        Path(rig),
+        Path(store),
+        enable=tuple(enable),
+        campaign=campaign,
+        most=trials,
+        claims="overrule" if no_stopping else "use",
+    )
     with stopping.signals(), extras.named("collect"):
         prepare_store(run_request.store)
         from sliplab.flows.collect import collect as take

@@ -53,9 +53,11 @@ def evaluate_on_classes(
     for option, value in (("--margin", margin), ("--smoothing", smoothing)):
         if value is not None:
             raise InputError(
-                option, "", value,
+                option,
+                "",
+                value,
                 f"sets how slip is detected, and '{campaigns[0].name}' shows classes; leave it out",
-            )  # fmt: skip
+            )
     job = make_class_job(Labels(store, reviewed), campaigns)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:

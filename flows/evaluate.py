@@ -82,9 +82,14 @@ def evaluate_flow(argument: Opaque[tuple[Job, Cluster | None]]) -> None:
         count_spikes(job.store, job.model.path, trials, keep, threads)
         for model, item in product(job.others, job.campaigns):
             count_spikes(
-                job.store, model.path, job.counted_by(model, item), keep, threads,
-                seed_step(model.seed), job.detection[item.name].stride_ms,
-            )  # fmt: skip
+                job.store,
+                model.path,
+                job.counted_by(model, item),
+                keep,
+                threads,
+                seed_step(model.seed),
+                job.detection[item.name].stride_ms,
+            )
         predict_trials(job.store, job.model.path, windows, job.detectors.requests, keep, threads)
         train, test = (
             load_samples(job.labels, job.campaigns, split, sample_maker(job.store, split, cluster))

@@ -25,9 +25,14 @@ from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk,
 
 MOTION = frozenset(ACTING)
 PERFECT = Clocks(
-    arm_ppm=0, event_camera_ppm=0, frame_camera_ppm=0, sync_box_ppm=0, offset_h=0,
-    pulse_jitter_us=0, frame_jitter_us=0,
-)  # fmt: skip
+    arm_ppm=0,
+    event_camera_ppm=0,
+    frame_camera_ppm=0,
+    sync_box_ppm=0,
+    offset_h=0,
+    pulse_jitter_us=0,
+    frame_jitter_us=0,
+)
 _SMALL_PX = 32
 
 

@@ -104,13 +104,18 @@ def _search(search: Search, store: Store, campaigns: list[Collected]) -> StepDon
 
 def study_plan(run_requests: Sequence[RunRequest]) -> StudyPlan:
     """Return the study that run requests are for."""
-    return StudyPlan([
-        PlannedCampaign(
-            each.campaign, each.plan, each.rig.frame_source,
-            each.rig.simulated, each.rig.in_virtual_time,
-        )
-        for each in run_requests
-    ])  # fmt: skip
+    return StudyPlan(
+        [
+            PlannedCampaign(
+                each.campaign,
+                each.plan,
+                each.rig.frame_source,
+                each.rig.simulated,
+                each.rig.in_virtual_time,
+            )
+            for each in run_requests
+        ]
+    )
 
 
 def searches(run_requests: Sequence[RunRequest]) -> list[Search]:

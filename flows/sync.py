@@ -36,8 +36,13 @@ if TYPE_CHECKING:
 
 PAGE_VERSION = 1
 COLUMNS = (
-    "device", "grade", "median\n(µs)", "worst\n(µs)", "drift (ppm)", "missed /\nlate / spurious"
-)  # fmt: skip
+    "device",
+    "grade",
+    "median\n(µs)",
+    "worst\n(µs)",
+    "drift (ppm)",
+    "missed /\nlate / spurious",
+)
 """Columns of the tables for a terminal; uncertainties are of events against the device, both clocks
 together; of events, their own."""
 
@@ -121,11 +126,16 @@ def tables(result: SyncDone) -> list[tuple[str, list[list[str]]]]:
         rows = []
         for device, numbers in known["devices"].items():
             drift, pulses = numbers["drift_ppm"], numbers["pulses"]
-            rows.append([
-                device, numbers["grade"], f"{numbers['uncertainty_us']['median']:.1f}",
-                f"{numbers['uncertainty_us']['worst']:.1f}", f"{drift[0]:.1f} to {drift[1]:.1f}",
-                "-" if pulses is None else " / ".join(map(str, pulses.values())),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    device,
+                    numbers["grade"],
+                    f"{numbers['uncertainty_us']['median']:.1f}",
+                    f"{numbers['uncertainty_us']['worst']:.1f}",
+                    f"{drift[0]:.1f} to {drift[1]:.1f}",
+                    "-" if pulses is None else " / ".join(map(str, pulses.values())),
+                ]
+            )
         trials = f"{plural(known['trials'], 'trial')}, {known['refitted']} refitted"
         title = f"Clocks of {campaign}{simulated}: {trials}, {known['changed']} changed"
         found.append((title, rows))

@@ -119,9 +119,13 @@ def window_checks(store: Store, campaigns: list[Collected], reviewed: bool = Fal
         )
         console.say("shuffled labels (nine short trainings)")
         chance = shuffled_chance(
-            (train.windows, train.y), (validation.windows, validation.y), (few, test.y[rows]),
-            settings.network, settings.windows, how,
-        )  # fmt: skip
+            (train.windows, train.y),
+            (validation.windows, validation.y),
+            (few, test.y[rows]),
+            settings.network,
+            settings.windows,
+            how,
+        )
         check_chance(chance)
     except (CheckFailed, ValueError) as error:
         raise StoreError(f"{store.folder}: {error}") from None

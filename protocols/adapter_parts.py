@@ -115,9 +115,18 @@ class StreamClock(StrictModel):
 
 Axis = Literal["taxel", "polarity", "step", "x", "y"]
 EventFormat = Literal[
-    "counts", "csv", "numpy", "aedat4", "dsec", "lab-hdf5", "raw", "es", "mcap", "rosbag",
+    "counts",
+    "csv",
+    "numpy",
+    "aedat4",
+    "dsec",
+    "lab-hdf5",
+    "raw",
+    "es",
+    "mcap",
+    "rosbag",
     "lab-pickles",
-]  # fmt: skip
+]
 SEVERAL_FILES = frozenset({"lab-pickles"})
 """Formats of events of which a trial may have more than one file."""
 _COUNTS = ("axes", "step_ms", "polarity_order")
@@ -189,9 +198,11 @@ class EventFiles(StrictModel):
         axes = list(self.axes)
         places = {"taxel"} & set(axes) or {"x", "y"} & set(axes)
         wanted = {"step"} | places | ({"polarity"} & set(axes))
-        if len(set(axes)) != len(axes) or set(axes) != wanted or places not in (
-            {"taxel"}, {"x", "y"}
-        ):  # fmt: skip
+        if (
+            len(set(axes)) != len(axes)
+            or set(axes) != wanted
+            or places not in ({"taxel"}, {"x", "y"})
+        ):
             raise KeyedError(
                 ".axes", axes, "must name each axis once: step, taxel (or y and x), and polarity"
             )
@@ -315,9 +326,10 @@ class AdaptedStreams(StrictModel):
     def _some(self) -> AdaptedStreams:
         if not any((self.events, self.frames, self.poses, self.wrenches, self.scalars)):
             raise KeyedError(
-                ".events", None,
+                ".events",
+                None,
                 "is missing; a trial needs a stream: events, frames, poses, wrenches or scalars",
-            )  # fmt: skip
+            )
         if self.events is None and self.frames is not None and self.frames.clock is not None:
             raise KeyedError(
                 ".frames.clock", None, "is for streams beside events; without them its own counts"

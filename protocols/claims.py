@@ -27,8 +27,14 @@ FigureName = Literal[
 Statistic = Literal["mean", "median", "p05", "p10", "p25", "p75", "p90", "p95"]
 Kind = Literal["within", "at_least", "at_most", "apart"]
 QUANTILES: Mapping[str, float] = {
-    "median": 0.5, "p05": 0.05, "p10": 0.1, "p25": 0.25, "p75": 0.75, "p90": 0.9, "p95": 0.95,
-}  # fmt: skip
+    "median": 0.5,
+    "p05": 0.05,
+    "p10": 0.1,
+    "p25": 0.25,
+    "p75": 0.75,
+    "p90": 0.9,
+    "p95": 0.95,
+}
 LEAST_BLOCKS = 6
 """Blocks before which nothing is called."""
 RARE = 3.0
@@ -85,9 +91,7 @@ def _statistic(info: Any, raw: object) -> object:
     raise ValueError("must be 'median'" if raw == "p50" else one_of(raw, known))
 
 
-Amount = Annotated[
-    Decimal, PlainSerializer(canonical), WithJsonSchema({"type": "string"})
-]  # fmt: skip
+Amount = Annotated[Decimal, PlainSerializer(canonical), WithJsonSchema({"type": "string"})]
 """A percentage or a time, by the claim's figure."""
 
 
@@ -172,9 +176,11 @@ class Claim(StrictModel):
             first, second = map(factors[name].text, self.between.levels)
             words = f"{words}, {name} {second} less {first},"
         said = {
-            "within": "known within +-", "at_least": "at least ", "at_most": "at most ",
+            "within": "known within +-",
+            "at_least": "at least ",
+            "at_most": "at most ",
             "apart": "in size at least ",
-        }  # fmt: skip
+        }
         return f"{words} {said[self.kind]}{self.value:g} {figure.unit}"
 
 
@@ -244,9 +250,11 @@ class Stopping(StrictModel):
         key = "collection.stopping.model"
         if self.model is None:
             raise KeyedError(
-                key, None, "is needed: a claim is about a network's output; name the file of a "
+                key,
+                None,
+                "is needed: a claim is about a network's output; name the file of a "
                 "trained one, such as STORE/models/seed0.pt of a pilot",
-            )  # fmt: skip
+            )
         path = Path(protocol).parent / self.model
         if not path.is_file():
             raise KeyedError(key, self.model, f"{path} is no file")

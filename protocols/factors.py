@@ -177,9 +177,12 @@ def in_canonical_unit(level: Any, symbol: object) -> Any:
 def written_units(*sections: Any) -> dict[str, Any]:
     """Return the unit of each factor, as the sections of a file have them."""
     return {
-        name: each.get("unit") for part in sections if isinstance(part, dict)
-        for name, each in part.items() if isinstance(each, dict)
-    }  # fmt: skip
+        name: each.get("unit")
+        for part in sections
+        if isinstance(part, dict)
+        for name, each in part.items()
+        if isinstance(each, dict)
+    }
 
 
 def levels_in_canonical_units(

@@ -43,10 +43,23 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
 
 COLUMNS = (
-    "campaign", "trial", "experiment", "role", "repetition", "block", "attempt", "simulated",
-    "recorded_s", "events", "frames", "frame_source", "sync_uncertainty_us", "passed", "split",
+    "campaign",
+    "trial",
+    "experiment",
+    "role",
+    "repetition",
+    "block",
+    "attempt",
+    "simulated",
+    "recorded_s",
+    "events",
+    "frames",
+    "frame_source",
+    "sync_uncertainty_us",
+    "passed",
+    "split",
     "motion_s",
-)  # fmt: skip
+)
 """Columns that tables of trials have beside the conditions."""
 
 
@@ -72,13 +85,13 @@ def _or_template(schema: dict[str, Any]) -> None:
                 **{key: {"type": "string"} for key in template.parameters},
             },
             "required": [
-                "template", *(key for key, each in template.parameters.items()
-                              if each.default is None),
+                "template",
+                *(key for key, each in template.parameters.items() if each.default is None),
             ],
             "additionalProperties": False,
         }
         for name, template in templates().items()
-    ]  # fmt: skip
+    ]
     schema["anyOf"] = [phases, *parts]
 
 
@@ -132,10 +145,15 @@ class Collection(StrictModel):
             made["references"] = {**references, "condition": condition}
         stopping = data.get("stopping")
         if isinstance(stopping, dict) and isinstance(claims := stopping.get("claims"), list):
-            made["stopping"] = {**stopping, "claims": [
-                _claim_in_canonical_units(claim, f"collection.stopping.claims[{k}]", units, faults)
-                for k, claim in enumerate(claims)
-            ]}  # fmt: skip
+            made["stopping"] = {
+                **stopping,
+                "claims": [
+                    _claim_in_canonical_units(
+                        claim, f"collection.stopping.claims[{k}]", units, faults
+                    )
+                    for k, claim in enumerate(claims)
+                ],
+            }
         if faults:
             raise KeyedError.joined(faults)
         return made
@@ -170,9 +188,10 @@ class Collection(StrictModel):
         names = [phase.phase for phase in self.motion]
         press, release = names.index("press"), names.index("release")
         return tuple(
-            index for index, name in enumerate(names)
+            index
+            for index, name in enumerate(names)
             if name in {"slide", "retract", "twist"} or (name == "move" and press < index < release)
-        )  # fmt: skip
+        )
 
     def key_of(self, name: str) -> str:
         """The key of a factor or of context: ``collection.context.skin``."""
@@ -221,10 +240,11 @@ class Collection(StrictModel):
             yield KeyedError("collection.choice", None, "is only used by order: adaptive")
         if self.stopping is not None and self.stopping.block is not None and self.adaptive:
             yield KeyedError(
-                "collection.stopping.block", self.stopping.block,
+                "collection.stopping.block",
+                self.stopping.block,
                 "has no meaning with order: adaptive, whose batches are the blocks "
                 "(collection.choice.batch)",
-            )  # fmt: skip
+            )
         if self.stopping is not None:
             yield from self.stopping.factor_faults(self.all_factors)
 
@@ -392,8 +412,9 @@ class Protocol(StrictModel):
         units = written_units(collection.get("factors"), collection.get("context"))
         made = {
             part: {name: _as_text(levels, units.get(name)) for name, levels in split[part].items()}
-            for part in ("validation_levels", "test_levels") if isinstance(split.get(part), dict)
-        }  # fmt: skip
+            for part in ("validation_levels", "test_levels")
+            if isinstance(split.get(part), dict)
+        }
         return {**data, "analysis": {**analysis, "split": {**split, **made}}}
 
 
@@ -402,7 +423,8 @@ def _as_text(levels: Any, symbol: object) -> Any:
     if not isinstance(symbol, str) or not isinstance(levels, list):
         return levels
     return [
-        f"{level} {symbol}" if isinstance(level, int | Decimal) and not isinstance(level, bool)
+        f"{level} {symbol}"
+        if isinstance(level, int | Decimal) and not isinstance(level, bool)
         else level
         for level in levels
-    ]  # fmt: skip
+    ]

@@ -136,9 +136,10 @@ def _disturbed_hold(
     """
     due = sorted(
         (number * float(each.every), order)
-        for order, each in enumerate(nuisances) if isinstance(each, _ByArm)
+        for order, each in enumerate(nuisances)
+        if isinstance(each, _ByArm)
         for number in range(1, int(max(seconds - QUIET_S, 0.0) / float(each.every)) + 1)
-    )  # fmt: skip
+    )
     past = 0.0
     for moment, order in due:
         if moment > past:
@@ -175,9 +176,11 @@ def _place(phase: Travel, at: Position, condition: Condition) -> Position:
 
     assert place is not None
     return Position(
-        coordinate(place.x, at.x_mm), coordinate(place.y, at.y_mm),
-        coordinate(place.depth, at.depth_mm), at.twist_deg,
-    )  # fmt: skip
+        coordinate(place.x, at.x_mm),
+        coordinate(place.y, at.y_mm),
+        coordinate(place.depth, at.depth_mm),
+        at.twist_deg,
+    )
 
 
 def _half_slide(phase: Any, condition: Condition) -> tuple[float, float]:

@@ -256,10 +256,13 @@ class Plan:
             for each, here in (self.protocol.analysis.overrides if preset else ())
         ]
         hold = min(
-            sum(step.seconds for step in self.program(trial).steps
-                if isinstance(step, Dwell) and step.recorded)
+            sum(
+                step.seconds
+                for step in self.program(trial).steps
+                if isinstance(step, Dwell) and step.recorded
+            )
             for trial in self.trials
-        )  # fmt: skip
+        )
         if hold < need:
             found.append(
                 f"collection.motion: the recorded hold of {hold:g} s is shorter than "

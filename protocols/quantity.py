@@ -29,10 +29,15 @@ _LARGEST = Decimal("1e9")
 _SIZES = {
     unit: Decimal(size)
     for unit, size in {
-        "mm": "1e5", "mm/s": "1e5", "s": "1e6", "deg": "360", "kg": "1e3", "percent": "1e4",
+        "mm": "1e5",
+        "mm/s": "1e5",
+        "s": "1e6",
+        "deg": "360",
+        "kg": "1e3",
+        "percent": "1e4",
         "px": "1e6",
     }.items()
-}  # fmt: skip
+}
 _DECIMALS = 40
 
 

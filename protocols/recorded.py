@@ -80,12 +80,17 @@ class RecordedPlan:
         parts = split_recorded(self.adapter, ordered, self.file)
         return tuple(
             Trial(
-                index, trial.id, "measured", 0, 0,
+                index,
+                trial.id,
+                "measured",
+                0,
+                0,
                 tuple((name, _level(text)) for name, text in trial.condition.items()),
-                parts[trial.id], hash_integer("recorded", trial.id),
+                parts[trial.id],
+                hash_integer("recorded", trial.id),
             )
             for index, trial in enumerate(ordered)
-        )  # fmt: skip
+        )
 
     @cached_property
     def _by_id(self) -> dict[str, RecordedTrial]:
@@ -154,10 +159,12 @@ def split_recorded(adapter: Adapter, trials: Sequence[RecordedTrial], file: str)
             part = split.parts.get(value, value)
             if part not in shares:
                 raise InputError(
-                    file, "split.given", split.given,
+                    file,
+                    "split.given",
+                    split.given,
                     f"of trial {trial.id} is {value}, which is neither train, validation nor test; "
                     "say below split.parts what it stands for",
-                )  # fmt: skip
+                )
             result[trial.id] = part
         if "validation" in result.values():
             return result
@@ -210,5 +217,6 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     """Key that sorts numbers in texts by value: ``sample_9`` before ``sample_10``."""
     return tuple(
         (0, int(part), "") if part.isdecimal() else (1, 0, part)
-        for part in re.split(r"(\d+)", text) if part
-    )  # fmt: skip
+        for part in re.split(r"(\d+)", text)
+        if part
+    )

@@ -66,9 +66,10 @@ def check_first_round(collection: Collection, levels: Levels) -> None:
     first = grid.ends(collection.repetitions, most)[0]
     if most < first:
         raise KeyedError(
-            "collection.stopping.most", most, f"must be at least {first}, the trials of the first "
-            "round, which is taken whole",
-        )  # fmt: skip
+            "collection.stopping.most",
+            most,
+            f"must be at least {first}, the trials of the first round, which is taken whole",
+        )
 
 
 def block_warnings(collection: Collection, levels: Levels) -> Iterator[str]:

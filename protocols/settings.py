@@ -64,9 +64,10 @@ class Windows(StrictModel):
                 value = getattr(self, name)
                 if value != type(self).model_fields[name].default:
                     raise KeyedError(
-                        f"analysis.windows.{name}", value,
+                        f"analysis.windows.{name}",
+                        value,
                         f"must be left out beside taxels = {self.taxels}: taxels have no crop",
-                    )  # fmt: skip
+                    )
         elif self.crop_px % self.pool_px:
             raise KeyedError("analysis.windows.pool_px", self.pool_px, "must divide crop_px")
         return self

@@ -159,14 +159,21 @@ def expected_onsets(
     scene = mock.scene
     skin = skin_of(mock)
     material = Material(
-        scene.friction.kinetic, scene.friction.static_excess, scene.skin.relaxation_share,
+        scene.friction.kinetic,
+        scene.friction.static_excess,
+        scene.skin.relaxation_share,
         scene.skin.relaxation_s,
-    )  # fmt: skip
+    )
     onsets = slide_onsets(
-        skin, material, level,
-        [slide.depth_mm for slide in slides], [slide.speed_mm_s for slide in slides],
-        [slide.press_mm_s for slide in slides], [slide.settled_s for slide in slides], grip,
-    )  # fmt: skip
+        skin,
+        material,
+        level,
+        [slide.depth_mm for slide in slides],
+        [slide.speed_mm_s for slide in slides],
+        [slide.press_mm_s for slide in slides],
+        [slide.settled_s for slide in slides],
+        grip,
+    )
     return np.stack([onsets.min(axis=-1), onsets[..., 0]], axis=-1)
 
 

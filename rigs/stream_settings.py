@@ -47,10 +47,19 @@ from sliplab.rigs.mock.further_settings import (
 from sliplab.rigs.mock.settings import Clocks, ForceSensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-RESERVED = frozenset({
-    "events", "frames", "arm", "force", "sync", "sync_box", "event_camera", "frame_camera",
-    "force_sensor",
-})  # fmt: skip
+RESERVED = frozenset(
+    {
+        "events",
+        "frames",
+        "arm",
+        "force",
+        "sync",
+        "sync_box",
+        "event_camera",
+        "frame_camera",
+        "force_sensor",
+    }
+)
 """Names of the first devices, in files, records and columns."""
 _PLACES = frozenset({"serial", "host", "port", "events_port", "triggers_port", "index", "path"})
 """Keys by which drivers tell their devices apart."""

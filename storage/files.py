@@ -382,9 +382,11 @@ def _indented(data: Any, depth: int) -> str:
 def _encoder(depth: int) -> json.JSONEncoder:
     """Return the encoder of values without nested ones."""
     return json.JSONEncoder(
-        sort_keys=True, allow_nan=False, ensure_ascii=False,
+        sort_keys=True,
+        allow_nan=False,
+        ensure_ascii=False,
         separators=(",\n" + " " * depth, ": "),
-    )  # fmt: skip
+    )
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -9,9 +9,18 @@ from importlib.metadata import PackageNotFoundError, version
 RECORDING = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 """Packages that record trials."""
 FIGURES = (
-    "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",
-    "opencv-contrib-python-headless", "scikit-learn",
-)  # fmt: skip
+    "sliplab",
+    "numpy",
+    "numba",
+    "scipy",
+    "torch",
+    "sinabs",
+    "prefect",
+    "pandas",
+    "h5py",
+    "opencv-contrib-python-headless",
+    "scikit-learn",
+)
 """Packages that compute figures."""
 
 

@@ -44,9 +44,13 @@ def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess
     environment.pop("PREFECT_HOME", None)
     environment |= dict.fromkeys(("PREFECT_API_KEY", "AWS_SECRET_ACCESS_KEY"), SECRET)
     return subprocess.run(
-        [*SLIPLAB, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True,
-        text=True, timeout=300,
-    )  # fmt: skip
+        [*SLIPLAB, *map(str, arguments)],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def here(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:

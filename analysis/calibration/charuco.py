@@ -204,11 +204,13 @@ def _fit(objects: list[Any], pixels: list[Any], size_px: tuple[int, int], flags:
     if not np.isfinite(matrix).all():
         raise BoardError("no lens fits the pictures: are they of one board and one camera?")
     return (
-        np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).reshape(-1)[:5],
+        np.asarray(matrix, np.float64),
+        np.asarray(distortion, np.float64).reshape(-1)[:5],
         [np.asarray(v, np.float64).reshape(3) for v in turns],
         [np.asarray(v, np.float64).reshape(3) for v in shifts],
-        np.asarray(doubts, np.float64).reshape(-1), np.asarray(residuals, np.float64).reshape(-1),
-    )  # fmt: skip
+        np.asarray(doubts, np.float64).reshape(-1),
+        np.asarray(residuals, np.float64).reshape(-1),
+    )
 
 
 def _fewest(fits: dict[str, _Fit], corners: int) -> str:

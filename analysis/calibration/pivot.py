@@ -80,6 +80,10 @@ def find_tip(xyz_mm: Floats, rotvec_deg: Floats) -> Pivot:
     errors = np.linalg.norm(off, axis=1)
     sigma = float(np.sqrt((off**2).sum() / (3 * len(xyz) - 6)))
     return Pivot(
-        tip, point, float(np.sqrt((errors**2).mean())), errors, spread,
+        tip,
+        point,
+        float(np.sqrt((errors**2).mean())),
+        errors,
+        spread,
         sigma / (spread * float(np.sqrt(len(xyz)))),
-    )  # fmt: skip
+    )

@@ -239,9 +239,13 @@ def _followed(line: ClockLine, x: Floats, y: Floats) -> ClockLine:
     residuals: Floats = y - gained(x, knots, values)
     inside: Bools = np.abs(residuals) <= _GATE * line.sigma
     return replace(
-        line, knots=knots, values=values, residuals=residuals, inside=inside,
+        line,
+        knots=knots,
+        values=values,
+        residuals=residuals,
+        inside=inside,
         unverified=(unverified[0], unverified[1]),
-    )  # fmt: skip
+    )
 
 
 def gained(x: Floats, knots: Floats, values: Floats) -> Floats:
@@ -293,15 +297,29 @@ def _changes(
     gate = float(np.abs(residuals[inside]).max())
     matrix = normal_equations(piece, share, np.zeros(x.size), rest, gate, limit, knots.size)[0]
     found = changes(
-        (x - x[0]) / (x[-1] - x[0]), piece, share, rest, gate, limit,
+        (x - x[0]) / (x[-1] - x[0]),
+        piece,
+        share,
+        rest,
+        gate,
+        limit,
         _CLIP * noise,
-        np.linalg.inv(_held(matrix)), max(1, x.size * knots.size**2 // 60_000), _PIECE_PULSES // 2,
-    )  # fmt: skip
+        np.linalg.inv(_held(matrix)),
+        max(1, x.size * knots.size**2 // 60_000),
+        _PIECE_PULSES // 2,
+    )
     knot, at, step, step_size, end, end_size, tail, tail_size, tail_at = found
     return _Changes(
-        knot / noise, int(at), step / noise, step_size, end / noise, end_size,
-        tail / noise, tail_size, int(tail_at),
-    )  # fmt: skip
+        knot / noise,
+        int(at),
+        step / noise,
+        step_size,
+        end / noise,
+        end_size,
+        tail / noise,
+        tail_size,
+        int(tail_at),
+    )
 
 
 def _jump(found: _Changes, hidden: float) -> float:
@@ -408,9 +426,17 @@ def _is_chance(residuals: Floats, parameters: int, sigma: float, slack: float) -
 
 
 def _judged(
-    x: Floats, knots: Floats, at: Floats, values: Floats, residuals: Floats, inside: Bools,
-    sigma: float, resolution: float, bend_per_ns: float, hidden: _Hidden | None,
-) -> ClockLine:  # fmt: skip
+    x: Floats,
+    knots: Floats,
+    at: Floats,
+    values: Floats,
+    residuals: Floats,
+    inside: Bools,
+    sigma: float,
+    resolution: float,
+    bend_per_ns: float,
+    hidden: _Hidden | None,
+) -> ClockLine:
     """The line with its uncertainty; `at` are the knots whose places were fitted to the pulses."""
     inner, n = residuals[inside], knots.size
     if hidden is not None:

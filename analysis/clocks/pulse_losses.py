@@ -89,8 +89,9 @@ def stray_stretch(
     low = np.searchsorted(predicted, reference - slack_ns, side="left")
     high = np.searchsorted(predicted, reference + slack_ns, side="right")
     for widths, at_ends, least, log_places in (
-        (_WIDTHS, False, BURST, places), (_WIDTHS_AT_END, True, BURST_AT_END, 1),
-    ):  # fmt: skip
+        (_WIDTHS, False, BURST, places),
+        (_WIDTHS_AT_END, True, BURST_AT_END, 1),
+    ):
         for width in widths:
             if width > reference.size:
                 continue

@@ -313,9 +313,15 @@ def _first_line(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[float
 
 
 def _pair_strip(
-    x: Floats, y: Floats, first: int, last: int, centre: float, slope: float, level: float,
+    x: Floats,
+    y: Floats,
+    first: int,
+    last: int,
+    centre: float,
+    slope: float,
+    level: float,
     tick: float,
-) -> tuple[Ints, Ints]:  # fmt: skip
+) -> tuple[Ints, Ints]:
     """Pairs of the device's pulses `first` to `last` that the line brings nearest to each other."""
     part = x[first:last]
     predicted = part + level + slope * (part - centre)

@@ -414,10 +414,12 @@ def _limits(clock: DeviceClock, timing: Timing) -> dict[str, Any]:
 def _by_exposures(begins: I64, streams: SyncStreams, timing: Timing) -> DeviceSync:
     """The camera runs by itself; the box stamped every exposure."""
     fit = fit_numbered(
-        begins, streams.frame_number, streams.exposures,
+        begins,
+        streams.frame_number,
+        streams.exposures,
         **_limits(timing.frame_camera, timing),
         reference_resolution_ns=timing.sync_box.resolution_us * 1e3,
-    )  # fmt: skip
+    )
     return DeviceSync(timing.frames, fit.map, fit.uncertainty_ns, fit)
 
 

@@ -77,8 +77,9 @@ def references_of(recording: Recording, label: TrialLabel) -> References:
     """
     found: dict[Name, OnsetReference] = {}
     rules: dict[Name, RuleOnsets | None] = {
-        "paper": label.paper, "change_point": label.change_point
-    }  # fmt: skip
+        "paper": label.paper,
+        "change_point": label.change_point,
+    }
     for name, onsets in rules.items():
         if label.rule == name:
             slip = slip_of(label.incipient_ns, label.gross_ns, label.end_ns)

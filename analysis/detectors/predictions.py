@@ -188,13 +188,15 @@ def predict_trials(
             step,
             [
                 TrialWork(
-                    item.recording, item.campaign, item.key,
+                    item.recording,
+                    item.campaign,
+                    item.key,
                     _Inference(content, windows, item.stride_ms, item.stateful, threads),
                 )
                 for item in requests
                 if item.step == step
             ],
-        )  # fmt: skip
+        )
         if work:
             keep(step, work, _infer)
         made += len(work)

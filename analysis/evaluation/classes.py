@@ -114,10 +114,11 @@ def evaluate_classes(job: ClassJob, parts: Mapping[str, SampleSet]) -> None:
         raise StoreError("there are no test samples; import more trials, or change the split")
     states = job.labels.states(job.campaigns)
     result = ClassEvaluation(
-        version=VERSION, seed=job.model.seed,
+        version=VERSION,
+        seed=job.model.seed,
         reviewed=None if states is None else {str(name): n for name, n in states.items()},
         scores=_scores(job, parts),
-    )  # fmt: skip
+    )
     Derived.of(job.labels.store, STEP).write(NAME, job.key, result)
 
 
@@ -151,17 +152,22 @@ def _scores(job: ClassJob, parts: Mapping[str, SampleSet]) -> ClassScores:
         by_length=by_length(fitted, test),
         wrong=_wrong(job.classes, counts, y, trial, known, hits),
         seeds=seed_scores(
-            job.models, job.model, y, margin,
+            job.models,
+            job.model,
+            y,
+            margin,
             lambda model: training.predict_counts(model_file.load(model.path), test.windows),
         ),
         work=synaptic.count_work(fitted, test.windows),
         beside=_beside(job.classes, parts, counts),
         windows=_part_numbers({name: len(part) for name, part in parts.items()}),
-        recordings=_part_numbers({
-            split: sum(1 for item in job.campaigns for _ in item.of_split(split))
-            for split in SPLITS
-        }),
-    )  # fmt: skip
+        recordings=_part_numbers(
+            {
+                split: sum(1 for item in job.campaigns for _ in item.of_split(split))
+                for split in SPLITS
+            }
+        ),
+    )
 
 
 def _part_numbers(numbers: Mapping[str, int]) -> PartTrials:
@@ -201,14 +207,20 @@ def _wrong(
     for k in np.flatnonzero(called != true).tolist():
         item, planned, _ = known[of[k]]
         there = (trial == of[k]) & (y == true[k])
-        rows.append((
-            (int(true[k]), int(of[k])),
-            WrongTrial(
-                campaign=item.name, trial=planned.id, condition=item.describe(planned),
-                true=classes[true[k]], called=None if called[k] < 0 else classes[called[k]],
-                windows=int(there.sum()), right=int(hits[there].sum()),
-            ),
-        ))  # fmt: skip
+        rows.append(
+            (
+                (int(true[k]), int(of[k])),
+                WrongTrial(
+                    campaign=item.name,
+                    trial=planned.id,
+                    condition=item.describe(planned),
+                    true=classes[true[k]],
+                    called=None if called[k] < 0 else classes[called[k]],
+                    windows=int(there.sum()),
+                    right=int(hits[there].sum()),
+                ),
+            )
+        )
     return tuple(row for _, row in sorted(rows, key=lambda pair: pair[0]))
 
 

@@ -79,17 +79,25 @@ def wanted_marker_models(labels: Labels, campaigns: list[Collected]) -> list[Mod
                 inputs.append([item.name, trial.id, trial.split, labels.key(item, recording)])
     settings = used[0].settings
     fixed = [
-        marker_net.KIND, displacement.VERSION, FRAMES, HIDDEN, EPOCHS, BATCH,
-        marker_net.LEARNING_RATE, marker_net.RIDGE,
+        marker_net.KIND,
+        displacement.VERSION,
+        FRAMES,
+        HIDDEN,
+        EPOCHS,
+        BATCH,
+        marker_net.LEARNING_RATE,
+        marker_net.RIDGE,
         [item.settings.samples.per_class for item in used],
-    ]  # fmt: skip
+    ]
     return [
         Model(
-            seed, labels.store.folder / "models" / f"markers-seed{seed}.model",
-            make_key("train markers", marker_net.VERSION, inputs, [*fixed, seed]), settings,
+            seed,
+            labels.store.folder / "models" / f"markers-seed{seed}.model",
+            make_key("train markers", marker_net.VERSION, inputs, [*fixed, seed]),
+            settings,
         )
         for seed in settings.training.seeds
-    ]  # fmt: skip
+    ]
 
 
 def train_marker_model(model: Model, train: MarkerSamples, validation: MarkerSamples) -> MarkerNet:
@@ -107,13 +115,14 @@ def train_marker_model(model: Model, train: MarkerSamples, validation: MarkerSam
     points = net.points(validation.x)
     found = metrics.accuracy(points, validation.y, MARGIN)
     info = TrainedModel(
-        key=model.key, seed=model.seed,
+        key=model.key,
+        seed=model.seed,
         samples=ModelSamples(train=len(train), validation=len(validation)),
         chosen_epoch=net.chosen_epoch,
         validation=ValidationAccuracy(
             argmax=found.argmax, strict=found.strict, margin=found.margin
         ),
-    )  # fmt: skip
+    )
     write_json(model.info_path, info.to_json())
     return net
 
@@ -154,9 +163,12 @@ def make_marker_job(
         change = {
             "smoothing": SMOOTHING if smoothing is None else smoothing,
             "margin": MARGIN if margin is None else margin,
-            "choose": by if chosen else "protocol", "stride_ms": None, "compare": None,
-            "smoothing_grid": SMOOTHINGS, "margin_grid": MARGINS,
-        }  # fmt: skip
+            "choose": by if chosen else "protocol",
+            "stride_ms": None,
+            "compare": None,
+            "smoothing_grid": SMOOTHINGS,
+            "margin_grid": MARGINS,
+        }
         detection[item.name] = Detection.model_validate({**said.model_dump(), **change})
         for trial, recording in item.trials:
             if not labels.fresh(item, recording):
@@ -193,18 +205,26 @@ def evaluate_markers(job: MarkerJob) -> None:
     rows = of_seeds[job.model.seed]
     states = labels.states(campaigns)
     result = Evaluation(
-        format=FORMAT, seed=job.model.seed,
+        format=FORMAT,
+        seed=job.model.seed,
         windows=_score_windows(job, net, detection[kinematic[0].name].margin),
-        trials=tuple(rows), experiments=summaries(rows, of_seeds, job.model.seed),
+        trials=tuple(rows),
+        experiments=summaries(rows, of_seeds, job.model.seed),
         label_error_ms=label_errors(labels.store, campaigns),
         label_rules_ms=rules_compared(labels.store, campaigns),
         reviewed=None if states is None else {str(name): n for name, n in states.items()},
-        detection=detection, choices=choices, detectors=None,
+        detection=detection,
+        choices=choices,
+        detectors=None,
         classifier=MarkerClassifier(
-            title=net.title, frames=FRAMES, markers=net.markers, points=POINTS, weights=net.size,
+            title=net.title,
+            frames=FRAMES,
+            markers=net.markers,
+            points=POINTS,
+            weights=net.size,
             multiply_adds=net.multiply_adds,
         ),
-    )  # fmt: skip
+    )
     Derived.of(labels.store, STEP).write(NAME, job.key, result)
 
 
@@ -262,36 +282,40 @@ def _score_windows(job: MarkerJob, net: MarkerNet, margin: float) -> WindowScore
     by_tenth, no_slip = phases(labels, known, test.newest_ns, test.y, trial, hits)
     kept = Derived.of(labels.store, WINDOWS)
     kept.write(
-        WINDOWS_NAME, job.key, {},
+        WINDOWS_NAME,
+        job.key,
+        {},
         {
-            "counts": points, "y": test.y, "trial": trial,
+            "counts": points,
+            "y": test.y,
+            "trial": trial,
             "trials": np.array(test.trials, np.str_).reshape(-1, 2),
         },
-    )  # fmt: skip
+    )
     cheap = _cheap(train, test)
     return WindowScores(
         **dict(metrics.score(points, test.y, margin)),
         interval=window_groups.share(hits, trial),
         reliability=tuple(reliability.by_lead(points, test.y, trial)),
-        calibration=reliability.calibration(
-            points, test.y, net.points(validation.x), validation.y
-        ),
+        calibration=reliability.calibration(points, test.y, net.points(validation.x), validation.y),
         by_factor=window_groups.by_factor(
             hits, trial, {k: item.describe(of) for k, (item, of, _) in enumerate(known)}
         ),
-        by_tenth=by_tenth, no_slip=no_slip,
-        by_trial=tuple(
-            window_groups.by_trial(points, test.y, trial, lambda k: named(known[k]))
-        ),
+        by_tenth=by_tenth,
+        no_slip=no_slip,
+        by_trial=tuple(window_groups.by_trial(points, test.y, trial, lambda k: named(known[k]))),
         seeds=seed_scores(
-            job.models, job.model, test.y, margin,
+            job.models,
+            job.model,
+            test.y,
+            margin,
             lambda model: marker_net.load(model.path).points(test.x),
         ),
         work=None,
         baselines={name: metrics.accuracy(votes, test.y).argmax for name, votes in cheap.items()},
         beside={name: compared(votes, points, test.y, trial) for name, votes in cheap.items()},
         samples=SampleCounts(train=len(train), test=len(test)),
-    )  # fmt: skip
+    )
 
 
 def _cheap(train: MarkerSamples, test: MarkerSamples) -> dict[str, npt.NDArray[Any]]:

@@ -117,23 +117,34 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
                 return _described(path.with_suffix(suffix), engine)
         reason = str(error).removeprefix(f"{path}: ")
         raise InputError(
-            path, "", None, f"{reason}; a state_dict needs a description beside it, such as "
+            path,
+            "",
+            None,
+            f"{reason}; a state_dict needs a description beside it, such as "
             f"{path.with_suffix('.yaml').name} (docs/models.md)",
-        ) from None  # fmt: skip
+        ) from None
     fitted.check_slip(path, "an evaluation of slip")
     return OtherNetwork(
-        f"model-{path.stem}", path.name, content, None, fitted.windows,
-        fitted.network.outputs_per_class, engine or "fast", exact=True,
-    )  # fmt: skip
+        f"model-{path.stem}",
+        path.name,
+        content,
+        None,
+        fitted.windows,
+        fitted.network.outputs_per_class,
+        engine or "fast",
+        exact=True,
+    )
 
 
 def _described(path: Path, engine: Engines | None) -> OtherNetwork:
     model = load_external(path)
     if model.description.classes != CLASSES:
         raise InputError(
-            path, "classes", list(model.description.classes),
+            path,
+            "classes",
+            list(model.description.classes),
             f"must be {', '.join(CLASSES)} for an evaluation of slip",
-        )  # fmt: skip
+        )
     exact = model.on_grid()
     if engine == "fast":
         try:
@@ -142,10 +153,15 @@ def _described(path: Path, engine: Engines | None) -> OtherNetwork:
             reason = f"cannot run {path}: {error}; use sinabs"
             raise InputError("--engine", "", engine, reason) from None
     return OtherNetwork(
-        f"model-{path.stem}", Path(model.description.weights).name, model.weights,
-        model.description, model.windows, model.outputs_per_class,
-        engine or ("fast" if exact else "sinabs"), exact,
-    )  # fmt: skip
+        f"model-{path.stem}",
+        Path(model.description.weights).name,
+        model.weights,
+        model.description,
+        model.windows,
+        model.outputs_per_class,
+        engine or ("fast" if exact else "sinabs"),
+        exact,
+    )
 
 
 class About(TypedDict):
@@ -177,9 +193,11 @@ class Judgement:
         network = self.network
         rules = {name: rule.model_dump(mode="json") for name, rule in self.rules.items()}
         return make_key(
-            STEP, VERSION,
-            [network.key, self.data_key, network.title, self.about, window_scores.VERSION], rules,
-        )  # fmt: skip
+            STEP,
+            VERSION,
+            [network.key, self.data_key, network.title, self.about, window_scores.VERSION],
+            rules,
+        )
 
     @property
     def fresh(self) -> bool:
@@ -201,10 +219,11 @@ class Judgement:
             for trial, recording in item.of_split("test"):
                 label = self.labels.read(item, recording) if item.name in kinematic else None
                 key = make_key(
-                    STEP, VERSION,
+                    STEP,
+                    VERSION,
                     [network.key, recording.checksum, self.labels.key(item, recording)],
                     [network.windows.model_dump(mode="json"), samples.model_dump(), stride],
-                )  # fmt: skip
+                )
                 seed = hash_integer("samples", trial.id)
                 judging = _Judging(network, label, samples, seed, stride, threads)
                 work.append(TrialWork(recording, item.name, key, judging))
@@ -247,9 +266,15 @@ def comparison_judgements(labels: Labels, campaigns: list[Collected]) -> list[Ju
             raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
         settings = model.settings
         network = OtherNetwork(
-            f"preset-{settings.preset}", f"preset: {settings.preset}", model.path.read_bytes(),
-            None, settings.windows, settings.network.outputs_per_class, "fast", exact=True,
-        )  # fmt: skip
+            f"preset-{settings.preset}",
+            f"preset: {settings.preset}",
+            model.path.read_bytes(),
+            None,
+            settings.windows,
+            settings.network.outputs_per_class,
+            "fast",
+            exact=True,
+        )
         rules = {
             item.name: settings.detection.model_copy(
                 update={"false_early_ms": item.settings.detection.false_early_ms}

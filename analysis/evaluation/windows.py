@@ -73,12 +73,16 @@ def score_windows(
     known = [found[name] for name in test.trials]
     hits = window_groups.strict_hits(counts, test.y)
     Derived.of(labels.store, STEP).write(
-        NAME, key, {},
+        NAME,
+        key,
+        {},
         {
-            "counts": counts, "y": test.y, "trial": trial,
+            "counts": counts,
+            "y": test.y,
+            "trial": trial,
             "trials": np.array(test.trials, np.str_).reshape(-1, 2),
         },
-    )  # fmt: skip
+    )
     cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
     middle = test.start_ns + settings.windows.length_ms * 500_000
     by_tenth, no_slip = phases(labels, known, middle, test.y, trial, hits)

@@ -50,9 +50,13 @@ def doubts(
 
 
 def unseen(
-    frame_ns: Ints, displacement: Floats, onsets: Onsets, centre: int, not_before_ns: int,
+    frame_ns: Ints,
+    displacement: Floats,
+    onsets: Onsets,
+    centre: int,
+    not_before_ns: int,
     motion_ns: int | None = None,
-) -> Doubts:  # fmt: skip
+) -> Doubts:
     """Return the onsets that hidden, lost or never seen markers could have changed.
 
     A marker that is out of sight and comes back where it was has not slipped; one that comes back
@@ -98,9 +102,14 @@ def unseen(
 
 
 def uncertain(
-    frame_ns: Ints, displacement: Floats, sigma: Floats, onsets: Onsets, centre: int,
-    threshold_px: float, not_before_ns: int,
-) -> Doubts:  # fmt: skip
+    frame_ns: Ints,
+    displacement: Floats,
+    sigma: Floats,
+    onsets: Onsets,
+    centre: int,
+    threshold_px: float,
+    not_before_ns: int,
+) -> Doubts:
     """Return the onsets whose threshold crossing the standard deviations leave ambiguous.
 
     Args:

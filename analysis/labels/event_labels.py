@@ -126,9 +126,17 @@ def onsets_by_events(recording: Recording, settings: Labelling) -> EventOnsets:
     moved[tracks.lost] = np.nan
     found = slips(way, moved, tracks.sigma, int(before), tracks.backlash_px)
     return _onsets(
-        found, tracks, edges_ns[1:], way, moved, settings, scale, centre, start_ns,
+        found,
+        tracks,
+        edges_ns[1:],
+        way,
+        moved,
+        settings,
+        scale,
+        centre,
+        start_ns,
         twists=recording.motion_phase == "twist",
-    )  # fmt: skip
+    )
 
 
 def bases(recording: Recording, layout_mm: F64, t_ns: I64, start_ns: int) -> F64:
@@ -181,9 +189,18 @@ def _directions(base: F64, way: F64) -> F64:
 
 
 def _onsets(
-    found: Slips, tracks: EventTracks, t_ns: I64, way: F64, moved: F64, settings: Labelling,
-    scale: float, centre: int, start_ns: int, *, twists: bool,
-) -> EventOnsets:  # fmt: skip
+    found: Slips,
+    tracks: EventTracks,
+    t_ns: I64,
+    way: F64,
+    moved: F64,
+    settings: Labelling,
+    scale: float,
+    centre: int,
+    start_ns: int,
+    *,
+    twists: bool,
+) -> EventOnsets:
     """Apply both rules to the slips."""
     moved_px, sigma = np.abs(found.distance_mm) * scale, found.sigma_mm * scale
     still = int(np.searchsorted(t_ns, start_ns))
@@ -207,31 +224,44 @@ def _onsets(
     )
 
     def doubts(onsets: Onsets) -> Doubts:
-        return (
-            held.or_else(unseen(t_ns, moved_px, onsets, centre, start_ns))
-            .or_else(_near_lost(onsets, lost_ns))
-        )  # fmt: skip
+        return held.or_else(unseen(t_ns, moved_px, onsets, centre, start_ns)).or_else(
+            _near_lost(onsets, lost_ns)
+        )
 
     return EventOnsets(
-        t_ns, moved_px, sigma, hold, paper, doubts(paper).or_else(_wide(intervals)), intervals,
-        slip_times, doubts(slip_times.onsets).or_else(slip_times.doubts()), tracks,
-    )  # fmt: skip
+        t_ns,
+        moved_px,
+        sigma,
+        hold,
+        paper,
+        doubts(paper).or_else(_wide(intervals)),
+        intervals,
+        slip_times,
+        doubts(slip_times.onsets).or_else(slip_times.doubts()),
+        tracks,
+    )
 
 
 def _times(t_ns: I64, way: F64, places_mm: tuple[float, ...]) -> list[int]:
     """Return the times at which a base passed some places, -1 for one that is unknown."""
     forwards = np.maximum.accumulate(way)
     return [
-        NO_ONSET if np.isnan(place) else round(float(np.interp(place, forwards, t_ns - t_ns[0])))
-        + int(t_ns[0])
+        NO_ONSET
+        if np.isnan(place)
+        else round(float(np.interp(place, forwards, t_ns - t_ns[0]))) + int(t_ns[0])
         for place in places_mm
-    ]  # fmt: skip
+    ]
 
 
 def crossing_intervals(
-    t_ns: I64, moved_px: F64, sigma_px: F64, paper: Onsets, centre: int, threshold_px: float,
+    t_ns: I64,
+    moved_px: F64,
+    sigma_px: F64,
+    paper: Onsets,
+    centre: int,
+    threshold_px: float,
     start_ns: int,
-) -> tuple[Interval | None, Interval | None]:  # fmt: skip
+) -> tuple[Interval | None, Interval | None]:
     """Return when the displacements, give or take two deviations, cross the threshold.
 
     Args:
@@ -282,6 +312,14 @@ def _refused(t_ns: I64, markers: int, centre: int, reason: str) -> EventOnsets:
     unknown = np.full((len(t_ns), markers), np.nan)
     doubts = Doubts(reason, reason)
     return EventOnsets(
-        t_ns, unknown, unknown, np.full(markers, np.nan), Onsets(None, None, None, none), doubts,
-        (None, None), SlipTimes(none, none, none, centre), doubts, None,
-    )  # fmt: skip
+        t_ns,
+        unknown,
+        unknown,
+        np.full(markers, np.nan),
+        Onsets(None, None, None, none),
+        doubts,
+        (None, None),
+        SlipTimes(none, none, none, centre),
+        doubts,
+        None,
+    )

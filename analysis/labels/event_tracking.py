@@ -268,9 +268,19 @@ def _offset(*sums: float) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True)
 def _follow(
-    t_us: Any, column: Any, row: Any, polarity: Any, edges_us: Any, lost: Any, xy: Any,
-    radius: Any, contrast: float, start_px: float, drift_px: float, scale: float,
-) -> Any:  # fmt: skip
+    t_us: Any,
+    column: Any,
+    row: Any,
+    polarity: Any,
+    edges_us: Any,
+    lost: Any,
+    xy: Any,
+    radius: Any,
+    contrast: float,
+    start_px: float,
+    drift_px: float,
+    scale: float,
+) -> Any:
     """Follow m discs over n slices.
 
     Args:

@@ -31,18 +31,26 @@ def given_label(recording: Recording) -> TrialLabel:
             for span in given.spans
         )
         return TrialLabel(
-            rule="given", source="given", incipient_ns=None, gross_ns=None, end_ns=end_ns,
+            rule="given",
+            source="given",
+            incipient_ns=None,
+            gross_ns=None,
+            end_ns=end_ns,
             spans=spans,
-        )  # fmt: skip
+        )
     incipient, gross = (None, None) if given is None else (given.incipient_ns, given.gross_ns)
     gross = None if incipient is None else gross  # without the first slip nothing is made of it
     label = TrialLabel(
-        rule="given", source="given", incipient_ns=incipient, gross_ns=gross, end_ns=end_ns,
+        rule="given",
+        source="given",
+        incipient_ns=incipient,
+        gross_ns=gross,
+        end_ns=end_ns,
         doubts=OnsetDoubts(
             incipient=UNKNOWN if incipient is None else None,
             gross=UNKNOWN if gross is None else None,
         ),
-    )  # fmt: skip
+    )
     if given is None or given.uncertainty_ns is None:
         return label
     error = round(given.uncertainty_ns)

@@ -125,8 +125,9 @@ def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Hold]:
         known = [label for label in known if label.references is not None]
         if not known:
             continue
-        most = [max((px for px in label.hold_slip_px if px is not None), default=0.0)
-                for label in known]  # fmt: skip
+        most = [
+            max((px for px in label.hold_slip_px if px is not None), default=0.0) for label in known
+        ]
         limit = item.settings.labelling.hold_slip_px
         apart: dict[str, list[float]] = {kind: [] for kind in KINDS}
         for label in known:

@@ -360,9 +360,14 @@ def label_places(
         rest_ns = rest_time(frame_ns[moving], plate[moving], settings.threshold_px, MAX_UNSEEN_NS)
     # change points are found near the slip, and so count from just before the motion
     slips = slip_times(
-        frame_ns, found.counted_from("hold_end"), found.sigma, centre, start_ns, exposure_ns,
+        frame_ns,
+        found.counted_from("hold_end"),
+        found.sigma,
+        centre,
+        start_ns,
+        exposure_ns,
         settings.threshold_px,
-    )  # fmt: skip
+    )
     moved = references["hold_end"].displacement_px
     slip_doubts = (
         held.or_else(unseen(frame_ns, moved, slips.onsets, centre, start_ns))

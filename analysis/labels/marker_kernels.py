@@ -161,9 +161,19 @@ def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def _one(
-    frame: Any, xy: Any, k: int, known: Any, radius: float, margin: float, found: Any, area: float,
-    tolerance: float, cuts: Any, c: Any, y_sums: Any,
-) -> Any:  # fmt: skip
+    frame: Any,
+    xy: Any,
+    k: int,
+    known: Any,
+    radius: float,
+    margin: float,
+    found: Any,
+    area: float,
+    tolerance: float,
+    cuts: Any,
+    c: Any,
+    y_sums: Any,
+) -> Any:
     """Marker k from its prediction: column, row, state; `found[k]` is filled."""
     height, width = frame.shape
     reach = radius + margin
@@ -228,9 +238,16 @@ def _one(
 
 @njit(cache=True, nogil=True)
 def follow(
-    frame: Any, xy: Any, selected: Any, radius: float, margin: float, area: Any, tolerance: float,
-    state: Any, found: Any,
-) -> Any:  # fmt: skip
+    frame: Any,
+    xy: Any,
+    selected: Any,
+    radius: float,
+    margin: float,
+    area: Any,
+    tolerance: float,
+    state: Any,
+    found: Any,
+) -> Any:
     """Move the markers `selected` of `xy` from their predictions to their centroids.
 
     Args:

@@ -227,9 +227,16 @@ class MarkerTracker:
 
     def _look(self, frame: Frame, selected: NDArray[np.bool_], tolerance: float) -> int:
         lost, self._whole = follow(
-            frame, self._xy, selected, self._radius, self._margin, self._area, tolerance,
-            self._state, self._measured,
-        )  # fmt: skip
+            frame,
+            self._xy,
+            selected,
+            self._radius,
+            self._margin,
+            self._area,
+            tolerance,
+            self._state,
+            self._measured,
+        )
         return int(lost)
 
     def _recover(self, frame: Frame, i: int) -> None:

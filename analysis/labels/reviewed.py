@@ -23,8 +23,11 @@ VERSION = 1
 State = Literal["open", "accepted", "adjusted", "rejected", "stale"]
 STATES: tuple[State, ...] = ("open", "accepted", "adjusted", "rejected", "stale")
 _AFTER: dict[str, State] = {
-    "accept": "accepted", "adjust": "adjusted", "reject": "rejected", "reopen": "open"
-}  # fmt: skip
+    "accept": "accepted",
+    "adjust": "adjusted",
+    "reject": "rejected",
+    "reopen": "open",
+}
 
 
 def label_key(recording: Recording, settings: Labelling) -> str:

@@ -162,8 +162,13 @@ def by_trial(
         campaign, name, condition = named(number)
         rows.append(
             TrialWindows(
-                campaign=campaign, trial=name, condition=condition, n=int(there.sum()),
-                errors=int(wrong.sum()), strict=float(1 - wrong.mean()), taken=taken,
+                campaign=campaign,
+                trial=name,
+                condition=condition,
+                n=int(there.sum()),
+                errors=int(wrong.sum()),
+                strict=float(1 - wrong.mean()),
+                taken=taken,
             )
-        )  # fmt: skip
+        )
     return sorted(rows, key=lambda row: row.strict)

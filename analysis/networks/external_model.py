@@ -285,14 +285,17 @@ class _Entries:
         found = self.perhaps(entry)
         if found is None:
             fit = [key for key, value in self._left.items() if value.ndim == dimensions]
-            why = f"is taken twice, again by {layer}" if entry in self._all else (
-                f"is missing, and {layer} takes it"
-            )  # fmt: skip
+            why = (
+                f"is taken twice, again by {layer}"
+                if entry in self._all
+                else (f"is missing, and {layer} takes it")
+            )
             raise EntryError(
-                entry, None,
+                entry,
+                None,
                 f"{why}; entries of {dimensions} dimensions that no layer before it takes: "
                 f"{', '.join(sorted(fit)) or 'none'}",
-            )  # fmt: skip
+            )
         if found.ndim != dimensions or not found.numel():
             sizes = "(outputs, inputs)" if dimensions == 2 else "(outputs, inputs, height, width)"
             raise EntryError(entry, found, f"{layer} takes weights of the shape {sizes}")
@@ -303,10 +306,11 @@ class _Entries:
         found = self.perhaps(f"{name}.bias")
         if found is not None and found.shape != weight.shape[:1]:
             raise EntryError(
-                f"{name}.bias", found,
+                f"{name}.bias",
+                found,
                 f"must have the shape {list(weight.shape[:1])}, one for each output of "
                 f"{name}.weight {list(weight.shape)}",
-            )  # fmt: skip
+            )
         return found
 
     def perhaps(self, entry: str) -> torch.Tensor | None:
@@ -315,9 +319,11 @@ class _Entries:
         if found is not None and not found.isfinite().all():
             wrong = int((~found.isfinite()).sum())
             raise EntryError(
-                entry, found, f"{wrong} of its {found.numel()} values are NaN, infinite, or beyond "
+                entry,
+                found,
+                f"{wrong} of its {found.numel()} values are NaN, infinite, or beyond "
                 "32-bit floats; all must be finite",
-            )  # fmt: skip
+            )
         return found
 
     def refuse_surplus(self) -> None:
@@ -325,9 +331,11 @@ class _Entries:
         for entry, tensor in self._left.items():
             more = f", nor {len(self._left) - 1} more" if len(self._left) > 1 else ""
             raise EntryError(
-                entry, tensor, f"no layer of the description takes it{more}; describe the layer, "
+                entry,
+                tensor,
+                f"no layer of the description takes it{more}; describe the layer, "
                 "or leave the entry out of the file",
-            )  # fmt: skip
+            )
 
 
 def _assemble(description: Description, tensors: dict[str, torch.Tensor]) -> SinabsNet:
@@ -376,13 +384,20 @@ def _module(
             raise _unfit(layer.name, weight, f"{key} is given {shape[0]} channels, {list(shape)}")
         outer = min(shape[1:]) + 2 * layer.padding
         if max(weight.shape[2:]) > outer:
-            raise KeyedError(f"{key}.padding", layer.padding, f"leaves {outer} cells for a kernel "
-                             f"of {max(weight.shape[2:])}")  # fmt: skip
+            raise KeyedError(
+                f"{key}.padding",
+                layer.padding,
+                f"leaves {outer} cells for a kernel of {max(weight.shape[2:])}",
+            )
         bias = entries.bias(layer.name, weight)
         made = nn.Conv2d(
-            weight.shape[1], weight.shape[0], (weight.shape[2], weight.shape[3]),
-            stride=layer.stride, padding=layer.padding, bias=bias is not None,
-        )  # fmt: skip
+            weight.shape[1],
+            weight.shape[0],
+            (weight.shape[2], weight.shape[3]),
+            stride=layer.stride,
+            padding=layer.padding,
+            bias=bias is not None,
+        )
         return _filled(made, weight, bias)
     if layer.size > min(shape[1:]):
         raise KeyedError(f"{key}.size", layer.size, f"must not exceed the {min(shape[1:])} cells")
@@ -444,8 +459,17 @@ def _neurons(layer: Neurons, key: str, entries: _Entries, steps: int) -> nn.Modu
 
 def _as_ours(description: Description, tensors: dict[str, torch.Tensor]) -> nn.Sequential:
     made: list[Any] = list(_assemble(description, tensors).net)
-    order = (nn.Conv2d, IAFSqueeze, nn.Conv2d, IAFSqueeze, nn.Flatten, nn.Linear, IAFSqueeze,
-             nn.Linear, IAFSqueeze)  # fmt: skip
+    order = (
+        nn.Conv2d,
+        IAFSqueeze,
+        nn.Conv2d,
+        IAFSqueeze,
+        nn.Flatten,
+        nn.Linear,
+        IAFSqueeze,
+        nn.Linear,
+        IAFSqueeze,
+    )
     if tuple(map(type, made)) != order:
         raise ValueError("the layers are not two convolutions and two fully connected ones")
     classes = description.classes

@@ -124,9 +124,12 @@ def fit(train: MarkerSamples, validation: MarkerSamples, seed: int) -> MarkerNet
         raise ValueError("no validation samples; collect more trials")
     z = _inputs(train.x)
     model = MLPClassifier(
-        (HIDDEN,), alpha=RIDGE, batch_size=min(BATCH, len(z)), learning_rate_init=LEARNING_RATE,
+        (HIDDEN,),
+        alpha=RIDGE,
+        batch_size=min(BATCH, len(z)),
+        learning_rate_init=LEARNING_RATE,
         random_state=seed,
-    )  # fmt: skip
+    )
     history: list[Epoch] = []
     best: tuple[tuple[float, float], MarkerNet] | None = None
     with threadpool_limits(1), warnings.catch_warnings():
@@ -134,18 +137,25 @@ def fit(train: MarkerSamples, validation: MarkerSamples, seed: int) -> MarkerNet
         for number in range(1, EPOCHS + 1):
             model.partial_fit(z, train.y, classes=np.arange(len(CLASSES)))
             net = MarkerNet(
-                _pair(model.coefs_), _pair(model.intercepts_), train.x.shape[2],
-                seed, (), number,
-            )  # fmt: skip
+                _pair(model.coefs_),
+                _pair(model.intercepts_),
+                train.x.shape[2],
+                seed,
+                (),
+                number,
+            )
             seen, held = net.probabilities(train.x), net.probabilities(validation.x)
             known = metrics.accuracy(held, validation.y)
             history.append(
                 Epoch(
-                    number, _loss(seen, train.y), _loss(held, validation.y),
-                    metrics.accuracy(seen, train.y).argmax or 0.0, known.argmax or 0.0,
+                    number,
+                    _loss(seen, train.y),
+                    _loss(held, validation.y),
+                    metrics.accuracy(seen, train.y).argmax or 0.0,
+                    known.argmax or 0.0,
                     known.strict or 0.0,
                 )
-            )  # fmt: skip
+            )
             rank = (history[-1].val_strict, -history[-1].val_loss)
             if best is None or rank > best[0]:
                 best = rank, net
@@ -172,15 +182,22 @@ def _loss(probabilities: F64, labels: I64) -> float:
 def save(path: Path, net: MarkerNet) -> None:
     """Write a model file: whole or not at all, and the same bytes for the same model."""
     said = {
-        "format": FORMAT, "kind": KIND, "classes": list(CLASSES), "frames": FRAMES,
-        "markers": net.markers, "seed": net.seed, "chosen_epoch": net.chosen_epoch,
+        "format": FORMAT,
+        "kind": KIND,
+        "classes": list(CLASSES),
+        "frames": FRAMES,
+        "markers": net.markers,
+        "seed": net.seed,
+        "chosen_epoch": net.chosen_epoch,
         "history": [asdict(epoch) for epoch in net.history],
-    }  # fmt: skip
+    }
     arrays: Arrays = {
-        "weights_0": net.weights[0], "weights_1": net.weights[1],
-        "biases_0": net.biases[0], "biases_1": net.biases[1],
+        "weights_0": net.weights[0],
+        "weights_1": net.weights[1],
+        "biases_0": net.biases[0],
+        "biases_1": net.biases[1],
         "said": np.frombuffer(json.dumps(said).encode(), np.uint8),
-    }  # fmt: skip
+    }
     write_arrays(path, arrays)
 
 
@@ -200,9 +217,12 @@ def load(path: Path) -> MarkerNet:
             raise ValueError(f"frames = {said['frames']}: must be {FRAMES}")
         net = MarkerNet(
             (arrays["weights_0"], arrays["weights_1"]),
-            (arrays["biases_0"], arrays["biases_1"]), said["markers"], said["seed"],
-            tuple(Epoch(**epoch) for epoch in said["history"]), said["chosen_epoch"],
-        )  # fmt: skip
+            (arrays["biases_0"], arrays["biases_1"]),
+            said["markers"],
+            said["seed"],
+            tuple(Epoch(**epoch) for epoch in said["history"]),
+            said["chosen_epoch"],
+        )
         net.probabilities(np.zeros((1, FRAMES, net.markers, 2), np.float32))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not a marker model of this program: {error}") from error

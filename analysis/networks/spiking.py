@@ -76,9 +76,20 @@ class Engine:
         def some(begin: int) -> None:
             state, scratch = self._borrow()
             spiking_kernels.windows(
-                x.cell, x.count, x.offsets, begin, min(begin + CHUNK, len(x)), self.steps,
-                self._layers, self.threshold, self._layout.rest, state, scratch, out, fired,
-            )  # fmt: skip
+                x.cell,
+                x.count,
+                x.offsets,
+                begin,
+                min(begin + CHUNK, len(x)),
+                self.steps,
+                self._layers,
+                self.threshold,
+                self._layout.rest,
+                state,
+                scratch,
+                out,
+                fired,
+            )
             self._idle.append((state, scratch))
 
         side_by_side(some, range(0, len(x), CHUNK), threads)
@@ -131,9 +142,16 @@ class Stream:
             raise ValueError(f"a step is {plane.dtype} {plane.shape}; uint8 {engine.shape[1:]}")
         cell = np.flatnonzero(plane).astype(np.uint32)
         n = spiking_kernels.step(
-            cell, plane.ravel()[cell], 0, len(cell), engine._layers, engine.threshold,
-            self._state, self._scratch, self._fired,
-        )  # fmt: skip
+            cell,
+            plane.ravel()[cell],
+            0,
+            len(cell),
+            engine._layers,
+            engine.threshold,
+            self._state,
+            self._scratch,
+            self._fired,
+        )
         classes = self._scratch[1][-1][:n] % np.uint64(engine.classes)
         return np.bincount(classes.astype(np.int64), minlength=engine.classes).astype(np.uint8)
 
@@ -198,11 +216,25 @@ class Job:
         trainer, x = self._trainer, self._windows
         memory = trainer.borrow()
         loss = spiking_gradients.windows_loss(
-            x.cell, x.count, x.offsets, self._rows, self._labels, self._gain, trainer.steps,
-            trainer.layers, trainer.layout.spans, trainer.back, trainer.constants,
-            trainer.layout.rest, memory[:4], trainer.layout.neurons[-1], memory[4], self.counts,
-            self._fired, self.grads,
-        )  # fmt: skip
+            x.cell,
+            x.count,
+            x.offsets,
+            self._rows,
+            self._labels,
+            self._gain,
+            trainer.steps,
+            trainer.layers,
+            trainer.layout.spans,
+            trainer.back,
+            trainer.constants,
+            trainer.layout.rest,
+            memory[:4],
+            trainer.layout.neurons[-1],
+            memory[4],
+            self.counts,
+            self._fired,
+            self.grads,
+        )
         trainer.give_back(memory)
         return float(loss)
 

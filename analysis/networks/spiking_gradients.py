@@ -35,10 +35,22 @@ _LEAST = np.float32(-80.0)
 
 @njit(cache=True, nogil=True)
 def forward_kept(
-    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, spans: Any,
-    threshold: Any, rest: Any, state: Any, scratch: Any, potentials: Any, lists: Any, ends: Any,
+    cell: Any,
+    count: Any,
+    offsets: Any,
+    row: int,
+    steps: int,
+    layers: Any,
+    spans: Any,
+    threshold: Any,
+    rest: Any,
+    state: Any,
+    scratch: Any,
+    potentials: Any,
+    lists: Any,
+    ends: Any,
     out: Any,
-) -> None:  # fmt: skip
+) -> None:
     """One window forward, with what the way back needs.
 
     Args:
@@ -63,16 +75,27 @@ def forward_kept(
         for k in range(len(state)):
             if k > 0:
                 scatter(
-                    lists[k - 1], ends[k - 1][t], ends[k - 1][t + 1], reach[k], weights[k],
-                    shape[k], currents[k],
-                )  # fmt: skip
+                    lists[k - 1],
+                    ends[k - 1][t],
+                    ends[k - 1][t + 1],
+                    reach[k],
+                    weights[k],
+                    shape[k],
+                    currents[k],
+                )
                 add_bias(bias[k], weights[k], shape[k][3], currents[k])
             n = ends[k][t]
             for i in range(spans[k].shape[0]):
                 n = fire(
-                    currents[k], state[k], potentials[k][t], threshold, spans[k][i, 0],
-                    spans[k][i, 1], lists[k], n,
-                )  # fmt: skip
+                    currents[k],
+                    state[k],
+                    potentials[k][t],
+                    threshold,
+                    spans[k][i, 0],
+                    spans[k][i, 1],
+                    lists[k],
+                    n,
+                )
             ends[k][t + 1] = n
     for e in range(ends[last][steps]):
         out[lists[last][e] % classes] += 1
@@ -172,10 +195,21 @@ def _gather(
 
 @njit(cache=True, nogil=True)
 def backward(
-    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, back: Any,
-    constants: Any, potentials: Any, lists: Any, ends: Any, by_count: Any, planes: Any,
+    cell: Any,
+    count: Any,
+    offsets: Any,
+    row: int,
+    steps: int,
+    layers: Any,
+    back: Any,
+    constants: Any,
+    potentials: Any,
+    lists: Any,
+    ends: Any,
+    by_count: Any,
+    planes: Any,
     grads: Any,
-) -> None:  # fmt: skip
+) -> None:
     """One window back: grows the gradients of the packed weights.
 
     The three layers above the first go back one after the other, each through all steps; the
@@ -209,9 +243,15 @@ def backward(
     for k in range(2, len(grads)):
         for t in range(steps):
             _gather(
-                lists[k - 1], None, ends[k - 1][t], ends[k - 1][t + 1], reach[k], above[k - 1][t],
-                shape[k], grads[k],
-            )  # fmt: skip
+                lists[k - 1],
+                None,
+                ends[k - 1][t],
+                ends[k - 1][t + 1],
+                reach[k],
+                above[k - 1][t],
+                shape[k],
+                grads[k],
+            )
             if bias[k] >= 0:
                 for j in range(_U0, shape[k][3], _LANES):
                     add(grads[k], np.uint64(bias[k]) + j, above[k - 1][t], j)
@@ -232,10 +272,25 @@ def backward(
 
 @njit(cache=True, nogil=True)
 def windows_loss(
-    cell: Any, count: Any, offsets: Any, rows: Any, labels: Any, gain: float, steps: int,
-    layers: Any, spans: Any, back: Any, constants: Any, rest: Any, memory: Any, outputs: int,
-    by_count: Any, out: Any, fired: Any, grads: Any,
-) -> float:  # fmt: skip
+    cell: Any,
+    count: Any,
+    offsets: Any,
+    rows: Any,
+    labels: Any,
+    gain: float,
+    steps: int,
+    layers: Any,
+    spans: Any,
+    back: Any,
+    constants: Any,
+    rest: Any,
+    memory: Any,
+    outputs: int,
+    by_count: Any,
+    out: Any,
+    fired: Any,
+    grads: Any,
+) -> float:
     """Windows forward and back, one after the other: what a window leaves stays in the cache.
 
     Args:
@@ -256,9 +311,22 @@ def windows_loss(
     classes, loss = out.shape[1], 0.0
     for i in range(rows.size):
         forward_kept(
-            cell, count, offsets, rows[i], steps, layers, spans, constants[0], rest, state,
-            scratch, potentials, lists, ends, out[i],
-        )  # fmt: skip
+            cell,
+            count,
+            offsets,
+            rows[i],
+            steps,
+            layers,
+            spans,
+            constants[0],
+            rest,
+            state,
+            scratch,
+            potentials,
+            lists,
+            ends,
+            out[i],
+        )
         for k in range(fired.size):
             fired[k] += np.int64(ends[k][steps])
         most, total = out[i].max(), 0.0
@@ -271,7 +339,19 @@ def windows_loss(
         for k in range(classes, outputs):
             by_count[k] = by_count[k - classes]
         backward(
-            cell, count, offsets, rows[i], steps, layers, back, constants, potentials,
-            lists, ends, by_count, planes, grads,
-        )  # fmt: skip
+            cell,
+            count,
+            offsets,
+            rows[i],
+            steps,
+            layers,
+            back,
+            constants,
+            potentials,
+            lists,
+            ends,
+            by_count,
+            planes,
+            grads,
+        )
     return loss

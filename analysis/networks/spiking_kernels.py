@@ -35,9 +35,15 @@ _LANES, _BLOCK = np.uint64(LANES), np.uint64(BLOCK)
 
 @njit(cache=True, nogil=True)
 def scatter_counts(
-    cell: Any, count: Any, begin: int, end: int, reach: Any, weights: Any, shape: Any,
+    cell: Any,
+    count: Any,
+    begin: int,
+    end: int,
+    reach: Any,
+    weights: Any,
+    shape: Any,
     current: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Currents grow by the weights of each non-empty cell, times its count.
 
     Args:
@@ -109,9 +115,16 @@ def fire(
 
 @njit(cache=True, nogil=True)
 def step(
-    cell: Any, count: Any, begin: int, end: int, layers: Any, threshold: Any, state: Any,
-    scratch: Any, fired_by: Any,
-) -> Any:  # fmt: skip
+    cell: Any,
+    count: Any,
+    begin: int,
+    end: int,
+    layers: Any,
+    threshold: Any,
+    state: Any,
+    scratch: Any,
+    fired_by: Any,
+) -> Any:
     """One time step of the whole network.
 
     Neurons that get nothing are left alone: they stay below the threshold.
@@ -155,18 +168,35 @@ def step(
         scatter(spikes[k - 1], _U0, n, reach[k], weights[k], shape[k], currents[k])
         add_bias(bias[k], weights[k], shape[k][3], currents[k])
         n = fire(
-            currents[k], state[k], None, threshold, _U0, np.uint64(currents[k].size), spikes[k],
+            currents[k],
+            state[k],
+            None,
+            threshold,
             _U0,
-        )  # fmt: skip
+            np.uint64(currents[k].size),
+            spikes[k],
+            _U0,
+        )
         fired_by[k] += np.int64(n)
     return n
 
 
 @njit(cache=True, nogil=True)
 def windows(
-    cell: Any, count: Any, offsets: Any, begin: int, end: int, steps: int, layers: Any,
-    threshold: Any, rest: Any, state: Any, scratch: Any, out: Any, fired_by: Any,
-) -> None:  # fmt: skip
+    cell: Any,
+    count: Any,
+    offsets: Any,
+    begin: int,
+    end: int,
+    steps: int,
+    layers: Any,
+    threshold: Any,
+    rest: Any,
+    state: Any,
+    scratch: Any,
+    out: Any,
+    fired_by: Any,
+) -> None:
     """Output spikes of the windows [begin, end), each from rest.
 
     Args:
@@ -182,9 +212,16 @@ def windows(
             state[k][:] = rest[k]
         for t in range(i * steps, i * steps + steps):
             n = step(
-                cell, count, offsets[t], offsets[t + 1], layers, threshold, state, scratch,
+                cell,
+                count,
+                offsets[t],
+                offsets[t + 1],
+                layers,
+                threshold,
+                state,
+                scratch,
                 fired_by[i],
-            )  # fmt: skip
+            )
             last = scratch[1][len(state) - 1]
             for k in range(n):
                 out[i, last[k] % classes] += 1

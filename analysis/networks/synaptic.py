@@ -80,10 +80,22 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> WindowWo
         row = begin // CHUNK
         for i in range(begin, min(begin + CHUNK, len(x))):
             forward_kept(
-                x.cell, x.count, x.offsets, i, trainer.steps, trainer.layers,
-                trainer.layout.spans, trainer.constants[0], trainer.layout.rest, state, scratch,
-                potentials, lists, ends, out,
-            )  # fmt: skip
+                x.cell,
+                x.count,
+                x.offsets,
+                i,
+                trainer.steps,
+                trainer.layers,
+                trainer.layout.spans,
+                trainer.constants[0],
+                trainer.layout.rest,
+                state,
+                scratch,
+                potentials,
+                lists,
+                ends,
+                out,
+            )
             for k in range(layers):
                 spikes = lists[k][: int(ends[k][-1])]
                 fired[row, k] += len(spikes)

@@ -294,10 +294,12 @@ class Fitted:
         if self.classes != metrics.CLASSES:
             some = ", ".join(self.classes[:4]) + (" ..." if len(self.classes) > 4 else "")
             raise InputError(
-                model, "", None,
+                model,
+                "",
+                None,
                 f"the network tells {len(self.classes)} classes apart ({some}); {purpose} needs "
                 f"one of the classes {', '.join(metrics.CLASSES)}",
-            )  # fmt: skip
+            )
 
 
 def fit(
@@ -362,9 +364,16 @@ def fit(
             loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
             val_counts = Engine(run.trained, windows.cells).counts(val)
             record = epoch_record(
-                epoch, loss, counts, train_y, val_counts, val_y, rates, training.gain,
+                epoch,
+                loss,
+                counts,
+                train_y,
+                val_counts,
+                val_y,
+                rates,
+                training.gain,
                 network.margin,
-            )  # fmt: skip
+            )
             run.keep(record)
             run.seconds.append(time.perf_counter() - started)
             if on_epoch is not None:

@@ -164,9 +164,7 @@ def shuffled_chance(
     test_x, test_y = test
 
     def reached(seed: int, learn_y: IntArray, choose_y: IntArray) -> float:
-        fitted = training.fit(
-            learn[0], learn_y, choose[0], choose_y, network, windows, how, seed
-        )  # fmt: skip
+        fitted = training.fit(learn[0], learn_y, choose[0], choose_y, network, windows, how, seed)
         found = metrics.accuracy(training.predict_counts(fitted, test_x), test_y).argmax
         if found is None:
             raise ValueError("the check of shuffled labels needs test windows")

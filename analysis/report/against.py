@@ -44,8 +44,14 @@ BASES: dict[Basis, str] = {
     "none": "no noise known",
 }
 COLUMNS = (
-    "figure", "here", "there", "difference", "95 % by chance", "more than noise?", "judged by",
-)  # fmt: skip
+    "figure",
+    "here",
+    "there",
+    "difference",
+    "95 % by chance",
+    "more than noise?",
+    "judged by",
+)
 TERMINAL = ("figure", "here", "there", "difference", "more than noise?")
 _TIMES = {
     "latency_incipient_ms": "incipient latency",
@@ -88,9 +94,13 @@ class Change:
 
     @staticmethod
     def of(
-        name: str, unit: str, here: float, there: float, span: tuple[float, float] | None,
+        name: str,
+        unit: str,
+        here: float,
+        there: float,
+        span: tuple[float, float] | None,
         basis: Basis,
-    ) -> Change:  # fmt: skip
+    ) -> Change:
         """Compare a difference with its interval; without one, its noise is unknown."""
         gap = here - there
         if span is None:
@@ -329,9 +339,13 @@ def _same_collection(here: Summary, there: Summary, experiment: str) -> bool:
 
 
 def _measured(
-    name: str, unit: str, rows: Sequence[Sequence[TrialOutcome]],
-    value: Callable[[TrialOutcome], float], statistic: str, same: bool,
-) -> list[Change]:  # fmt: skip
+    name: str,
+    unit: str,
+    rows: Sequence[Sequence[TrialOutcome]],
+    value: Callable[[TrialOutcome], float],
+    statistic: str,
+    same: bool,
+) -> list[Change]:
     """Compare a figure of trials; nothing where a report has no value of it."""
     a, b = (np.array([value(row) for row in of], np.float64) for of in rows)
     if not np.isfinite(a).any() or not np.isfinite(b).any():

@@ -68,14 +68,26 @@ def collected_section(
         known = summary.planned[item.name]
         minutes = (known.seconds / 60, known.seconds_collected / 60)
         megabytes = (known.bytes / 1e6, known.bytes_collected / 1e6)
-        rows.append([
-            item.name, item.experiment, str(len(item.planned)), str(len(item.trials)),
-            *(number(value, 2) for value in minutes), *(number(value, 1) for value in megabytes),
-        ])  # fmt: skip
+        rows.append(
+            [
+                item.name,
+                item.experiment,
+                str(len(item.planned)),
+                str(len(item.trials)),
+                *(number(value, 2) for value in minutes),
+                *(number(value, 1) for value in megabytes),
+            ]
+        )
     columns = (
-        "campaign", "experiment", "planned", "committed", "planned (min)", "taken (min)",
-        "planned (MB)", "taken (MB)",
-    )  # fmt: skip
+        "campaign",
+        "experiment",
+        "planned",
+        "committed",
+        "planned (min)",
+        "taken (min)",
+        "planned (MB)",
+        "taken (MB)",
+    )
     frames = summary.labels is not None and any(
         count for name, count in summary.labels.source.items() if name != "events"
     )
@@ -265,15 +277,26 @@ def _depth_zeros(taken: Sequence[Collected]) -> list[Table]:
         zeros = np.array([zero for _, zero, _ in blocks], np.float64)
         squares = [sd**2 for _, _, sd in blocks if sd is not None]
         sd = float(np.mean(squares)) ** 0.5 if squares else None
-        rows.append([
-            item.name, str(len(blocks)), str(rezero.touches),
-            *(f"{value:+.3f}" for value in (zeros[0], zeros[-1], zeros.min(), zeros.max())),
-            *("-" if sd is None else f"{sd / share:.3f}" for share in (1, rezero.touches**0.5)),
-        ])  # fmt: skip
+        rows.append(
+            [
+                item.name,
+                str(len(blocks)),
+                str(rezero.touches),
+                *(f"{value:+.3f}" for value in (zeros[0], zeros[-1], zeros.min(), zeros.max())),
+                *("-" if sd is None else f"{sd / share:.3f}" for share in (1, rezero.touches**0.5)),
+            ]
+        )
     columns = (
-        "campaign", "touched off", "touches each", "first (mm)", "last (mm)", "lowest (mm)",
-        "highest (mm)", "SD of one touch (mm)", "SD of their mean (mm)",
-    )  # fmt: skip
+        "campaign",
+        "touched off",
+        "touches each",
+        "first (mm)",
+        "last (mm)",
+        "lowest (mm)",
+        "highest (mm)",
+        "SD of one touch (mm)",
+        "SD of their mean (mm)",
+    )
     caption = (
         "Depth zero from the rig's plane, as touching off found it. A drift moves all depths; so "
         "does the scatter of single touches, which `touches` of `maintenance.rezero` averages."

@@ -64,11 +64,14 @@ def class_report_key(store: Store, campaigns: list[Collected]) -> str:
     evaluation = class_evaluation_of(store)
     collected = [
         [
-            item.name, item.planned.collection_hash, item.planned.analysis_hash, _title(item),
+            item.name,
+            item.planned.collection_hash,
+            item.planned.analysis_hash,
+            _title(item),
             [recording.checksum for _, recording in item.trials],
         ]
         for item in campaigns
-    ]  # fmt: skip
+    ]
     # commands in the page name the store's folder
     place = str(store.folder.resolve())
     inputs = [
@@ -93,10 +96,12 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
     evaluation = class_evaluation_of(store)
     return ClassSummary(
         simulated=store.simulated,
-        classes=JudgedClasses.model_validate({
-            **evaluation.scores.to_json(),
-            "trained_baselines": baselines.class_methods(campaigns).results(store),
-        }),
+        classes=JudgedClasses.model_validate(
+            {
+                **evaluation.scores.to_json(),
+                "trained_baselines": baselines.class_methods(campaigns).results(store),
+            }
+        ),
         data={item.name: _origin(item) for item in campaigns},
         reviewed=evaluation.reviewed,
         versions=package_versions(),
@@ -104,7 +109,7 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
         seeds=ClassSeeds(
             network=agreeing(campaigns)[0].settings.training.seeds, chosen=evaluation.seed
         ),
-    )  # fmt: skip
+    )
 
 
 def _origin(item: Collected) -> DataOrigin:
@@ -114,9 +119,12 @@ def _origin(item: Collected) -> DataOrigin:
     )
     about = {} if item.recorded is None else dict(item.recorded.adapter.about)
     return DataOrigin(
-        title=_title(item), about=about, trials=len(records),
-        seconds=sum(record.recorded_s for record in records), unknown=dict(unknown),
-    )  # fmt: skip
+        title=_title(item),
+        about=about,
+        trials=len(records),
+        seconds=sum(record.recorded_s for record in records),
+        unknown=dict(unknown),
+    )
 
 
 def headline(summary: ClassSummary) -> list[Number]:
@@ -132,10 +140,11 @@ def headline(summary: ClassSummary) -> list[Number]:
             f"{scores.recordings.test} of them to test",
         ),
         Number(
-            "window accuracy", percent(scores.accuracy.argmax),
+            "window accuracy",
+            percent(scores.accuracy.argmax),
             f"argmax; strict {percent(scores.accuracy.strict)}, n = {scores.accuracy.n}",
         ),
-    ]  # fmt: skip
+    ]
     if _several(scores):
         whole = scores.trials.argmax
         found.append(Number("recording accuracy", percent(whole.share), f"argmax, n = {whole.n}"))
@@ -146,10 +155,11 @@ def headline(summary: ClassSummary) -> list[Number]:
         operations = scores.work.synaptic_operations["all"]
         found.append(
             Number(
-                "synaptic operations", f"{operations:,.0f}",
+                "synaptic operations",
+                f"{operations:,.0f}",
                 f"a window; {percent(scores.work.share)} of dense multiply-adds",
             )
-        )  # fmt: skip
+        )
     return found
 
 
@@ -198,11 +208,13 @@ def _data_section(campaigns: Sequence[Collected], summary: ClassSummary) -> Clas
     ]
     kinds = [item.recorded.recorded for item in campaigns if item.recorded is not None]
     return ClassDataSection(
-        len(scores.classes), all(len(trial.classes) < 2 for found in kinds for trial in found),
-        shown, Table(["part", "recordings", "windows"], parts),
+        len(scores.classes),
+        all(len(trial.classes) < 2 for found in kinds for trial in found),
+        shown,
+        Table(["part", "recordings", "windows"], parts),
         [row.name for row in scores.by_class if not row.windows.train],
         Table(["campaign", "what is not known", "recordings"], unknown),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -245,20 +257,27 @@ def _network_section(summary: ClassSummary, fitted: Fitted) -> ClassNetworkSecti
         for row in scores.seeds.each
     ]
     return ClassNetworkSection(
-        fitted.windows.length_ms, scores, _chance(scores), _several(scores),
-        bool(scores.trained_baselines), fitted.warnings,
+        fitted.windows.length_ms,
+        scores,
+        _chance(scores),
+        _several(scores),
+        bool(scores.trained_baselines),
+        fitted.warnings,
         Table(
             ["method", "argmax", "strict", "network ahead by (points)"],
             [["spiking network", percent(accuracy.argmax), percent(accuracy.strict), ""], *methods],
         ),
         training_figure(
-            [vars(record) for record in fitted.history], fitted.chosen_epoch,
+            [vars(record) for record in fitted.history],
+            fitted.chosen_epoch,
             simulated=summary.simulated,
         ),
         Table(["seed", "validation, strict", "test, argmax", "test, strict"], seeds),
-        _argmax_words(scores), share_words(scores.interval),
-        share_words(trials.argmax), share_words(trials.strict),
-    )  # fmt: skip
+        _argmax_words(scores),
+        share_words(scores.interval),
+        share_words(trials.argmax),
+        share_words(trials.strict),
+    )
 
 
 def _argmax_words(scores: JudgedClasses) -> str:
@@ -287,11 +306,8 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
     matrix = np.asarray(scores.confusion)
     called = [*scores.classes, "undecided"]
     pairs = sorted(
-        (
-            (-int(matrix[i, j]), i, j)
-            for i, j in np.argwhere(matrix).tolist() if i != j
-        ),
-    )[:PAIRS]  # fmt: skip
+        ((-int(matrix[i, j]), i, j) for i, j in np.argwhere(matrix).tolist() if i != j),
+    )[:PAIRS]
     worst = sorted(
         (row for row in scores.by_class if row.recall.share is not None),
         key=lambda row: row.recall.share or 0.0,
@@ -333,13 +349,15 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
             ["class", "recall", "precision", *(f"{split} (windows)" for split in SPLITS)],
             [
                 [
-                    row.name, share_words(row.recall), percent(row.precision),
+                    row.name,
+                    share_words(row.recall),
+                    percent(row.precision),
                     *(str(getattr(row.windows, split)) for split in SPLITS),
                 ]
                 for row in scores.by_class
             ],
         ),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -398,19 +416,25 @@ def _error_section(summary: ClassSummary) -> ErrorSection:
     }
     rows = [
         [
-            row.trial, row.true, row.called or "undecided", f"{row.right} of {row.windows}",
+            row.trial,
+            row.true,
+            row.called or "undecided",
+            f"{row.right} of {row.windows}",
             ", ".join(f"{name} {level}" for name, level in row.condition.items()),
         ]
         for row in scores.wrong[:SHOWN]
-    ]  # fmt: skip
+    ]
     columns = ["recording", "true class", "called", "windows right", "condition"]
     if not any(row[-1] for row in rows):
         rows, columns = [row[:-1] for row in rows], columns[:-1]
     return ErrorSection(
         factor_figure(by_factor, scores.accuracy, simulated=summary.simulated)
-        if by_factor else None,
-        Table(columns, rows), len(scores.wrong), scores.trials.argmax.n,
-    )  # fmt: skip
+        if by_factor
+        else None,
+        Table(columns, rows),
+        len(scores.wrong),
+        scores.trials.argmax.n,
+    )
 
 
 @dataclass(frozen=True)
@@ -430,21 +454,28 @@ def _made_section(
     place = store.folder.resolve()
     chosen = campaigns[0].settings
     said = {
-        "windows": fitted.windows, "samples": chosen.samples, "network": fitted.network,
+        "windows": fitted.windows,
+        "samples": chosen.samples,
+        "network": fitted.network,
         "training": fitted.training,
-    }  # fmt: skip
+    }
     settings = [
-        [f"analysis.{part}.{key}", ", ".join(map(str, value)) if isinstance(value, list)
-         else str(value)]
+        [
+            f"analysis.{part}.{key}",
+            ", ".join(map(str, value)) if isinstance(value, list) else str(value),
+        ]
         for part, found in said.items()
         for key, value in found.model_dump(mode="json").items()
         if key != "seeds"
-    ]  # fmt: skip
+    ]
     commands = [
-        [f"import {item.name}", f"sliplab import --adapter {item.campaign.protocol_file.resolve()} "
-         f"DATA --store NEW_STORE --name {item.name}"]
+        [
+            f"import {item.name}",
+            f"sliplab import --adapter {item.campaign.protocol_file.resolve()} "
+            f"DATA --store NEW_STORE --name {item.name}",
+        ]
         for item in campaigns
-    ]  # fmt: skip
+    ]
     commands += [
         [step, f"sliplab {step} {place}"] for step in ("label", "train", "evaluate", "report")
     ]
@@ -455,13 +486,14 @@ def _made_section(
     ]
     versions = [[name, value] for name, value in summary.versions.items()]
     return ClassMadeSection(
-        summary.seeds, Table(["setting", "value"], settings),
+        summary.seeds,
+        Table(["setting", "value"], settings),
         Table(["step", "command"], commands, commands=(1,)),
         [
             Table(["adapter", "hash of the data", "hash of split and analysis"], hashes),
             Table(["package", "version"], versions),
         ],
-    )  # fmt: skip
+    )
 
 
 def class_sections(
@@ -487,6 +519,9 @@ def render(
 ) -> str:
     """Render the page."""
     return render_page(
-        "classes.html", sections, simulated=summary.simulated,
-        campaigns=[item.name for item in campaigns], headline=headline(summary),
-    )  # fmt: skip
+        "classes.html",
+        sections,
+        simulated=summary.simulated,
+        campaigns=[item.name for item in campaigns],
+        headline=headline(summary),
+    )

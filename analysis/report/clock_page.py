@@ -133,9 +133,10 @@ def _residuals(shown: _Shown) -> Figure | None:
     panels = []
     for device, name in shown.titles.items():
         fitted = [
-            trial for _, trial in shown.rows
+            trial
+            for _, trial in shown.rows
             if device in trial.devices and f"{device}_us" in trial.residuals
-        ]  # fmt: skip
+        ]
         if not fitted:
             continue
         uncertainty = [trial.devices[device].against_events_us for trial in fitted]
@@ -213,16 +214,32 @@ def _by_campaign(shown: _Shown) -> Table:
         for name, device in known["devices"].items():
             uncertainty = device["uncertainty_us"]
             least, most = device["drift_ppm"]
-            rows.append([
-                campaign, name, device["grade"], device["kind"],
-                number(uncertainty["median"]), number(uncertainty["worst"]),
-                " or ".join(f"{gate:g}" for gate in device["gates_us"]) or "–",
-                f"{least:.2f} to {most:.2f}", str(device["trials"]), str(known["changed"]),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    campaign,
+                    name,
+                    device["grade"],
+                    device["kind"],
+                    number(uncertainty["median"]),
+                    number(uncertainty["worst"]),
+                    " or ".join(f"{gate:g}" for gate in device["gates_us"]) or "–",
+                    f"{least:.2f} to {most:.2f}",
+                    str(device["trials"]),
+                    str(known["changed"]),
+                ]
+            )
     columns = (
-        "campaign", "device", "grade", "uncertainty is", "median (µs)", "worst (µs)", "gate (µs)",
-        "drift (ppm)", "trials", "refitted clocks in use",
-    )  # fmt: skip
+        "campaign",
+        "device",
+        "grade",
+        "uncertainty is",
+        "median (µs)",
+        "worst (µs)",
+        "gate (µs)",
+        "drift (ppm)",
+        "trials",
+        "refitted clocks in use",
+    )
     return Table(columns, rows)
 
 
@@ -288,9 +305,10 @@ def _reason(folder: Path, known: QuarantineEntry) -> str:
         for name, gate in failed.items()
         if name.startswith("sync_uncertainty_")
     ]
-    return "; ".join(found + [
-        _unvouched(gate) for name, gate in failed.items() if name.startswith("sync_unvouched_s")
-    ])  # fmt: skip
+    return "; ".join(
+        found
+        + [_unvouched(gate) for name, gate in failed.items() if name.startswith("sync_unvouched_s")]
+    )
 
 
 def _uncertain(device: str, gate: Gate) -> str:

@@ -31,10 +31,15 @@ WORDS = {
 }
 PAPER = ("smoothing", "smoothing chosen")
 _COLUMNS = (
-    "detector", "stride (ms)", "false early in validation", "false early in test (95 %)",
-    "incipient, median / 95 % (ms)", "missed, late", "gross, median (ms); missed, late",
+    "detector",
+    "stride (ms)",
+    "false early in validation",
+    "false early in test (95 %)",
+    "incipient, median / 95 % (ms)",
+    "missed, late",
+    "gross, median (ms); missed, late",
     "lead, median (ms)",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -87,11 +92,13 @@ def detector_section(
             for rate, late in curve
         ],
         columns=[
-            "stride", "detector", "false early, validation trials (share)",
+            "stride",
+            "detector",
+            "false early, validation trials (share)",
             "median incipient latency, test trials (ms)",
         ],
         dtype=object,
-    )  # fmt: skip
+    )
     return DetectorSection(
         compared.trials,
         entries[0][1].rates[0].choice,

@@ -77,11 +77,14 @@ def force_section(
     by_force = label.force if label is not None else None
     knees = [None, None] if by_force is None else [by_force.incipient_ns, by_force.gross_ns]
     svg = force_overview(
-        time_s, normal, along, friction,
+        time_s,
+        normal,
+        along,
+        friction,
         [None if t is None else (t - start) / 1e9 for t in onsets],
         [None if t is None else (t - start) / 1e9 for t in knees],
         simulated=simulated,
-    )  # fmt: skip
+    )
     data = {
         "time since the recording began (s)": time_s.tolist(),
         "normal force (N)": normal.tolist(),
@@ -129,8 +132,13 @@ def _figures(there: Sequence[tuple[Collected, Recording]]) -> Table:
 def _rules(store: Store, campaigns: Sequence[Collected]) -> Table:
     """List onsets by the force less those of the other rules, and less the truth where known."""
     columns = (
-        "force less the", "onset", "trials", "median (ms)", "median distance (ms)", "largest (ms)"
-    )  # fmt: skip
+        "force less the",
+        "onset",
+        "trials",
+        "median (ms)",
+        "median distance (ms)",
+        "largest (ms)",
+    )
     rows = []
     for (title, onset), values in force_compared(store, campaigns).items():
         found = spread(values)

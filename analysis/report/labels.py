@@ -19,9 +19,11 @@ from sliplab.storage.trials.store import Store
 
 RULES = {"paper": "paper's rule", "change_point": "change point"}
 RULING = {
-    "paper": "the paper's rule", "change_point": "the change points",
-    "force": "the force along the plate", "given": "the data set's own labels",
-}  # fmt: skip
+    "paper": "the paper's rule",
+    "change_point": "the change points",
+    "force": "the force along the plate",
+    "given": "the data set's own labels",
+}
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,14 @@ def label_section(
     known = rules.paper.incipient.n > 0
     errors = {RULES[rule]: kinds for rule, kinds in distances.items()}
     every = [
-        (item, recording.record.geometry.centre,
-         Derived.of(store, LABELS, item.name).load(trial.id, TrialLabel))
-        for item in campaigns for trial, recording in item.trials
-    ]  # fmt: skip
+        (
+            item,
+            recording.record.geometry.centre,
+            Derived.of(store, LABELS, item.name).load(trial.id, TrialLabel),
+        )
+        for item in campaigns
+        for trial, recording in item.trials
+    ]
     causes = Counter(
         (item.name, kind, doubt)
         for item, _, label in every
@@ -114,16 +120,23 @@ def _rules(rules: RuleErrors, known: bool) -> Table:
         ("paper's rule less the change point", rules.apart),
     ]
     columns = (
-        "difference", "onset", "trials", "median (ms)", "median distance (ms)", "largest (ms)"
-    )  # fmt: skip
+        "difference",
+        "onset",
+        "trials",
+        "median (ms)",
+        "median distance (ms)",
+        "largest (ms)",
+    )
     cells = [
         [
-            title, f"{kind} onset", str(values.n),
+            title,
+            f"{kind} onset",
+            str(values.n),
             *(number(value, 2) for value in (values.median, values.median_abs, values.max_abs)),
         ]
         for title, found in (rows if known else rows[2:])
         for kind, values in (("incipient", found.incipient), ("gross", found.gross))
-    ]  # fmt: skip
+    ]
     return Table(columns, cells)
 
 
@@ -156,15 +169,27 @@ def _figure(
 def _holds(holds: Mapping[str, Hold]) -> Table:
     """List slips in the hold, and how the onsets depend on the reference end of the hold."""
     columns = (
-        "campaign", "trials", "slipped in the hold", "most (px)", "incipient apart, median (ms)",
-        "largest (ms)", "gross apart, median (ms)", "largest (ms)",
-    )  # fmt: skip
+        "campaign",
+        "trials",
+        "slipped in the hold",
+        "most (px)",
+        "incipient apart, median (ms)",
+        "largest (ms)",
+        "gross apart, median (ms)",
+        "largest (ms)",
+    )
     rows = [
         [
-            name, str(found.trials), str(found.slipped), number(found.most_px, 2),
-            *(number(value, 0) for spread in (found.apart_ms.incipient, found.apart_ms.gross)
-              for value in (spread.median, spread.max_abs)),
+            name,
+            str(found.trials),
+            str(found.slipped),
+            number(found.most_px, 2),
+            *(
+                number(value, 0)
+                for spread in (found.apart_ms.incipient, found.apart_ms.gross)
+                for value in (spread.median, spread.max_abs)
+            ),
         ]
         for name, found in holds.items()
-    ]  # fmt: skip
+    ]
     return Table(columns, rows)

@@ -37,10 +37,17 @@ NAMES = {
     "lead_ms": "lead",
 }
 STATISTICS = {
-    "n": "n", "mean": "mean (95 %)", "median": "median (95 %)",
-    "p95": "95th percentile (95 %)", "std": "std", "min": "min", "max": "max",
-    "missed": "missed", "late": "late", "false_early": "false early",
-}  # fmt: skip
+    "n": "n",
+    "mean": "mean (95 %)",
+    "median": "median (95 %)",
+    "p95": "95th percentile (95 %)",
+    "std": "std",
+    "min": "min",
+    "max": "max",
+    "missed": "missed",
+    "late": "late",
+    "false_early": "false early",
+}
 _CAUSE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
 """Entry of a trial that gives the reason for a missing time."""
 _SHORT = {"missed": "missed", "late": "late", "false_early": "early", "without_onsets": "no onset"}
@@ -131,16 +138,23 @@ def latency_section(
     shown = TIMES[1:3] if kinematic else TIMES
     kinds = ("incipient", "gross") if kinematic else ("incipient", "gross", "lead")
     return LatencySection(
-        experiment, numbers, smallest_lead(summary, experiment), PAPER, DISTURBANCE_LEAD_STD_MS,
-        by, late,
+        experiment,
+        numbers,
+        smallest_lead(summary, experiment),
+        PAPER,
+        DISTURBANCE_LEAD_STD_MS,
+        by,
+        late,
         sorted({choice_note(rule) for rule in rules} - {""}),
         {NAMES[name]: trends for name in shown if (trends := _trends(found, name))},
-        clocks.latency_note(summary.sync, summary.labels), clocks.figure_note(summary.sync),
-        _figures(experiment, found, by, summary.simulated), _statistics(numbers, kinds),
+        clocks.latency_note(summary.sync, summary.labels),
+        clocks.figure_note(summary.sync),
+        _figures(experiment, found, by, summary.simulated),
+        _statistics(numbers, kinds),
         _accounts(experiment, numbers.accounted),
         [] if kinematic else [_by_level(found, factor) for factor in found.varied()],
         _by_seed(numbers, kinds),
-    )  # fmt: skip
+    )
 
 
 def smallest_lead(summary: Summary | OneCameraSummary, experiment: str) -> str:
@@ -159,10 +173,12 @@ def smallest_lead(summary: Summary | OneCameraSummary, experiment: str) -> str:
     others = [(f"seed {it.seed}", it.lead_ms.min) for it in numbers.by_seed if not it.chosen]
     if isinstance(summary, Summary):
         others += [
-            (f"the {of.preset} preset" if of.preset else of.title,
-             getattr(of, experiment).lead_ms.min)
+            (
+                f"the {of.preset} preset" if of.preset else of.title,
+                getattr(of, experiment).lead_ms.min,
+            )
             for of in summary.networks.values()
-        ]  # fmt: skip
+        ]
     known = [f"{name} {least:.0f} ms" for name, least in others if least is not None]
     return "; ".join([text, *known])
 
@@ -188,8 +204,9 @@ def _figures(
         groups, breaks = {"all test trials": found.trials}, []
         for factor in by:
             breaks.append(len(groups))
-            groups |= {f"{factor} {text}": found.at(**{factor: text})
-                       for text in found.factors[factor]}  # fmt: skip
+            groups |= {
+                f"{factor} {text}": found.at(**{factor: text}) for text in found.factors[factor]
+            }
         lines = {
             "latency_incipient_ms": (value["incipient_latency"], "paper's mean, 88 ms"),
             "latency_gross_ms": (value["gross_latency"], "paper's mean, 70 ms"),
@@ -207,9 +224,13 @@ def _figures(
 
 
 def _draw(
-    groups: Mapping[str, Sequence[TrialOutcome]], shown: Sequence[str], breaks: Sequence[int],
-    lines: Mapping[str, tuple[float | None, str]], name: str, simulated: bool,
-) -> Figure:  # fmt: skip
+    groups: Mapping[str, Sequence[TrialOutcome]],
+    shown: Sequence[str],
+    breaks: Sequence[int],
+    lines: Mapping[str, tuple[float | None, str]],
+    name: str,
+    simulated: bool,
+) -> Figure:
     panels = []
     for time in shown:
         label, colour, zero = AXES[time]

@@ -74,13 +74,15 @@ def with_classifier(
     """Add the classifier's figures, under the names that the spiking network's have."""
     evaluation = judged.evaluation
     parts = judged_part(campaigns, evaluation, window_intervals(store, evaluation.key), {}, {}, {})
-    return OneCameraSummary.model_validate({
-        **summary.to_json(),
-        **parts,
-        "classifier": evaluation.classifier,
-        "detection": plain_rules(evaluation.detection),
-        "choices": evaluation.choices,
-    })  # fmt: skip
+    return OneCameraSummary.model_validate(
+        {
+            **summary.to_json(),
+            **parts,
+            "classifier": evaluation.classifier,
+            "detection": plain_rules(evaluation.detection),
+            "choices": evaluation.choices,
+        }
+    )
 
 
 @dataclass(frozen=True)
@@ -117,12 +119,17 @@ def _network_section(
     history = [asdict(epoch) for epoch in net.history]
     own = [percent(value) for value in (accuracy.argmax, accuracy.strict, accuracy.margin)]
     return MarkerNetworkSection(
-        summary.classifier, accuracy, kinematic.interval,
-        alarm_words(kinematic.false_alarms), kinematic.seeds,
-        sorted({
-            f"{_frames(rule.smoothing)} leads by {rule.margin:g} points"
-            for rule in summary.detection.values()
-        }),
+        summary.classifier,
+        accuracy,
+        kinematic.interval,
+        alarm_words(kinematic.false_alarms),
+        kinematic.seeds,
+        sorted(
+            {
+                f"{_frames(rule.smoothing)} leads by {rule.margin:g} points"
+                for rule in summary.detection.values()
+            }
+        ),
         confusion_figure(kinematic, simulated=simulated),
         training_figure(history, net.chosen_epoch, simulated=simulated),
         Table(
@@ -134,7 +141,7 @@ def _network_section(
             ],
         ),
         class_table(kinematic),
-    )  # fmt: skip
+    )
 
 
 def marker_sections(

@@ -296,9 +296,12 @@ def render(
 ) -> str:
     """Render the page."""
     return render_page(
-        "report.html", sections, simulated=summary.simulated,
-        campaigns=[item.name for item in campaigns], headline=headline(summary),
-    )  # fmt: skip
+        "report.html",
+        sections,
+        simulated=summary.simulated,
+        campaigns=[item.name for item in campaigns],
+        headline=headline(summary),
+    )
 
 
 def _rates(

@@ -17,10 +17,15 @@ WORDS = {
     "true": "true (simulated)",
 }
 _COLUMNS = (
-    "decided by", "onset", "trials (lacking)", "incipient, median (95 %) (ms)",
-    "false early (95 %)", "missed, late", "early by 2 pixels, not before this",
+    "decided by",
+    "onset",
+    "trials (lacking)",
+    "incipient, median (95 %) (ms)",
+    "false early (95 %)",
+    "missed, late",
+    "early by 2 pixels, not before this",
     "gross, median (ms); false early, missed, late",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)

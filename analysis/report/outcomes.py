@@ -227,14 +227,21 @@ def failure_section(folder: Path, trials: Sequence[TrialOutcome]) -> FailureSect
             wrong += f", {row.late_gross_ms:.0f} ms after it ended"
         rows.append([command, wrong, *(number(value, 0) for value in latencies)])
     columns = (
-        "look at the trial", "what went wrong", "incipient latency (ms)", "gross latency (ms)",
+        "look at the trial",
+        "what went wrong",
+        "incipient latency (ms)",
+        "gross latency (ms)",
         "lead (ms)",
-    )  # fmt: skip
+    )
     counts = Counter(text for row in trials for text in _wrong(row))
     return FailureSection(
-        len(failed), len(trials), counts.most_common(), MOST_FAILURES,
-        Table(columns, rows, commands=(0,)), store,
-    )  # fmt: skip
+        len(failed),
+        len(trials),
+        counts.most_common(),
+        MOST_FAILURES,
+        Table(columns, rows, commands=(0,)),
+        store,
+    )
 
 
 def _wrong(row: TrialOutcome) -> list[str]:

@@ -73,16 +73,21 @@ def paper_section(summary: Summary) -> PaperSection | None:
     return PaperSection(
         summary.paper,
         [
-            (_title(found), found,
-             ", ".join(sorted({f"{rule.margin:g}" for rule in found.detection.values()})))
+            (
+                _title(found),
+                found,
+                ", ".join(sorted({f"{rule.margin:g}" for rule in found.detection.values()})),
+            )
             for found in summary.networks.values()
         ],
-        Table(["figure", "paper", *networks],
-              [[of[0].name, of[0].paper, *(row.text for row in of)] for of in same]),
+        Table(
+            ["figure", "paper", *networks],
+            [[of[0].name, of[0].paper, *(row.text for row in of)] for of in same],
+        ),
         Table(["figure", *networks], [[of[0].name, *(row.count for row in of)] for of in same]),
         Table(("setting", "paper", "here", "the paper's value is"), [*differences, _SCANNED]),
         seed_words(summary.kinematic.seeds),
-    )  # fmt: skip
+    )
 
 
 def _title(network: Network) -> str:
@@ -95,21 +100,36 @@ def _windows(kinematic: NetworkWindows) -> list[Row]:
     right = kinematic.accuracy
     count = _count(known.get("accuracy"))
     rows = [
-        Row("test accuracy of windows", PAPER["accuracy"].text, percent(right.argmax),
-            _percents(known.get("accuracy")), count),
-        Row("the same, a tie wrong", "–", percent(right.strict), _percents(kinematic.interval),
-            count),
+        Row(
+            "test accuracy of windows",
+            PAPER["accuracy"].text,
+            percent(right.argmax),
+            _percents(known.get("accuracy")),
+            count,
+        ),
+        Row(
+            "the same, a tie wrong",
+            "–",
+            percent(right.strict),
+            _percents(kinematic.interval),
+            count,
+        ),
         Row("the same, won by the margin", "–", percent(right.margin), count=count),
-    ]  # fmt: skip
+    ]
     for name, value in (
         ("precision", kinematic.precision["incipient"]),
         ("recall", kinematic.recall["incipient"]),
     ):
         row = known.get(f"incipient_{name}")
         rows.append(
-            Row(f"incipient {name}", PAPER[f"incipient_{name}"].text, percent(value),
-                _percents(row), _count(row))
-        )  # fmt: skip
+            Row(
+                f"incipient {name}",
+                PAPER[f"incipient_{name}"].text,
+                percent(value),
+                _percents(row),
+                _count(row),
+            )
+        )
     return [*rows, *_alarms(kinematic.false_alarms), _confused(kinematic.confusion)]
 
 
@@ -164,16 +184,24 @@ def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) 
     first = "{0.detected_first} of {0.planned} trials detected first"
     if gravity.accounted.planned:
         rows.append(
-            Row("gravity lead, smallest", PAPER["gravity_lead"].text,
-                number(gravity.lead_ms.min, 0, "ms"), count=first.format(gravity.accounted))
-        )  # fmt: skip
+            Row(
+                "gravity lead, smallest",
+                PAPER["gravity_lead"].text,
+                number(gravity.lead_ms.min, 0, "ms"),
+                count=first.format(gravity.accounted),
+            )
+        )
     if disturbance.accounted.planned:
         lead = disturbance.lead_ms
         rows.append(
-            Row("disturbance lead, mean ± standard deviation", PAPER["disturbance_lead"].text,
+            Row(
+                "disturbance lead, mean ± standard deviation",
+                PAPER["disturbance_lead"].text,
                 f"{number(lead.mean, 0)} ± {number(lead.std, 0, 'ms')}",
-                _ms(disturbance.intervals.lead_ms.mean), first.format(disturbance.accounted))
-        )  # fmt: skip
+                _ms(disturbance.intervals.lead_ms.mean),
+                first.format(disturbance.accounted),
+            )
+        )
     return rows
 
 

@@ -68,9 +68,10 @@ def registration_section(store: Store, campaigns: list[Collected]) -> Registrati
     collected = [item for item in campaigns if IMPORTED not in item.info]
     shown = {item.name for item in collected}
     absent = [
-        folder.name for folder in sorted((store.folder / "campaigns").glob("*"))
+        folder.name
+        for folder in sorted((store.folder / "campaigns").glob("*"))
         if folder.name not in shown and registration_files(Campaign(folder))
-    ]  # fmt: skip
+    ]
     if not collected and not absent:
         return None
     return RegistrationSection([_registered(store, campaigns, it) for it in collected], absent)
@@ -99,10 +100,12 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
         after = after or "but cannot be read"
         found.append(Deviation("a file cannot be read", "–", str(error)))
     return Registered(
-        item.name, after, rig,
+        item.name,
+        after,
+        rig,
         Table(("file", "registered (UTC)", "when", "stamps", "SHA-256 of the file"), files),
         Table(("deviation", "registered", "found"), found),
-    )  # fmt: skip
+    )
 
 
 def _evaluation_deviations(

@@ -86,9 +86,12 @@ def render(sources: Sources, summary: Summary, sections: Sequence[Content]) -> s
     """Render the page; everything in it is escaped but the figures' SVG."""
     names = [item.name for item in sources.campaigns]
     return render_page(
-        "report.html", sections, simulated=summary.simulated, campaigns=names,
+        "report.html",
+        sections,
+        simulated=summary.simulated,
+        campaigns=names,
         headline=headline(summary),
-    )  # fmt: skip
+    )
 
 
 def headline(summary: Summary) -> list[Number]:
@@ -147,12 +150,14 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
         onset_section(summary),
         label_section(store, campaigns, summary, shown.distances),
         clocks.clock_section(
-            campaigns, summary.sync, page=(store.folder / "report" / clocks.PAGE).exists(),
+            campaigns,
+            summary.sync,
+            page=(store.folder / "report" / clocks.PAGE).exists(),
             simulated=simulated,
         ),
         *plugin_sections(data, last=True),
         _provenance(summary),
-    ]  # fmt: skip
+    ]
     return [section for section in sections if section is not None]
 
 

@@ -44,9 +44,23 @@ from sliplab.storage.versions import FIGURES, installed_versions
 Slips = Mapping[tuple[str, str], References]
 """Slips of trials by each onset, by campaign and trial."""
 _WINDOWS = (
-    "accuracy", "confusion", "precision", "recall", "baselines", "samples", "interval", "seeds",
-    "reliability", "calibration", "by_factor", "by_tenth", "no_slip", "by_trial", "work", "beside",
-)  # fmt: skip
+    "accuracy",
+    "confusion",
+    "precision",
+    "recall",
+    "baselines",
+    "samples",
+    "interval",
+    "seeds",
+    "reliability",
+    "calibration",
+    "by_factor",
+    "by_tenth",
+    "no_slip",
+    "by_trial",
+    "work",
+    "beside",
+)
 """Keys that the summary takes over from the evaluation's windows; docs/metrics.md."""
 
 
@@ -73,51 +87,60 @@ def make_summary(sources: Sources) -> Summary:
     """
     campaigns, evaluation = sources.campaigns, sources.evaluation
     judged = judged_part(
-        campaigns, evaluation, sources.window_intervals, sources.baselines, sources.references,
+        campaigns,
+        evaluation,
+        sources.window_intervals,
+        sources.baselines,
+        sources.references,
         sources.programs,
-    )  # fmt: skip
+    )
     holdout = None
     if "holdout" in sources.programs:
         kept = HOLDOUT.parse(HoldoutResult, sources.programs["holdout"])
         holdout = holdout_part(kept)
-    return Summary.model_validate({
-        "simulated": sources.store.simulated,
-        **judged,
-        "networks": {
-            name: _network(campaigns, of, sources.references, sources.programs)
-            for name, of in sources.networks.items()
-        },
-        "paper": _paper(sources.settings, campaigns),
-        "references": references_of(sources.store, campaigns),
-        "labels": {
-            "error_ms": evaluation.label_error_ms,
-            "rules_ms": evaluation.label_rules_ms,
-            "source": label_sources(campaigns),
-            "reviewed": evaluation.reviewed,
-            "check": sources.label_check,
-            "holds": sources.holds,
-            **_given(campaigns),
-        },
-        "detection": plain_rules(evaluation.detection),
-        "choices": evaluation.choices,
-        "detectors": evaluation.detectors,
-        "holdout": holdout,
-        "sync": sync_part(campaigns),
-        "quality": quality_part(campaigns),
-        "planned": {
-            item.name: planned_part(item, sources.planned_bytes[item.name]) for item in campaigns
-        },
-        "timing_s": sources.step_seconds,
-        "versions": package_versions(),
-        "protocols": protocol_hashes(campaigns),
-        "seeds": {
-            "network": sources.settings.training.seeds,
-            "chosen": evaluation.seed,
-            "collection": {
-                item.name: item.planned.seed for item in campaigns if item.planned.seed is not None
+    return Summary.model_validate(
+        {
+            "simulated": sources.store.simulated,
+            **judged,
+            "networks": {
+                name: _network(campaigns, of, sources.references, sources.programs)
+                for name, of in sources.networks.items()
             },
-        },
-    })  # fmt: skip
+            "paper": _paper(sources.settings, campaigns),
+            "references": references_of(sources.store, campaigns),
+            "labels": {
+                "error_ms": evaluation.label_error_ms,
+                "rules_ms": evaluation.label_rules_ms,
+                "source": label_sources(campaigns),
+                "reviewed": evaluation.reviewed,
+                "check": sources.label_check,
+                "holds": sources.holds,
+                **_given(campaigns),
+            },
+            "detection": plain_rules(evaluation.detection),
+            "choices": evaluation.choices,
+            "detectors": evaluation.detectors,
+            "holdout": holdout,
+            "sync": sync_part(campaigns),
+            "quality": quality_part(campaigns),
+            "planned": {
+                item.name: planned_part(item, sources.planned_bytes[item.name])
+                for item in campaigns
+            },
+            "timing_s": sources.step_seconds,
+            "versions": package_versions(),
+            "protocols": protocol_hashes(campaigns),
+            "seeds": {
+                "network": sources.settings.training.seeds,
+                "chosen": evaluation.seed,
+                "collection": {
+                    item.name: item.planned.seed
+                    for item in campaigns
+                    if item.planned.seed is not None
+                },
+            },
+        }
+    )
 
 
 def judged_part(
@@ -205,13 +228,19 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
     }
     differences = tuple(
         Difference(
-            setting=each.words, key=each.key, paper=_in_words(each.value), here=_in_words(here),
+            setting=each.words,
+            key=each.key,
+            paper=_in_words(each.value),
+            here=_in_words(here),
             source=each.source,
         )
         for each, here in settings.overrides
-    )  # fmt: skip
-    assumed = [f"{each.words}: {_in_words(at(settings, each.key))}" for each in PAPER
-               if each.source == "assumed"]  # fmt: skip
+    )
+    assumed = [
+        f"{each.words}: {_in_words(at(settings, each.key))}"
+        for each in PAPER
+        if each.source == "assumed"
+    ]
     if depths:
         assumed.append(
             f"press depth of gravity and disturbance trials: {', '.join(sorted(depths))}"

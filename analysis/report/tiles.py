@@ -64,9 +64,10 @@ def _alarms(kinematic: Kinematic) -> Number:
     held = "" if quiet is None else f", {plural(quiet.clusters, 'trial')}, {quiet.hours:.3f} h"
     under = f"not measured ({COMMAND})" if disturbed is None else rate_words(disturbed)
     return Number(
-        "false alarms an hour", rate_words(quiet),
+        "false alarms an hour",
+        rate_words(quiet),
         f"in quiet holding (95 %){held}; under nuisances {under}",
-    )  # fmt: skip
+    )
 
 
 def _gross(summary: Summary | OneCameraSummary) -> list[Number]:

@@ -32,9 +32,11 @@ F64 = npt.NDArray[np.float64]
 BIN_S = 0.03
 """Bin of the event rate, s: a window of the network."""
 _PHASES = (
-    "at rest", "from the start of the motion to the first slip", "in incipient slip",
+    "at rest",
+    "from the start of the motion to the first slip",
+    "in incipient slip",
     "in gross slip",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,16 @@ def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSe
     motion_s = (recording.motion_ns[0] - start) / 1e9 if recording.record.steps else None
     frame_s = (frame_ns - start) / 1e9
     svg = figures.trial_overview(
-        frame_s, displacement_px, event_s, cell - 0.5, onsets, motion_s,
-        item.settings.labelling.threshold_px, item.settings.windows.cells, simulated=simulated,
-    )  # fmt: skip
+        frame_s,
+        displacement_px,
+        event_s,
+        cell - 0.5,
+        onsets,
+        motion_s,
+        item.settings.labelling.threshold_px,
+        item.settings.windows.cells,
+        simulated=simulated,
+    )
     return TrialSection(
         example.condition,
         _rates(event_s, [0.0, motion_s, *onsets, (end - start) / 1e9]),
@@ -189,9 +198,12 @@ class OutputSection(Content):
 
 
 def output_section(
-    example: Example, counts: Mapping[str, npt.NDArray[Any]], settings: Detection, *,
+    example: Example,
+    counts: Mapping[str, npt.NDArray[Any]],
+    settings: Detection,
+    *,
     simulated: bool,
-) -> OutputSection:  # fmt: skip
+) -> OutputSection:
     """Draw the outputs.
 
     Args:

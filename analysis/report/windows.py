@@ -93,16 +93,22 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
     ]
     history = [vars(record) for record in fitted.history]
     return NetworkSection(
-        fitted.windows.length_ms, accuracy, kinematic.interval,
-        alarm_words(kinematic.false_alarms), kinematic.seeds, bool(baselines), fitted.warnings,
-        PAPER, confusion_figure(kinematic, simulated=simulated),
+        fitted.windows.length_ms,
+        accuracy,
+        kinematic.interval,
+        alarm_words(kinematic.false_alarms),
+        kinematic.seeds,
+        bool(baselines),
+        fitted.warnings,
+        PAPER,
+        confusion_figure(kinematic, simulated=simulated),
         training_figure(history, fitted.chosen_epoch, simulated=simulated),
         Table(
             ["method", "argmax", "strict", "margin", "network ahead by (points)"],
             [["spiking network", *own, ""], *methods],
         ),
         class_table(kinematic),
-    )  # fmt: skip
+    )
 
 
 def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> Figure:
@@ -170,25 +176,35 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
         for level, row in _in_order(rows)
     ]
     still = kinematic.no_slip
-    phases = [] if still is None else [
-        ("while holding", still.hold), ("while moving, before the first slip", still.loading)
-    ]  # fmt: skip
+    phases = (
+        []
+        if still is None
+        else [("while holding", still.hold), ("while moving, before the first slip", still.loading)]
+    )
     worst = [
         [
-            row.trial, f"{row.errors} of {row.n}",
+            row.trial,
+            f"{row.errors} of {row.n}",
             ", ".join(f"{count} {what.replace('_', ' ')}" for what, count in row.taken.items()),
         ]
-        for row in kinematic.by_trial[:WORST] if row.errors
-    ]  # fmt: skip
+        for row in kinematic.by_trial[:WORST]
+        if row.errors
+    ]
     tenths = pd.DataFrame(
         [
-            {"class": name, "phase, from (%)": 10 * row.tenth - 10, "recall (share)": row.share,
-             "95 % interval, low (share)": row.low, "95 % interval, high (share)": row.high,
-             "windows": row.n}
-            for name, rows in kinematic.by_tenth.items() for row in rows
+            {
+                "class": name,
+                "phase, from (%)": 10 * row.tenth - 10,
+                "recall (share)": row.share,
+                "95 % interval, low (share)": row.low,
+                "95 % interval, high (share)": row.high,
+                "windows": row.n,
+            }
+            for name, rows in kinematic.by_tenth.items()
+            for row in rows
         ],
         dtype=object,
-    )  # fmt: skip
+    )
     return WhereSection(
         Figure(
             figures.recall_by_tenth(kinematic.by_tenth, simulated=simulated),
@@ -324,11 +340,13 @@ def work_section(scores: Kinematic | JudgedClasses) -> WorkSection | None:
         [name, number(work.spikes[name], 1), percent(rate, 2)] for name, rate in work.rates.items()
     ]
     return WorkSection(
-        work, scores.seeds, _rival(scores),
+        work,
+        scores.seeds,
+        _rival(scores),
         Table(["layer", "synaptic operations", "dense multiply-adds", "share"], layers),
         Table(["spiking layer", "spikes a window", "of neurons and steps"], fired),
         _others(scores.trained_baselines),
-    )  # fmt: skip
+    )
 
 
 def _rival(scores: Kinematic | JudgedClasses) -> Rival | None:
@@ -353,12 +371,17 @@ def _others(baselines: Mapping[str, TrainedBaseline]) -> Table:
         spread = "–"
         if shares:
             spread = f"{percent(fmean(shares))} ({percent(min(shares))} to {percent(max(shares))})"
-        rows.append([
-            METHODS[name],
-            *("–" if key not in made else f"{made[key]:,}" for key in ("weights", "multiply_adds")),
-            f"{ran} of at most {most}" if most is not None else str(ran),
-            spread,
-        ])  # fmt: skip
+        rows.append(
+            [
+                METHODS[name],
+                *(
+                    "–" if key not in made else f"{made[key]:,}"
+                    for key in ("weights", "multiply_adds")
+                ),
+                f"{ran} of at most {most}" if most is not None else str(ran),
+                spread,
+            ]
+        )
     columns = ["method", "weights", "multiply-adds a window", "epochs or rounds", "argmax of seeds"]
     return Table(columns, rows)
 

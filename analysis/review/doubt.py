@@ -118,12 +118,15 @@ def labelled_trials(store: Store, item: Collected) -> list[Labelled]:
     derived = Derived.of(store, LABELS, item.name)
     return [
         Labelled(
-            item, trial, recording, derived.load(trial.id, TrialLabel),
+            item,
+            trial,
+            recording,
+            derived.load(trial.id, TrialLabel),
             last(store, item.name, trial.id),
         )
         for trial, recording in item.trials
         if derived.fresh(trial.id, label_key(recording, item.settings.labelling))
-    ]  # fmt: skip
+    ]
 
 
 def reasons_for_doubt(label: TrialLabel) -> list[tuple[int, str]]:
@@ -263,9 +266,14 @@ def _crossed(store: Store, case: Labelled) -> dict[Kind, tuple[int, int] | None]
     if label.reference == "hold_start":
         start_ns = int(frame_ns[0])
     found = crossing_intervals(
-        frame_ns, arrays["displacement_px"], arrays["sigma_px"], _marker_onsets(label.paper),
-        _centre(case, label.paper), settings.threshold_px, start_ns - 1,
-    )  # fmt: skip
+        frame_ns,
+        arrays["displacement_px"],
+        arrays["sigma_px"],
+        _marker_onsets(label.paper),
+        _centre(case, label.paper),
+        settings.threshold_px,
+        start_ns - 1,
+    )
     return dict(zip(KINDS, found, strict=True))
 
 

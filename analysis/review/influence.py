@@ -26,9 +26,10 @@ from sliplab.storage.streams import F64, I64
 DRAWS = 1000
 """Reviews that are drawn of each trial, twice."""
 TIMES = {
-    "latency_incipient_ms": "incipient latency", "latency_gross_ms": "gross latency",
+    "latency_incipient_ms": "incipient latency",
+    "latency_gross_ms": "gross latency",
     "lead_ms": "lead",
-}  # fmt: skip
+}
 """Times of a trial that figures are over, and their names."""
 LOST_MS = {"latency_incipient_ms": np.inf, "latency_gross_ms": np.inf, "lead_ms": -np.inf}
 """What a missed or late detection counts as in a median."""
@@ -172,10 +173,17 @@ def time_figures(
                     span = None
                 found.append(
                     Figure(
-                        f"{statistic} {title}", experiment, "ms", statistic, places, sums, sizes,
-                        drawn_times, span,
+                        f"{statistic} {title}",
+                        experiment,
+                        "ms",
+                        statistic,
+                        places,
+                        sums,
+                        sizes,
+                        drawn_times,
+                        span,
                     )
-                )  # fmt: skip
+                )
     return found
 
 
@@ -218,9 +226,12 @@ def _times(row: TrialScore, tolerance_ns: int, end_ns: int, drawn: Drawn) -> dic
 
 
 def accuracy_figure(
-    evaluation: Evaluation, samples: SampleSet, counts: I64, length_ns: int,
+    evaluation: Evaluation,
+    samples: SampleSet,
+    counts: I64,
+    length_ns: int,
     drawn: Mapping[Name, Drawn],
-) -> Figure:  # fmt: skip
+) -> Figure:
     """Return strict accuracy of the test windows.
 
     Args:
@@ -241,12 +252,16 @@ def accuracy_figure(
             )
     known = evaluation.windows.interval
     return Figure(
-        "strict accuracy", "kinematic", "share", "mean", places,
+        "strict accuracy",
+        "kinematic",
+        "share",
+        "mean",
+        places,
         np.bincount(samples.trial, hits, total).astype(np.float64),
         np.bincount(samples.trial, minlength=total).astype(np.float64),
         reviews,
         None if known.low is None or known.high is None else (known.low, known.high),
-    )  # fmt: skip
+    )
 
 
 def drawn_classes(middle_ns: I64, drawn: Drawn) -> I64:

@@ -123,12 +123,17 @@ class ReviewOrder:
         first = [found.name for found in self.trials[:count]]
         gains = [
             Gain(
-                figure.name, figure.experiment, figure.unit, figure.value, figure.width,
-                _NORMAL_95 * before, _NORMAL_95 * figure.label_deviation(first),
+                figure.name,
+                figure.experiment,
+                figure.unit,
+                figure.value,
+                figure.width,
+                _NORMAL_95 * before,
+                _NORMAL_95 * figure.label_deviation(first),
             )
             for figure in self.figures
             if figure.width and (before := figure.label_deviation(()))
-        ]  # fmt: skip
+        ]
         return sorted(gains, key=lambda gain: -gain.label_width / gain.width)
 
 
@@ -172,17 +177,21 @@ def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
     error = _network_error(evaluation)
     trials = [
         Waiting(
-            *case.name, str(case.trial.split), doubts[case.name],
+            *case.name,
+            str(case.trial.split),
+            doubts[case.name],
             _moves(case.name, figures, shares.get(case.name, 0.0), error),
         )
         for case in waiting
         if case.name in doubts
-    ]  # fmt: skip
+    ]
     trials.sort(
         key=lambda found: (
-            -found.score, -found.doubt.severity, -max(found.doubt.spread_ms.values())
+            -found.score,
+            -found.doubt.severity,
+            -max(found.doubt.spread_ms.values()),
         )
-    )  # fmt: skip
+    )
     return ReviewOrder(trials, figures, notes)
 
 
@@ -256,10 +265,14 @@ def _moves(
             change = float(np.abs(known).mean())
             found.append(
                 Move(
-                    figure.name, figure.experiment, figure.unit, change, float(known.mean()),
+                    figure.name,
+                    figure.experiment,
+                    figure.unit,
+                    change,
+                    float(known.mean()),
                     None if figure.width is None else change / figure.width,
                 )
-            )  # fmt: skip
+            )
     if trained:
         of_interval = None if error is None else trained * error
         found.append(Move(TRAINING, "kinematic", "share", trained, None, of_interval))

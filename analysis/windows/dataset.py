@@ -224,8 +224,9 @@ def span_samples(
     for number, name in enumerate(classes):
         there = [
             consecutive_windows(span.start_ns, span.end_ns, length_ns)
-            for span in label.spans if span.name == name
-        ]  # fmt: skip
+            for span in label.spans
+            if span.name == name
+        ]
         found = np.concatenate([starts[0], *there])
         if len(found) > most:
             found = np.sort(rng.choice(found, most, replace=False))

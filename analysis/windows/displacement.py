@@ -88,9 +88,12 @@ def marker_displacements(labels: Labels, item: Collected, recording: Recording) 
             width, height = recording.frame_px[:2]
             plane = plane_of(corners, seen, (width, height))
     places = Places(
-        kept["xy_px"].astype(np.float64), kept["sigma_px"].astype(np.float64),
-        kept["quality"] / 100, plate, plane,
-    )  # fmt: skip
+        kept["xy_px"].astype(np.float64),
+        kept["sigma_px"].astype(np.float64),
+        kept["quality"] / 100,
+        plate,
+        plane,
+    )
     frame_ns: I64 = kept["frame_ns"]
     found = offsets(places, frame_ns, recording.motion_ns[0], item.settings.labelling.reference_ms)
     return frame_ns, _held(found.counted_from("hold_start"))
@@ -190,9 +193,12 @@ def load_marker_samples(labels: Labels, campaigns: list[Collected], split: str) 
             frame_ns, displacement = marker_displacements(labels, item, recording)
             label = labels.read(item, recording)
             chosen = choose_frames(
-                frame_ns, label.incipient_ns, label.gross_ns, item.settings.samples.per_class,
+                frame_ns,
+                label.incipient_ns,
+                label.gross_ns,
+                item.settings.samples.per_class,
                 hash_integer("samples", known.id),
-            )  # fmt: skip
+            )
             for name, newest in sorted(chosen.items()):
                 x.append(cut_frames(displacement, newest))
                 y.append(np.full(len(newest), name, np.int64))
@@ -203,9 +209,11 @@ def load_marker_samples(labels: Labels, campaigns: list[Collected], split: str) 
     none = np.empty(0, np.int64)
     return MarkerSamples(
         np.concatenate(x) if x else np.empty((0, FRAMES, 0, 2), np.float32),
-        np.concatenate([none, *y]), np.concatenate([none, *trial]),
-        np.concatenate([none, *times]), tuple(names),
-    )  # fmt: skip
+        np.concatenate([none, *y]),
+        np.concatenate([none, *trial]),
+        np.concatenate([none, *times]),
+        tuple(names),
+    )
 
 
 def _check_alike(x: Sequence[F32], names: Sequence[TrialId]) -> None:

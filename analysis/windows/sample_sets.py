@@ -119,14 +119,20 @@ def _make(
 ) -> SampleSet:
     work = [
         TrialWork(
-            recording, item.name, "",
+            recording,
+            item.name,
+            "",
             _SampleInputs(
-                labels.read(item, recording), TrialId(item.name, trial.id), windows,
-                item.settings.samples, hash_integer("samples", trial.id), classes,
+                labels.read(item, recording),
+                TrialId(item.name, trial.id),
+                windows,
+                item.settings.samples,
+                hash_integer("samples", trial.id),
+                classes,
             ),
         )
         for item, trial, recording in trials
-    ]  # fmt: skip
+    ]
     parts: dict[int, SampleSet] = {}
     each(work, _samples, parts.__setitem__)
     return SampleSet.join([parts[number] for number in range(len(work))], windows)
@@ -135,9 +141,14 @@ def _make(
 def _samples(recording: Recording, inputs: _SampleInputs) -> SampleSet:
     if inputs.classes:
         return dataset.span_samples(
-            recording, inputs.label, inputs.trial, inputs.windows, inputs.samples.per_class,
-            inputs.classes, inputs.seed,
-        )  # fmt: skip
+            recording,
+            inputs.label,
+            inputs.trial,
+            inputs.windows,
+            inputs.samples.per_class,
+            inputs.classes,
+            inputs.seed,
+        )
     return dataset.trial_samples(
         recording, inputs.label, inputs.trial, inputs.windows, inputs.samples, inputs.seed
     )

@@ -103,9 +103,9 @@ class SparseWindows:
             raise ValueError(f"{how.shape} mirrors of 0 to 3 for {len(self)} samples")
         steps, *plane = self.shape
         cells = np.arange(math.prod(plane), dtype=np.uint32).reshape(plane)
-        places = np.stack([
-            cells, cells[:, :, ::-1], cells[:, ::-1], cells[:, ::-1, ::-1]
-        ]).reshape(4, -1)  # fmt: skip
+        places = np.stack([cells, cells[:, :, ::-1], cells[:, ::-1], cells[:, ::-1, ::-1]]).reshape(
+            4, -1
+        )
         cell, count = self.cell.copy(), self.count.copy()
         _mirror(how.astype(np.uint8), places, self.offsets, steps, cell, count)
         return SparseWindows(self.shape, self.offsets, cell, count)

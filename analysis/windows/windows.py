@@ -89,9 +89,21 @@ def list_events(
     rows, across = _plane(settings, width, height)
     plane = np.zeros(settings.polarities * rows * across + 1, np.uint8)
     state = _list(
-        *columns, starts, settings.step_ms * 1000, settings.steps, _CODES[settings.polarity],
-        of_x, of_y, rows, across, plane, np.empty(plane.size, np.uint32), offsets, cell, count,
-    )  # fmt: skip
+        *columns,
+        starts,
+        settings.step_ms * 1000,
+        settings.steps,
+        _CODES[settings.polarity],
+        of_x,
+        of_y,
+        rows,
+        across,
+        plane,
+        np.empty(plane.size, np.uint32),
+        offsets,
+        cell,
+        count,
+    )
     _raise_for_status(state, columns, width, height)
     return SparseWindows(shape, offsets, cell[: offsets[-1]].copy(), count[: offsets[-1]].copy())
 
@@ -232,9 +244,17 @@ def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _bin(
-    x: Any, y: Any, p: Any, t: Any, starts: Any, step_us: int, polarity: int, of_x: Any, of_y: Any,
+    x: Any,
+    y: Any,
+    p: Any,
+    t: Any,
+    starts: Any,
+    step_us: int,
+    polarity: int,
+    of_x: Any,
+    of_y: Any,
     out: Any,
-) -> int:  # fmt: skip
+) -> int:
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state
@@ -262,10 +282,24 @@ def _bin(
 
 @njit(cache=True, nogil=True)
 def _list(
-    x: Any, y: Any, p: Any, t: Any, starts: Any, step_us: int, steps: int, polarity: int,
-    of_x: Any, of_y: Any, rows: int, across: int, plane: Any, touched: Any, offsets: Any,
-    cell: Any, count: Any,
-) -> int:  # fmt: skip
+    x: Any,
+    y: Any,
+    p: Any,
+    t: Any,
+    starts: Any,
+    step_us: int,
+    steps: int,
+    polarity: int,
+    of_x: Any,
+    of_y: Any,
+    rows: int,
+    across: int,
+    plane: Any,
+    touched: Any,
+    offsets: Any,
+    cell: Any,
+    count: Any,
+) -> int:
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state
@@ -307,9 +341,17 @@ def _list(
 
 @njit(cache=True, nogil=True)
 def _total(
-    x: Any, y: Any, p: Any, t: Any, starts: Any, length_us: int, polarity: int, of_x: Any,
-    of_y: Any, out: Any,
-) -> int:  # fmt: skip
+    x: Any,
+    y: Any,
+    p: Any,
+    t: Any,
+    starts: Any,
+    length_us: int,
+    polarity: int,
+    of_x: Any,
+    of_y: Any,
+    out: Any,
+) -> int:
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state

@@ -251,10 +251,11 @@ def _squares(board: Board, axes: object, corner: tuple[float, float]) -> None:
         # y counts down the page from the board's top
         top = corner[1] + board.size_mm[1] - y
         quads.append(
-            [(corner[0] + x + a, top - b) for a, b in (
-                (0, 0), (side_x, 0), (side_x, side_y), (0, side_y)
-            )]
-        )  # fmt: skip
+            [
+                (corner[0] + x + a, top - b)
+                for a, b in ((0, 0), (side_x, 0), (side_x, side_y), (0, side_y))
+            ]
+        )
 
     for row in range(board.rows):
         for column in range(board.columns):
@@ -269,8 +270,10 @@ def _squares(board: Board, axes: object, corner: tuple[float, float]) -> None:
                 edges = np.flatnonzero(np.diff(np.concatenate([[0], black, [0]]).astype(int)))
                 for begin, end in edges.reshape(-1, 2).tolist():
                     quad(
-                        x + inset + begin * module, y + inset + line * module,
-                        (end - begin) * module, module,
-                    )  # fmt: skip
+                        x + inset + begin * module,
+                        y + inset + line * module,
+                        (end - begin) * module,
+                        module,
+                    )
     shapes = PolyCollection(quads, facecolors="black", edgecolors="none", antialiased=False)
     axes.add_collection(shapes)  # type: ignore[attr-defined]

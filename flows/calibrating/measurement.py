@@ -144,9 +144,13 @@ class Measurement:
             finally:
                 rig.close()
         written = write_entries(
-            self.path, target, finding.changes, today=today, remove=finding.remove,
+            self.path,
+            target,
+            finding.changes,
+            today=today,
+            remove=finding.remove,
             expected=self.text,
-        )  # fmt: skip
+        )
         self._report(finding, written.path, written.kept)
 
     def _rows(self, moves: Sequence[PlannedMove]) -> list[AnnouncedMove]:
@@ -175,12 +179,25 @@ class Measurement:
         rows = self._rows(moves)
         if self.as_json:
             console.print_json(
-                {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
-                 "dry_run": True, "how": who or ANNOUNCEMENT, "moves": rows}
-            )  # fmt: skip
+                {
+                    "what": self.what,
+                    "rig": self.file.name,
+                    "simulated": self.file.simulated,
+                    "dry_run": True,
+                    "how": who or ANNOUNCEMENT,
+                    "moves": rows,
+                }
+            )
             return
-        columns = ["what", "x, mm", "y, mm", "from depth, mm", "to at most, mm", "speed, mm/s",
-                   "deepest in base, mm"]  # fmt: skip
+        columns = [
+            "what",
+            "x, mm",
+            "y, mm",
+            "from depth, mm",
+            "to at most, mm",
+            "speed, mm/s",
+            "deepest in base, mm",
+        ]
         table = [[*list(vars(row).values())[:-1], _cell(row.base_mm)] for row in rows]
         title = f"{self.what} of rig {self.file.name}: nothing moved (dry run)"
         console.print_table(title, columns, table)
@@ -190,10 +207,17 @@ class Measurement:
         removed = [key for key in finding.remove if self._had(key)]
         if self.as_json:
             console.print_json(
-                {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
-                 **finding.figures, "written": str(path), "kept": kept and str(kept),
-                 "keys": list(finding.changes), "removed": removed}
-            )  # fmt: skip
+                {
+                    "what": self.what,
+                    "rig": self.file.name,
+                    "simulated": self.file.simulated,
+                    **finding.figures,
+                    "written": str(path),
+                    "kept": kept and str(kept),
+                    "keys": list(finding.changes),
+                    "removed": removed,
+                }
+            )
             return
         simulated = " (simulated)" if self.file.simulated else ""
         shown = {name: _cell(value) for name, value in finding.figures.items()}
@@ -211,8 +235,9 @@ class Measurement:
 def _confirm() -> None:
     if not sys.stdin.isatty():
         raise InputError("--yes", "", None, "is required without a terminal")
-    typer.confirm("Is the path clear, and a hand on the stop button? Move the arm?", abort=True,
-                  err=True)  # fmt: skip
+    typer.confirm(
+        "Is the path clear, and a hand on the stop button? Move the arm?", abort=True, err=True
+    )
 
 
 def _cell(value: object) -> object:
@@ -224,6 +249,8 @@ def _cell(value: object) -> object:
 
 
 def _number_text(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) and abs(value) < 100 else (
-        f"{value:.2f}" if isinstance(value, float) else str(value)
-    )  # fmt: skip
+    return (
+        f"{value:.6g}"
+        if isinstance(value, float) and abs(value) < 100
+        else (f"{value:.2f}" if isinstance(value, float) else str(value))
+    )

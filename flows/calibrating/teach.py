@@ -35,9 +35,11 @@ def plane_places(span_mm: float) -> dict[str, tuple[float, float]]:
     """Return where the plane is touched, in plate coordinates: three points, and one to check."""
     diagonal = -span_mm / 2**0.5
     return {
-        "centre": (0.0, 0.0), "right": (span_mm, 0.0), "above": (0.0, span_mm),
+        "centre": (0.0, 0.0),
+        "right": (span_mm, 0.0),
+        "above": (0.0, span_mm),
         "check": (diagonal, diagonal),
-    }  # fmt: skip
+    }
 
 
 def planned_touches(

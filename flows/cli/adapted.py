@@ -58,9 +58,13 @@ def import_by_adapter(
         bar = console.bar("import (trials)", len(found.trials))
         with new_store(place) as store, store_lock(store), bar as progress:
             result = import_adapted(
-                store, name, found, text, lambda trial: progress.advance(1, trial),
+                store,
+                name,
+                found,
+                text,
+                lambda trial: progress.advance(1, trial),
                 salvage=salvage,
-            )  # fmt: skip
+            )
         say_faults(result)
         warnings = [*found.warnings, *result.get("warnings", ())]
         result |= {"split": dict(Counter(parts.values())), "warnings": warnings}
@@ -89,17 +93,22 @@ def _list(found: AdaptedSet, parts: dict[str, str], place: Path, name: str, as_j
             ("trial", "condition", "label", "part", "there"),
             [
                 (
-                    row["trial"], _condition(found.adapter, row["condition"]), row["label"] or "-",
-                    row["part"], "yes" if row["there"] else "no",
+                    row["trial"],
+                    _condition(found.adapter, row["condition"]),
+                    row["label"] or "-",
+                    row["part"],
+                    "yes" if row["there"] else "no",
                 )
                 for row in rows
             ],
             limit=4 * _SHOWN,
-        )  # fmt: skip
+        )
     result: Json = {
-        "campaign": name, "trials": rows if as_json else len(rows),
-        "split": dict(Counter(parts.values())), "warnings": list(found.warnings),
-    }  # fmt: skip
+        "campaign": name,
+        "trials": rows if as_json else len(rows),
+        "split": dict(Counter(parts.values())),
+        "warnings": list(found.warnings),
+    }
     _finish(result, found, f"{name}: nothing was written", as_json)
 
 

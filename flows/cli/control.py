@@ -48,9 +48,12 @@ CampaignOption = Annotated[
 
 @app.command()
 def pause(
-    store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 600.0,
+    store: StoreArgument,
+    why: WhyOption = "",
+    who: WhoOption = "",
+    wait: WaitOption = 600.0,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Pause after the current trial; returns once the collection is paused."""
     outcome = _request(store, "pause", who, why, wait)
     _finish([outcome], as_json, _pause_words(store, outcome))
@@ -58,9 +61,12 @@ def pause(
 
 @app.command()
 def resume(
-    store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
+    store: StoreArgument,
+    why: WhyOption = "",
+    who: WhoOption = "",
+    wait: WaitOption = 60.0,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Resume a paused collection."""
     outcome = _request(store, "resume", who, why, wait)
     running = outcome.answer is not None and outcome.answer["did"].get("running")
@@ -70,9 +76,12 @@ def resume(
 
 @app.command()
 def stop(
-    store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
+    store: StoreArgument,
+    why: WhyOption = "",
+    who: WhoOption = "",
+    wait: WaitOption = 60.0,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Stop a running collection at once, arm first, like Ctrl-C in its terminal."""
     from sliplab.flows.collecting.requests import halt
     from sliplab.storage.trials.store import Store
@@ -88,20 +97,28 @@ def stop(
 
 @app.command()
 def skip(
-    store: StoreArgument, trials: TrialsArgument, why: NeededWhyOption,
-    campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
+    store: StoreArgument,
+    trials: TrialsArgument,
+    why: NeededWhyOption,
+    campaign: CampaignOption = None,
+    who: WhoOption = "",
+    wait: WaitOption = 600.0,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Skip trials: they are not collected until `sliplab again` requests them."""
     _decide(store, "skip", trials, campaign, who, why, wait, as_json)
 
 
 @app.command()
 def again(
-    store: StoreArgument, trials: TrialsArgument, why: NeededWhyOption,
-    campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
+    store: StoreArgument,
+    trials: TrialsArgument,
+    why: NeededWhyOption,
+    campaign: CampaignOption = None,
+    who: WhoOption = "",
+    wait: WaitOption = 600.0,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Retake trials: the committed recording is moved to quarantine, never deleted."""
     _decide(store, "again", trials, campaign, who, why, wait, as_json)
 
@@ -114,9 +131,15 @@ def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> Outcom
 
 
 def _decide(
-    store: Path, kind: Kind, trials: list[str], campaign: str | None, who: str, why: str,
-    wait: float, as_json: bool,
-) -> None:  # fmt: skip
+    store: Path,
+    kind: Kind,
+    trials: list[str],
+    campaign: str | None,
+    who: str,
+    why: str,
+    wait: float,
+    as_json: bool,
+) -> None:
     from sliplab.flows.collecting import requests
     from sliplab.protocols.errors import InputError
     from sliplab.storage.trials.store import Store

@@ -27,14 +27,38 @@ from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fau
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _WITH_TRIALS = {
-    "collect", "sync", "label", "train", "evaluate", "generalise", "guesses", "holdout", "study",
-    "demo", "stress", "tradeoff", "push", "pull", "import", "serve", "migrate", "reflex",
-}  # fmt: skip
+    "collect",
+    "sync",
+    "label",
+    "train",
+    "evaluate",
+    "generalise",
+    "guesses",
+    "holdout",
+    "study",
+    "demo",
+    "stress",
+    "tradeoff",
+    "push",
+    "pull",
+    "import",
+    "serve",
+    "migrate",
+    "reflex",
+}
 """Commands that take trials or process them, and resume."""
 _EXPECTED = {
-    "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
-    "OutputLost", "WorkerKilled", "WorkNotBegun", "MainModuleError",
-}  # fmt: skip
+    "RigError",
+    "ArmFault",
+    "Locked",
+    "CampaignStopped",
+    "ClusterError",
+    "ServerError",
+    "OutputLost",
+    "WorkerKilled",
+    "WorkNotBegun",
+    "MainModuleError",
+}
 """Errors that need no traceback, by name: their modules are slow to import."""
 _OPTION = re.compile(r"--[a-z-]+|DETECTOR|FOLDER|KIND|NAME|TRIAL|URL")
 """Names of options and arguments: an `InputError` about one has it in place of a file."""

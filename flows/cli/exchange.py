@@ -67,9 +67,14 @@ def import_(
         from sliplab.flows.cli.adapted import import_by_adapter
 
         import_by_adapter(
-            adapter, Path(kind_or_path), store, name,
-            salvage=salvage, dry_run=dry_run, as_json=as_json,
-        )  # fmt: skip
+            adapter,
+            Path(kind_or_path),
+            store,
+            name,
+            salvage=salvage,
+            dry_run=dry_run,
+            as_json=as_json,
+        )
         return
     if dry_run:
         raise InputError("--dry-run", "", None, "is for an import with --adapter")
@@ -147,10 +152,13 @@ def export(
         holders = [item for item in campaigns.values() if what in item.committed()]
         if len(holders) != 1:
             raise InputError(
-                store, "", what,
-                "is in several campaigns; name a trial or another campaign" if holders
+                store,
+                "",
+                what,
+                "is in several campaigns; name a trial or another campaign"
+                if holders
                 else f"is no campaign or committed trial; campaigns: {', '.join(campaigns)}",
-            )  # fmt: skip
+            )
         campaign, names = holders[0], [what]
     if labels:
         table = label_table(opened, campaign.name, names)

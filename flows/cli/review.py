@@ -123,16 +123,28 @@ def _print_order(trials: TrialList, found: ReviewOrder, count: int) -> None:
         console.show(f"No label is in doubt: a review would change nothing{simulated}.")
         return
     first = found.trials[:count]
-    columns = ("campaign", "trial", "part", "incipient sd (ms)", "gross sd (ms)", "may be lost",
-               "would change", "because")  # fmt: skip
+    columns = (
+        "campaign",
+        "trial",
+        "part",
+        "incipient sd (ms)",
+        "gross sd (ms)",
+        "may be lost",
+        "would change",
+        "because",
+    )
     rows = [
         (
-            item.campaign, item.trial, item.split,
+            item.campaign,
+            item.trial,
+            item.split,
             *(f"{spread:.0f}" for spread in item.doubt.spread_ms.values()),
-            f"{item.doubt.unusable:.0%}", _moves(item), "; ".join(item.doubt.reasons),
+            f"{item.doubt.unusable:.0%}",
+            _moves(item),
+            "; ".join(item.doubt.reasons),
         )
         for item in first
-    ]  # fmt: skip
+    ]
     title = (
         f"{len(first)} of {plural(len(found.trials), 'trial')} in doubt, by what a "
         "review would change"

@@ -106,11 +106,16 @@ def _list_drivers(as_json: bool) -> None:
         except DriverError as error:
             wrong.append(str(error))
             continue
-        found.append({
-            "name": item.name, "kind": driver.kind, "title": driver.title, "package": item.package,
-            "simulated_on_loopback": getattr(driver, "fake", None) is not None
-            or getattr(driver, "reach", None) is not None,
-        })  # fmt: skip
+        found.append(
+            {
+                "name": item.name,
+                "kind": driver.kind,
+                "title": driver.title,
+                "package": item.package,
+                "simulated_on_loopback": getattr(driver, "fake", None) is not None
+                or getattr(driver, "reach", None) is not None,
+            }
+        )
     if as_json:
         console.print_json({"drivers": found, "wrong": wrong})
     else:
@@ -151,9 +156,14 @@ def _about(path: Path, ask: bool) -> RigRow:
     except InputError as error:
         text = masked(str(error))
         return {
-            "name": path.name, "driver": "", "arm": "", "cameras": "", "answer": text,
-            "wrong": True, "file": str(path),
-        }  # fmt: skip
+            "name": path.name,
+            "driver": "",
+            "arm": "",
+            "cameras": "",
+            "answer": text,
+            "wrong": True,
+            "file": str(path),
+        }
     answers = _ask(file) if ask and file.driver == "devices" else {}
     silent = {name: masked(why) for name, why in answers.items() if why is not None}
     return {
@@ -300,15 +310,16 @@ def teach_tool(
     tool: Annotated[
         str | None,
         typer.Option(
-            "--tool", help="Current tool of the controller, x,y,z in mm and rotation vector in "
-            "degrees, from the flange; the rig file's if left out."
+            "--tool",
+            help="Current tool of the controller, x,y,z in mm and rotation vector in "
+            "degrees, from the flange; the rig file's if left out.",
         ),
     ] = None,
     out: OutOption = None,
     yes: YesOption = False,
     dry_run: DryOption = False,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Find the tool centre point by jogging the tip onto one point at different tilts."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
@@ -317,10 +328,12 @@ def teach_tool(
     command = Measurement(rig, out, "tool", as_json)
     set_now = None if tool is None else _tool(tool)
     command.run(
-        [], yes, dry_run,
+        [],
+        yes,
+        dry_run,
         lambda session: steps.teach_tool(session, poses, set_now or tool_of(session.file)),
         "a person jogs the arm",
-    )  # fmt: skip
+    )
 
 
 @calibrate_app.command("lens")

@@ -165,7 +165,7 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
     shown: dict[str, str | int] = {
         "windows": f"{accuracy.n} of {plural(interval.trials, 'trial')}",
         "engine": f"{result['engine']}{differ}",
-    }  # fmt: skip
+    }
     if accuracy.n:
         shown |= {
             "strict accuracy": f"{accuracy.strict:.1%}{sure}",

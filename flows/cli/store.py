@@ -25,9 +25,16 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 SHOWN = (
-    "campaign", "trial", "recorded_s", "events", "frames", "frame_source", "attempt", "simulated",
+    "campaign",
+    "trial",
+    "recorded_s",
+    "events",
+    "frames",
+    "frame_source",
+    "attempt",
+    "simulated",
     "unread_bytes",
-)  # fmt: skip
+)
 """Columns of the catalogue that fit a terminal."""
 
 
@@ -153,8 +160,10 @@ def verify(
             "quarantined": moved,
         }
         further = {
-            "mended": [str(path) for path in mended], "salvaged": torn, "failed_gates": failing,
-        }  # fmt: skip
+            "mended": [str(path) for path in mended],
+            "salvaged": torn,
+            "failed_gates": failing,
+        }
         console.print_json(result | {key: found for key, found in further.items() if found})
     else:
         for item in problems:
@@ -250,9 +259,13 @@ def push(
         total = sum(len(item.committed()) for item in chosen)
         with console.bar(f"push {store} (trials)", total) as bar:
             now = send(
-                opened, remote, chosen, options,
-                lambda name: bar.advance(1, name), lambda _: stopping.check(),
-            )  # fmt: skip
+                opened,
+                remote,
+                chosen,
+                options,
+                lambda name: bar.advance(1, name),
+                lambda _: stopping.check(),
+            )
         if done is None:
             done = now
         else:
@@ -282,9 +295,13 @@ def pull(
             bar.advance(1, name)
 
         done = pull_trials(
-            Remote(url), store, campaigns=campaign, quarantine=quarantine, on_trial=seen,
+            Remote(url),
+            store,
+            campaigns=campaign,
+            quarantine=quarantine,
+            on_trial=seen,
             on_bytes=lambda _: bar.advance(0),
-        )  # fmt: skip
+        )
     _finish({"url": url, "store": str(store), **vars(done)}, "pull", as_json)
 
 
@@ -300,9 +317,12 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
 
     if quarantine:
         raise InputError(
-            "--quarantine", "", url, "must not be given with a URL: `sliplab push --check` from a "
+            "--quarantine",
+            "",
+            url,
+            "must not be given with a URL: `sliplab push --check` from a "
             "whole store sends anew what is damaged there",
-        )  # fmt: skip
+        )
     with console.bar(f"verify {url} (trials)", 0) as bar:
 
         def seen(name: str) -> None:

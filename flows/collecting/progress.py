@@ -294,11 +294,14 @@ def outcome_rows(counts: CampaignCounts, here: Counter[str]) -> list[Json]:
     return [
         {"outcome": "planned", "this run": "", "campaign": counts["planned"]},
         {"outcome": "committed", "this run": here["committed"], "campaign": counts["committed"]},
-        {"outcome": "set aside", "this run": here["set aside"] + here["skipped"],
-         "campaign": len(counts["set_aside"])},
+        {
+            "outcome": "set aside",
+            "this run": here["set aside"] + here["skipped"],
+            "campaign": len(counts["set_aside"]),
+        },
         {"outcome": "missing", "this run": "", "campaign": counts["missing"]},
         {"outcome": "takes in quarantine", "this run": "", "campaign": counts["quarantined"]},
-    ]  # fmt: skip
+    ]
 
 
 def artifact_key(campaign: str, kind: str) -> str:

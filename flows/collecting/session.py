@@ -330,8 +330,9 @@ class TrialCollector:
         collection = self.plan.protocol.collection
         rate_hz = collection.recording.sync_rate
         frame_px, frame_rate_hz = (
-            self.rig_file.frame_px(self.plan), self.rig_file.frame_rate_hz(self.plan),
-        )  # fmt: skip
+            self.rig_file.frame_px(self.plan),
+            self.rig_file.frame_rate_hz(self.plan),
+        )
         with_events = self.rig_file.with_events(self.plan)
         mid_exposure_ns = None if frame_px is None else self.rig.frames.mid_exposure_ns
         spool = self.rig_file.frame_camera.spool

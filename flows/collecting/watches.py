@@ -111,19 +111,35 @@ class ReferenceWatch:
             return
         recording = self._campaign.recording(trial.id)
         self._compare(
-            trial, "event_rate", self._gate.event_rate, hold_rate(recording),
-            "{:,.0f}", "events/s in the hold", "Skin, light or lens changed",
-        )  # fmt: skip
+            trial,
+            "event_rate",
+            self._gate.event_rate,
+            hold_rate(recording),
+            "{:,.0f}",
+            "events/s in the hold",
+            "Skin, light or lens changed",
+        )
         if self._gate.friction is not None:
             self._compare(
-                trial, "friction", self._gate.friction, sliding_friction(recording),
-                "{:.3f}", "N/N of friction in the slide", "Skin worn, or skin or plate dirty",
-            )  # fmt: skip
+                trial,
+                "friction",
+                self._gate.friction,
+                sliding_friction(recording),
+                "{:.3f}",
+                "N/N of friction in the slide",
+                "Skin worn, or skin or plate dirty",
+            )
 
     def _compare(
-        self, trial: Trial, key: str, bound: Decimal, value: float, figure: str, where: str,
+        self,
+        trial: Trial,
+        key: str,
+        bound: Decimal,
+        value: float,
+        figure: str,
+        where: str,
         cause: str,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Compare a figure with that of the first reference trial.
 
         Args:

@@ -105,9 +105,13 @@ def make_detect_request(
         right = f"must be over 0 and at most the window's {fitted.windows.length_ms} ms"
         raise InputError("--stride", "", f"{stride_ms:g} ms", right)
     requested = partial(
-        DetectRequest, model=model, model_sha256=sha256(model), fitted=fitted,
-        stride_ms=stride_ms, poll_s=poll_s,
-    )  # fmt: skip
+        DetectRequest,
+        model=model,
+        model_sha256=sha256(model),
+        fitted=fitted,
+        stride_ms=stride_ms,
+        poll_s=poll_s,
+    )
     if protocol is None:
         for name, text in (("--trial", trial), ("--reflex", reflex)):
             if text is not None:

@@ -74,9 +74,14 @@ def excluded_trials(
             continue
         person = known or {}
         found.append(
-            {"trial": trial.id, "cause": cause, "attempts": attempts,
-             "by": person.get("who"), "when": person.get("when")}
-        )  # fmt: skip
+            {
+                "trial": trial.id,
+                "cause": cause,
+                "attempts": attempts,
+                "by": person.get("who"),
+                "when": person.get("when"),
+            }
+        )
     return found
 
 

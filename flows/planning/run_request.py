@@ -188,9 +188,18 @@ def make_request(
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
     run_request = RunRequest(
-        plan, rig_file, rig_text, store, name, enable, metadata, most, until,
-        claims=claims, judging_model=None if claims == "ignore" else judging_model(plan),
-    )  # fmt: skip
+        plan,
+        rig_file,
+        rig_text,
+        store,
+        name,
+        enable,
+        metadata,
+        most,
+        until,
+        claims=claims,
+        judging_model=None if claims == "ignore" else judging_model(plan),
+    )
     if begun:
         _check_same(run_request, begun)
     return run_request

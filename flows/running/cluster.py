@@ -70,9 +70,11 @@ class Cluster:
             ClusterError: one does not.
         """
         _ask_all(
-            self.client, reach_server, url,
+            self.client,
+            reach_server,
+            url,
             "start a server that all machines reach, and set PREFECT_API_URL to it",
-        )  # fmt: skip
+        )
 
     def check_store(self, look: Callable[[Any], None], job: Any) -> None:
         """Check that each worker finds a trial: `look(job)` raises there if it does not.
@@ -81,10 +83,12 @@ class Cluster:
             ClusterError: one does not.
         """
         _ask_all(
-            self.client, look, job,
+            self.client,
+            look,
+            job,
             "workers need the store at the same path (share its folder), or give the URL of a "
             "pushed one",
-        )  # fmt: skip
+        )
 
     def report(self) -> None:
         """Have the workers send their reports while Prefect's server still runs."""

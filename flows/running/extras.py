@@ -7,8 +7,14 @@ from contextlib import contextmanager
 
 EXTRAS = {
     "hardware": (
-        "rtde_control", "rtde_receive", "abb_motion_program_exec", "abb_robot_client", "requests",
-        "serial", "pypylon", "dv_processing",
+        "rtde_control",
+        "rtde_receive",
+        "abb_motion_program_exec",
+        "abb_robot_client",
+        "requests",
+        "serial",
+        "pypylon",
+        "dv_processing",
     ),
     "learn": ("torch", "sinabs", "sklearn", "threadpoolctl"),
     "prefect": ("prefect",),
@@ -18,7 +24,7 @@ EXTRAS = {
     "onnx": ("onnx", "onnxruntime"),
     "publish": ("mcap", "zstandard", "lz4"),
     "formats": ("faery", "rosbags"),
-}  # fmt: skip
+}
 """Modules that each extra installs."""
 
 _BRINGS = {module: extra for extra, modules in EXTRAS.items() for module in modules}

@@ -190,9 +190,14 @@ def trial_job(store: Store, work: TrialWork, make: Make) -> TrialJob:
     """Return some work as another process can do it, by `make_in_process`."""
     recording = work.recording
     return TrialJob(
-        place_of(store), work.campaign, recording.folder.name, recording.checksum,
-        recording.clocks_elsewhere, make, work.settings,
-    )  # fmt: skip
+        place_of(store),
+        work.campaign,
+        recording.folder.name,
+        recording.checksum,
+        recording.clocks_elsewhere,
+        make,
+        work.settings,
+    )
 
 
 def run_trials(

@@ -56,9 +56,15 @@ def begin(store: Path, run: str, flow: str, server: str, deployment: str = "") -
     make_folder(folder)
     write_new_json(
         folder / f"{run}.json",
-        {"run": run, "flow": flow, "deployment": deployment, "server": server,
-         "began": now(), "process": this_process()},
-    )  # fmt: skip
+        {
+            "run": run,
+            "flow": flow,
+            "deployment": deployment,
+            "server": server,
+            "began": now(),
+            "process": this_process(),
+        },
+    )
 
 
 def end(store: Path, run: str, state: str, message: str, by: str) -> bool:

@@ -258,10 +258,15 @@ def _take(wanted: OnRig, run_request: RunRequest, run: Any) -> str:
 
 def _collect(wanted: Collect, here: Service, run: Any) -> str:
     run_request = _run_request(
-        here, wanted, here.protocol(wanted.protocol), run,
-        most=wanted.trials, campaign=wanted.campaign, enable=tuple(wanted.enable),
+        here,
+        wanted,
+        here.protocol(wanted.protocol),
+        run,
+        most=wanted.trials,
+        campaign=wanted.campaign,
+        enable=tuple(wanted.enable),
         claims="overrule" if wanted.no_stopping else "use",
-    )  # fmt: skip
+    )
     return _take(wanted, run_request, run)
 
 

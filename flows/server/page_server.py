@@ -146,15 +146,19 @@ def refuse_open(url: str) -> None:
         if not isinstance(getattr(error, "reason", error), TimeoutError):
             return
         raise InputError(
-            "PREFECT_API_URL", "", address,
+            "PREFECT_API_URL",
+            "",
+            address,
             f"did not answer in {ANSWER_S:g} s, so whether it asks for a password is not known; "
             "try again",
-        ) from None  # fmt: skip
+        ) from None
     raise InputError(
-        "PREFECT_API_URL", "", address,
+        "PREFECT_API_URL",
+        "",
+        address,
         "has no password, so any web page in a browser that reaches it could move the arm; "
         "set PREFECT_SERVER_API_AUTH_STRING for the server and PREFECT_API_AUTH_STRING here",
-    )  # fmt: skip
+    )
 
 
 def page_password(home: Path) -> str:
@@ -176,9 +180,11 @@ def page_password(home: Path) -> str:
     if not private:
         path.unlink()
         raise InputError(
-            path, "", None,
+            path,
+            "",
+            None,
             "can be read by other users on this file system; name another folder in PREFECT_HOME",
-        )  # fmt: skip
+        )
     return password
 
 

@@ -329,9 +329,13 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
         parameters["protocol"] = _protocol(path, model.protocol, model.enable)
         _check_campaign(path, model.campaign)
     return Scheduled(
-        name=model.name, flow=flow, cron=_cron(model), timezone=timezone, active=model.active,
+        name=model.name,
+        flow=flow,
+        cron=_cron(model),
+        timezone=timezone,
+        active=model.active,
         parameters=parameters,
-    )  # fmt: skip
+    )
 
 
 def _cron(model: Any) -> str:

@@ -86,9 +86,11 @@ async def _serve(
         await _refuse_another(flow.name, here.name, here.folder)
         when = _prefects([item for item in schedules if item.flow == flow.name])
         made = await flow.ato_deployment(
-            deployment_name(flow.name, here.name), schedules=when,
-            tags=_tags(here.folder, here.rig), description=flow.description,
-        )  # fmt: skip
+            deployment_name(flow.name, here.name),
+            schedules=when,
+            tags=_tags(here.folder, here.rig),
+            description=flow.description,
+        )
         (on_rig if flow in ON_RIG else control)[await made.aapply()] = flow
     names = [flow.name for flow in (*ON_RIG, *CONTROL)]
     await _close_stranded(here.name, names, here.folder)

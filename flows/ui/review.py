@@ -211,9 +211,13 @@ def _count(counts: dict[str, dict[str, int]], row: Row) -> int:
 
 
 def filtered_rows(
-    rows: Iterable[Row], *, campaign: str = "", state: str = "", text: str = "",
+    rows: Iterable[Row],
+    *,
+    campaign: str = "",
+    state: str = "",
+    text: str = "",
     doubtful_first: bool = True,
-) -> list[Row]:  # fmt: skip
+) -> list[Row]:
     """Return the rows that pass the filters, in the order of work.
 
     Args:
@@ -364,11 +368,19 @@ def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
     motion = recording.motion_ns
     rate_s, rate = event_rate(recording, start, end)
     return ShownTrial(
-        row, item, recording, label, frame_ns, moved,
+        row,
+        item,
+        recording,
+        label,
+        frame_ns,
+        moved,
         None if places is None else np.asarray(places, np.float64),
         None if plate is None else np.asarray(plate, np.float64),
-        rate_s, rate, (start / 1e9, end / 1e9), (motion[0] / 1e9, motion[1] / 1e9),
-    )  # fmt: skip
+        rate_s,
+        rate,
+        (start / 1e9, end / 1e9),
+        (motion[0] / 1e9, motion[1] / 1e9),
+    )
 
 
 def event_rate(recording: Recording, start_ns: int, end_ns: int) -> tuple[F64, F64]:
@@ -413,6 +425,13 @@ def record_verdict(
             name = kind.removesuffix("_ns")
             raise ValueError(f"the {name} onset lies outside the recording")
     return review.decide(
-        trials.store, *shown.row.name, verdict, label=shown.label_key, old=shown.onsets, new=new,
-        seen=shown.row.decisions, who=who.strip(), why=why,
-    )  # fmt: skip
+        trials.store,
+        *shown.row.name,
+        verdict,
+        label=shown.label_key,
+        old=shown.onsets,
+        new=new,
+        seen=shown.row.decisions,
+        who=who.strip(),
+        why=why,
+    )

@@ -98,9 +98,12 @@ class Page:
         campaign = "" if self.see.campaign.value == ALL else self.see.campaign.value
         state = "" if self.see.state.value == ALL else self.see.state.value
         self._rows = filtered_rows(
-            self.trials.rows, campaign=campaign, state=state, text=self.see.text.value,
+            self.trials.rows,
+            campaign=campaign,
+            state=state,
+            text=self.see.text.value,
             doubtful_first=bool(self.see.first.active),
-        )  # fmt: skip
+        )
         columns = as_columns(self._rows)
         if columns != dict(self.see.source.data):
             self.see.source.data = columns
@@ -263,9 +266,13 @@ class Page:
             return
         try:
             made = record_verdict(
-                self.trials, shown, verdict, self.plots.onsets(), self.see.who.value,
+                self.trials,
+                shown,
+                verdict,
+                self.plots.onsets(),
+                self.see.who.value,
                 self.see.reason.value,
-            )  # fmt: skip
+            )
         except (LabelChanged, review.Overtaken) as error:
             self._say(f"Not saved: {error}. Review it and decide again.")
             self._choose(self.trials.renew(shown.row))

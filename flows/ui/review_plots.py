@@ -76,10 +76,12 @@ class TimePlots:
         span = Range1d(0, 1)
         tools = "xwheel_zoom,reset"
         common: dict[str, Any] = {
-            "x_range": span, "sizing_mode": "stretch_width", "tools": tools,
+            "x_range": span,
+            "sizing_mode": "stretch_width",
+            "tools": tools,
             "active_scroll": "xwheel_zoom",
             "min_border_left": 62,
-        }  # fmt: skip
+        }
         # the program sets all ranges: a page that had to find them in data not yet there complains
         self.moved = figure(
             height=330,
@@ -114,15 +116,21 @@ class TimePlots:
         for plot in (self.moved, self.rate):
             plot.on_event("mousemove", lambda event: on_cursor(float(event.x)))
             plot.xgrid.grid_line_alpha = plot.ygrid.grid_line_alpha = 0.4
-        named = (("centre marker", RED, 2.0), ("first marker to slip", ORANGE, 1.6),
-                  ("other markers", _FAINT, 1.0))  # fmt: skip
+        named = (
+            ("centre marker", RED, 2.0),
+            ("first marker to slip", ORANGE, 1.6),
+            ("other markers", _FAINT, 1.0),
+        )
         for text, colour, width in named:
             self.moved.line([0], [np.nan], color=colour, line_width=width, legend_label=text)
         legend = self.moved.legend[0]
         legend.update(
-            orientation="horizontal", label_text_font_size="11px", padding=2, border_line_width=0,
+            orientation="horizontal",
+            label_text_font_size="11px",
+            padding=2,
+            border_line_width=0,
             spacing=12,
-        )  # fmt: skip
+        )
         self.moved.add_layout(legend, "above")
         self.moved.title.align, self.moved.title.text_color = "right", GREY
         self.moved.title.text_font_style = "italic"
@@ -143,14 +151,28 @@ class TimePlots:
         self._automatic[kind] = _line(colour, 1, "dashed")
         self._below[kind] = _line(colour, 2)
         line = Span(
-            dimension="height", location=0, visible=False, name=f"onset {kind}",
-            line_color=colour, line_width=3, line_alpha=0.9, level="overlay",
-        )  # fmt: skip
+            dimension="height",
+            location=0,
+            visible=False,
+            name=f"onset {kind}",
+            line_color=colour,
+            line_width=3,
+            line_alpha=0.9,
+            level="overlay",
+        )
         text = Label(
-            x=0, y=0, text=f"{kind} \u2194", text_color=colour, text_font_size="12px",
-            text_font_style="bold", visible=False, background_fill_color="white",
-            background_fill_alpha=0.7, x_offset=5, y_offset=-18 if kind == "incipient" else -36,
-        )  # fmt: skip
+            x=0,
+            y=0,
+            text=f"{kind} \u2194",
+            text_color=colour,
+            text_font_size="12px",
+            text_font_style="bold",
+            visible=False,
+            background_fill_color="white",
+            background_fill_alpha=0.7,
+            x_offset=5,
+            y_offset=-18 if kind == "incipient" else -36,
+        )
         follow = CustomJS(
             args={"text": text, "below": self._below[kind]},
             code="text.x = cb_obj.location; below.location = cb_obj.location;",
@@ -180,10 +202,11 @@ class TimePlots:
         self._markers.data = {
             "xs": [shown.frame_s] * count,
             "ys": [moved[:, i] for i in order],
-            "colour": [RED if i == shown.centre else ORANGE if i == first else _FAINT
-                       for i in order],
+            "colour": [
+                RED if i == shown.centre else ORANGE if i == first else _FAINT for i in order
+            ],
             "width": [2.0 if i == shown.centre else 1.6 if i == first else 1.0 for i in order],
-        }  # fmt: skip
+        }
         self._crossings.data = _crossings(shown)
         self._events.data = {"x": shown.rate_s, "y": shown.rate}
         self._threshold.location = shown.threshold_px
@@ -255,9 +278,13 @@ class TimePlots:
 
 def _line(colour: str, width: int, dash: str = "solid") -> Span:
     return Span(
-        dimension="height", location=0, visible=False, line_color=colour, line_width=width,
+        dimension="height",
+        location=0,
+        visible=False,
+        line_color=colour,
+        line_width=width,
         line_dash=dash,
-    )  # fmt: skip
+    )
 
 
 def _rounded(time_s: float) -> int:
@@ -275,8 +302,11 @@ def _crossings(shown: ShownTrial) -> dict[str, npt.NDArray[np.float64]]:
         low, high = (np.asarray(bound, np.float64) for bound in (bounds.low_ns, bounds.high_ns))
     height = np.full(int(there.sum()), shown.threshold_px)
     return {
-        "x": times[there] / 1e9, "y": height, "low": low[there] / 1e9, "high": high[there] / 1e9
-    }  # fmt: skip
+        "x": times[there] / 1e9,
+        "y": height,
+        "low": low[there] / 1e9,
+        "high": high[there] / 1e9,
+    }
 
 
 _TAIL_FRAMES = 60
@@ -291,24 +321,40 @@ class FramePlot:
 
     def __init__(self) -> None:
         self.plot = figure(
-            height=400, width=400, match_aspect=True, tools="pan,wheel_zoom,reset",
-            x_range=Range1d(0, 1), y_range=Range1d(0, 1), toolbar_location="right",
-            background_fill_color=_DARK, active_scroll="wheel_zoom",
-        )  # fmt: skip
+            height=400,
+            width=400,
+            match_aspect=True,
+            tools="pan,wheel_zoom,reset",
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1),
+            toolbar_location="right",
+            background_fill_color=_DARK,
+            active_scroll="wheel_zoom",
+        )
         self.plot.axis.visible = False
         self.plot.grid.visible = False
         self._picture = ColumnDataSource({"image": [], "w": [], "h": []})
         self.plot.image(
-            "image", x=0, y=0, dw="w", dh="h", source=self._picture,
+            "image",
+            x=0,
+            y=0,
+            dw="w",
+            dh="h",
+            source=self._picture,
             color_mapper=LinearColorMapper(palette=grey(256), low=0, high=255),
-        )  # fmt: skip
+        )
         self._tails = ColumnDataSource({"xs": [], "ys": []})
         self.plot.multi_line("xs", "ys", source=self._tails, line_color=GREEN, line_width=1.5)
         self._rings = ColumnDataSource({"x": [], "y": [], "r": [], "colour": []})
         self.plot.circle(
-            "x", "y", radius="r", source=self._rings, fill_alpha=0.0, line_color="colour",
+            "x",
+            "y",
+            radius="r",
+            source=self._rings,
+            fill_alpha=0.0,
+            line_color="colour",
             line_width=2,
-        )  # fmt: skip
+        )
         self._plate = ColumnDataSource({"x": [], "y": []})
         self.plot.scatter("x", "y", source=self._plate, marker="x", size=14, color=ORANGE)
         self._size = (0, 0)

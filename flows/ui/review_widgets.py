@@ -26,9 +26,11 @@ from sliplab.storage.trials.review import Decision, Onsets, Verdict
 
 ALL = "all"
 VERDICTS: tuple[tuple[Verdict, str, str], ...] = (
-    ("accept", "Accept label", "success"), ("adjust", "Adjust to lines", "primary"),
-    ("reject", "Reject", "warning"), ("reopen", "Reopen", "default"),
-)  # fmt: skip
+    ("accept", "Accept label", "success"),
+    ("adjust", "Adjust to lines", "primary"),
+    ("reject", "Reject", "warning"),
+    ("reopen", "Reopen", "default"),
+)
 _REDRAW = "const view = Bokeh.index.find_one(table); if (view) view.updateGrid();"
 KEYBOARD = """
 if (window.sliplab_keys) return;
@@ -102,15 +104,22 @@ class Widgets:
         self.source = ColumnDataSource({name: [] for name in names})
         cell = HTMLTemplateFormatter(template=_CELL)
         self.table = DataTable(
-            source=self.source, width=430, height=600, index_position=None, row_height=24,
-            sortable=False, reorderable=False, scroll_to_selection=True, autosize_mode="none",
+            source=self.source,
+            width=430,
+            height=600,
+            index_position=None,
+            row_height=24,
+            sortable=False,
+            reorderable=False,
+            scroll_to_selection=True,
+            autosize_mode="none",
             columns=[
                 TableColumn(field="doubt", title="", width=26, formatter=cell),
                 TableColumn(field="trial", title="trial", width=318, formatter=cell),
                 TableColumn(field="state", title="decision", width=66, formatter=cell),
             ],
             stylesheets=[_TABLE_STYLE],
-        )  # fmt: skip
+        )
         # a table draws itself anew only where its rows became more or fewer
         self.source.js_on_change("data", CustomJS(args={"table": self.table}, code=_REDRAW))
         self.heading, self.lines, self.flags, self.past = _div(), _div(), _div(), _div()
@@ -148,9 +157,17 @@ class Widgets:
         decide = row(self.who, self.reason)
         buttons = row(*self.buttons.values(), self.go_on)
         middle = column(
-            self.heading, moved, rate, self.lines, tools, decide, buttons,
-            self.said, self.past, sizing_mode="stretch_width",
-        )  # fmt: skip
+            self.heading,
+            moved,
+            rate,
+            self.lines,
+            tools,
+            decide,
+            buttons,
+            self.said,
+            self.past,
+            sizing_mode="stretch_width",
+        )
         right = column(frame, self.caption, self.flags, width=410)
         return row(left, middle, right, sizing_mode="stretch_width")
 
@@ -160,10 +177,17 @@ def _div() -> Div:
 
 
 KEYS = (
-    ("n, &darr;", "next"), ("p, &uarr;", "previous"), ("&larr; &rarr;", "frame"),
-    ("i, g", "line to the cursor"), ("a", "accept"), ("s", "adjust"), ("r", "reason, reject"),
-    ("u", "reopen"), ("0", "lines back"), ("z", "zoom"),
-)  # fmt: skip
+    ("n, &darr;", "next"),
+    ("p, &uarr;", "previous"),
+    ("&larr; &rarr;", "frame"),
+    ("i, g", "line to the cursor"),
+    ("a", "accept"),
+    ("s", "adjust"),
+    ("r", "reason, reject"),
+    ("u", "reopen"),
+    ("0", "lines back"),
+    ("z", "zoom"),
+)
 
 
 def keys_html() -> str:
@@ -188,9 +212,10 @@ def heading_html(shown: ShownTrial, position: str) -> str:
         )
     if row.state == "stale":
         reasons.insert(
-            0, "<li class='doubt'>The last decision was made on a label that has changed since; "
+            0,
+            "<li class='doubt'>The last decision was made on a label that has changed since; "
             "it is not used.</li>",
-        )  # fmt: skip
+        )
     if row.problem:
         reasons.insert(0, f"<li class='doubt'>{escape(row.problem)}</li>")
     if not reasons:
@@ -247,10 +272,14 @@ def history_html(history: Sequence[Decision], key: str) -> str:
         return "<p class='id'>no decision yet</p>"
     rows = []
     for made in reversed(history):
-        change = "" if made.verdict in {"accept", "reopen"} else (
-            f"{_seconds(made.old.incipient_ns)}, {_seconds(made.old.gross_ns)} &rarr; "
-            f"{_seconds(made.new.incipient_ns)}, {_seconds(made.new.gross_ns)}"
-        )  # fmt: skip
+        change = (
+            ""
+            if made.verdict in {"accept", "reopen"}
+            else (
+                f"{_seconds(made.old.incipient_ns)}, {_seconds(made.old.gross_ns)} &rarr; "
+                f"{_seconds(made.new.incipient_ns)}, {_seconds(made.new.gross_ns)}"
+            )
+        )
         old = "" if made.label == key else " (on an older label)"
         rows.append(
             f"<tr><td>{made.number}</td><td>{escape(made.verdict)}{old}</td><td>{change}</td>"

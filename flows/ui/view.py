@@ -75,9 +75,11 @@ def find(store: Store, trial: str, campaign: str | None = None) -> Subject:
     if not found:
         where = str(store.folder) if campaign is None else f"campaign '{campaign}'"
         raise InputError(
-            "TRIAL", "", trial,
+            "TRIAL",
+            "",
+            trial,
             f"is no committed trial of {where}; `sliplab trials {store.folder}` lists them",
-        )  # fmt: skip
+        )
     if len(found) > 1:
         names = ", ".join(item.name for item in found)
         raise InputError("TRIAL", "", trial, f"is in {names}; name one with --campaign")
@@ -203,9 +205,12 @@ def silent() -> Iterator[dict[str, str]]:
     with scratch_folder() as folder:
         environment = {**os.environ, "XDG_CONFIG_HOME": str(folder)}
         done = subprocess.run(
-            [program(), "analytics", "disable"], env=environment, capture_output=True, timeout=60,
+            [program(), "analytics", "disable"],
+            env=environment,
+            capture_output=True,
+            timeout=60,
             check=False,
-        )  # fmt: skip
+        )
         if done.returncode:
             raise StoreError(f"Rerun's analytics cannot be switched off: {done.stderr.decode()}")
         yield environment
@@ -418,9 +423,10 @@ def _markers(to: _Columns, path: str, time_ns: I64, places: Any) -> None:
     seen = np.isfinite(places).all(axis=2)
     numbers = np.broadcast_to(np.arange(places.shape[1], dtype=np.uint16), seen.shape)[seen]
     columns = [
-        *to.rr.Points2D.columns(positions=places[seen].astype(np.float32), class_ids=numbers)
-        .partition(seen.sum(axis=1))
-    ]  # fmt: skip
+        *to.rr.Points2D.columns(
+            positions=places[seen].astype(np.float32), class_ids=numbers
+        ).partition(seen.sum(axis=1))
+    ]
     to.send(path, time_ns, columns)
 
 
@@ -526,12 +532,15 @@ def blueprint(
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (
-            ("displacement", "displacement (px)"), ("events/rate", "events (1/s)"),
-            ("onsets", "onsets: 1 incipient, 2 gross"), ("network", "network, spikes a window"),
-            *force, ("pulses", "sync pulses"),
+            ("displacement", "displacement (px)"),
+            ("events/rate", "events (1/s)"),
+            ("onsets", "onsets: 1 incipient, 2 gross"),
+            ("network", "network, spikes a window"),
+            *force,
+            ("pulses", "sync pulses"),
             *((f"streams/{name}", name) for name in curves_of),
         )
-    ]  # fmt: skip
+    ]
     pictures = [
         views.Spatial2DView(origin="/camera", name="outside camera, markers"),
         views.Spatial2DView(origin="/events", name="events"),

@@ -15,9 +15,17 @@ from sliplab.storage.schema.evaluation import AlarmRate
 SHIPPED = tuple(_SHIPPED)
 PLOT = "bench.svg"
 COLUMNS = (
-    "detector", "latency (ms)", "from 2 px (ms)", "missed (early)", "false alarms/h",
-    "with nuisances", "accuracy (%)", "operations", "memory (B)", "decision (us)",
-)  # fmt: skip
+    "detector",
+    "latency (ms)",
+    "from 2 px (ms)",
+    "missed (early)",
+    "false alarms/h",
+    "with nuisances",
+    "accuracy (%)",
+    "operations",
+    "memory (B)",
+    "decision (us)",
+)
 COSTS = 7
 """Column of the first cost; on a page costs have a table of their own."""
 BEGIN, END = "<!-- bench: written by `sliplab bench` -->", "<!-- bench: end -->"

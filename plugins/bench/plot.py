@@ -42,9 +42,15 @@ def latency_against_alarms(found: BenchResult) -> str:
             axes.plot(x, y, style, color=colour, lw=1, marker=marker, ms=4.5, mfc="white")
             filled = row.table.test.latency_ms.value is not None
             axes.plot(
-                x[:1], y[:1], "", color=colour, marker=marker, ms=6.5,
-                mfc=colour if filled else "white", label=row.name,
-            )  # fmt: skip
+                x[:1],
+                y[:1],
+                "",
+                color=colour,
+                marker=marker,
+                ms=6.5,
+                mfc=colour if filled else "white",
+                label=row.name,
+            )
             drawn += 1
         axes.set_xscale("log")
         axes.set_yscale("log")

@@ -85,10 +85,12 @@ def make_detector(name: str) -> Detector:
     if name not in names and ":" not in name:
         hint = did_you_mean(name, names)
         raise InputError(
-            _KEY, "", name,
+            _KEY,
+            "",
+            name,
             f"must be one of {', '.join(names)}, MODULE:ATTRIBUTE, a file that ends in {ONNX}, or "
             f"{PROGRAM}COMMAND{hint}",
-        )  # fmt: skip
+        )
     return _imported(name, names.get(name, name))
 
 

@@ -167,9 +167,10 @@ class Bench:
         return {
             name: hours_without_slip([Judged(none, scene.slip) for scene in part])
             for name, part in (
-                ("validation", self.training.validation), ("test", self.tests.scenes),
+                ("validation", self.training.validation),
+                ("test", self.tests.scenes),
             )
-        }  # fmt: skip
+        }
 
     def _simulated(self, drawn: Sequence[Drawn]) -> list[Scene]:
         found = []

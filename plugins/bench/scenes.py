@@ -168,9 +168,11 @@ def simulated(drawn: Drawn) -> Scene:
     inside = slice(*np.searchsorted(t_us, (0, end_us)))
     # copies: views would keep what follows in memory
     kept = EventChunk(
-        events.x[inside].copy(), events.y[inside].copy(), events.p[inside].copy(),
+        events.x[inside].copy(),
+        events.y[inside].copy(),
+        events.p[inside].copy(),
         t_us[inside].copy(),
-    )  # fmt: skip
+    )
     size = built.events.width, built.events.height
     return Scene(drawn.name, kept, *size, int(end_us), slip, drawn.world)
 

@@ -146,10 +146,13 @@ class Evidence:
         """Return the evidence at an earlier look, by its number."""
         n = int(self.looks[look])
         return Evidence(
-            self.grid, self.taken[:n], self.looks[: look + 1],
+            self.grid,
+            self.taken[:n],
+            self.looks[: look + 1],
             {name: value[:n] for name, value in self.values.items()},
-            None if self.chances is None else self.chances[:n], self.block,
-        )  # fmt: skip
+            None if self.chances is None else self.chances[:n],
+            self.block,
+        )
 
 
 def members_of(claim: Claim, grid: Grid) -> list[Mask]:

@@ -229,9 +229,13 @@ class ClaimWatch:
             for claim in self._stopping.claims
         }
         return Evidence(
-            grid, np.array(taken, np.int64), np.array(looks, np.int64), values, chances,
+            grid,
+            np.array(taken, np.int64),
+            np.array(looks, np.int64),
+            values,
+            chances,
             self._stopping.block,
-        )  # fmt: skip
+        )
 
     def _look(self, number: int, otherwise: Verdict) -> Verdict:
         """Look at the claims after a round, and all before it; keep what was seen.

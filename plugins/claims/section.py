@@ -25,9 +25,19 @@ ENDED: dict[Verdict, str] = {
     "overruled": "Its claims were settled; a person went on with --no-stopping.",
 }
 COLUMNS = (
-    "claim", "verdict", "after (trials)", "estimate", "low", "high", "unit", "figures",
-    "undetected", "missing", "blocks", "variance between blocks (%)",
-)  # fmt: skip
+    "claim",
+    "verdict",
+    "after (trials)",
+    "estimate",
+    "low",
+    "high",
+    "unit",
+    "figures",
+    "undetected",
+    "missing",
+    "blocks",
+    "variance between blocks (%)",
+)
 
 
 @dataclass(frozen=True)
@@ -98,10 +108,17 @@ def _row(looks: Sequence[Look], k: int) -> list[str]:
     called = [look.taken for look in looks if look.claims[k].holds or look.claims[k].refuted]
     numbers = ["–" if v is None else f"{v:.4g}" for v in (last.estimate, last.low, last.high)]
     return [
-        last.claim, verdict_text(last), str(called[0]) if called else "–", *numbers, last.unit,
-        str(last.trials), str(last.undetected), str(last.missing), str(last.blocks),
+        last.claim,
+        verdict_text(last),
+        str(called[0]) if called else "–",
+        *numbers,
+        last.unit,
+        str(last.trials),
+        str(last.undetected),
+        str(last.missing),
+        str(last.blocks),
         "–" if last.block_share is None else f"{100.0 * last.block_share:.0f}",
-    ]  # fmt: skip
+    ]
 
 
 def _figure(name: str, looks: Sequence[Look], simulated: bool) -> Figure:

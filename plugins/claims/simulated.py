@@ -51,9 +51,7 @@ class Course:
     ended: int | None
 
 
-def course(
-    plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None
-) -> Course:  # fmt: skip
+def course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None) -> Course:
     """Return how a campaign of a plan with claims goes.
 
     Args:
@@ -125,9 +123,7 @@ def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
     return tuple(Called(look, at_call.get(k, found[k])) for k, look in enumerate(looks))
 
 
-def _chosen_course(
-    plan: Plan, grid: Grid, values: Figures, over_time: Figures | None
-) -> Course:  # fmt: skip
+def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None) -> Course:
     """Return how an adaptive campaign goes: it takes one more round than it needs."""
     stopping = claims_of(plan)
     called: dict[int, Called] = {}

@@ -114,9 +114,10 @@ class History:
         shares = tuple(float(n) / planned for n in evidence.looks[enough])
         blocks = int(evidence.block_count[-1])
         return Limit(
-            float(boundaries(shares, error)[-1]), float(boundaries((1.0,), error / 8.0)[0]),
+            float(boundaries(shares, error)[-1]),
+            float(boundaries((1.0,), error / 8.0)[0]),
             blocks / shares[-1],
-        )  # fmt: skip
+        )
 
     def share_below(
         self, figure: str, value: float, members: Mask, *, at: bool, missing: float | None = None

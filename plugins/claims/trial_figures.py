@@ -100,9 +100,7 @@ def _of_network(
     scored = score_trial(detect(counts, end_ns, rule), slip, round(rule.false_early_ms * 1e6))
     name = dataset.TrialId("", recording.folder.name)
     seed = hash_integer("samples", recording.folder.name)
-    samples = dataset.trial_samples(
-        recording, label, name, fitted.windows, settings.samples, seed
-    )  # fmt: skip
+    samples = dataset.trial_samples(recording, label, name, fitted.windows, settings.samples, seed)
     hits = window_groups.strict_hits(training.predict_counts(fitted, samples.windows), samples.y)
 
     def or_never(value: float | None, never: float) -> float:

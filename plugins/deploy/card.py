@@ -113,13 +113,16 @@ def card_markdown(card: ModelCard) -> str:
         ["campaign", "experiment", "collection", "analysis", "rig", "train", "validation", "test"],
         [
             [
-                item.name, item.experiment, f"`{item.collection_hash[:12]}`",
-                f"`{item.analysis_hash[:12]}`", item.rig,
+                item.name,
+                item.experiment,
+                f"`{item.collection_hash[:12]}`",
+                f"`{item.analysis_hash[:12]}`",
+                item.rig,
                 *(item.trials.get(split, 0) for split in ("train", "validation", "test")),
             ]
             for item in data.campaigns
         ],
-    )  # fmt: skip
+    )
     text += ["", f"## Accuracy over windows{said}", ""]
     names = [name.replace("_", " ") for name in CLASSES]
     text += table(

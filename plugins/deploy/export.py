@@ -225,9 +225,15 @@ def _card(
     versions = {name: version(name) for name in PACKAGES}
     margin = source.margin
     return model_card(
-        source.fitted, source.about, data, splits, activity(net, seen.x), detection, versions,
+        source.fitted,
+        source.about,
+        data,
+        splits,
+        activity(net, seen.x),
+        detection,
+        versions,
         margin,
-    )  # fmt: skip
+    )
 
 
 class ExportFigures(TypedDict):

@@ -178,11 +178,14 @@ def _step_nodes(helper: Any, layers: dict[str, Any]) -> list[Any]:
         if isinstance(layer, nn.Conv2d):
             nodes.append(
                 helper.make_node(
-                    "Conv", [at, weight], [f"{weighted}.current"],
-                    kernel_shape=list(layer.kernel_size), strides=list(layer.stride),
+                    "Conv",
+                    [at, weight],
+                    [f"{weighted}.current"],
+                    kernel_shape=list(layer.kernel_size),
+                    strides=list(layer.stride),
                     pads=[*map(int, layer.padding)] * 2,
                 )
-            )  # fmt: skip
+            )
         else:
             if len(nodes) and weighted == "fc1":
                 nodes.append(helper.make_node("Flatten", [at], ["flat"], axis=1))

@@ -49,9 +49,13 @@ def export_model(
     trials = sum(1 for item in campaigns for _ in item.of_split("test"))
     with console.bar("export", 4 + trials) as bar:
         files, figures = export_files(
-            model, fitted, store, campaigns, checked if onnx else None,
+            model,
+            fitted,
+            store,
+            campaigns,
+            checked if onnx else None,
             lambda part: bar.advance(1, part),
-        )  # fmt: skip
+        )
     make_folder(out)
     for suffix, content in files.items():
         path = out / f"{model.stem}{suffix}"

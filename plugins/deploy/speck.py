@@ -172,16 +172,26 @@ def speck_fit(network: Network, windows: Windows) -> SpeckFit:
     side = -(-windows.cells // 2)
     layers = (
         _layer(
-            "conv1", windows.channels, windows.cells, network.conv1_channels,
-            network.conv1_kernel, 1, network.conv1_kernel // 2,
+            "conv1",
+            windows.channels,
+            windows.cells,
+            network.conv1_channels,
+            network.conv1_kernel,
+            1,
+            network.conv1_kernel // 2,
         ),
         _layer(
-            "conv2", network.conv1_channels, windows.cells, network.conv2_channels,
-            network.conv2_kernel, 2, network.conv2_kernel // 2,
+            "conv2",
+            network.conv1_channels,
+            windows.cells,
+            network.conv2_channels,
+            network.conv2_kernel,
+            2,
+            network.conv2_kernel // 2,
         ),
         _layer("fc1", network.conv2_channels, side, network.hidden, side, 1, 0),
         _layer("fc2", network.hidden, 1, len(CLASSES) * network.outputs_per_class, 1, 1, 0),
-    )  # fmt: skip
+    )
     problems = [problem for layer in layers for problem in layer.problems]
     cores = _assign(layers)
     if not problems and len(cores) < len(layers):
@@ -190,20 +200,32 @@ def speck_fit(network: Network, windows: Windows) -> SpeckFit:
 
 
 def _layer(
-    name: str, in_channels: int, in_side: int, out_channels: int, kernel: int, stride: int,
+    name: str,
+    in_channels: int,
+    in_side: int,
+    out_channels: int,
+    kernel: int,
+    stride: int,
     padding: int,
-) -> SpeckLayer:  # fmt: skip
+) -> SpeckLayer:
     out_side = (in_side - kernel + 2 * padding) // stride + 1
     reach = min(-(-kernel // stride), out_side)
     return SpeckLayer(
-        name, in_channels, in_side, out_channels, out_side, kernel, stride, padding,
+        name,
+        in_channels,
+        in_side,
+        out_channels,
+        out_side,
+        kernel,
+        stride,
+        padding,
         weights=in_channels * kernel**2 * out_channels,
         neurons=out_channels * out_side**2,
         kernel_words=in_channels << _bits(kernel**2) + _bits(out_channels),
         neuron_words=out_channels << 2 * _bits(out_side),
         fan_in=in_channels * kernel**2,
         fan_out=out_channels * reach**2,
-    )  # fmt: skip
+    )
 
 
 def _bits(count: int) -> int:
@@ -251,32 +273,49 @@ def speck_markdown(found: SpeckDescription) -> str:
         text += ["**It does not fit:**", "", *(f"- {problem}" for problem in fit.problems)]
     text += ["", "## Memory (words of the chip, rounded up as it rounds)", ""]
     text += table(
-        ["layer", "core", "kernel memory", "of", "neuron memory", "of", "fan-in", "fan-out",
-         "sends to"],
+        [
+            "layer",
+            "core",
+            "kernel memory",
+            "of",
+            "neuron memory",
+            "of",
+            "fan-in",
+            "fan-out",
+            "sends to",
+        ],
         [
             [
                 f"{layer.name} {layer.in_channels}x{layer.in_side}² → "
                 f"{layer.out_channels}x{layer.out_side}², kernel {layer.kernel}",
-                _or_dash(layer.core), _words(layer.kernel_words),
-                _words(layer.core_kernel_words), _words(layer.neuron_words),
-                _words(layer.core_neuron_words), layer.fan_in, layer.fan_out,
+                _or_dash(layer.core),
+                _words(layer.kernel_words),
+                _words(layer.core_kernel_words),
+                _words(layer.neuron_words),
+                _words(layer.core_neuron_words),
+                layer.fan_in,
+                layer.fan_out,
                 ", ".join(map(str, layer.destinations)) or "output",
             ]
             for layer in fit.layers
         ],
-    )  # fmt: skip
+    )
     text += ["", "## 8-bit weights", ""]
     text += table(
         ["layer", "scale", "threshold", "rounding (RMS)", "lowest potential", "highest", "cut off"],
         [
             [
-                name, f"{layer.scale:g}", layer.threshold, f"{layer.rounding:.2%}",
-                f"{layer.potential[0]:,.0f}", f"{layer.potential[1]:,.0f}",
+                name,
+                f"{layer.scale:g}",
+                layer.threshold,
+                f"{layer.rounding:.2%}",
+                f"{layer.potential[0]:,.0f}",
+                f"{layer.potential[1]:,.0f}",
                 f"{layer.saturated:.3%}",
             ]
             for name, layer in whole.layers.items()
         ],
-    )  # fmt: skip
+    )
     change = whole.change
     real, chip = whole.accuracy["real"], whole.accuracy["whole"]
     text += [
@@ -295,12 +334,19 @@ def speck_markdown(found: SpeckDescription) -> str:
                 ["argmax", percent(real.argmax), percent(chip.argmax)],
             ],
         ),
-        "", f"## Detection latency as trained{said}", "",
+        "",
+        f"## Detection latency as trained{said}",
+        "",
         *latency_table(found.detection["real"]),
-        "", f"## Detection latency with 8 bits{said}", "",
+        "",
+        f"## Detection latency with 8 bits{said}",
+        "",
         *latency_table(found.detection["whole"]),
-        "", "## What this does not show", "", *(f"- {line}" for line in NOT_SHOWN),
-    ]  # fmt: skip
+        "",
+        "## What this does not show",
+        "",
+        *(f"- {line}" for line in NOT_SHOWN),
+    ]
     return "\n".join(text) + "\n"
 
 

@@ -319,92 +319,122 @@ SPEED, CALLS, POSES, HOST = "speed and length", "calls while moving", "poses", "
 TURN, TILT, WRAPS = "orientation", "limits of turn and depth", "counter wraps"
 ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "TenTimesTooFast": (
-        moves(lambda self, v: [*v[:6], 10 * v[6]]), (SPEED,), "followed at .* instead of 40 mm/s",
+        moves(lambda self, v: [*v[:6], 10 * v[6]]),
+        (SPEED,),
+        "followed at .* instead of 40 mm/s",
     ),
     "SpeedIgnored": (moves(lambda self, v: [*v[:6], 50.0]), (SPEED,), "followed at 50.0 mm/s"),
     "SlowMovesTooFast": (
-        moves(lambda self, v: [*v[:6], max(v[6], 10.0)]), (SPEED,), "10.0 mm/s instead of 2 mm/s",
+        moves(lambda self, v: [*v[:6], max(v[6], 10.0)]),
+        (SPEED,),
+        "10.0 mm/s instead of 2 mm/s",
     ),
     "StopsOnce": (StopsOnce, ("stop while moving",), "still moving when the call"),
     "MovesAfterStop": (MovesAfterStop, ("stop while moving",), "still moving when the call|moved"),
     "DropsThirdSegment": (
-        takes(ExampleArm, "start", lambda self, path: (path[:2],)), ("path",), "before the end",
+        takes(ExampleArm, "start", lambda self, path: (path[:2],)),
+        ("path",),
+        "before the end",
     ),
     "LastSegmentOnly": (LastSegmentOnly, ("limits",), "that leaves the box and returns"),
     "EmergencyIsReady": (
         reports(ExampleArm, taken_for_ready(ArmState.EMERGENCY_STOP), "state"),
-        ("emergency stop",), "no call reported it",
+        ("emergency stop",),
+        "no call reported it",
     ),
     "OffIsReady": (
         reports(ExampleArm, taken_for_ready(ArmState.NOT_RUNNING), "state"),
-        ("power off",), "no call reported it",
+        ("power off",),
+        "no call reported it",
     ),
     "ProgressAlwaysReady": (
-        reports(ExampleArm, always_ready, "progress"), (CALLS, "protective stop"),
+        reports(ExampleArm, always_ready, "progress"),
+        (CALLS, "protective stop"),
         "the state of its progress was",
     ),
     "PosesAveraged": (
-        reports(ExampleArm, averaged, "read_poses"), (POSES,), "read_poses returned",
+        reports(ExampleArm, averaged, "read_poses"),
+        (POSES,),
+        "read_poses returned",
     ),
     "ArmHostTimeOfRead": (ArmHostTimeOfRead, (HOST,), "of all poses of a read was the same"),
     "TurnsTwiceTooFast": (moves(turns_twice), ("turn",), "followed at 40.0 deg/s instead of 20"),
     "CommandsRadians": (
-        moves(lambda self, v: [*v[:3], *np.radians(v[3:6]), v[6]]), (TURN,), "orientation was",
+        moves(lambda self, v: [*v[:3], *np.radians(v[3:6]), v[6]]),
+        (TURN,),
+        "orientation was",
     ),
     "CutsCorners": (CutsCorners, (SPEED,), "came no nearer to the end of segment 1"),
     "HostSegmentTimes": (
-        reports(ExampleArm, host_spans, "progress"), (SPEED,), "segment 1 was reported to begin",
+        reports(ExampleArm, host_spans, "progress"),
+        (SPEED,),
+        "segment 1 was reported to begin",
     ),
     "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
     "KeepsFinished": (KeepsFinished, ("path",), "4 segments of the next path, of one"),
     "ReadyWhileMoving": (
-        reports(ExampleArm, ready, "state"), (CALLS,), "its state was ArmState.READY",
+        reports(ExampleArm, ready, "state"),
+        (CALLS,),
+        "its state was ArmState.READY",
     ),
     "StopsSwapped": (
-        reports(ExampleArm, swapped_stops, "state"), ("protective stop",),
+        reports(ExampleArm, swapped_stops, "state"),
+        ("protective stop",),
         "its state was ArmState.EMERGENCY_STOP",
     ),
     "ProgressWaits": (ProgressWaits, (CALLS,), "had not returned before the arm was at rest"),
     "StopDoesNotWait": (StopDoesNotWait, ("stop while moving",), "still moving when the call"),
     "TiltNotChecked": (
-        takes(ExampleArm, "start", without_tilt), (TILT,), "turns the tool too far",
+        takes(ExampleArm, "start", without_tilt),
+        (TILT,),
+        "turns the tool too far",
     ),
     "PosesInMetres": (poses(scaled(xyz_mm=1e-3)), (POSES,), r"pose returned \(0\.4"),
     "PosesInRadians": (
-        poses(scaled(rotvec_deg=np.pi / 180)), (TURN,), "returned the rotation vector",
+        poses(scaled(rotvec_deg=np.pi / 180)),
+        (TURN,),
+        "returned the rotation vector",
     ),
     "ScalarPartLast": (poses(scalar_last), (TURN,), "returned the rotation vector"),
     "AxesSwapped": (
-        reports(ExampleArm, scaled(xyz_mm=[1, 0, 2]), "read_poses"), (POSES,), "read_poses returned"
+        reports(ExampleArm, scaled(xyz_mm=[1, 0, 2]), "read_poses"),
+        (POSES,),
+        "read_poses returned",
     ),
     "HeightFlipped": (
-        reports(ExampleArm, scaled(xyz_mm=np.array([1, 1, -1])), "read_poses"), (POSES,), ", -3",
+        reports(ExampleArm, scaled(xyz_mm=np.array([1, 1, -1])), "read_poses"),
+        (POSES,),
+        ", -3",
     ),
     "SamplesTwice": (SamplesTwice, (POSES,), "was read twice"),
     "NewestSampleOnly": (
-        reports(
-            ExampleArm, lambda c: PoseChunk(*(v[-1:] for v in vars(c).values())), "read_poses"
-        ),
-        (POSES,), "returned 1 samples of 0.000 s",
+        reports(ExampleArm, lambda c: PoseChunk(*(v[-1:] for v in vars(c).values())), "read_poses"),
+        (POSES,),
+        "returned 1 samples of 0.000 s",
     ),
     "LosesLastSample": (
-        reports(
-            ExampleArm, lambda c: PoseChunk(*(v[:-1] for v in vars(c).values())), "read_poses"
-        ),
-        (POSES,), "each read loses some",
+        reports(ExampleArm, lambda c: PoseChunk(*(v[:-1] for v in vars(c).values())), "read_poses"),
+        (POSES,),
+        "each read loses some",
     ),
     "HostTimeIsZero": (
-        reports(ExampleArm, at_host(lambda: 0), "read_poses"), (HOST,), "host_ns was 0, received",
+        reports(ExampleArm, at_host(lambda: 0), "read_poses"),
+        (HOST,),
+        "host_ns was 0, received",
     ),
     "HostTimeOld": (
         reports(ExampleArm, lambda c: replace(c, host_ns=c.host_ns - 600_000_000), "read_poses"),
-        (HOST,), "was 0.* s old when it was read",
+        (HOST,),
+        "was 0.* s old when it was read",
     ),
     "HostWallClock": (
-        reports(ExampleArm, at_host(time.time_ns), "read_poses"), (HOST,), "host_ns was 1",
+        reports(ExampleArm, at_host(time.time_ns), "read_poses"),
+        (HOST,),
+        "host_ns was 1",
     ),
     "HostTimeStands": (
-        reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"), (HOST,),
+        reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"),
+        (HOST,),
         "host_ns (was|of)",
     ),
     "CommandedPose": (CommandedPose, (POSES,), "and not there in the"),
@@ -412,24 +442,30 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "ClockStands": (ClockStands, ("clock",), "now_ns went on by -?0|came when now_ns"),
     "ClockInMicroseconds": (
         reports(reports(ExampleArm, us("t_ns"), "read_poses"), lambda t_ns: t_ns // 1000, "now_ns"),
-        ("clock",), "now_ns went on by|came when now_ns",
+        ("clock",),
+        "now_ns went on by|came when now_ns",
     ),
     "ArmCounterWraps": (
-        takes(ExampleArm, "_take", lambda self, line: (counted(line),)), (WRAPS,), "fell back",
+        takes(ExampleArm, "_take", lambda self, line: (counted(line),)),
+        (WRAPS,),
+        "fell back",
     ),
     "PulsesLate": (
         reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns + 60_000_000), "read_pulses"),
-        ("sync input",), "or more from its rising edge",
+        ("sync input",),
+        "or more from its rising edge",
     ),
     "NoPulses": (
-        reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns[:0]), "read_pulses"), ("sync input",),
+        reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns[:0]), "read_pulses"),
+        ("sync input",),
         "0 of about 4 pulses",
     ),
     "FallingEdges": (
-        takes(ExampleArm, "_take", lambda self, line: (inverted(line),)), ("sync input",),
+        takes(ExampleArm, "_take", lambda self, line: (inverted(line),)),
+        ("sync input",),
         "from the nearest rising edge",
     ),
-}  # fmt: skip
+}
 
 
 # -- cameras and sensors -------------------------------------------------------------------------
@@ -599,119 +635,160 @@ DATA = ("data",)
 EVENTS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "SizeSwapped": (SizeSwapped, ("sensor size",), "width and height were 48 x 64"),
     "ColumnsSwapped": (
-        _read(ExampleEvents, lambda c: replace(c, x=c.y, y=c.x)), DATA, "x came otherwise",
+        _read(ExampleEvents, lambda c: replace(c, x=c.y, y=c.x)),
+        DATA,
+        "x came otherwise",
     ),
     "PolarityInverted": (
-        _read(ExampleEvents, lambda c: replace(c, p=1 - c.p)), DATA, "p came otherwise",
+        _read(ExampleEvents, lambda c: replace(c, p=1 - c.p)),
+        DATA,
+        "p came otherwise",
     ),
     "PolaritySigned": (
-        _read(ExampleEvents, lambda c: replace(c, p=c.p.astype(np.int8) * 2 - 1)), ("arrays",),
+        _read(ExampleEvents, lambda c: replace(c, p=c.p.astype(np.int8) * 2 - 1)),
+        ("arrays",),
         "p was an array of int8",
     ),
     "EventsInNanoseconds": (
-        _read(ExampleEvents, scaled(t_us=1000)), DATA, "t_us came otherwise|were sent and",
+        _read(ExampleEvents, scaled(t_us=1000)),
+        DATA,
+        "t_us came otherwise|were sent and",
     ),
     "EventCounterWraps": (
-        _read(ExampleEvents, lambda c: replace(c, t_us=c.t_us % COUNTER)), (WRAPS,), "came after",
+        _read(ExampleEvents, lambda c: replace(c, t_us=c.t_us % COUNTER)),
+        (WRAPS,),
+        "came after",
     ),
     "EventsTwice": (EventsTwice, DATA, "came after|were sent and"),
     "OneEventATime": (_read(ExampleEvents, first_of_each_time), DATA, "were sent and"),
     "PulsesInMicroseconds": (
-        reports(ExampleEvents, us("t_ns"), "read_pulses"), DATA, "pulses up to",
+        reports(ExampleEvents, us("t_ns"), "read_pulses"),
+        DATA,
+        "pulses up to",
     ),
     "StopDrops": (StopDrops, ("read after stop",), "could not be read after it"),
     "OldPulses": (OldPulses, ("fresh start",), "began with pulses of the first one"),
     "ReadWaits": (ReadWaits, ("read at once",), "read took"),
-}  # fmt: skip
+}
 FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "Transposed": (
         _read(FakedExampleFrames, lambda c: replace(c, images=c.images.transpose(0, 2, 1))),
-        ("region",), "frames of",
+        ("region",),
+        "frames of",
     ),
     "UpsideDown": (
-        _read(FakedExampleFrames, lambda c: replace(c, images=c.images[:, ::-1])), DATA,
+        _read(FakedExampleFrames, lambda c: replace(c, images=c.images[:, ::-1])),
+        DATA,
         "images came otherwise",
     ),
     "StartOfExposure": (StartOfExposure, DATA, "t_ns up to 50.* was sent"),
     "LevelInverted": (
         _read(FakedExampleFrames, lambda c: replace(c, sync=1 - c.sync)),
-        ("level of the sync line",), "of the sync line, and came with",
+        ("level of the sync line",),
+        "of the sync line, and came with",
     ),
     "HostTimeOfCamera": (
-        _read(FakedExampleFrames, lambda c: replace(c, host_ns=c.t_ns)), (HOST,), "host_ns was",
+        _read(FakedExampleFrames, lambda c: replace(c, host_ns=c.t_ns)),
+        (HOST,),
+        "host_ns was",
     ),
     "HostTimeOfRead": (
-        _read(FakedExampleFrames, at_host(time.monotonic_ns)), (HOST,), "after a sample was sent",
+        _read(FakedExampleFrames, at_host(time.monotonic_ns)),
+        (HOST,),
+        "after a sample was sent",
     ),
     "FrameCounterWraps": (
-        _read(FakedExampleFrames, wrapped("t_ns", 1000)), (WRAPS,), "came after",
+        _read(FakedExampleFrames, wrapped("t_ns", 1000)),
+        (WRAPS,),
+        "came after",
     ),
     "FrameNumberOf16Bits": (
         _read(FakedExampleFrames, lambda c: replace(c, number=c.number % 2**16)),
-        ("lost frames",), "number came otherwise",
+        ("lost frames",),
+        "number came otherwise",
     ),
     "NumbersOfItsOwn": (NumbersOfItsOwn, ("lost frames",), "number came otherwise"),
     "RegionStays": (RegionStays, ("another region",), "frames of"),
-}  # fmt: skip
+}
 FORCE: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "MilliNewtons": (_read(ExampleForce, scaled(force_n=1e3)), DATA, "force_n came otherwise"),
     "NewtonMillimetres": (
-        _read(ExampleForce, scaled(torque_nm=1e3)), DATA, "torque_nm came otherwise",
+        _read(ExampleForce, scaled(torque_nm=1e3)),
+        DATA,
+        "torque_nm came otherwise",
     ),
     "Reaction": (_read(ExampleForce, scaled(force_n=-1.0)), DATA, "force_n came otherwise"),
     "ForceAxesSwapped": (
-        _read(ExampleForce, scaled(force_n=[2, 1, 0])), DATA, "force_n came otherwise",
+        _read(ExampleForce, scaled(force_n=[2, 1, 0])),
+        DATA,
+        "force_n came otherwise",
     ),
     "BufferReused": (BufferReused, DATA, "a read changed the arrays"),
     "OneLoad": (_read(ExampleForce, first_load), DATA, "force_n came otherwise"),
     "ForceHostTimeIsZero": (_read(ExampleForce, at_host(lambda: 0)), (HOST,), "host_ns was 0"),
     "ForceCounterWraps": (
-        _read(ExampleForce, wrapped("t_ns", 1_000_000)), (WRAPS,), "came after",
+        _read(ExampleForce, wrapped("t_ns", 1_000_000)),
+        (WRAPS,),
+        "came after",
     ),
     "ZeroOnce": (ZeroOnce, ("zero",), "was not zero after a second zero"),
     "ZeroHides": (ZeroHides, ("zero",), "its change was not read"),
-}  # fmt: skip
+}
 BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "SeedIgnored": (
         takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed and 77, code)),
-        ("trains",), "the box sent 200 Hz, seed 77",
+        ("trains",),
+        "the box sent 200 Hz, seed 77",
     ),
     "CodeIgnored": (
-        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed, "lfsr")), ("trains",),
+        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed, "lfsr")),
+        ("trains",),
         "and code lfsr",
     ),
     "HalfTheRate": (
         takes(ExampleSync, "start", lambda self, hz, seed, code: (hz / 2, seed, code)),
-        ("trains",), "the box sent 100 Hz",
+        ("trains",),
+        "the box sent 100 Hz",
     ),
     "KeepsTicking": (KeepsTicking, ("ticks stop",), "the box still ticked"),
     "BoxClockInMicroseconds": (
-        reports(ExampleSync, us("device_ns"), "read_clock"), ("clock",), "the clock went on by",
+        reports(ExampleSync, us("device_ns"), "read_clock"),
+        ("clock",),
+        "the clock went on by",
     ),
     "BoxHostWallClock": (
-        reports(ExampleSync, wall_reads, "read_clock"), ("clock",), "times before and after",
+        reports(ExampleSync, wall_reads, "read_clock"),
+        ("clock",),
+        "times before and after",
     ),
     "ClockOfPowerOn": (
         reports(
             ExampleSync, lambda c: replace(c, device_ns=c.device_ns + 3_000_000_000), "read_clock"
         ),
-        ("clock at start",), "after start its clock was",
+        ("clock at start",),
+        "after start its clock was",
     ),
     "BoxCounterWraps": (
-        reports(ExampleSync, wrapped("device_ns", 1000), "read_clock"), (WRAPS,), "went on by",
+        reports(ExampleSync, wrapped("device_ns", 1000), "read_clock"),
+        (WRAPS,),
+        "went on by",
     ),
     "PulseCounterWraps": (
-        reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"), (WRAPS,),
+        reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"),
+        (WRAPS,),
         "no pulse had|silent for",
     ),
     "EndOfPulses": (
-        reports(ExampleSync, lambda c: replace(c, t_ns=c.t_ns + 2_500_000), "read_pulses"), DATA,
+        reports(ExampleSync, lambda c: replace(c, t_ns=c.t_ns + 2_500_000), "read_pulses"),
+        DATA,
         "pulses came at",
     ),
     "ExposuresInMicroseconds": (
-        reports(ExampleSync, us("t_ns"), "read_exposures"), ("exposures",), "an exposure between",
+        reports(ExampleSync, us("t_ns"), "read_exposures"),
+        ("exposures",),
+        "an exposure between",
     ),
-}  # fmt: skip
+}
 
 
 # -- grippers ------------------------------------------------------------------------------------
@@ -787,27 +864,34 @@ MOVE, STATE = "values of a move", "state while moving"
 GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "OpensToClose": (
         takes(ExampleGripper, "move", lambda self, mm, *rest: (80.0 - mm, *rest)),
-        (MOVE, "move of the fingers"), "asked for",
+        (MOVE, "move of the fingers"),
+        "asked for",
     ),
     "GripperSpeedIgnored": (
-        takes(ExampleGripper, "move", lambda self, mm, speed, force: (mm, 90.0, force)), (MOVE,),
+        takes(ExampleGripper, "move", lambda self, mm, speed, force: (mm, 90.0, force)),
+        (MOVE,),
         "the fingers went at",
     ),
     "GripperForceInPercent": (
-        takes(ExampleGripper, "_send", percent), (MOVE,), "the gripper was sent",
+        takes(ExampleGripper, "_send", percent),
+        (MOVE,),
+        "the gripper was sent",
     ),
     "OpeningInSteps": (
         reports(ExampleGripper, lambda s: replace(s, opening_mm=10 * s.opening_mm), "state"),
-        (STATE,), "the fingers were at",
+        (STATE,),
+        "the fingers were at",
     ),
     "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
     "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it said"),
     "StopOpens": (StopOpens, ("stop of the fingers",), "the fingers opened to 80 mm after"),
     "StopWaitsForAnswer": (
-        StopWaitsForAnswer, ("silent gripper",), "it waited for the answer to another call",
+        StopWaitsForAnswer,
+        ("silent gripper",),
+        "it waited for the answer to another call",
     ),
     "OpensOnConnect": (OpensOnConnect, ("fingers stay",), "the fingers went from"),
-}  # fmt: skip
+}
 
 
 def _declared(declaration: Driver[Any], name: str, device: type[Any]) -> Driver[Any]:
@@ -822,9 +906,13 @@ def _declared(declaration: Driver[Any], name: str, device: type[Any]) -> Driver[
 WRONG_VALUES = tuple(
     Broken(_declared(declaration, name, device), rules, seen)
     for declaration, table in (
-        (arm.DRIVER, ARMS), (events.DRIVER, EVENTS), (frames.DRIVER, FRAMES),
-        (force.DRIVER, FORCE), (sync.DRIVER, BOXES), (gripper.DRIVER, GRIPPERS),
+        (arm.DRIVER, ARMS),
+        (events.DRIVER, EVENTS),
+        (frames.DRIVER, FRAMES),
+        (force.DRIVER, FORCE),
+        (sync.DRIVER, BOXES),
+        (gripper.DRIVER, GRIPPERS),
     )
     for name, (device, rules, seen) in table.items()
-)  # fmt: skip
+)
 """Each driver with wrong magnitudes, with the rules about them and what the first one sees."""

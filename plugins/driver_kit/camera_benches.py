@@ -53,9 +53,11 @@ class EventBench(StreamBench):
         at = t_us // 100
         t_us[9::10] = t_us[8::10]
         chunk = EventChunk(
-            (at % SIZE[0]).astype(np.uint16), (at % SIZE[1]).astype(np.uint16),
-            (at % 2).astype(np.uint8), t_us,
-        )  # fmt: skip
+            (at % SIZE[0]).astype(np.uint16),
+            (at % SIZE[1]).astype(np.uint16),
+            (at % 2).astype(np.uint8),
+            t_us,
+        )
         pulse = PulseChunk(t_us[-1:] * 1000)
         self.fed.append(chunk)
         self.fed_pulses.extend(pulse.t_ns.tolist())

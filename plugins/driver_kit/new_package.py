@@ -12,9 +12,13 @@ from string import Template
 from sliplab.rigs.core.registry import listed
 
 KINDS = {
-    "arm": "arm", "events": "event_camera", "frames": "frame_camera", "sync": "sync_box",
-    "force": "force_sensor", "gripper": "gripper",
-}  # fmt: skip
+    "arm": "arm",
+    "events": "event_camera",
+    "frames": "frame_camera",
+    "sync": "sync_box",
+    "force": "force_sensor",
+    "gripper": "gripper",
+}
 """Key of the device in a rig file, by the example that a new driver starts from."""
 _EXAMPLES = "sliplab.plugins.driver_kit.examples"
 _OWN_IMPORT = r"^from {package}\S* import (?:\([^)]*\)|[^\n(]*)\n"
@@ -130,11 +134,13 @@ def package_files(name: str, kind: str) -> dict[str, str]:
     example = f"Example{kind.capitalize()}"
     device, rest = _IN_RIG.get(kind, ("", ""))
     words = {
-        "name": name, "project": name.replace("_", "-"), "key": KINDS[kind],
+        "name": name,
+        "project": name.replace("_", "-"),
+        "key": KINDS[kind],
         "settings": f"{class_name}Settings",
         "more": ", free_port" if kind == "arm" else "",
         "arguments": _ARGUMENTS.get(kind, ""),
-    }  # fmt: skip
+    }
     found = {
         "pyproject.toml": PYPROJECT.substitute(words),
         "README.md": README.substitute(words),
@@ -145,8 +151,12 @@ def package_files(name: str, kind: str) -> dict[str, str]:
         text = (files(_EXAMPLES) / kind / f"{module}.py").read_text()
         text = text.replace(f"{_EXAMPLES}.{kind}", name)
         text = text.replace(example, class_name).replace(f"example_{kind}", name)
-        text = re.sub(r"(?:the e|E)xample (?:arm|event camera|frame camera|sync box|"
-                      r"force sensor|gripper)", name, text)  # fmt: skip
+        text = re.sub(
+            r"(?:the e|E)xample (?:arm|event camera|frame camera|sync box|"
+            r"force sensor|gripper)",
+            name,
+            text,
+        )
         found[f"{name}/{module}.py"] = _own_imports_last(text, name)
     return found
 

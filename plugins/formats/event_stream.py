@@ -87,10 +87,12 @@ def check_faery(path: Path) -> None:
     """Check that faery is there for a file. Raises InputError where it is not installed."""
     if util.find_spec(LIBRARY) is None:
         raise InputError(
-            path, "", None,
+            path,
+            "",
+            None,
             "needs the library faery, which is not installed; the extra 'formats' brings it: "
             "pip install 'sliplab[formats]'",
-        )  # fmt: skip
+        )
 
 
 def _begin(path: Path) -> int:
@@ -166,10 +168,14 @@ def _trial(path: Path, name: str, most: int | None) -> ForeignTrial:
             yield event_chunk(rows["x"], rows["y"], rows["on"].view("u1"), rows["t"])
 
     return ForeignTrial(
-        name, path.name, all_events, "the camera's own clock, us, from the file's beginning",
-        lambda: size, about={"read_by": LIBRARY},
+        name,
+        path.name,
+        all_events,
+        "the camera's own clock, us, from the file's beginning",
+        lambda: size,
+        about={"read_by": LIBRARY},
         unknown=("sync grade", "poses", "motion", "condition", "frames", "triggers"),
-    )  # fmt: skip
+    )
 
 
 def _guarded(step: Callable[[], T], size: tuple[int, int] | None, count: int) -> T:

@@ -28,9 +28,23 @@ from sliplab.storage.streams import I64
 OUTSIDE, FELL, LATE = 1, 2, 3
 """Faults of a word: a pixel that the camera has not, a high part that fell, a time too late."""
 (
-    NOW, HIGH_US, HIGH, LOW, ROW, BASE, ON, EDGE_US, EDGES, X_BITS, Y_BITS, FAULT, GOT, HAD, RAISED,
+    NOW,
+    HIGH_US,
+    HIGH,
+    LOW,
+    ROW,
+    BASE,
+    ON,
+    EDGE_US,
+    EDGES,
+    X_BITS,
+    Y_BITS,
+    FAULT,
+    GOT,
+    HAD,
+    RAISED,
     RAISED_US,
-) = range(16)  # fmt: skip
+) = range(16)
 """Places in a state (int64).
 
 NOW: time of the last event, us. HIGH_US: time of the last high part, with all turns of the clock

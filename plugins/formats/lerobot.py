@@ -63,8 +63,13 @@ _LENGTHS, _ANGLES = {"mm": 1.0, "m": 1000.0}, {"deg": 1.0, "rad": 180 / math.pi}
 _MOST_COMPONENTS, _MOST_ROWS, _MOST_GROUP, _MOST_NAME = 64, 1 << 24, 1 << 31, 32
 _FRAMES_AT_ONCE = 32
 _DAMAGES = (
-    pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError,
-)  # fmt: skip
+    pa.ArrowException,
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    OverflowError,
+)
 
 
 @dataclass(frozen=True)
@@ -198,9 +203,11 @@ def _described(path: Path) -> _DataSet:
             _add(data, key, feature)
     if not data.cameras and not data.vectors:
         raise InputError(
-            info, "features", ", ".join(features) or "none",
+            info,
+            "features",
+            ", ".join(features) or "none",
             "must have an image, a video from a camera, or numbers: a trial needs a stream",
-        )  # fmt: skip
+        )
     return data
 
 
@@ -367,12 +374,20 @@ def _trial(data: _DataSet, row: Json, seen: set[int]) -> ForeignTrial:
     unknown += [] if found.poses is not None else ["poses"]
     unknown += ["units"] if any(isinstance(s, ScalarChunk) for s in found.streams.values()) else []
     return ForeignTrial(
-        f"episode-{number:06d}", file.relative_to(data.folder).as_posix(), lambda: iter(()),
+        f"episode-{number:06d}",
+        file.relative_to(data.folder).as_posix(),
+        lambda: iter(()),
         "the episode's start; seconds of its rows, rounded to us",
-        frames=frames, frame_px=size,
-        simulated=data.simulated, about=about, unknown=tuple(unknown), kind="lerobot",
-        poses=found.poses, streams=found.streams, cameras=cameras,
-    )  # fmt: skip
+        frames=frames,
+        frame_px=size,
+        simulated=data.simulated,
+        about=about,
+        unknown=tuple(unknown),
+        kind="lerobot",
+        poses=found.poses,
+        streams=found.streams,
+        cameras=cameras,
+    )
 
 
 @dataclass

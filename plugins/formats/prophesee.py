@@ -275,12 +275,16 @@ def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
 
     unknown = ("sync grade", "poses", "motion", "condition", "frames")
     return ForeignTrial(
-        name, path.name, all_events, "the camera's own clock, us, from the file's beginning",
-        lambda: header.size, triggers,
+        name,
+        path.name,
+        all_events,
+        "the camera's own clock, us, from the file's beginning",
+        lambda: header.size,
+        triggers,
         about={"encoding": header.encoding.name, "left_out": left_out},
         unknown=unknown if triggers is not None else (*unknown, "triggers"),
         notes=lambda: tuple(line for state in states for line in raised_warning(state)),
-    )  # fmt: skip
+    )
 
 
 def _triggers(path: Path, header: Header) -> tuple[Triggers | None, list[str]]:
@@ -334,9 +338,18 @@ def _decoded(
         at = 0
         while at < len(words):
             at, filled = header.encoding.decode(
-                words, at, filled, state, width, height,
-                chunk.x, chunk.y, chunk.p, chunk.t_us, edges,
-            )  # fmt: skip
+                words,
+                at,
+                filled,
+                state,
+                width,
+                height,
+                chunk.x,
+                chunk.y,
+                chunk.p,
+                chunk.t_us,
+                edges,
+            )
             fault = int(state[FAULT])
             if fault or filled > _CHUNK - ROOM or state[EDGES] == _EDGES:
                 yield _part(chunk, filled), edges[: state[EDGES]].copy()

@@ -58,16 +58,24 @@ episodes = LeRobotDataset("name", root=".")
 """
 )
 _FEATURES = (
-    ("timestamp", "s after the start of the episode, which is `start_ns` of `meta/episodes` on the "
-     "time line"),
-    ("observation.state", "tool centre point, mm and rotation vector in degrees, interpolated at "
-     "the end of the row; no action is given, since none was recorded"),
+    (
+        "timestamp",
+        "s after the start of the episode, which is `start_ns` of `meta/episodes` on the time line",
+    ),
+    (
+        "observation.state",
+        "tool centre point, mm and rotation vector in degrees, interpolated at "
+        "the end of the row; no action is given, since none was recorded",
+    ),
     ("observation.NAME", "force, N, and torque, N m, of a sensor, interpolated likewise"),
-    ("observation.images.events", "events of the row: red counts brighter, green darker ones, at "
-     "most 255; times within the row are in `data.h5` alone"),
+    (
+        "observation.images.events",
+        "events of the row: red counts brighter, green darker ones, at "
+        "most 255; times within the row are in `data.h5` alone",
+    ),
     ("observation.images.frames", "the last frame before the end of the row"),
     ("slip", "0 before slip, 1 from its first onset, 2 from its second, -1 without a label"),
-)  # fmt: skip
+)
 _LIMITS = (
     "Labels follow from the rule that they name; they are measurements with doubts, not a truth.",
     "An onset that is missing is unknown or in doubt, or the slip did not happen; the label's "
@@ -104,9 +112,11 @@ def data_card(
         else f" in part: {simulated} of {plural(publication.count, 'trial')}."
     )
     first = [f"Simulated data{part}", ""] if simulated else []
-    licence = f"{about.licence}" if about.licence else (
-        "None was given: nobody but the authors may use these data until they choose one."
-    )  # fmt: skip
+    licence = (
+        f"{about.licence}"
+        if about.licence
+        else ("None was given: nobody but the authors may use these data until they choose one.")
+    )
     if about.licence_url:
         licence = f"[{about.licence}]({about.licence_url})"
     sections = [
@@ -122,12 +132,15 @@ def data_card(
             for name, table in sorted(tables.items(), reverse=True)
         ),
         *([[contents, ""]] if contents else []),
-        *([["## Features", "", *_rows(("feature", "meaning"), _FEATURES), ""]]
-          if form == "lerobot" else []),
+        *(
+            [["## Features", "", *_rows(("feature", "meaning"), _FEATURES), ""]]
+            if form == "lerobot"
+            else []
+        ),
         ["## Columns of `data.h5`", "", *_hdf5(), ""],
         ["## Known limits", "", *(f"- {text}" for text in _limits(publication)), ""],
         ["## Checksums", "", "`sha256sum -c checksums.sha256` checks every file.", ""],
-    ]  # fmt: skip
+    ]
     return "\n".join([*first, *(line for section in sections for line in section)])
 
 
@@ -136,21 +149,30 @@ def _made(publication: Publication) -> list[str]:
     for campaign in publication.campaigns:
         info = campaign.info
         origin = "simulated" if info["simulated"] else "a real rig"
-        rows.append([
-            campaign.name, str(len(campaign.committed())),
-            "imported" if IMPORTED in info else info.get("protocol", ""),
-            info.get("collection_hash", ""), info.get("rig", ""), info.get("rig_hash", ""),
-            f"{origin}, scene level {info['scene_level']}" if info.get("scene_level") else origin,
-        ])  # fmt: skip
+        rows.append(
+            [
+                campaign.name,
+                str(len(campaign.committed())),
+                "imported" if IMPORTED in info else info.get("protocol", ""),
+                info.get("collection_hash", ""),
+                info.get("rig", ""),
+                info.get("rig_hash", ""),
+                f"{origin}, scene level {info['scene_level']}"
+                if info.get("scene_level")
+                else origin,
+            ]
+        )
     header = ("campaign", "trials", "protocol", "hash of its collection", "rig", "hash", "by")
     versions = [
         f"{name} {', '.join(found)}" for name, found in sorted(publication.versions.items())
     ]
     return [
-        *_rows(header, rows), "",
-        "Protocol and rig of a campaign are in its folder: `protocol.yaml`, `rig.yaml`.", "",
+        *_rows(header, rows),
+        "",
+        "Protocol and rig of a campaign are in its folder: `protocol.yaml`, `rig.yaml`.",
+        "",
         f"Software: {'; '.join(versions) or 'unknown'}.",
-    ]  # fmt: skip
+    ]
 
 
 def _splits(publication: Publication) -> list[str]:
@@ -184,9 +206,10 @@ def _clocks(publication: Publication) -> list[str]:
         f"Every trial has one time line, in integer ns; its clock: {', '.join(sorted(lines))}. "
         "Raw times are in each device's own clock; `clocks` in `record.json` has the maps onto the "
         "time line: a line with `device_ns`, `reference_ns` and `drift` (parts in 10^18) for each "
-        "piece.", "",
+        "piece.",
+        "",
         *_rows(header, rows),
-    ]  # fmt: skip
+    ]
 
 
 def _columns_of(table: pa.Table) -> list[str]:

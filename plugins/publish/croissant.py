@@ -33,9 +33,26 @@ _CONTEXT: Json = {
     **{
         name: f"cr:{name}"
         for name in (
-            "equivalentProperty", "extract", "field", "fileProperty", "fileObject", "fileSet",
-            "format", "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path",
-            "recordSet", "references", "regex", "repeated", "replace", "samplingRate",
+            "equivalentProperty",
+            "extract",
+            "field",
+            "fileProperty",
+            "fileObject",
+            "fileSet",
+            "format",
+            "includes",
+            "isLiveDataset",
+            "jsonPath",
+            "key",
+            "md5",
+            "parentField",
+            "path",
+            "recordSet",
+            "references",
+            "regex",
+            "repeated",
+            "replace",
+            "samplingRate",
         )
     },
     "sc": "https://schema.org/",
@@ -43,13 +60,13 @@ _CONTEXT: Json = {
     "source": "cr:source",
     "subField": "cr:subField",
     "transform": "cr:transform",
-}  # fmt: skip
+}
 _FILE_SETS = (
     ("recordings", "trials/*/*.h5", "application/x-hdf5", "events, poses, pulses, frame times"),
     ("videos", "trials/*/*.mkv", "video/x-matroska", "frames: FFV1 in Matroska, lossless"),
     ("records", "trials/*/record.json", "application/json", "condition, clocks, gates, phases"),
     ("trial-files", "*.mcap", "application/x-mcap", "ROS 2 messages, a file for each trial"),
-)  # fmt: skip
+)
 
 
 def croissant(publication: Publication, tables: dict[str, pa.Table], folder: Path) -> Json:
@@ -115,13 +132,23 @@ def _splits(parts: tuple[str, ...]) -> Json:
         "dataType": "cr:Split",
         "key": {"@id": "splits/name"},
         "field": [
-            {"@type": "cr:Field", "@id": "splits/name", "name": "splits/name",
-             "description": "name of the part", "dataType": "sc:Text"},
-            {"@type": "cr:Field", "@id": "splits/url", "name": "splits/url",
-             "description": "Croissant's name of the part", "dataType": "sc:URL"},
+            {
+                "@type": "cr:Field",
+                "@id": "splits/name",
+                "name": "splits/name",
+                "description": "name of the part",
+                "dataType": "sc:Text",
+            },
+            {
+                "@type": "cr:Field",
+                "@id": "splits/url",
+                "name": "splits/url",
+                "description": "Croissant's name of the part",
+                "dataType": "sc:URL",
+            },
         ],
         "data": [{"splits/name": name, "splits/url": SPLITS[name]} for name in parts],
-    }  # fmt: skip
+    }
 
 
 def _record_set(table: str, rows: pa.Table) -> Json:

@@ -46,8 +46,11 @@ from sliplab.storage.trials.store import (
 )
 
 CROISSANT, RO_CRATE, CARD, SUMS = (
-    "croissant.json", "ro-crate-metadata.json", "README.md", "checksums.sha256"
-)  # fmt: skip
+    "croissant.json",
+    "ro-crate-metadata.json",
+    "README.md",
+    "checksums.sha256",
+)
 
 
 @dataclass(frozen=True)

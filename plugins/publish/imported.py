@@ -66,10 +66,13 @@ def of_one_campaign(path: Path) -> Path:
 def _several(path: Path, folders: list[Path]) -> InputError:
     names = ", ".join(map(str, folders))
     return InputError(
-        path, "", None,
-        f"must be of one campaign; name one of these folders: {names}" if names
+        path,
+        "",
+        None,
+        f"must be of one campaign; name one of these folders: {names}"
+        if names
         else "holds no campaign",
-    )  # fmt: skip
+    )
 
 
 def read_publication(path: Path) -> Iterator[ForeignTrial]:
@@ -138,14 +141,18 @@ def _trial(
     }
     record = Recording(folder).record
     return ForeignTrial(
-        folder.name, source, lambda: iter(()), "the trial's time line",
+        folder.name,
+        source,
+        lambda: iter(()),
+        "the trial's time line",
         simulated=record.simulated,
         campaign=texts,
         original=PublishedTrial(
-            folder, record.counts,
+            folder,
+            record.counts,
             {step: [f for f in files if f.exists()] for step, files in kept.items()},
         ),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

@@ -38,9 +38,13 @@ _CHUNK = 1000
 """Files of a folder."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _PLAIN = {
-    "timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
-    "task_index": "int64", SLIP: "int64",
-}  # fmt: skip
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+    SLIP: "int64",
+}
 _POSE = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 _WRENCH = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 Array = npt.NDArray[Any]
@@ -232,13 +236,22 @@ def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording)
     path = made.folder / _file("data", **place)
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table({key: columns[key] for key in made.features}), path, compression="zstd")
-    made.episodes.append({
-        "episode_index": number, "tasks": [_task(recording)], "length": count,
-        "data/chunk_index": place["chunk_index"], "data/file_index": place["file_index"],
-        "dataset_from_index": made.rows, "dataset_to_index": made.rows + count,
-        "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-        "campaign": campaign.name, "trial": recording.folder.name, "start_ns": start,
-    })  # fmt: skip
+    made.episodes.append(
+        {
+            "episode_index": number,
+            "tasks": [_task(recording)],
+            "length": count,
+            "data/chunk_index": place["chunk_index"],
+            "data/file_index": place["file_index"],
+            "dataset_from_index": made.rows,
+            "dataset_to_index": made.rows + count,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+            "campaign": campaign.name,
+            "trial": recording.folder.name,
+            "start_ns": start,
+        }
+    )
     made.rows += count
 
 
@@ -257,9 +270,11 @@ def _grid(recording: Recording) -> tuple[int, int]:
             device, times = "arm", reader.column("poses/t")
     if not len(times) or device not in recording.clocks.devices():
         raise InputError(
-            "--as", "", "lerobot",
+            "--as",
+            "",
+            "lerobot",
             f"trial {recording.folder.name} has neither events nor poses; it fits croissant",
-        )  # fmt: skip
+        )
     first, last = recording.clock(device).to_reference(times[[0, -1]]).tolist()
     return first, (last - first) // STEP_NS + 1
 

@@ -21,10 +21,24 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 
 LICENCES = (
-    "CC0-1.0", "CC-BY-4.0", "CC-BY-SA-4.0", "CC-BY-NC-4.0", "CC-BY-NC-SA-4.0", "CC-BY-ND-4.0",
-    "CC-BY-NC-ND-4.0", "ODbL-1.0", "ODC-By-1.0", "PDDL-1.0", "CDLA-Permissive-1.0",
-    "CDLA-Permissive-2.0", "CDLA-Sharing-1.0", "C-UDA-1.0", "Apache-2.0", "BSD-3-Clause", "MIT",
-)  # fmt: skip
+    "CC0-1.0",
+    "CC-BY-4.0",
+    "CC-BY-SA-4.0",
+    "CC-BY-NC-4.0",
+    "CC-BY-NC-SA-4.0",
+    "CC-BY-ND-4.0",
+    "CC-BY-NC-ND-4.0",
+    "ODbL-1.0",
+    "ODC-By-1.0",
+    "PDDL-1.0",
+    "CDLA-Permissive-1.0",
+    "CDLA-Permissive-2.0",
+    "CDLA-Sharing-1.0",
+    "C-UDA-1.0",
+    "Apache-2.0",
+    "BSD-3-Clause",
+    "MIT",
+)
 """Licences of data by their SPDX ids; any other one is ``LicenseRef-NAME``, as SPDX has it."""
 _OWN_LICENCE = re.compile(r"LicenseRef-[A-Za-z0-9.-]+")
 PERSONAL = ("operator", "host")
@@ -63,9 +77,11 @@ class About:
         known = self.licence is None or self.licence in LICENCES
         if not known and not _OWN_LICENCE.fullmatch(str(self.licence)):
             raise InputError(
-                "--licence", "", self.licence,
+                "--licence",
+                "",
+                self.licence,
                 f"must be one of {', '.join(LICENCES)}, or LicenseRef-NAME for another licence",
-            )  # fmt: skip
+            )
 
     @property
     def licence_url(self) -> str | None:
@@ -95,9 +111,11 @@ class Publication:
                 raise _damaged(campaign, trial, cause)
         if not self.count:
             raise InputError(
-                self.store.folder, "campaigns", ", ".join(c.name for c in self.campaigns) or "none",
+                self.store.folder,
+                "campaigns",
+                ", ".join(c.name for c in self.campaigns) or "none",
                 "must have a committed trial to publish; run `sliplab collect` or `sliplab import`",
-            )  # fmt: skip
+            )
 
     @property
     def count(self) -> int:
@@ -183,9 +201,11 @@ TrialPath = Callable[[str, str], str]
 
 def _damaged(campaign: Campaign, trial: str, cause: str) -> InputError:
     return InputError(
-        campaign.folder.parents[1], f"campaigns.{campaign.name}.trials.{trial}", cause,
+        campaign.folder.parents[1],
+        f"campaigns.{campaign.name}.trials.{trial}",
+        cause,
         "must be whole to be published; `sliplab verify STORE --quarantine` quarantines it",
-    )  # fmt: skip
+    )
 
 
 @contextmanager

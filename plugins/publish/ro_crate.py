@@ -36,13 +36,19 @@ def ro_crate(
         data: gives the path of a trial's data.
     """
     about = publication.about
-    people = [{"@id": f"#creator-{n}", "@type": "Person", "name": name}
-              for n, name in enumerate(about.creators, 1)]  # fmt: skip
+    people = [
+        {"@id": f"#creator-{n}", "@type": "Person", "name": name}
+        for n, name in enumerate(about.creators, 1)
+    ]
     programs = [
-        {"@id": f"#sliplab-{version}", "@type": "SoftwareApplication", "name": "SlipLab",
-         "version": version}
+        {
+            "@id": f"#sliplab-{version}",
+            "@type": "SoftwareApplication",
+            "name": "SlipLab",
+            "version": version,
+        }
         for version in publication.versions.get("sliplab", ())
-    ]  # fmt: skip
+    ]
     used = [item["@id"] for item in programs]
     runs = [_run(campaign, used, data) for campaign in publication.campaigns]
     files = [

@@ -9,9 +9,17 @@ from sliplab.plugins.reflex import plot as figures
 from sliplab.plugins.reflex.document import ReflexRow, ReflexStudy, ReflexTrial
 
 COLUMNS = (
-    "reflex", "trials", "dropped", "drops prevented (95 %)", "too early", "missed",
-    "fallen (mm), median", "95 %", "extra force (N), median", "largest",
-)  # fmt: skip
+    "reflex",
+    "trials",
+    "dropped",
+    "drops prevented (95 %)",
+    "too early",
+    "missed",
+    "fallen (mm), median",
+    "95 %",
+    "extra force (N), median",
+    "largest",
+)
 MOST_SHOWN = 7
 """Courses in the figure of one trial."""
 REACTION = ("reflex", "total (ms)", "window", "sensor", "network", "command", "actuator", "p99")
@@ -20,10 +28,17 @@ REACTION = ("reflex", "total (ms)", "window", "sensor", "network", "command", "a
 def cells(row: ReflexRow) -> list[str]:
     """Return a row's outcome below `COLUMNS`."""
     return [
-        figures.title_of(row), str(row.trials), str(row.dropped), prevented(row), str(row.early),
-        str(row.missed) if row.reflex else "–", number(row.fallen_mm, 2),
-        number(row.fallen_p95_mm, 2), number(row.extra_n, 2), number(row.most_extra_n, 2),
-    ]  # fmt: skip
+        figures.title_of(row),
+        str(row.trials),
+        str(row.dropped),
+        prevented(row),
+        str(row.early),
+        str(row.missed) if row.reflex else "–",
+        number(row.fallen_mm, 2),
+        number(row.fallen_p95_mm, 2),
+        number(row.extra_n, 2),
+        number(row.most_extra_n, 2),
+    ]
 
 
 def prevented(row: ReflexRow) -> str:
@@ -39,9 +54,7 @@ def reaction_cells(row: ReflexRow) -> list[str]:
     parts = row.reaction
     assert parts is not None
     times = (row.total_ms, *(getattr(parts, name) for name in figures.PART_COLOURS))
-    return [
-        figures.title_of(row), *(number(ms, 1) for ms in times), number(row.computer_p99_ms, 2)
-    ]  # fmt: skip
+    return [figures.title_of(row), *(number(ms, 1) for ms in times), number(row.computer_p99_ms, 2)]
 
 
 def example(study: ReflexStudy) -> list[ReflexTrial]:

@@ -21,8 +21,12 @@ from sliplab.analysis.report.figures.style import (
 from sliplab.plugins.reflex.document import ReflexRow, ReflexTrial
 
 PART_COLOURS = {
-    "window": BLUE, "sensor": ORANGE, "network": GREEN, "command": PURPLE, "actuator": RED,
-}  # fmt: skip
+    "window": BLUE,
+    "sensor": ORANGE,
+    "network": GREEN,
+    "command": PURPLE,
+    "actuator": RED,
+}
 
 
 def title_of(it: ReflexRow | ReflexTrial) -> str:
@@ -38,10 +42,11 @@ def outcomes(rows: Sequence[ReflexRow], trials: Sequence[ReflexTrial], *, simula
     for i, row in enumerate(rows):
         for k, condition in enumerate(conditions):
             found = [
-                it for it in trials
+                it
+                for it in trials
                 if (it.detector, it.reflex) == (row.detector, row.reflex)
                 and (it.speed_mm_s, it.mass_kg) == condition
-            ]  # fmt: skip
+            ]
             count = sum(not it.dropped for it in found)
             held[i, k] = count / len(found) if found else np.nan
             text[i][k] = f"{count}/{len(found)}"
@@ -105,9 +110,13 @@ def courses(trials: Sequence[ReflexTrial], *, simulated: bool) -> str:
         for k, it in enumerate(trials):
             t_s = np.arange(len(it.heights_mm)) * it.step_ms / 1e3
             axes.plot(
-                t_s, it.heights_mm, color=colours[k % len(colours)], label=title_of(it), lw=1.4,
+                t_s,
+                it.heights_mm,
+                color=colours[k % len(colours)],
+                label=title_of(it),
+                lw=1.4,
                 ls="-" if k < len(colours) else "--",
-            )  # fmt: skip
+            )
             if it.detected_ms is not None:
                 axes.axvline(it.detected_ms / 1e3, color=colours[k % len(colours)], lw=0.6, ls=":")
         axes.set_xlabel("s after the retraction began; dotted: slip detected")

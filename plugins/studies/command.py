@@ -130,11 +130,20 @@ def tradeoff(
             "--scene", "", None, "give exactly one of --scene PROTOCOL and --detector STORE"
         )
     of_detector = {
-        "--samples": samples, "--epochs": epochs, "--seeds": seeds, "--stride": stride,
-        "--length": length, "--step": step, "--pool": pool, "--width": width, "--full": full,
-        "--minutes": minutes, "--dry-run": dry_run, "--campaign": campaign,
+        "--samples": samples,
+        "--epochs": epochs,
+        "--seeds": seeds,
+        "--stride": stride,
+        "--length": length,
+        "--step": step,
+        "--pool": pool,
+        "--width": width,
+        "--full": full,
+        "--minutes": minutes,
+        "--dry-run": dry_run,
+        "--campaign": campaign,
         "--reviewed": reviewed,
-    }  # fmt: skip
+    }
     of_scene = {"--rig": rig, "--sensitivity": sensitivity, "--dask": dask}
     if scene is not None:
         _refuse(of_detector, "--detector")
@@ -145,13 +154,24 @@ def tradeoff(
     _refuse(of_scene, "--scene")
     assert detector is not None
     size = {
-        "samples": samples, "epochs": epochs, "trials": trials, "seeds": seeds,
+        "samples": samples,
+        "epochs": epochs,
+        "trials": trials,
+        "seeds": seeds,
         "stride_ms": stride,
-    }  # fmt: skip
+    }
     _detector(
-        detector, out, size, _axes(length, step, pool, width), campaign,
-        full=full, reviewed=reviewed, minutes=minutes, dry_run=dry_run, as_json=as_json,
-    )  # fmt: skip
+        detector,
+        out,
+        size,
+        _axes(length, step, pool, width),
+        campaign,
+        full=full,
+        reviewed=reviewed,
+        minutes=minutes,
+        dry_run=dry_run,
+        as_json=as_json,
+    )
 
 
 def _axes(
@@ -223,9 +243,16 @@ def _detector(
     sizes = {name: value for name, value in size.items() if value is not None}
     target = folder / "report" if out is None else out
     result = tradeoff_detector(
-        store, campaigns, target, SearchSize(**sizes), axes,
-        full, reviewed, minutes, dry_run,
-    )  # fmt: skip
+        store,
+        campaigns,
+        target,
+        SearchSize(**sizes),
+        axes,
+        full,
+        reviewed,
+        minutes,
+        dry_run,
+    )
     if as_json:
         console.print_json(result)
         return

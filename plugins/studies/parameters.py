@@ -18,20 +18,35 @@ from sliplab.storage.streams import Json
 CHANGE = 0.2
 LARGEST_POISSON = 0.499
 CONTACT = (
-    "scene.skin.youngs_modulus_mpa", "scene.skin.poisson_ratio",
-    "scene.skin.base_normal_n_per_m", "scene.skin.base_tangential_n_per_m",
-    "scene.skin.height_scatter_mm", "scene.skin.relaxation_share", "scene.skin.relaxation_s",
-    "scene.friction.kinetic", "scene.friction.static_excess", "scene.friction.strengthening",
-    "scene.friction.path_variation", "scene.friction.correlation_mm",
+    "scene.skin.youngs_modulus_mpa",
+    "scene.skin.poisson_ratio",
+    "scene.skin.base_normal_n_per_m",
+    "scene.skin.base_tangential_n_per_m",
+    "scene.skin.height_scatter_mm",
+    "scene.skin.relaxation_share",
+    "scene.skin.relaxation_s",
+    "scene.friction.kinetic",
+    "scene.friction.static_excess",
+    "scene.friction.strengthening",
+    "scene.friction.path_variation",
+    "scene.friction.correlation_mm",
     "scene.friction.papilla_scatter",
-)  # fmt: skip
+)
 CAMERA = tuple(
     f"event_camera.{name}"
     for name in (
-        "shift_mm_per_n", "growth_mm_per_n", "radius_mm", "edge_px", "contrast", "threshold",
-        "threshold_sigma", "refractory_us", "noise_hz", "readout_hz",
+        "shift_mm_per_n",
+        "growth_mm_per_n",
+        "radius_mm",
+        "edge_px",
+        "contrast",
+        "threshold",
+        "threshold_sigma",
+        "refractory_us",
+        "noise_hz",
+        "readout_hz",
     )
-)  # fmt: skip
+)
 OTHER_SEED = "another seed"
 
 AS_IT_IS = "as it is"

@@ -74,9 +74,15 @@ def cost_and_error(points: Sequence[Point], panels: Sequence[Panel], *, simulate
             for on, colour, name in ((False, GREY, "others"), (True, BLUE, "Pareto front")):
                 there = [(x, y) for point, x, y in drawn if point.front == on]
                 axes.plot(
-                    [x for x, _ in there], [y for _, y in there], "o",
-                    color=colour, ms=3 + on, mew=0, alpha=0.4 + 0.5 * on, label=name,
-                )  # fmt: skip
+                    [x for x, _ in there],
+                    [y for _, y in there],
+                    "o",
+                    color=colour,
+                    ms=3 + on,
+                    mew=0,
+                    alpha=0.4 + 0.5 * on,
+                    label=name,
+                )
             for point, x, y in drawn:
                 if point.paper:
                     axes.plot(x, y, "*", color=RED, ms=12, zorder=3)
@@ -130,14 +136,28 @@ def _points(axes: Any, points: Sequence[Point], panel: Panel) -> None:
     for name, front, colour, mark, size, above, alpha in kinds:
         ours = [(x, y) for point, x, y in drawn if point.front == front]
         axes.plot(
-            [x for x, _ in ours], [y for _, y in ours], mark, ms=size, mew=0,
-            color=colour, alpha=alpha, zorder=above, label=name,
-        )  # fmt: skip
+            [x for x, _ in ours],
+            [y for _, y in ours],
+            mark,
+            ms=size,
+            mew=0,
+            color=colour,
+            alpha=alpha,
+            zorder=above,
+            label=name,
+        )
     ours = [(x, y) for point, x, y in drawn if point.paper]
     axes.plot(
-        [x for x, _ in ours], [y for _, y in ours], "*", ms=13, mec="black", mew=0.7,
-        color=ORANGE, zorder=3, label="the paper's",
-    )  # fmt: skip
+        [x for x, _ in ours],
+        [y for _, y in ours],
+        "*",
+        ms=13,
+        mec="black",
+        mew=0.7,
+        color=ORANGE,
+        zorder=3,
+        label="the paper's",
+    )
 
 
 def factor_lines(
@@ -152,9 +172,13 @@ def factor_lines(
     with plt.rc_context(STYLE):
         widths = [max(2, len(bars)) for bars in factors.values()]
         figure, grid = plt.subplots(
-            len(figures), len(factors), figsize=(9.6, 1.9 * len(figures) + 0.5), sharey="row",
-            squeeze=False, width_ratios=widths,
-        )  # fmt: skip
+            len(figures),
+            len(factors),
+            figsize=(9.6, 1.9 * len(figures) + 0.5),
+            sharey="row",
+            squeeze=False,
+            width_ratios=widths,
+        )
         for row, (key, name) in zip(grid, figures.items(), strict=True):
             row[0].set_ylabel(name)
             for axes, bars in zip(row, factors.values(), strict=True):
@@ -175,9 +199,12 @@ def _line(axes: Any, bars: Sequence[Bar], key: str) -> None:
         axes.plot([k], [mean], mark, ms=size, color=colour, mec=edge, mew=0.6)
     turned = 40 if any(len(bar.value) > 3 for bar in bars) else 0
     axes.set_xticks(
-        range(len(bars)), [bar.value for bar in bars], fontsize=7, rotation=turned,
+        range(len(bars)),
+        [bar.value for bar in bars],
+        fontsize=7,
+        rotation=turned,
         ha="right" if turned else "center",
-    )  # fmt: skip
+    )
     axes.set_xlim(-0.6, len(bars) - 0.4)
 
 
@@ -250,7 +277,12 @@ def _cost_points(
     for (text, cost, value), height in zip(there, heights, strict=True):
         axes.plot([cost], [height], marker, ms=4.5, mec=colour, mfc=colour if value else "white")
         axes.annotate(
-            text, (cost, height), fontsize=7, color=colour, ha=side, xytext=offset,
+            text,
+            (cost, height),
+            fontsize=7,
+            color=colour,
+            ha=side,
+            xytext=offset,
             textcoords="offset points",
-        )  # fmt: skip
+        )
     axes.plot([], [], marker, ms=4.5, color=colour, label=title)

@@ -46,9 +46,11 @@ def guesses(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search | 
         return None
     names = in_all(GUESSES, [each.rig.mock for each in run_requests])
     return Search(
-        "guesses", "settings", GUESS_S * (1 + 2 * len(names)),
+        "guesses",
+        "settings",
+        GUESS_S * (1 + 2 * len(names)),
         lambda store, campaigns: measure_guesses(store, campaigns, names, TRIALS).measured,
-    )  # fmt: skip
+    )
 
 
 def scene(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search | None:
@@ -69,11 +71,13 @@ def detector(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search |
         return None
     file = RESULTS["detector"].file
     return Search(
-        "detector search", "trainings", SEARCH_S,
+        "detector search",
+        "trainings",
+        SEARCH_S,
         lambda store, campaigns: tradeoff_detector(
             store, campaigns, (store.folder / file).parent, SIZE, AXES
         )["made"],
-    )  # fmt: skip
+    )
 
 
 def _simulated(planned: StudyPlan) -> bool:

@@ -54,8 +54,12 @@ def tradeoff_section(store: Store, found: Mapping[str, Json]) -> TradeoffSection
     Raises:
         StoreError: a file is of another shape.
     """
-    titles = {"scene": "the scene", "labels": "the labels", "labels_truth": "the labels",
-              "detector": "the detector"}  # fmt: skip
+    titles = {
+        "scene": "the scene",
+        "labels": "the labels",
+        "labels_truth": "the labels",
+        "detector": "the detector",
+    }
     scene, scene_figure, search, table, front, tried = None, None, None, None, 0, 0
     if "scene" in found:
         with RESULTS["scene"].shape_checked():
@@ -82,8 +86,16 @@ def tradeoff_section(store: Store, found: Mapping[str, Json]) -> TradeoffSection
     return TradeoffSection(
         [(titles[name], RESULTS[name].command(store)) for name in titles if name not in found],
         found["scene"]["protocol"] if scene is not None else None,
-        scene, scene_figure, tables, search, table, MOST, front, tried, links,
-    )  # fmt: skip
+        scene,
+        scene_figure,
+        tables,
+        search,
+        table,
+        MOST,
+        front,
+        tried,
+        links,
+    )
 
 
 def _scene_data(rows: Sequence[Json]) -> dict[str, Sequence[object]]:

@@ -66,12 +66,15 @@ def view_of(slips: Slips) -> View:
     ahead = base / np.hypot(*base.T)[:, None]
     x, y = last / reach, first / reach
     columns = [
-        base, base[:, ::-1] * [-1.0, 1.0], base * [1.0, -1.0], base[:, ::-1],
+        base,
+        base[:, ::-1] * [-1.0, 1.0],
+        base * [1.0, -1.0],
+        base[:, ::-1],
         reach * (_cubic(x) - _cubic(y)),
         *(reach * (x * x[:, [k]] - y * y[:, [k]]) for k in (0, 1)),
         # what still relaxes is in proportion to the lag
         -ahead * (lag * left)[:, None],
-    ]  # fmt: skip
+    ]
     error = np.stack([np.hypot(VARIATION * lag, NOISE_MM), np.full(len(lag), NOISE_MM)], axis=1)
     # along the way and across it
     axes = np.stack([ahead, ahead[:, ::-1] * [-1.0, 1.0]], axis=1)
@@ -79,9 +82,12 @@ def view_of(slips: Slips) -> View:
     right = np.einsum("nab,nb->na", axes, seen - base).ravel()
     found = _robust(rows, right, error.ravel())
     return View(
-        float(found[0]), float(np.degrees(found[1])), float(2.0 * np.hypot(*found[2:4])),
-        float(found[4]), float(np.hypot(*found[5:7])),
-    )  # fmt: skip
+        float(found[0]),
+        float(np.degrees(found[1])),
+        float(2.0 * np.hypot(*found[2:4])),
+        float(found[4]),
+        float(np.hypot(*found[5:7])),
+    )
 
 
 def _ways(slips: Slips, i: int) -> Iterator[tuple[F64, F64, F64, F64, float, float]]:
@@ -225,10 +231,12 @@ def force_delay_ms(slips: Slips, growth: Growth) -> float:
         moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
         way = trial.base_mm[moving] @ slips.direction[i]
         stretch = relaxing(way[:, None], frame_s, growth)[:, 0]
-        model = np.column_stack([
-            np.interp(t[rows], frame_s, column)
-            for column in (stretch, -np.gradient(stretch, frame_s))
-        ])  # fmt: skip
+        model = np.column_stack(
+            [
+                np.interp(t[rows], frame_s, column)
+                for column in (stretch, -np.gradient(stretch, frame_s))
+            ]
+        )
         right = pull[rows] - pull[before].mean()
         stiffness, product = np.linalg.lstsq(model, right, rcond=1e-9)[0]
         if stiffness > 0.0:

@@ -93,9 +93,13 @@ class Calibration:
 
 
 def request(
-    rig_path: Path, out: Path, worlds: int, spread: float, seed: int,
+    rig_path: Path,
+    out: Path,
+    worlds: int,
+    spread: float,
+    seed: int,
     gain_error: float = GAIN_ERROR,
-) -> Calibration:  # fmt: skip
+) -> Calibration:
     """Check what is asked for before anything is simulated.
 
     Raises:
@@ -121,10 +125,12 @@ def fitted_rig(rig_path: Path) -> RigFile:
     rig, _ = load_rig_file(rig_path)
     if not rig.in_virtual_time:
         raise InputError(
-            "--rig", "", str(rig_path),
+            "--rig",
+            "",
+            str(rig_path),
             "must be a simulated rig with driver: mock, whose scene is fitted; such as rehearsal, "
             "or a file that extends it with your skin and cameras",
-        )  # fmt: skip
+        )
     return rig
 
 
@@ -214,9 +220,10 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     judged = [pilot.slides[trial.id] for trial in pilot.judged]
     twin, before = predict(worlds)
     shown = (
-        [show(slide) for slide in judged], [one.shown for one in twin],
+        [show(slide) for slide in judged],
+        [one.shown for one in twin],
         [one.shown for one in before],
-    )  # fmt: skip
+    )
     needs = Needs()
     if wanted.needs:
         needs = measure_needs(judged, worlds[: len(twin)], [one.marks for one in twin])
@@ -359,13 +366,19 @@ def parameter_fits(
         withheld = tuple(check.title for check in checks if check.found and it.key in check.touches)
         found.append(
             ParameterFit(
-                key=it.key, title=it.title, unit=it.unit, assumed=assumed,
+                key=it.key,
+                title=it.title,
+                unit=it.unit,
+                assumed=assumed,
                 value=float(np.exp(estimate.median)) if estimate.identified else assumed,
-                low=None if withheld else float(low), high=None if withheld else float(high),
-                least=float(least), most=float(most), identified=estimate.identified,
+                low=None if withheld else float(low),
+                high=None if withheld else float(high),
+                least=float(least),
+                most=float(most),
+                identified=estimate.identified,
                 withheld=withheld,
             )
-        )  # fmt: skip
+        )
     return tuple(found)
 
 
@@ -395,11 +408,14 @@ def compared(
         return ()
     return tuple(
         QuantityCompared(
-            title=QUANTITIES[it.name], pilot=it.pilot, twin=it.twin, before=it.before,
+            title=QUANTITIES[it.name],
+            pilot=it.pilot,
+            twin=it.twin,
+            before=it.before,
             scatter=it.scatter,
         )
         for it in compare(pilot, twin, before)
-    )  # fmt: skip
+    )
 
 
 def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None:

@@ -50,13 +50,32 @@ from sliplab.storage.streams import F64, EventChunk
 Mask = NDArray[np.bool_]
 
 NAMES = (
-    "px_per_mm", "marker_radius_mm", "image_shift_mm_per_n", "image_shift_px",
-    "image_growth_mm_per_n", "image_growth_px_per_mm", "edge_px", "contrast_in_thresholds",
-    "on_thresholds", "off_thresholds", "threshold_mismatch", "refractory_us", "noise_hz",
-    "leak_share", "hot_pixels", "hot_hz", "readout_hz", "scan_us", "hold_events_per_s",
-    "first_mm_events_per_mm", "last_mm_events_per_mm", "interval_us", "radius_step_px",
-    "radius_scatter_px", "shift_scatter",
-)  # fmt: skip
+    "px_per_mm",
+    "marker_radius_mm",
+    "image_shift_mm_per_n",
+    "image_shift_px",
+    "image_growth_mm_per_n",
+    "image_growth_px_per_mm",
+    "edge_px",
+    "contrast_in_thresholds",
+    "on_thresholds",
+    "off_thresholds",
+    "threshold_mismatch",
+    "refractory_us",
+    "noise_hz",
+    "leak_share",
+    "hot_pixels",
+    "hot_hz",
+    "readout_hz",
+    "scan_us",
+    "hold_events_per_s",
+    "first_mm_events_per_mm",
+    "last_mm_events_per_mm",
+    "interval_us",
+    "radius_step_px",
+    "radius_scatter_px",
+    "shift_scatter",
+)
 """Of the estimates, with their units; all are positive, for their logarithms."""
 FIRST_MM = 0.3
 """Way of the sensor in which discs are looked for: less than most need to slip."""
@@ -569,10 +588,12 @@ def _loads(trial: PilotTrial) -> F64:
     if trial.forces is None:
         return np.full((2, 3), np.nan)
     begin_s = max(trial.hold_s, -trial.slide_s)
-    return np.array([
-        _mean_force(trial.forces, begin_s, begin_s + SHORT_S),
-        _mean_force(trial.forces, trial.slide_s - SHORT_S, trial.slide_s),
-    ])  # fmt: skip
+    return np.array(
+        [
+            _mean_force(trial.forces, begin_s, begin_s + SHORT_S),
+            _mean_force(trial.forces, trial.slide_s - SHORT_S, trial.slide_s),
+        ]
+    )
 
 
 def _mean_force(forces: Forces, begin_s: float, end_s: float) -> F64:

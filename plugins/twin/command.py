@@ -66,13 +66,15 @@ def calibrate_scene(
     gain_error: Annotated[
         float,
         typer.Option(
-            "--gain-error", min=0, max=0.5,
+            "--gain-error",
+            min=0,
+            max=0.5,
             help="Largest error of the force sensor's gain, a share: what a check with known "
             "weights leaves.",
         ),
     ] = 0.15,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Fit a simulated rig's scene to a labelled pilot: writes a rig file, a page and numbers.
 
     Ends with exit code 1 where the pilot shows an effect that the scene lacks.
@@ -92,12 +94,15 @@ def calibrate_scene(
         return
     rows = [
         [
-            it.title, f"{it.assumed:.4g}", f"{it.value:.4g}" if it.identified else "-",
+            it.title,
+            f"{it.assumed:.4g}",
+            f"{it.value:.4g}" if it.identified else "-",
             "withheld" if it.low is None or it.high is None else f"{it.low:.4g} to {it.high:.4g}",
-            it.unit, "yes" if it.identified else "no",
+            it.unit,
+            "yes" if it.identified else "no",
         ]
         for it in fit.parameters
-    ]  # fmt: skip
+    ]
     pilot = "simulated pilot" if fit.simulated else "pilot"
     console.print_table(
         f"twin of the {pilot} '{fit.campaign}'",
@@ -144,7 +149,9 @@ def calibrate_drift(
     limit: Annotated[
         float | None,
         typer.Option(
-            "--limit", min=0.1, max=1000,
+            "--limit",
+            min=0.1,
+            max=1000,
             help="Exit with 1 if friction changed by more than so many percent.",
         ),
     ] = None,
@@ -152,7 +159,7 @@ def calibrate_drift(
     spread: SpreadOption = 0.5,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Fit a campaign's reference trials one by one: wear of the skin, drift of the rig."""
     store, found = _campaigns_of(folder, None if campaign is None else [campaign])
     from sliplab.plugins.twin.calibrate import fitted_rig
@@ -163,9 +170,15 @@ def calibrate_drift(
     simulated = fitted_rig(rig)
     out = store.folder / "report" if out is None else out
     fit = fit_to(
-        store, _only(found), simulated, out, worlds=worlds, spread=spread, seed=seed,
+        store,
+        _only(found),
+        simulated,
+        out,
+        worlds=worlds,
+        spread=spread,
+        seed=seed,
         limit_percent=limit,
-    )  # fmt: skip
+    )
     page = out / "drift.html"
     if as_json:
         console.print_json({"page": str(page), **fit.to_json()})

@@ -131,10 +131,16 @@ def lags_of(slips: Slips, ring: I64, table: SteadyLags, growth: Growth) -> Lags:
 def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:
     """Return what the fitted springs say of the common parameters and of the scatters."""
     names = (
-        "kinetic", "normal_compliance_per_mm", "tangential_compliance_per_mm", "layer_step_mm",
-        "depth_zero_mm", "youngs_modulus_mpa", "friction_scatter", "height_scatter_mm",
+        "kinetic",
+        "normal_compliance_per_mm",
+        "tangential_compliance_per_mm",
+        "layer_step_mm",
+        "depth_zero_mm",
+        "youngs_modulus_mpa",
+        "friction_scatter",
+        "height_scatter_mm",
         "height_reach_mm",
-    )  # fmt: skip
+    )
     if fit is None:
         return dict.fromkeys(names, float("nan"))
     outer = ring > 0
@@ -146,10 +152,16 @@ def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:
     free = max(len(inside) - len(np.unique(inside)), 1)
     reach = max((np.ptp(raised[inside == r]) / 2 for r in np.unique(inside)), default=np.nan)
     shown = (
-        fit.kinetic, fit.normal_compliance, fit.tangential_compliance, fit.layer_step_mm,
-        fit.zero_mm, fit.youngs_modulus_mpa, float(np.sqrt(np.sum(friction**2) / free)),
-        float(np.sqrt(np.sum(raised**2) / free)), float(reach),
-    )  # fmt: skip
+        fit.kinetic,
+        fit.normal_compliance,
+        fit.tangential_compliance,
+        fit.layer_step_mm,
+        fit.zero_mm,
+        fit.youngs_modulus_mpa,
+        float(np.sqrt(np.sum(friction**2) / free)),
+        float(np.sqrt(np.sum(raised**2) / free)),
+        float(reach),
+    )
     return dict(zip(names, shown, strict=True))
 
 
@@ -229,6 +241,11 @@ def papillae(contact: Contact) -> Papillae | None:
     seen = np.maximum(np.isfinite(apart).sum(axis=0), 2)
     error = np.sqrt(mean_seen(apart**2) / 2 / (seen - 1))
     return Papillae(
-        ring, place - mean_seen(place), error, fit.gap_mm, fit.gap_error_mm,
-        fit.friction / fit.friction.mean(), fit.friction_error,
-    )  # fmt: skip
+        ring,
+        place - mean_seen(place),
+        error,
+        fit.gap_mm,
+        fit.gap_error_mm,
+        fit.friction / fit.friction.mean(),
+        fit.friction_error,
+    )

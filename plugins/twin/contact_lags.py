@@ -89,9 +89,13 @@ def fit_growth(slips: Slips) -> Growth | None:
 
     low, high = np.array([-5.0, -3.0, -0.5, -0.5]), np.array([1.5, 2.5, 0.5, 0.5])
     solved = least_squares(
-        reduced, begin[free], bounds=(low[free], high[free]), loss="soft_l1", f_scale=3.0,
+        reduced,
+        begin[free],
+        bounds=(low[free], high[free]),
+        loss="soft_l1",
+        f_scale=3.0,
         max_nfev=30,
-    )  # fmt: skip
+    )
     full = begin.copy()
     full[free] = solved.x
     return growth(full)

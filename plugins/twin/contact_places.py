@@ -14,10 +14,12 @@ def rest_places(slips: Slips) -> F64:
     Slides begin at different places of the plate: they are shifted onto those of
     one slide.
     """
-    places = np.array([
-        mean_seen(trial.tips_mm[(trial.frame_s < 0.0) & (trial.frame_s >= -0.5)])
-        for trial in slips.trials
-    ])  # fmt: skip
+    places = np.array(
+        [
+            mean_seen(trial.tips_mm[(trial.frame_s < 0.0) & (trial.frame_s >= -0.5)])
+            for trial in slips.trials
+        ]
+    )
     here = places[int(np.argmax(np.isfinite(places[:, :, 0]).sum(axis=1)))]
     for place in places:
         shift = (place - here)[np.isfinite(place - here).all(axis=1)]

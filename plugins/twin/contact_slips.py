@@ -94,9 +94,15 @@ def find_slips(trials: Sequence[PilotTrial]) -> Slips | None:
         np.array([trial.slide.depth_mm for trial in kept]),
         np.array([trial.slide.speed_mm_s for trial in kept]),
         np.array([trial.slide.direction for trial in kept]),
-        np.array(noise), np.array(free), np.array(slipped), np.array(stretch), np.array(after),
-        list(lag), list(frame_s), list(path),
-    )  # fmt: skip
+        np.array(noise),
+        np.array(free),
+        np.array(slipped),
+        np.array(stretch),
+        np.array(after),
+        list(lag),
+        list(frame_s),
+        list(path),
+    )
 
 
 def _slips_of(trial: PilotTrial) -> tuple[float, Mask, F64, F64, F64, F64, F64, F64]:

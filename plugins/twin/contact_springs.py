@@ -180,12 +180,19 @@ def fit_springs(lags: Lags, guess: Guess) -> Fit | None:
     slope[:, _LAYER_STEP] = LOOSE * step * lags.ring
     slope[:, COMMON + m :] = SCATTER * (centre / centre.sum() - np.eye(m))
     return Fit(
-        mu, normal, tangential, step, float(zero[0]),
-        young if np.isfinite(lags.normal_n).any() else float("nan"), friction[0], raised[0], gap,
+        mu,
+        normal,
+        tangential,
+        step,
+        float(zero[0]),
+        young if np.isfinite(lags.normal_n).any() else float("nan"),
+        friction[0],
+        raised[0],
+        gap,
         SCATTER * np.sqrt(np.diag(spread)[COMMON : COMMON + m]),
         np.sqrt(np.einsum("jp,pq,jq->j", slope, spread, slope)),
         float(np.sqrt(np.mean(solved.fun[: int(np.isfinite(lags.lag_mm).sum())] ** 2))),
-    )  # fmt: skip
+    )
 
 
 COMMON, _LAYER_STEP = 6, 3
@@ -196,10 +203,15 @@ _STEP = 1e-5
 def _unpacked(x: F64, guess: Guess) -> tuple[F64, F64, F64, F64]:
     """Return common quantities (b, 5), depth zero (b,), friction and raised heights (b, m)."""
     young = guess.youngs_modulus_mpa
-    start = np.log([
-        guess.kinetic, 1000 * young / guess.base_normal_n_per_m,
-        1000 * young / guess.base_tangential_n_per_m, guess.layer_step_mm, young,
-    ])  # fmt: skip
+    start = np.log(
+        [
+            guess.kinetic,
+            1000 * young / guess.base_normal_n_per_m,
+            1000 * young / guess.base_tangential_n_per_m,
+            guess.layer_step_mm,
+            young,
+        ]
+    )
     m = (x.shape[1] - COMMON) // 2
     own = SCATTER * x[:, COMMON:]
     zero = guess.zero_mm / 3**0.5 * x[:, 5]  # as it scatters if no error is more likely

@@ -52,15 +52,20 @@ EFFECTS = (
     Effect("path", "friction that varies along a path", _friction(path_variation=0.0)),
     Effect("speed", "friction that rises with speed", _friction(strengthening=0.0)),
     Effect(
-        "bending", "large deflection, up to buckling", {"scene": {"level": "L1"}},
-        {"scene": {"level": "L2"}}, ("relaxation", "stick_slip", "speed"),
+        "bending",
+        "large deflection, up to buckling",
+        {"scene": {"level": "L1"}},
+        {"scene": {"level": "L2"}},
+        ("relaxation", "stick_slip", "speed"),
     ),
     Effect(
-        "base", "compliance of the base",
+        "base",
+        "compliance of the base",
         _skin(base_normal_n_per_m=None, base_tangential_n_per_m=None),
     ),
     Effect(
-        "papillae", "differences between papillae",
+        "papillae",
+        "differences between papillae",
         {
             "scene": {
                 "skin": {"papillae": None, "height_scatter_mm": 0.0, "position_scatter_mm": 0.0},
@@ -72,7 +77,8 @@ EFFECTS = (
     Effect("growth", "markers that grow with force", _camera(growth_mm_per_n=0.0)),
     Effect("mismatch", "mismatch of the pixels' thresholds", _camera(threshold_sigma=0.0)),
     Effect(
-        "negative", "thresholds of their own for negative events",
+        "negative",
+        "thresholds of their own for negative events",
         _camera(threshold_off=None, threshold_off_sigma=None),
     ),
     Effect("refractory", "refractory time of a pixel", _camera(refractory_us=0.0)),
@@ -84,7 +90,7 @@ EFFECTS = (
     Effect("readout", "read-out in scans", _camera(readout_hz=0.0)),
     Effect("columns", "columns that are read one after the other", _camera(scan_us=0.0)),
     Effect("chords", "smooth paths between two steps", _camera(path="chord")),
-)  # fmt: skip
+)
 NOT_SHOWN = {
     "dynamics of the falling plate": "gravity trials",
     "damping and stiction of the plate's slider": "gravity trials",
@@ -102,9 +108,10 @@ def effects_of(mock: Any) -> Iterator[Effect]:
     step_ms = mock.scene.step_ms
     if step_ms < LONG_STEP_MS:
         yield Effect(
-            "steps", f"steps of the contact of {step_ms} instead of {LONG_STEP_MS} ms",
+            "steps",
+            f"steps of the contact of {step_ms} instead of {LONG_STEP_MS} ms",
             {"scene": {"step_ms": LONG_STEP_MS}},
-        )  # fmt: skip
+        )
     for effect in EFFECTS:
         if _differs(mock, effect.without):
             yield effect

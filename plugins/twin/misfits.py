@@ -47,12 +47,23 @@ FEWEST = 20
 """Worlds that a check takes."""
 
 TILT, STICKY, BROKEN, LIGHT, RAMP, SPOT = (
-    "tilt_mm_per_mm", "odd_friction", "missing_share", "line_over_noise", "ramp_mm", "spot",
-)  # fmt: skip
+    "tilt_mm_per_mm",
+    "odd_friction",
+    "missing_share",
+    "line_over_noise",
+    "ramp_mm",
+    "spot",
+)
 SCALE, TURN, STRETCH, BENT, PERSPECTIVE, FRAME_DELAY, FORCE_DELAY, FORCE_TURN = (
-    "frame_scale", "frame_turn_deg", "frame_stretch", "frame_bent", "frame_perspective",
-    "frame_delay_ms", "force_delay_ms", "force_turn_deg",
-)  # fmt: skip
+    "frame_scale",
+    "frame_turn_deg",
+    "frame_stretch",
+    "frame_bent",
+    "frame_perspective",
+    "frame_delay_ms",
+    "force_delay_ms",
+    "force_turn_deg",
+)
 
 VIEWS = frozenset((SCALE, TURN, STRETCH, BENT, PERSPECTIVE))
 """Of the frames: a picture that is wrong makes delays and trends that are none."""
@@ -119,21 +130,37 @@ CHECKS = (
     _delay(EVENT_DELAY, "frames late or early against the events", "frames", IN_MM),
     _delay(FORCE_DELAY, "forces late or early against the arm's poses", "force", FORCE_KEYS),
     Check(
-        FORCE_TURN, "force sensor turned against the arm's axes", "force", "deg", 0.1, FORCE_KEYS,
-        signed=True, setup=True,
+        FORCE_TURN,
+        "force sensor turned against the arm's axes",
+        "force",
+        "deg",
+        0.1,
+        FORCE_KEYS,
+        signed=True,
+        setup=True,
     ),
     _trend(LAG, "friction or stiffness", "frames", CONTACT_KEYS | FORCE_KEYS),
     _trend(PULL, "stiffness or the force sensor's gain", "force", CONTACT_KEYS | FORCE_KEYS),
     _trend(RATIO, "friction", "force", CONTACT_KEYS | FORCE_KEYS),
-    _trend(SHIFT_TREND, "stiffness or the event image's shift by force", "events",
-           CONTACT_KEYS | FORCE_KEYS),
+    _trend(
+        SHIFT_TREND,
+        "stiffness or the event image's shift by force",
+        "events",
+        CONTACT_KEYS | FORCE_KEYS,
+    ),
     _trend(CONTRAST_TREND, "contrast or threshold of events", "events", CAMERA_KEYS),
     _trend(NOISE_TREND, "noise of the event camera", "events", NOISE_KEYS),
     Check(
-        PICTURE_TURN, "event camera turned against the arm's axes", "events", "deg", 0.1,
-        CAMERA_KEYS, signed=True, setup=True,
+        PICTURE_TURN,
+        "event camera turned against the arm's axes",
+        "events",
+        "deg",
+        0.1,
+        CAMERA_KEYS,
+        signed=True,
+        setup=True,
     ),
-)  # fmt: skip
+)
 GENERAL: Mapping[Stream, str] = {
     "frames": "all that frames show",
     "force": "all that forces show",
@@ -141,8 +168,10 @@ GENERAL: Mapping[Stream, str] = {
 }
 """Titles of the checks that compare all statistics of a stream."""
 SHOWN_BY: Mapping[Stream, frozenset[str]] = {
-    "frames": CONTACT_KEYS, "force": FORCE_KEYS, "events": CAMERA_KEYS,
-}  # fmt: skip
+    "frames": CONTACT_KEYS,
+    "force": FORCE_KEYS,
+    "events": CAMERA_KEYS,
+}
 
 
 def misfit_numbers(
@@ -171,13 +200,16 @@ def misfit_numbers(
     found[SPOT] = largest_spot(contact.slips, contact.growth)
     view = view_of(contact.slips)
     found |= {
-        SCALE: view.scale, TURN: view.turn_deg, STRETCH: view.stretch, BENT: view.distortion,
+        SCALE: view.scale,
+        TURN: view.turn_deg,
+        STRETCH: view.stretch,
+        BENT: view.distortion,
         PERSPECTIVE: view.perspective,
         FRAME_DELAY: frame_delay_ms(contact.slips, contact.steady),
         FORCE_DELAY: force_delay_ms(contact.slips, contact.growth),
         FORCE_TURN: force_turn_deg(contact.slips),
         **contact_trends(contact.slips, contact.steady),
-    }  # fmt: skip
+    }
     return found
 
 
@@ -390,9 +422,15 @@ SEEN = 0.95
 RIDGE = 0.01
 """Added to variances, of statistics of unit spread."""
 FORCE_NAMES = (
-    "normal_n", "normal_lost", "ratio", "ratio_per_speed", "stiffness_n_per_mm",
-    "hold_relaxing_share", "hold_relaxation_s", "youngs_modulus_mpa",
-)  # fmt: skip
+    "normal_n",
+    "normal_lost",
+    "ratio",
+    "ratio_per_speed",
+    "stiffness_n_per_mm",
+    "hold_relaxing_share",
+    "hold_relaxation_s",
+    "youngs_modulus_mpa",
+)
 
 
 def stream_of(statistic: str) -> Stream:
@@ -533,12 +571,19 @@ def misfits(
         tail = Tail.of(values, check.floor, check.setup)
         share = tail.share(value)
         general = check.key == ""
-        found.append((
-            (share >= level, general, not check.setup, check.key not in VIEWS, share),
-            MisfitCheck(
-                title=check.title, stream=check.stream, unit=check.unit, pilot=value,
-                limit=tail.limit(level), share=share, found=share < level,
-                touches=tuple(it.key for it in PARAMETERS if it.key in check.touches),
-            ),
-        ))  # fmt: skip
+        found.append(
+            (
+                (share >= level, general, not check.setup, check.key not in VIEWS, share),
+                MisfitCheck(
+                    title=check.title,
+                    stream=check.stream,
+                    unit=check.unit,
+                    pilot=value,
+                    limit=tail.limit(level),
+                    share=share,
+                    found=share < level,
+                    touches=tuple(it.key for it in PARAMETERS if it.key in check.touches),
+                ),
+            )
+        )
     return tuple(check for _, check in sorted(found, key=lambda it: it[0]))

@@ -41,10 +41,15 @@ def render(
     """
     minutes = f"{fit.seconds / 60:.1f} min" if fit.seconds >= 60 else f"{fit.seconds:.0f} s"
     misfits = [
-        [check.title, check.stream, f"{check.pilot:.3g} {check.unit}".strip(),
-         f"{check.limit:.3g} {check.unit}".strip()]
-        for check in fit.checks if check.found
-    ]  # fmt: skip
+        [
+            check.title,
+            check.stream,
+            f"{check.pilot:.3g} {check.unit}".strip(),
+            f"{check.limit:.3g} {check.unit}".strip(),
+        ]
+        for check in fit.checks
+        if check.found
+    ]
     return render_page(
         Path(__file__).with_name("page.html"),
         simulated=fit.simulated,
@@ -58,8 +63,10 @@ def render(
             ("parameter", "key", "assumed", "fitted", "95 % interval", "identified"),
             [
                 [
-                    f"{it.title} ({it.unit})" if it.unit else it.title, it.key,
-                    _short(it.assumed), _short(it.value) if it.identified else "–",
+                    f"{it.title} ({it.unit})" if it.unit else it.title,
+                    it.key,
+                    _short(it.assumed),
+                    _short(it.value) if it.identified else "–",
                     _interval(it),
                     _identified(it),
                 ]
@@ -86,7 +93,7 @@ def render(
                 for key, it in fit.statistics.items()
             ],
         ),
-    )  # fmt: skip
+    )
 
 
 def _short(value: float) -> str:
@@ -112,25 +119,39 @@ def _need(it: EffectNeed) -> list[str]:
         return [it.title, it.verdict, "–", "–", "–", it.shown_by or "–", "–"]
     verdict = f"{it.verdict}; left out" if it.left_out else it.verdict
     return [
-        it.title, verdict, f"{it.loss:.3f}", f"{it.low:.3f} to {it.high:.3f}",
-        "–" if it.limit is None else f"{it.limit:.3f}", it.shown_by,
+        it.title,
+        verdict,
+        f"{it.loss:.3f}",
+        f"{it.low:.3f} to {it.high:.3f}",
+        "–" if it.limit is None else f"{it.limit:.3f}",
+        it.shown_by,
         "–" if it.time is None else f"{it.time:.2f}",
-    ]  # fmt: skip
+    ]
 
 
 def _intervals(fit: TwinFit) -> str:
     rows = [
         figures.Factor(
-            it.title, it.low / it.assumed, it.value / it.assumed, it.high / it.assumed,
-            it.least / it.assumed, it.most / it.assumed, it.identified,
+            it.title,
+            it.low / it.assumed,
+            it.value / it.assumed,
+            it.high / it.assumed,
+            it.least / it.assumed,
+            it.most / it.assumed,
+            it.identified,
         )
         if it.low is not None and it.high is not None
         else figures.Factor(
-            f"{it.title} (withheld)", math.nan, math.nan, math.nan,
-            it.least / it.assumed, it.most / it.assumed, False,
+            f"{it.title} (withheld)",
+            math.nan,
+            math.nan,
+            math.nan,
+            it.least / it.assumed,
+            it.most / it.assumed,
+            False,
         )
         for it in fit.parameters
-    ]  # fmt: skip
+    ]
     return figures.intervals(rows, simulated=fit.simulated)
 
 

@@ -96,10 +96,12 @@ PARAMETERS = (*CONTACT, *CAMERA)
 
 
 GAIN_SLOPES: Mapping[str, float] = {
-    "scene.skin.youngs_modulus_mpa": 1.0, "scene.skin.base_normal_n_per_m": 1.0,
-    "scene.skin.base_tangential_n_per_m": 1.0, "event_camera.shift_mm_per_n": -1.0,
+    "scene.skin.youngs_modulus_mpa": 1.0,
+    "scene.skin.base_normal_n_per_m": 1.0,
+    "scene.skin.base_tangential_n_per_m": 1.0,
+    "event_camera.shift_mm_per_n": -1.0,
     "event_camera.growth_mm_per_n": -1.0,
-}  # fmt: skip
+}
 """Exponents of the force sensor's gain in what is fitted. A skin that is stiffer by a factor, seen
 with an image that moves less by it, differs from a gain in nothing that a pilot shows."""
 

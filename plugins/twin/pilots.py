@@ -104,9 +104,14 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
         raise StoreError(f"campaign '{item.name}': has no straight slides to fit a scene to")
     fitted = tuple(parts[False])
     return Pilot(
-        item.plan, fitted, tuple(parts[True]), slides, event_trials(fitted), sums.hexdigest(),
+        item.plan,
+        fitted,
+        tuple(parts[True]),
+        slides,
+        event_trials(fitted),
+        sums.hexdigest(),
         zero_error_mm(item),
-    )  # fmt: skip
+    )
 
 
 def zero_error_mm(item: Collected) -> float:
@@ -232,12 +237,17 @@ def simulate_pilot(
                 )
             found.append(
                 PilotTrial(
-                    trial.id, slide, (steps["hold"].start_ns - start_ns) * 1e-9,
-                    (steps["slide"].end_ns - start_ns) * 1e-9, frame_s,
-                    (xy_px - middle) * [1.0, -1.0] / scale, base_at(pose_s, xyz, turn, frame_s),
-                    camera, forces,
+                    trial.id,
+                    slide,
+                    (steps["hold"].start_ns - start_ns) * 1e-9,
+                    (steps["slide"].end_ns - start_ns) * 1e-9,
+                    frame_s,
+                    (xy_px - middle) * [1.0, -1.0] / scale,
+                    base_at(pose_s, xyz, turn, frame_s),
+                    camera,
+                    forces,
                 )
-            )  # fmt: skip
+            )
     finally:
         built.close()
     return found

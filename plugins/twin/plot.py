@@ -84,8 +84,9 @@ def over_time(panels: Sequence[Curves], label: str, *, simulated: bool) -> str:
         )
         for ax, it in zip(axes[:, 0], panels, strict=True):
             for worlds, colour, name in (
-                (it.before, ORANGE, "rig file as it was"), (it.twin, BLUE, "twin"),
-            ):  # fmt: skip
+                (it.before, ORANGE, "rig file as it was"),
+                (it.twin, BLUE, "twin"),
+            ):
                 low, middle, high = np.nanquantile(worlds, (0.025, 0.5, 0.975), axis=0)
                 ax.fill_between(it.t_s, low, high, color=colour, alpha=0.25, lw=0)
                 ax.plot(it.t_s, middle, color=colour, lw=1, label=f"{name}, middle 95 %")
@@ -112,16 +113,21 @@ def slip_order(
         figure, axes = plt.subplots(1, 2, figsize=(6.4, 3.1), sharex=True, sharey=True)
         most = float(np.nanmax([np.nanmax(pilot_s), np.nanmax(twin_s), np.nanmax(before_s)]))
         for ax, found, name in (
-            (axes[0], before_s, "rig file as it was"), (axes[1], twin_s, "twin"),
-        ):  # fmt: skip
+            (axes[0], before_s, "rig file as it was"),
+            (axes[1], twin_s, "twin"),
+        ):
             ax.plot([0, most], [0, most], color="black", lw=0.8)
             for ring, colour in zip(np.unique(rings), (RED, ORANGE, BLUE, GREY) * 15, strict=False):
                 of = rings == ring
                 title = "centre" if ring == 0 else f"ring {ring:.0f}"
                 ax.plot(
-                    pilot_s[:, of].ravel(), found[:, of].ravel(), ".", color=colour, ms=4,
+                    pilot_s[:, of].ravel(),
+                    found[:, of].ravel(),
+                    ".",
+                    color=colour,
+                    ms=4,
                     label=title,
-                )  # fmt: skip
+                )
             ax.set_title(name)
             ax.set_xlabel("time of a marker's slip, pilot (s)")
         axes[0].set_ylabel("the same, simulated (s)")

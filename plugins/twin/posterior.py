@@ -229,9 +229,17 @@ class Fitted:
             shares = power / max(float(power.sum()), 1e-300)
             carriers = tuple((str(names[i]), float(shares[i])) for i in order if shares[i] >= 0.1)
         return Estimate(
-            self.bank.parameters[j], float(median), sd, float(low), float(high),
-            lower + tail, upper - tail, left, left <= IDENTIFIED, carriers,
-        )  # fmt: skip
+            self.bank.parameters[j],
+            float(median),
+            sd,
+            float(low),
+            float(high),
+            lower + tail,
+            upper - tail,
+            left,
+            left <= IDENTIFIED,
+            carriers,
+        )
 
 
 def fitted(bank: Bank, usable: Bools | None = None) -> Fitted:
@@ -258,9 +266,18 @@ def fitted(bank: Bank, usable: Bools | None = None) -> Fitted:
     errors = y - predicted
     axes = np.linalg.eigh(np.atleast_2d(np.cov(errors.T)))[1]
     return Fitted(
-        bank, used, centre, scale, regression(x, y), predicted, errors, skilled,
-        _spread(predicted, errors, skilled), axes, _spread(predicted, errors @ axes, skilled),
-    )  # fmt: skip
+        bank,
+        used,
+        centre,
+        scale,
+        regression(x, y),
+        predicted,
+        errors,
+        skilled,
+        _spread(predicted, errors, skilled),
+        axes,
+        _spread(predicted, errors @ axes, skilled),
+    )
 
 
 def posterior(bank: Bank, observed: F64) -> Posterior:

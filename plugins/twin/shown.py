@@ -79,9 +79,11 @@ def event_map(trial: PilotTrial) -> F64:
     side = min(width, height)
     kept = (events.p > 0) & (events.t_us >= 0) & (events.t_us < trial.slide_s * 1e6)
     found, _, _ = np.histogram2d(
-        events.y[kept] - (height - side) / 2, events.x[kept] - (width - side) / 2,
-        bins=CELLS, range=[[0, side], [0, side]],
-    )  # fmt: skip
+        events.y[kept] - (height - side) / 2,
+        events.x[kept] - (width - side) / 2,
+        bins=CELLS,
+        range=[[0, side], [0, side]],
+    )
     result: F64 = found
     return result
 

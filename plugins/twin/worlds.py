@@ -218,9 +218,12 @@ class Prior:
         rows = [self.values(number) for number in range(len(seen))]
         theta = np.log([[row[key] for key in keys] for row in rows])
         return Bank(
-            keys, names, theta, np.stack([of_names(one.fitted, names) for one in seen]),
+            keys,
+            names,
+            theta,
+            np.stack([of_names(one.fitted, names) for one in seen]),
             *self.bounds,
-        )  # fmt: skip
+        )
 
 
 def simulated(
@@ -238,9 +241,12 @@ def simulated(
     wanted = [rig, slides.plan.collection_hash, sorted(trial.id for trial in slides.trials)]
     # what is drawn depends on the kind of prior, too
     drawn_by = [
-        type(prior).__name__, [it.key for it in prior.parameters],
-        prior.spread, prior.seed, prior.zero_mm,
-    ]  # fmt: skip
+        type(prior).__name__,
+        [it.key for it in prior.parameters],
+        prior.spread,
+        prior.seed,
+        prior.zero_mm,
+    ]
     key = make_key("scene worlds", VERSION, wanted, [sorted(slides.with_events), *drawn_by])
     name = f"worlds-{key[:16]}"
     found = _read(kept, name) if kept.fresh(name, key) else {}

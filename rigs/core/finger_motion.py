@@ -137,10 +137,14 @@ class FingerMotion:
             last = self._legs[-1]
             self._legs = [
                 _Leg(
-                    _EVER_NS, last.start_ns - now_ns, last.begin_mm, last.end_mm, last.ramp,
+                    _EVER_NS,
+                    last.start_ns - now_ns,
+                    last.begin_mm,
+                    last.end_mm,
+                    last.ramp,
                     last.force_n,
                 )
-            ]  # fmt: skip
+            ]
 
     def _reacting(self, now_ns: int) -> tuple[int, float, float]:
         """Return when a command of now takes effect, and opening (mm) and speed (mm/s) then."""

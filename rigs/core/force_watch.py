@@ -37,8 +37,11 @@ _OUTWARD_MM = 0.01
 _SAME_N = 1e-6
 """Largest difference of normal forces that are the same, N: a mounting rounds."""
 _SHAPES: dict[str, tuple[int, ...]] = {
-    "t_ns": (), "host_ns": (), "force_n": (3,), "torque_nm": (3,),
-}  # fmt: skip
+    "t_ns": (),
+    "host_ns": (),
+    "force_n": (3,),
+    "torque_nm": (3,),
+}
 _LINE_NS = 10_000_000
 _FEWEST = 5
 """Samples through which a straight line is laid: those of the last 10 ms, at least five."""

@@ -212,8 +212,13 @@ class Rig:
     def _devices(self) -> list[Any]:
         """Return arm, cameras, sync box and sensors, as far as the rig has them, the arm first."""
         found = (
-            self.arm, self.event_camera, self.frame_camera, self.sync, self.force, self.gripper,
-        )  # fmt: skip
+            self.arm,
+            self.event_camera,
+            self.frame_camera,
+            self.sync,
+            self.force,
+            self.gripper,
+        )
         return [*(device for device in found if device is not None), *self.further]
 
     def connect(self) -> None:
@@ -268,9 +273,11 @@ class Rig:
         """Return settings, counts and losses of the trial that just ran, by device."""
         described = {}
         devices = {
-            "arm": self.arm, "event_camera": self.event_camera, "frame_camera": self.frame_camera,
+            "arm": self.arm,
+            "event_camera": self.event_camera,
+            "frame_camera": self.frame_camera,
             "force_sensor": self.force,
-        }  # fmt: skip
+        }
         for name, device in devices.items():
             if (describe := getattr(device, "describe", None)) is not None:
                 described[name] = describe()
@@ -362,10 +369,15 @@ class Rig:
         zeroed = self._zeroed or self.force.zeroing != "trial"
         limit_n = None if turns and not zeroed else self.force_limit_n
         self._forces = ForceWatch(
-            self.force, self.plate_frame, limit_n, delay.shortest_us * 1e-6,
-            longest_s=delay.longest_us * 1e-6, now_ns=self.clock.now_ns, zeroed=zeroed,
+            self.force,
+            self.plate_frame,
+            limit_n,
+            delay.shortest_us * 1e-6,
+            longest_s=delay.longest_us * 1e-6,
+            now_ns=self.clock.now_ns,
+            zeroed=zeroed,
             leaving=leaving,
-        )  # fmt: skip
+        )
         self._forces.needed = self.force_limit_n is not None
         return self._forces
 
@@ -404,9 +416,14 @@ class Rig:
         self.guard.check_segment(begin, segment, self.plate_frame, self._closed_mm)
         self.arm.start([segment])
         self._motion = MotionWatch(
-            self.guard, segment, begin, self.plate_frame, self._closed_mm, self.clock.now_ns,
+            self.guard,
+            segment,
+            begin,
+            self.plate_frame,
+            self._closed_mm,
+            self.clock.now_ns,
             self.poll_s,
-        )  # fmt: skip
+        )
 
     def move_fingers(self, opening_mm: float, speed_mm_s: float, force_n: float) -> None:
         """Start to move the gripper's fingers and return at once; forces are watched.

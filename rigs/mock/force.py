@@ -51,8 +51,9 @@ class MockForceSensor:
         self._mix: F64 = np.eye(6) + _cross_talk(settings, seed)
         self._ppb = round(
             float(generator(seed, "force sensor drift").uniform(-1.0, 1.0))
-            * settings.clock_ppm * 1000
-        )  # fmt: skip
+            * settings.clock_ppm
+            * 1000
+        )
         self._period_ns = 1_000_000_000 // settings.rate_hz
         self._bias = np.zeros(6)
         self._begin()

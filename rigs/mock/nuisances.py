@@ -75,36 +75,50 @@ def _maker(nuisance: AnyNuisance, camera: EventCamera) -> Callable[[float], AnyF
             )
         case Vibration():
             return lambda at_s: Shaking(
-                kind="shaking", at_s=at_s, mm_s=float(nuisance.speed), low_hz=float(nuisance.low),
-                high_hz=float(nuisance.high), sweep_s=float(nuisance.sweep),
-            )  # fmt: skip
+                kind="shaking",
+                at_s=at_s,
+                mm_s=float(nuisance.speed),
+                low_hz=float(nuisance.low),
+                high_hz=float(nuisance.high),
+                sweep_s=float(nuisance.sweep),
+            )
         case Flicker():
             return lambda at_s: MainsLight(
-                kind="mains_light", at_s=at_s, share=float(nuisance.share) / 100,
+                kind="mains_light",
+                at_s=at_s,
+                share=float(nuisance.share) / 100,
                 hz=float(nuisance.frequency),
-            )  # fmt: skip
+            )
         case Brush():
             return lambda at_s: SkinBrushed(
-                kind="skin_brushed", at_s=at_s, newtons=float(nuisance.force),
-                mm_s=float(nuisance.speed), width_mm=float(nuisance.width),
-            )  # fmt: skip
+                kind="skin_brushed",
+                at_s=at_s,
+                newtons=float(nuisance.force),
+                mm_s=float(nuisance.speed),
+                width_mm=float(nuisance.width),
+            )
         case LostPackets():
             return lambda at_s: EventGap(
                 kind="event_gap", at_s=at_s, seconds=float(nuisance.duration)
             )
         case HotPixels():
             return lambda at_s: EventNoise(
-                kind="event_noise", at_s=at_s, hz=float(nuisance.rate), pixels=nuisance.pixels,
+                kind="event_noise",
+                at_s=at_s,
+                hz=float(nuisance.rate),
+                pixels=nuisance.pixels,
                 positive=1.0,
-            )  # fmt: skip
+            )
         case Warmth():
             more = 2.0 ** (float(nuisance.rise) / DOUBLING_C) - 1.0
             if not camera.noise_hz:
                 return None
             return lambda at_s: EventNoise(
-                kind="event_noise", at_s=at_s, hz=camera.noise_hz * more,
+                kind="event_noise",
+                at_s=at_s,
+                hz=camera.noise_hz * more,
                 positive=0.5 + 0.5 * camera.leak_share,
-            )  # fmt: skip
+            )
     return None
 
 

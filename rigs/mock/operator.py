@@ -108,8 +108,11 @@ HAND_MM = 0.02
 PIN_MM = (0.0, 0.0, -40.0)
 """Point of the pin for pivoting, in plate coordinates."""
 _TOUCHED = {
-    "centre": (0.0, 0.0), "right": (12.0, 0.0), "above": (0.0, 12.0), "check": (-9.0, -9.0),
-}  # fmt: skip
+    "centre": (0.0, 0.0),
+    "right": (12.0, 0.0),
+    "above": (0.0, 12.0),
+    "check": (-9.0, -9.0),
+}
 _SPEED_MM_S = 20.0
 
 
@@ -140,10 +143,13 @@ def jog(world: World, expected: str) -> bool:
 def _pivoted(world: World, number: int) -> Pose:
     """Return a pose with the tip on the pin, tilted in another direction for each number."""
     tilt, azimuth = np.radians(25.0), np.radians(100.0 * number)
-    tilted = matrix((
-        float(np.degrees(tilt * np.cos(azimuth))), float(np.degrees(tilt * np.sin(azimuth))),
-        15.0 * (number % 3 - 1),
-    ))  # fmt: skip
+    tilted = matrix(
+        (
+            float(np.degrees(tilt * np.cos(azimuth))),
+            float(np.degrees(tilt * np.sin(azimuth))),
+            15.0 * (number % 3 - 1),
+        )
+    )
     tool = world.plane.rotation @ tilted
     pin = world.plane.origin_mm + world.plane.rotation @ np.array(PIN_MM)
     x, y, z = (pin - tool @ world.plane.tip_mm).tolist()

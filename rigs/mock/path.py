@@ -40,11 +40,13 @@ def matrix(rotvec_deg: tuple[float, float, float]) -> F64:
 
 def rotvec_deg(rotation: F64) -> tuple[float, float, float]:
     """Rotation vector of a matrix, degrees; for angles below 180."""
-    axis = np.array([
-        rotation[2, 1] - rotation[1, 2],
-        rotation[0, 2] - rotation[2, 0],
-        rotation[1, 0] - rotation[0, 1],
-    ])  # fmt: skip
+    axis = np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
     sine = 0.5 * float(np.sqrt(axis @ axis))
     angle = math.atan2(sine, 0.5 * (float(np.trace(rotation)) - 1.0))
     scale = 0.5 if sine < 1e-12 else 0.5 * angle / sine
@@ -69,9 +71,13 @@ class ContactPlane:
         """Tilt the nominal plane about an axis in it, and offset it along its normal."""
         nominal = matrix(contact.nominal_rotvec_deg)
         azimuth = math.radians(contact.tilt_axis_deg)
-        tilt = matrix((
-            contact.tilt_deg * math.cos(azimuth), contact.tilt_deg * math.sin(azimuth), 0.0,
-        ))  # fmt: skip
+        tilt = matrix(
+            (
+                contact.tilt_deg * math.cos(azimuth),
+                contact.tilt_deg * math.sin(azimuth),
+                0.0,
+            )
+        )
         rotation = nominal @ tilt
         origin = np.asarray(contact.nominal_origin_mm) + contact.offset_mm * rotation[:, 2]
         return cls(origin, rotation, np.asarray(tip_mm, np.float64))

@@ -167,18 +167,37 @@ class Physics:
             height[0] = self._plate_motion[0]
             height[1:] = self._prescribed(t_ns[1:])
             advance(
-                springs.table, springs.friction, springs.law, state, t_ns, sensor, height, track,
-                load, springs.spots,
-            )  # fmt: skip
+                springs.table,
+                springs.friction,
+                springs.law,
+                state,
+                t_ns,
+                sensor,
+                height,
+                track,
+                load,
+                springs.spots,
+            )
             self._plate_motion[:] = height[-1], 0.0
             self._sum_up(t_ns[1:], track, load, count)
             return
         plate, mass_kg = self._settings.scene.plate, self._release[2]
         done, landed = advance_free(
-            springs.table, springs.friction, springs.law, state, t_ns, sensor,
-            self._plate_motion, mass_kg, self._weight(t_ns), plate.stiction_n,
-            -plate.stroke_mm, track, load, springs.spots,
-        )  # fmt: skip
+            springs.table,
+            springs.friction,
+            springs.law,
+            state,
+            t_ns,
+            sensor,
+            self._plate_motion,
+            mass_kg,
+            self._weight(t_ns),
+            plate.stiction_n,
+            -plate.stroke_mm,
+            track,
+            load,
+            springs.spots,
+        )
         self._sum_up(t_ns[1:], track, load, done)
         if landed:
             self._hold_plate(-plate.stroke_mm)

@@ -482,16 +482,22 @@ def check_timing(mock: MockSettings, timing: Timing, force_of_arm: bool = False)
     if timing.frames == "host arrival":
         camera = mock.frame_camera
         _check_delay(
-            "frame_camera", camera.latency_us, camera.arrival_jitter_us,
-            "frame_delay", timing.frame_delay,
-        )  # fmt: skip
+            "frame_camera",
+            camera.latency_us,
+            camera.arrival_jitter_us,
+            "frame_delay",
+            timing.frame_delay,
+        )
     if mock.force is not None and not force_of_arm:
         _check_force(mock.force, timing)
     if timing.arm == "host time":
         _check_delay(
-            "arm", mock.arm.latency_us, mock.arm.arrival_jitter_us,
-            "pose_delay", timing.pose_delay,
-        )  # fmt: skip
+            "arm",
+            mock.arm.latency_us,
+            mock.arm.arrival_jitter_us,
+            "pose_delay",
+            timing.pose_delay,
+        )
 
 
 def _check_force(force: ForceSensor, timing: Timing) -> None:

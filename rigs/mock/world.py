@@ -150,9 +150,15 @@ class World:
         )
         self._shake = Shake(self.faults, seed)
         self.physics = Physics(
-            settings, self.faults.grips(self.skin, self.slid_mm), seed, self._weak_sensor_at(),
-            self.faults.torn, self.faults.spots(), self.fingers, fine=bool(self._shake),
-        )  # fmt: skip
+            settings,
+            self.faults.grips(self.skin, self.slid_mm),
+            seed,
+            self._weak_sensor_at(),
+            self.faults.torn,
+            self.faults.spots(),
+            self.fingers,
+            fine=bool(self._shake),
+        )
         self.plate_marked = False
 
     def _weak_sensor_at(self) -> Callable[[I64], F64]:

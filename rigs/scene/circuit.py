@@ -77,10 +77,16 @@ def new_circuit(on: F64, off: F64, leak_hz: F64, cutoff_hz: float) -> Circuit:
     cells[..., ON], cells[..., OFF], cells[..., LEAK] = on, off, leak_hz * on * 1e-9
     empty = np.zeros(on.shape, np.int64)
     return Circuit(
-        cells, empty, np.full(on.shape, NEVER), empty.copy(), np.empty(on.size, np.int64),
-        np.zeros(1, np.int64), 2e-9 * np.pi * cutoff_hz, float(min(on.min(), off.min())),
+        cells,
+        empty,
+        np.full(on.shape, NEVER),
+        empty.copy(),
+        np.empty(on.size, np.int64),
+        np.zeros(1, np.int64),
+        2e-9 * np.pi * cutoff_hz,
+        float(min(on.min(), off.min())),
         bool((leak_hz > 0.0).any()),
-    )  # fmt: skip
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -228,9 +234,24 @@ def _pace(cutoff, level, contrast):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pass_rim(  # type: ignore[no-untyped-def]
-    cell, x, y, first, last, fires, since, until, inverse, curve, arcs, cutoff, contrast, edge,
-    head, out, n,
-):  # fmt: skip
+    cell,
+    x,
+    y,
+    first,
+    last,
+    fires,
+    since,
+    until,
+    inverse,
+    curve,
+    arcs,
+    cutoff,
+    contrast,
+    edge,
+    head,
+    out,
+    n,
+):
     """Apply a passing marker to a cell; see `advance`. `arcs`: largest path in each step, px."""
     for k in range(first, last):
         parts = max(int(np.ceil(arcs[k] / _PART_PX)), 1)
@@ -250,9 +271,29 @@ def _pass_rim(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_circuit(  # type: ignore[no-untyped-def]
-    circuit, path, row, row_ns, first, blocks, rows, since, until, chord, inverse, weights, inner,
-    curve, spread, contrast, edge, seen, base_ns, pixels, events, n,
-):  # fmt: skip
+    circuit,
+    path,
+    row,
+    row_ns,
+    first,
+    blocks,
+    rows,
+    since,
+    until,
+    chord,
+    inverse,
+    weights,
+    inner,
+    curve,
+    spread,
+    contrast,
+    edge,
+    seen,
+    base_ns,
+    pixels,
+    events,
+    n,
+):
     """Events of all pixels over some blocks.
 
     Args:
@@ -331,9 +372,24 @@ def events_of_circuit(  # type: ignore[no-untyped-def]
                 if n + most > events.shape[0]:
                     events = larger(events, 2 * (n + most))
                 n = _pass_rim(
-                    cell, x, y, a, b, fires, since, until, inverse, curve, arcs, circuit.cutoff,
-                    contrast, edge, start + (x << 13 | y << 1), events, n,
-                )  # fmt: skip
+                    cell,
+                    x,
+                    y,
+                    a,
+                    b,
+                    fires,
+                    since,
+                    until,
+                    inverse,
+                    curve,
+                    arcs,
+                    circuit.cutoff,
+                    contrast,
+                    edge,
+                    start + (x << 13 | y << 1),
+                    events,
+                    n,
+                )
         left = 0
         most = int(contrast / circuit.lowest) + 4
         for index in range(circuit.awake[0]):
@@ -345,9 +401,18 @@ def events_of_circuit(  # type: ignore[no-untyped-def]
                     events = larger(events, 2 * (n + most))
                 pace = _pace(circuit.cutoff, cell[INPUT], contrast)
                 n = advance(
-                    cell, length, cell[INPUT], cell[INPUT], pace, contrast, True,
-                    start + (x << 13 | y << 1), 0.0, events, n,
-                )  # fmt: skip
+                    cell,
+                    length,
+                    cell[INPUT],
+                    cell[INPUT],
+                    pace,
+                    contrast,
+                    True,
+                    start + (x << 13 | y << 1),
+                    0.0,
+                    events,
+                    n,
+                )
                 if abs(cell[SEEN] - cell[INPUT]) <= _SETTLED * contrast:
                     _rest(circuit, x, y, end_ns)
                     continue

@@ -65,34 +65,36 @@ from sliplab.storage.kernels import njit
 
 LANES = 20
 """Nineteen papillae, and one more for whole registers of four."""
-BLOCK = np.dtype([
-    (name, "f8", LANES)
-    for names in (
-        # the state and the constants, in the order of the columns in `rigs.scene.springs`
-        "place_x place_y base_x base_y branch_x branch_y force_x force_y normal normal_branch",
-        "indentation bent path slipped mode speed slid_s earlier",
-        "layout_x layout_y gap along bending compliance across shorter",
-        # where the base moves to, and the depth; where the tip stands, and its stretch at first
-        "to_x to_y deep foot_x foot_y old_x old_y",
-        # force along the papilla and the gain of its relaxing branch; soft part across it
-        "pressed gain soft",
-        # friction behind a knot of the path, and the knot that is needed
-        "knot c0 c1 c2 c3 wanted",
-        # how the step ends: mode, place, force, bend; slip, and share of the step at which the
-        # tip lets go (negative: it does not)
-        "end_mode end_x end_y end_force_x end_force_y end_normal end_bent slip share",
-        # the search for the bend: bracket, whether it goes on (negative: failed), stretch
-        "low high seeks stretch",
-        # the force when the slip begins, the cone's radii at both ends; the slip's direction
-        "from_x from_y before after unit_x unit_y top bottom arc",
-        # the search for the slip (`rigs.scene.slip.slip_step`)
-        "bend ahead aside rest_x rest_y soft_x soft_y quick lag grip grip_slope far",
-        # for lanes that are prepared one by one: kind, share of the drive until the tip lets
-        # go, how long it slides then (s), what it takes from the plate by letting go
-        "rare held slides_s kick",
-    )
-    for name in names.split()
-])  # fmt: skip
+BLOCK = np.dtype(
+    [
+        (name, "f8", LANES)
+        for names in (
+            # the state and the constants, in the order of the columns in `rigs.scene.springs`
+            "place_x place_y base_x base_y branch_x branch_y force_x force_y normal normal_branch",
+            "indentation bent path slipped mode speed slid_s earlier",
+            "layout_x layout_y gap along bending compliance across shorter",
+            # where the base moves to, and the depth; where the tip stands, and its stretch at first
+            "to_x to_y deep foot_x foot_y old_x old_y",
+            # force along the papilla and the gain of its relaxing branch; soft part across it
+            "pressed gain soft",
+            # friction behind a knot of the path, and the knot that is needed
+            "knot c0 c1 c2 c3 wanted",
+            # how the step ends: mode, place, force, bend; slip, and share of the step at which the
+            # tip lets go (negative: it does not)
+            "end_mode end_x end_y end_force_x end_force_y end_normal end_bent slip share",
+            # the search for the bend: bracket, whether it goes on (negative: failed), stretch
+            "low high seeks stretch",
+            # the force when the slip begins, the cone's radii at both ends; the slip's direction
+            "from_x from_y before after unit_x unit_y top bottom arc",
+            # the search for the slip (`rigs.scene.slip.slip_step`)
+            "bend ahead aside rest_x rest_y soft_x soft_y quick lag grip grip_slope far",
+            # for lanes that are prepared one by one: kind, share of the drive until the tip lets
+            # go, how long it slides then (s), what it takes from the plate by letting go
+            "rare held slides_s kick",
+        )
+        for name in names.split()
+    ]
+)
 """A block of tips: a row of lanes for each quantity. A processor computes four or eight numbers at
 once if they lie next to each other and if it is known beforehand how many there are."""
 _ROWS, _STATES, _CONSTANTS = len(BLOCK.names or ()), 18, 8
@@ -193,9 +195,18 @@ def respond(w, field, law, first, count, sensor, plate_y, step):  # type: ignore
     """
     turn = sensor[5] if sensor.shape[0] > 5 else 0.0
     stale, touching = _approach(
-        w, law, sensor[0], sensor[1], sensor[2], sensor[3], sensor[4], np.cos(turn), np.sin(turn),
-        plate_y, step,
-    )  # fmt: skip
+        w,
+        law,
+        sensor[0],
+        sensor[1],
+        sensor[2],
+        sensor[3],
+        sensor[4],
+        np.cos(turn),
+        np.sin(turn),
+        plate_y,
+        step,
+    )
     if stale > 0:
         for j in range(count):
             if w.wanted[j] != w.knot[j]:
@@ -280,9 +291,16 @@ def _bend(w):  # type: ignore[no-untyped-def]
     for j in range(LANES):
         seeks = w.seeks[j] > 0.0
         bent, low, high, found = bend_step(
-            w.end_bent[j], w.low[j], w.high[j], w.stretch[j], w.bending[j], w.shorter[j],
-            w.compliance[j], w.pressed[j], w.along[j],
-        )  # fmt: skip
+            w.end_bent[j],
+            w.low[j],
+            w.high[j],
+            w.stretch[j],
+            w.bending[j],
+            w.shorter[j],
+            w.compliance[j],
+            w.pressed[j],
+            w.along[j],
+        )
         w.end_bent[j] = bent if seeks else w.end_bent[j]
         w.low[j], w.high[j] = low, high
         still = seeks and not found
@@ -401,10 +419,25 @@ def _slide(w, field, law, first, count, step, rare):  # type: ignore[no-untyped-
         for j in range(count):
             if w.end_mode[j] == SLIDING and (w.seeks[j] != 0.0 or w.slip[j] > w.far[j]):
                 w.slip[j], w.bend[j] = march_to_slip(
-                    w.end_bent[j], w.ahead[j], w.aside[j], w.rest_x[j], w.rest_y[j], w.soft_x[j],
-                    w.soft_y[j], w.pressed[j], w.along[j], w.bending[j], w.shorter[j],
-                    w.compliance[j], field, first + j, w.path[j], w.quick[j], w.lag[j], law,
-                )  # fmt: skip
+                    w.end_bent[j],
+                    w.ahead[j],
+                    w.aside[j],
+                    w.rest_x[j],
+                    w.rest_y[j],
+                    w.soft_x[j],
+                    w.soft_y[j],
+                    w.pressed[j],
+                    w.along[j],
+                    w.bending[j],
+                    w.shorter[j],
+                    w.compliance[j],
+                    field,
+                    first + j,
+                    w.path[j],
+                    w.quick[j],
+                    w.lag[j],
+                    law,
+                )
     if _arrive(w) > 0:
         for j in range(count):
             if w.end_mode[j] == SLIDING and w.wanted[j] != w.knot[j]:
@@ -423,15 +456,24 @@ def _aim(w, law):  # type: ignore[no-untyped-def]
         for j in range(LANES):
             from_x, from_y = w.from_x[j], w.from_y[j]
             w.unit_x[j], w.unit_y[j], w.top[j], w.bottom[j], w.arc[j] = tractrix(
-                from_x, from_y, w.end_force_x[j] - from_x, w.end_force_y[j] - from_y, w.before[j],
+                from_x,
+                from_y,
+                w.end_force_x[j] - from_x,
+                w.end_force_y[j] - from_y,
+                w.before[j],
                 w.after[j],
-            )  # fmt: skip
+            )
         for j in range(LANES):
             unit_x, unit_y = tractrix_end(w.unit_x[j], w.unit_y[j], w.top[j], w.bottom[j], w.arc[j])
             w.unit_x[j], w.unit_y[j] = slip_direction(
-                w.from_x[j], w.from_y[j], w.end_force_x[j], w.end_force_y[j], unit_x, unit_y,
+                w.from_x[j],
+                w.from_y[j],
+                w.end_force_x[j],
+                w.end_force_y[j],
+                unit_x,
+                unit_y,
                 w.after[j],
-            )  # fmt: skip
+            )
     else:
         for j in range(LANES):
             trial_x, trial_y = w.end_force_x[j], w.end_force_y[j]
@@ -455,16 +497,42 @@ def _begin_search(w, law, j, quick, lag, slides, rough, per_s, step):  # type: i
     old_x, old_y = w.old_x[j], w.old_y[j]
     unit_x, unit_y = w.unit_x[j], w.unit_y[j]
     (
-        w.ahead[j], w.aside[j], w.rest_x[j], w.rest_y[j], w.soft_x[j], w.soft_y[j],
+        w.ahead[j],
+        w.aside[j],
+        w.rest_x[j],
+        w.rest_y[j],
+        w.soft_x[j],
+        w.soft_y[j],
     ) = along_slip(
-        new_x, new_y, old_x, old_y, w.branch_x[j] * step.decay, w.branch_y[j] * step.decay,
-        w.across[j] * law.maxwell * w.gain[j], w.across[j] * law.damping_s, per_s, step.swerve,
-        unit_x, unit_y, quick, lag,
-    )  # fmt: skip
+        new_x,
+        new_y,
+        old_x,
+        old_y,
+        w.branch_x[j] * step.decay,
+        w.branch_y[j] * step.decay,
+        w.across[j] * law.maxwell * w.gain[j],
+        w.across[j] * law.damping_s,
+        per_s,
+        step.swerve,
+        unit_x,
+        unit_y,
+        quick,
+        lag,
+    )
     slip, w.bend[j], w.far[j] = first_slip(
-        new_x - old_x, new_y - old_y, unit_x, unit_y, slides, w.bent[j], w.bending[j],
-        w.shorter[j], w.compliance[j], w.pressed[j], w.along[j], rough,
-    )  # fmt: skip
+        new_x - old_x,
+        new_y - old_y,
+        unit_x,
+        unit_y,
+        slides,
+        w.bent[j],
+        w.bending[j],
+        w.shorter[j],
+        w.compliance[j],
+        w.pressed[j],
+        w.along[j],
+        rough,
+    )
     w.slip[j] = slip if w.seeks[j] > 0.0 else 0.0
     w.quick[j], w.lag[j] = quick, lag
 
@@ -499,10 +567,24 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
     for j in range(LANES):
         seeks = w.seeks[j] > 0.0
         slip, bend, found, hopeful, _ = slip_step(
-            w.slip[j], w.bend[j], w.ahead[j], w.aside[j], w.rest_x[j], w.rest_y[j], w.soft_x[j],
-            w.soft_y[j], w.pressed[j], w.along[j], w.bending[j], w.shorter[j], w.compliance[j],
-            w.grip[j], w.grip_slope[j], w.quick[j], law.weak_mm_s,
-        )  # fmt: skip
+            w.slip[j],
+            w.bend[j],
+            w.ahead[j],
+            w.aside[j],
+            w.rest_x[j],
+            w.rest_y[j],
+            w.soft_x[j],
+            w.soft_y[j],
+            w.pressed[j],
+            w.along[j],
+            w.bending[j],
+            w.shorter[j],
+            w.compliance[j],
+            w.grip[j],
+            w.grip_slope[j],
+            w.quick[j],
+            law.weak_mm_s,
+        )
         w.slip[j], w.bend[j] = slip if seeks else w.slip[j], bend if seeks else w.bend[j]
         still = seeks and hopeful and not found
         ended = -1.0 if seeks and not hopeful else (0.0 if seeks else w.seeks[j])
@@ -542,9 +624,19 @@ def _pull(w, law):  # type: ignore[no-untyped-def]
     for j in range(LANES):
         slides, slip = w.end_mode[j] == SLIDING, w.slip[j]
         force_x, force_y, normal = force_after(
-            slip, w.end_bent[j], w.ahead[j], w.aside[j], w.rest_x[j], w.rest_y[j], w.soft_x[j],
-            w.soft_y[j], w.pressed[j], w.along[j], w.bending[j], w.shorter[j],
-        )  # fmt: skip
+            slip,
+            w.end_bent[j],
+            w.ahead[j],
+            w.aside[j],
+            w.rest_x[j],
+            w.rest_y[j],
+            w.soft_x[j],
+            w.soft_y[j],
+            w.pressed[j],
+            w.along[j],
+            w.bending[j],
+            w.shorter[j],
+        )
         grip, _ = grip_between(w.path[j] + slip, w.knot[j], w.c0[j], w.c1[j], w.c2[j], w.c3[j])
         grip, _ = strengthened(grip, 0.0, slip, w.quick[j], w.lag[j], law)
         x, y = onto_cone(force_x, force_y, w.unit_x[j], w.unit_y[j], grip * normal)
@@ -622,9 +714,7 @@ def _excess(share, w, law, j, limit, step):  # type: ignore[no-untyped-def]
     along, was = w.along[j], w.indentation[j]
     bending, shortening = w.bending[j], w.shorter[j]
     sunk = share * (w.deep[j] - was)
-    pressed = (
-        along * (was + sunk) + w.normal_branch[j] * decay + law.maxwell * along * gain * sunk
-    )  # fmt: skip
+    pressed = along * (was + sunk) + w.normal_branch[j] * decay + law.maxwell * along * gain * sunk
     stretch = np.sqrt(x * x + y * y)
     bent = bend_for(stretch, w.bent[j], bending, shortening, w.compliance[j], pressed, along)
     force, normal, _, _ = column(bent, bending, shortening, pressed, along)
@@ -655,9 +745,18 @@ def _begin_rare(w, field, law, i, j, rough, step):  # type: ignore[no-untyped-de
     if _needs_speed(law, before, w.slides_s[j]):
         first = np.sqrt(w.from_x[j] * w.from_x[j] + w.from_y[j] * w.from_y[j])
         _take_speed(
-            w, field, law, i, j, 0.0, w.end_bent[j], before, after, 0.5 * (before + after),
+            w,
+            field,
+            law,
+            i,
+            j,
+            0.0,
+            w.end_bent[j],
+            before,
+            after,
+            0.5 * (before + after),
             first / before,
-        )  # fmt: skip
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -695,10 +794,24 @@ def _take_speed(w, field, law, i, j, slip, bend, before, after, cone, more):  # 
     """
     grip, slope = grip_at(field, i, w.path[j] + slip)
     _, _, _, _, steepness = slip_step(
-        slip, bend, w.ahead[j], w.aside[j], w.rest_x[j], w.rest_y[j], w.soft_x[j], w.soft_y[j],
-        w.pressed[j], w.along[j], w.bending[j], w.shorter[j], w.compliance[j], grip * more,
-        slope * more, 0.0, law.weak_mm_s,
-    )  # fmt: skip
+        slip,
+        bend,
+        w.ahead[j],
+        w.aside[j],
+        w.rest_x[j],
+        w.rest_y[j],
+        w.soft_x[j],
+        w.soft_y[j],
+        w.pressed[j],
+        w.along[j],
+        w.bending[j],
+        w.shorter[j],
+        w.compliance[j],
+        grip * more,
+        slope * more,
+        0.0,
+        law.weak_mm_s,
+    )
     first = np.sqrt(w.from_x[j] * w.from_x[j] + w.from_y[j] * w.from_y[j])
     x, y = w.end_force_x[j], w.end_force_y[j]
     speed = relaxed_speed(

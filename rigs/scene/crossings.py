@@ -161,9 +161,30 @@ def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, c
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_segment(  # type: ignore[no-untyped-def]
-    x, y, on, off, last_one, level, step, ga, segment, base, begin, final, since, until, inverse,
-    curve, tree, contrast, edge, head, stack, out, n,
-):  # fmt: skip
+    x,
+    y,
+    on,
+    off,
+    last_one,
+    level,
+    step,
+    ga,
+    segment,
+    base,
+    begin,
+    final,
+    since,
+    until,
+    inverse,
+    curve,
+    tree,
+    contrast,
+    edge,
+    head,
+    stack,
+    out,
+    n,
+):
     """Events of one pixel on a segment of a block, for any course of its distance.
 
     Args:

@@ -186,22 +186,38 @@ def draw_discs(image, centres, radii, paths, smeared, ground, level, dark, brigh
         boxes[i, 0], boxes[i, 1] = int(np.floor(low_x - reach)), int(np.floor(low_y - reach))
         boxes[i, 2], boxes[i, 3] = int(high_x + reach), int(high_y + reach)
         down, along = _shift(frame_key, i + 1)
-        _ground(
-            image, boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3], dark, down, along
-        )  # fmt: skip
+        _ground(image, boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3], dark, down, along)
     for i in range(n):
         down, along = _shift(frame_key, i + 1)
         left, top = boxes[i, 0], boxes[i, 1]
         if smeared[i]:
             _smeared(
-                image, paths[:, i], radii[i], ground, level, dark, left, top, boxes[i, 2],
-                boxes[i, 3], down, along,
-            )  # fmt: skip
+                image,
+                paths[:, i],
+                radii[i],
+                ground,
+                level,
+                dark,
+                left,
+                top,
+                boxes[i, 2],
+                boxes[i, 3],
+                down,
+                along,
+            )
         else:
             _sharp(
-                image, centres[i, 0], centres[i, 1], radii[i], ground, level, dark, bright,
-                down - top, along - left,
-            )  # fmt: skip
+                image,
+                centres[i, 0],
+                centres[i, 1],
+                radii[i],
+                ground,
+                level,
+                dark,
+                bright,
+                down - top,
+                along - left,
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -215,6 +231,14 @@ def draw_still(images, centres, radii, drawn, ground, level, dark, bright, frame
     for k in range(images.shape[0]):
         if drawn[k]:
             draw_discs(
-                images[k], centres[k], radii[k], nowhere, still, ground, level, dark, bright,
+                images[k],
+                centres[k],
+                radii[k],
+                nowhere,
+                still,
+                ground,
+                level,
+                dark,
+                bright,
                 frame_keys[k],
-            )  # fmt: skip
+            )

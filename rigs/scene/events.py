@@ -174,28 +174,43 @@ class MarkerSensor:
         if optics.leak == "reference":
             rate_hz, leaks = rate_hz * (1.0 - leaks), 0.0
         self._noise = NoiseRates(
-            optics.width, optics.height, rate_hz, leaks, optics.hot_hz,
+            optics.width,
+            optics.height,
+            rate_hz,
+            leaks,
+            optics.hot_hz,
             hot_places(optics.width, optics.height, optics.hot_pixels, seed),
-        )  # fmt: skip
+        )
         self._circuit = self._new_circuit(seed) if optics.has_circuit else no_circuit()
         self._light = steady()
         self._started = True
         middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
         self._projection = (
-            float(optics.px_per_mm), float(optics.shift_mm_per_n), float(optics.growth_mm_per_n),
-            float(optics.radius_mm), *middle,
-        )  # fmt: skip
+            float(optics.px_per_mm),
+            float(optics.shift_mm_per_n),
+            float(optics.growth_mm_per_n),
+            float(optics.radius_mm),
+            *middle,
+        )
         # floats also where a setting was written as whole
         self._camera = Camera(
-            optics.block_ns, optics.path == "chord", float(optics.contrast), float(optics.edge_px),
-            round(optics.refractory_us * 1e3), optics.period_ns, optics.column_ns,
-            float(self.threshold.min()), self._noise.leak_below,
-        )  # fmt: skip
+            optics.block_ns,
+            optics.path == "chord",
+            float(optics.contrast),
+            float(optics.edge_px),
+            round(optics.refractory_us * 1e3),
+            optics.period_ns,
+            optics.column_ns,
+            float(self.threshold.min()),
+            self._noise.leak_below,
+        )
         self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
         self._pixels = Pixels(
-            self.threshold, self._dark.copy(), np.empty(shape, np.int64),
+            self.threshold,
+            self._dark.copy(),
+            np.empty(shape, np.int64),
             np.tile([np.inf, -np.inf, np.inf, -np.inf], (len(self._layout_mm), 1)),
-        )  # fmt: skip
+        )
         self._lists = no_lists(len(self._layout_mm), 0)
         self._pending = np.empty(0, np.int64)
         self._phase_ns = 0
@@ -230,7 +245,7 @@ class MarkerSensor:
         """
         result: F64 = markers_in_image(
             np.ascontiguousarray(loads), self._layout_mm, self._projection
-        )  # fmt: skip
+        )
         return result
 
     def reset(self, load: F64, seed: int) -> None:
@@ -245,9 +260,13 @@ class MarkerSensor:
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
         darken(self._pixels.seen, self._dark, self._pixels.state)
         memorise_discs(
-            discs, optics.contrast, optics.edge_px, self.threshold, self._pixels.state,
+            discs,
+            optics.contrast,
+            optics.edge_px,
+            self.threshold,
+            self._pixels.state,
             self._pixels.seen,
-        )  # fmt: skip
+        )
         if optics.has_circuit:
             # a camera that has run for long: each pixel is at a random point between two leaks
             phase = generator(seed, "leak phases").random(self.threshold.shape)
@@ -287,10 +306,19 @@ class MarkerSensor:
         if flicker is not None and self._light.share == 0.0 and flicker[2] < t_ns[-1]:
             self._light = self._flickering(*flicker[:2], max(flicker[2], int(t_ns[0])))
         when, x, y, p, self._pending = trace(
-            np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, self._camera,
-            self._phase_ns, self._pixels, self._lists, self._circuit,
-            self._candidates(int(t_ns[0]), int(t_ns[-1])), self._light, self._pending,
-        )  # fmt: skip
+            np.ascontiguousarray(loads),
+            self._layout_mm,
+            self._projection,
+            t_ns,
+            self._camera,
+            self._phase_ns,
+            self._pixels,
+            self._lists,
+            self._circuit,
+            self._candidates(int(t_ns[0]), int(t_ns[-1])),
+            self._light,
+            self._pending,
+        )
         return when, x, y, p
 
     def _flickering(self, share: float, hz: float, since_ns: int) -> Flicker:
@@ -352,9 +380,19 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
-    loads, layout_mm, projection, row_ns, camera, phase_ns, of_pixels, lists, circuit, noise,
-    light, pending,
-):  # fmt: skip
+    loads,
+    layout_mm,
+    projection,
+    row_ns,
+    camera,
+    phase_ns,
+    of_pixels,
+    lists,
+    circuit,
+    noise,
+    light,
+    pending,
+):
     """Return signal and noise events under `loads`, as the camera delivers them.
 
     In a block each marker's path is fitted and cut into segments, the pixels that may fire are
@@ -423,9 +461,17 @@ def trace(  # type: ignore[no-untyped-def]
             events, other = larger(events, capacity), np.empty(capacity, np.int64)
         for block in range(blocks):
             noise_at, n = noise_events(
-                noise, noise_at, row_ns[begin + first[block + 1]], base_ns, camera.leak_below,
-                contrast, edge, path[:, :, begin + first[block]], events, n,
-            )  # fmt: skip
+                noise,
+                noise_at,
+                row_ns[begin + first[block + 1]],
+                base_ns,
+                camera.leak_below,
+                contrast,
+                edge,
+                path[:, :, begin + first[block]],
+                events,
+                n,
+            )
         if light.share > 0.0:
             for block in range(blocks):
                 begin_ns = row_ns[begin + first[block]]
@@ -443,9 +489,29 @@ def trace(  # type: ignore[no-untyped-def]
         inner_weights(first, blocks, weights, inner)
         if circuit.awake.shape[0] > 0:
             events, n = events_of_circuit(
-                circuit, path, begin, row_ns, first, blocks, rows, since, until, chord, inverse,
-                weights, inner, curve, spread, contrast, edge, seen, base_ns, pixels, events, n,
-            )  # fmt: skip
+                circuit,
+                path,
+                begin,
+                row_ns,
+                first,
+                blocks,
+                rows,
+                since,
+                until,
+                chord,
+                inverse,
+                weights,
+                inner,
+                curve,
+                spread,
+                contrast,
+                edge,
+                seen,
+                base_ns,
+                pixels,
+                events,
+                n,
+            )
             if capacity < events.shape[0]:
                 capacity = events.shape[0]
                 other = np.empty(capacity, np.int64)
@@ -462,9 +528,21 @@ def trace(  # type: ignore[no-untyped-def]
             count = 0
             if listed:
                 count = may_fire(
-                    i, column, row, radius, end_x - column, end_y - row, end_r - radius,
-                    off_chord, origin, aim, place, hit, slots, pixels,
-                )  # fmt: skip
+                    i,
+                    column,
+                    row,
+                    radius,
+                    end_x - column,
+                    end_y - row,
+                    end_r - radius,
+                    off_chord,
+                    origin,
+                    aim,
+                    place,
+                    hit,
+                    slots,
+                    pixels,
+                )
                 if count == 0:
                     continue
             else:
@@ -473,9 +551,18 @@ def trace(  # type: ignore[no-untyped-def]
             amount = np.int64(0)
             for block in range(blocks):
                 amount = cut_block(
-                    first[block], first[block + 1], block, rows[first[block]], reach, since,
-                    until, curve, spread, segments, amount,
-                )  # fmt: skip
+                    first[block],
+                    first[block + 1],
+                    block,
+                    rows[first[block]],
+                    reach,
+                    since,
+                    until,
+                    curve,
+                    spread,
+                    segments,
+                    amount,
+                )
                 behind[block] = amount
             pack_steps(last, since, inverse, curve, steps)
             # pixels that are not from a list are those near the rim, block by block
@@ -497,10 +584,29 @@ def trace(  # type: ignore[no-untyped-def]
                     capacity = 2 * most
                     events, other = larger(events, capacity), np.empty(capacity, np.int64)
                 n = events_of_pixels(
-                    pixels, count, segments[done:end], first, since, until, inverse, curve, steps,
-                    tree, threshold, contrast, edge, lead_ns, stack, tile, fire, wait, state,
-                    gaps, events, n,
-                )  # fmt: skip
+                    pixels,
+                    count,
+                    segments[done:end],
+                    first,
+                    since,
+                    until,
+                    inverse,
+                    curve,
+                    steps,
+                    tree,
+                    threshold,
+                    contrast,
+                    edge,
+                    lead_ns,
+                    stack,
+                    tile,
+                    fire,
+                    wait,
+                    state,
+                    gaps,
+                    events,
+                    n,
+                )
                 done = end
                 if listed:
                     break
@@ -512,18 +618,44 @@ def trace(  # type: ignore[no-untyped-def]
             xs, ys = larger(xs, room), larger(ys, room)
         if period_ns > 0:
             kept, waiting = read_scans(
-                events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns,
-                camera.refractory_ns, fired, t_ns, xs, ys, ps, kept,
-            )  # fmt: skip
+                events,
+                n,
+                other,
+                base_ns,
+                end_ns,
+                period_ns,
+                phase_ns,
+                column_ns,
+                camera.refractory_ns,
+                fired,
+                t_ns,
+                xs,
+                ys,
+                ps,
+                kept,
+            )
             for k in range(waiting):
                 events[k] -= (end_ns - row_ns[begin]) << 25
         else:
             kept = read_each(
-                events, n, other, base_ns, end_ns - base_ns, camera.refractory_ns, fired, t_ns,
-                xs, ys, ps, kept,
-            )  # fmt: skip
+                events,
+                n,
+                other,
+                base_ns,
+                end_ns - base_ns,
+                camera.refractory_ns,
+                fired,
+                t_ns,
+                xs,
+                ys,
+                ps,
+                kept,
+            )
         begin = stop
     return (
-        t_ns[:kept].copy(), xs[:kept].copy(), ys[:kept].copy(), ps[:kept].copy(),
+        t_ns[:kept].copy(),
+        xs[:kept].copy(),
+        ys[:kept].copy(),
+        ps[:kept].copy(),
         events[:waiting].copy(),
-    )  # fmt: skip
+    )

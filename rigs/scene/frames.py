@@ -294,9 +294,13 @@ class PlateView:
     def __init__(self, optics: FrameOptics, width: int, height: int) -> None:
         self.optics, self.width, self.height = optics, width, height
         self.lens = Lens(
-            optics.px_per_mm, width, height, tilt_deg=optics.tilt_deg, k1=optics.k1,
+            optics.px_per_mm,
+            width,
+            height,
+            tilt_deg=optics.tilt_deg,
+            k1=optics.k1,
             distance_mm=optics.distance_mm,
-        )  # fmt: skip
+        )
         printed = Print(optics.marker_id, optics.marker_side_mm, optics.marker_centre_mm)
         self.marker = PlateMarker(printed, self.lens, optics.ground_level, optics.tip_level)
         # a tilt enlarges the near side by a few percent

@@ -45,11 +45,13 @@ class Lens:
         """True if the picture is the plane at one scale."""
         a, b = (math.radians(angle) for angle in tilt_deg)
         # rows: x, y and depth over the distance, of the plane point (X, Y, 1) after both turns
-        self._turn = np.array([
-            [math.cos(b), math.sin(a) * math.sin(b), 0.0],
-            [0.0, math.cos(a), 0.0],
-            [-math.sin(b) / distance_mm, math.sin(a) * math.cos(b) / distance_mm, 1.0],
-        ])  # fmt: skip
+        self._turn = np.array(
+            [
+                [math.cos(b), math.sin(a) * math.sin(b), 0.0],
+                [0.0, math.cos(a), 0.0],
+                [-math.sin(b) / distance_mm, math.sin(a) * math.cos(b) / distance_mm, 1.0],
+            ]
+        )
         self._centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
         self._per_mm = 1.0 / distance_mm
 
@@ -186,11 +188,13 @@ class BoardCamera:
     def see(self, place: BoardPlace) -> tuple[F64, F64]:
         """Rotation (3, 3) and translation (3,), mm, from the board to the camera (y down)."""
         a, b = (math.radians(angle) for angle in self.tilt_deg)
-        turn = np.array([
-            [math.cos(b), math.sin(a) * math.sin(b), math.cos(a) * math.sin(b)],
-            [0.0, math.cos(a), -math.sin(a)],
-            [-math.sin(b), math.sin(a) * math.cos(b), math.cos(a) * math.cos(b)],
-        ])  # fmt: skip
+        turn = np.array(
+            [
+                [math.cos(b), math.sin(a) * math.sin(b), math.cos(a) * math.sin(b)],
+                [0.0, math.cos(a), -math.sin(a)],
+                [-math.sin(b), math.sin(a) * math.cos(b), math.cos(a) * math.cos(b)],
+            ]
+        )
         flip = np.diag([1.0, -1.0, 1.0])
         rotation: F64 = flip @ turn @ place.rotation
         shift: F64 = flip @ turn @ np.array(place.centre_mm) + np.array(

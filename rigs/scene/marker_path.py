@@ -286,22 +286,44 @@ def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
     return np.sqrt(dx * dx + dy * dy) + abs(dr) + most, most
 
 
-SEGMENT = np.dtype([
-    # first step and the step behind the last one; the node of the block's tree that is this
-    # segment; the block
-    ("k0", "i8"), ("k1", "i8"), ("node", "i8"), ("block", "i8"),
-    # when the segment begins and ends, ns after its block; when the block begins, ns after the
-    # first row; how far the marker strays from its chord at most, px
-    ("begin", "f8"), ("end", "f8"), ("zero", "f8"), ("stray", "f8"),
-    # mean rates of column, row and radius; how far rates stray from them together; the highest
-    # speed of the centre, px/ns
-    ("mx", "f8"), ("my", "f8"), ("mr", "f8"), ("deviation", "f8"), ("speed", "f8"),
-    # column, row and radius at both ends, px, and their rates there, px/ns
-    ("x0", "f8"), ("y0", "f8"), ("r0", "f8"), ("x1", "f8"), ("y1", "f8"), ("r1", "f8"),
-    ("vx0", "f8"), ("vy0", "f8"), ("vr0", "f8"), ("vx1", "f8"), ("vy1", "f8"), ("vr1", "f8"),
-    # how long a step of Newton's method may be after which a time is good, ns
-    ("fine", "f8"),
-])  # fmt: skip
+SEGMENT = np.dtype(
+    [
+        # first step and the step behind the last one; the node of the block's tree that is this
+        # segment; the block
+        ("k0", "i8"),
+        ("k1", "i8"),
+        ("node", "i8"),
+        ("block", "i8"),
+        # when the segment begins and ends, ns after its block; when the block begins, ns after the
+        # first row; how far the marker strays from its chord at most, px
+        ("begin", "f8"),
+        ("end", "f8"),
+        ("zero", "f8"),
+        ("stray", "f8"),
+        # mean rates of column, row and radius; how far rates stray from them together; the highest
+        # speed of the centre, px/ns
+        ("mx", "f8"),
+        ("my", "f8"),
+        ("mr", "f8"),
+        ("deviation", "f8"),
+        ("speed", "f8"),
+        # column, row and radius at both ends, px, and their rates there, px/ns
+        ("x0", "f8"),
+        ("y0", "f8"),
+        ("r0", "f8"),
+        ("x1", "f8"),
+        ("y1", "f8"),
+        ("r1", "f8"),
+        ("vx0", "f8"),
+        ("vy0", "f8"),
+        ("vr0", "f8"),
+        ("vx1", "f8"),
+        ("vy1", "f8"),
+        ("vr1", "f8"),
+        # how long a step of Newton's method may be after which a time is good, ns
+        ("fine", "f8"),
+    ]
+)
 """A part of a marker's path on which it does not move far."""
 _MOST_PX = 2.0
 _CLOSE = 1e-4  # of the block: after a step as small as that the next error is below 1e-7

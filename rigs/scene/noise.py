@@ -84,10 +84,15 @@ def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
     gaps, draws = rng.standard_exponential(n + 1), rng.random((2, n))
     return Candidates(
         *_spread(
-            gaps, draws, index * BIN_NS, rates.width, rates.height, rates.hot_share,
+            gaps,
+            draws,
+            index * BIN_NS,
+            rates.width,
+            rates.height,
+            rates.hot_share,
             rates.hot_places,
         )
-    )  # fmt: skip
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

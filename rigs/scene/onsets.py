@@ -67,9 +67,13 @@ def slide_onsets(
     shorter = SHORTENING / skin.height_mm if level >= 2 else np.zeros(len(skin))
     pressing_s = deep / press
     branch = (
-        maxwell * skin.normal_n_per_mm * press * tau
-        * -np.expm1(-pressing_s / tau) * np.exp(-settled / tau)
-    )  # fmt: skip
+        maxwell
+        * skin.normal_n_per_mm
+        * press
+        * tau
+        * -np.expm1(-pressing_s / tau)
+        * np.exp(-settled / tau)
+    )
     k_t = skin.tangential_n_per_mm
 
     def beyond(t_s: F64) -> F64:

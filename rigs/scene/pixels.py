@@ -315,10 +315,20 @@ def finish(wait, n, since, until, steps, inverse, curve, out, count):  # type: i
             return count
     for j in range(n):
         t = solve(
-            wait[R_X + j], wait[R_Y + j], wait[R_TARGET + j], np.int64(wait[R_HEAD + j]) & 1 > 0,
-            wait[R_LOW + j], wait[R_HIGH + j], wait[R_TIME + j], np.int64(wait[R_STEP + j]),
-            wait[R_FINE + j], since, until, inverse, curve,
-        )  # fmt: skip
+            wait[R_X + j],
+            wait[R_Y + j],
+            wait[R_TARGET + j],
+            np.int64(wait[R_HEAD + j]) & 1 > 0,
+            wait[R_LOW + j],
+            wait[R_HIGH + j],
+            wait[R_TIME + j],
+            np.int64(wait[R_STEP + j]),
+            wait[R_FINE + j],
+            since,
+            until,
+            inverse,
+            curve,
+        )
         out[count] = np.int64(wait[R_HEAD + j] + np.floor(t) * _TICK)
         count += 1
     return count
@@ -333,9 +343,29 @@ def move(source, j, target, k):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels, count, segments, first, since, until, inverse, curve, steps, tree, threshold,
-    contrast, edge, origin, stack, tile, fire, wait, state, gaps, out, n,
-):  # fmt: skip
+    pixels,
+    count,
+    segments,
+    first,
+    since,
+    until,
+    inverse,
+    curve,
+    steps,
+    tree,
+    threshold,
+    contrast,
+    edge,
+    origin,
+    stack,
+    tile,
+    fire,
+    wait,
+    state,
+    gaps,
+    out,
+    n,
+):
     """Events of pixels over some blocks.
 
     Args:
@@ -396,12 +426,30 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                         bound_rates(curve, begin, final, 4 * begin, tree)
                         tree[4 * begin, 0] = 1.0
                     on, off, last, level, n = events_of_segment(
-                        tile[P_X + j], tile[P_Y + j], tile[P_ON + j],
-                        tile[P_OFF + j], tile[P_LAST + j], tile[P_LEVEL + j],
-                        tile[P_STEP + j], tile[P_BEGIN + j], segment, 4 * begin, begin, final,
-                        since, until, inverse, curve, tree, contrast, edge,
-                        np.int64(head + tile[P_CODE + j]), stack, out, n,
-                    )  # fmt: skip
+                        tile[P_X + j],
+                        tile[P_Y + j],
+                        tile[P_ON + j],
+                        tile[P_OFF + j],
+                        tile[P_LAST + j],
+                        tile[P_LEVEL + j],
+                        tile[P_STEP + j],
+                        tile[P_BEGIN + j],
+                        segment,
+                        4 * begin,
+                        begin,
+                        final,
+                        since,
+                        until,
+                        inverse,
+                        curve,
+                        tree,
+                        contrast,
+                        edge,
+                        np.int64(head + tile[P_CODE + j]),
+                        stack,
+                        out,
+                        n,
+                    )
                     tile[P_ON + j], tile[P_OFF + j] = on, off
                     tile[P_LAST + j], tile[P_LEVEL + j] = last, level
                     continue
@@ -466,9 +514,17 @@ def settle(tile, fire, n):  # type: ignore[no-untyped-def]
         end, comes = fire[R_END + j], fire[R_RISE + j] > 0.0
         if (following >= end) if comes else (following <= end):
             for field in (
-                R_X, R_Y, R_HEAD, R_BEGIN, R_END, R_LEVEL, R_RISE,
-                R_LANE, R_SCALE_A, R_SCALE_B,
-            ):  # fmt: skip
+                R_X,
+                R_Y,
+                R_HEAD,
+                R_BEGIN,
+                R_END,
+                R_LEVEL,
+                R_RISE,
+                R_LANE,
+                R_SCALE_A,
+                R_SCALE_B,
+            ):
                 fire[field + left] = fire[field + j]
             fire[R_LAST + left], fire[R_TARGET + left] = target, following
             left += 1

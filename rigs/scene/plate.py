@@ -105,9 +105,21 @@ def _solve(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance_free(  # type: ignore[no-untyped-def]
-    table, friction, law, state, t_ns, sensor, motion, mass, weight, stiction, stop, track, load,
+    table,
+    friction,
+    law,
+    state,
+    t_ns,
+    sensor,
+    motion,
+    mass,
+    weight,
+    stiction,
+    stop,
+    track,
+    load,
     spots,
-):  # fmt: skip
+):
     """Advance tips and plate together until the steps end or the plate meets its stop.
 
     Args:
@@ -129,9 +141,14 @@ def advance_free(  # type: ignore[no-untyped-def]
     if spots.shape[0] > 0:
         field = friction.copy()
     holding = Law(
-        _NEVER, law.strengthening, law.weak_mm_s, law.maxwell, law.relaxation_s, law.damping_s,
+        _NEVER,
+        law.strengthening,
+        law.weak_mm_s,
+        law.maxwell,
+        law.relaxation_s,
+        law.damping_s,
         law.exact_turns,
-    )  # fmt: skip
+    )
     step_ns, h, decay, gain, new, stiffness = np.int64(0), 0.0, 1.0, 1.0, 0.5, 0.0
     for i in range(n):
         stiffness += table[i, ACROSS]
@@ -151,20 +168,46 @@ def advance_free(  # type: ignore[no-untyped-def]
                 pulls += blocks[i // LANES].force_y[i % LANES]
             before, step = motion[1], Step(h, decay, gain, 0.0)
             speed = _solve(
-                blocks, n, field, law, sensor[k], motion, step, mass, mean_weight, stiction,
-                new, pulls,
-            )  # fmt: skip
+                blocks,
+                n,
+                field,
+                law,
+                sensor[k],
+                motion,
+                step,
+                mass,
+                mean_weight,
+                stiction,
+                new,
+                pulls,
+            )
             if new == 1.0 or law.static_excess == 0.0 or _lets_go_first(blocks, n) > 1.0:
                 break
             # a tip that lets go makes the plate faster, which may not have made it let go
             held = _solve(
-                blocks, n, field, holding, sensor[k], motion, step, mass, mean_weight, stiction,
-                new, pulls,
-            )  # fmt: skip
+                blocks,
+                n,
+                field,
+                holding,
+                sensor[k],
+                motion,
+                step,
+                mass,
+                mean_weight,
+                stiction,
+                new,
+                pulls,
+            )
             _pull(
-                blocks, n, field, law, sensor[k], motion[0] + 0.5 * (before + held) * h,
-                Step(h, decay, gain, 0.5 * (before - held)), new,
-            )  # fmt: skip
+                blocks,
+                n,
+                field,
+                law,
+                sensor[k],
+                motion[0] + 0.5 * (before + held) * h,
+                Step(h, decay, gain, 0.5 * (before - held)),
+                new,
+            )
             share = _lets_go_first(blocks, n)
             if share > 1.0:
                 speed = held
@@ -179,9 +222,15 @@ def advance_free(  # type: ignore[no-untyped-def]
             part = ns * 1e-9
             decay, gain = relaxing(part, law.relaxation_s)
             move_tips(
-                blocks, n, field, holding, at, height, begin_ns * 1e-9,
+                blocks,
+                n,
+                field,
+                holding,
+                at,
+                height,
+                begin_ns * 1e-9,
                 Step(part, decay, gain, 0.5 * share * (before - held)),
-            )  # fmt: skip
+            )
             motion[0], motion[1] = height, before + share * (held - before)
             begin_weight += share * (weight[k + 1] - begin_weight)
             begin_ns += ns

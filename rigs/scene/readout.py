@@ -109,9 +109,22 @@ def read_each(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def read_scans(  # type: ignore[no-untyped-def]
-    events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns, refractory_ns, fired, t_ns,
-    xs, ys, ps, kept,
-):  # fmt: skip
+    events,
+    n,
+    other,
+    base_ns,
+    end_ns,
+    period_ns,
+    phase_ns,
+    column_ns,
+    refractory_ns,
+    fired,
+    t_ns,
+    xs,
+    ys,
+    ps,
+    kept,
+):
     """Deliver the scans that are read to their last column by `end_ns`; see `read_each`.
 
     Args:

@@ -41,9 +41,10 @@ class RimLists(NamedTuple):
 def no_lists(markers: int, slots: int) -> RimLists:
     """Room for lists, none of which is made yet."""
     return RimLists(
-        np.zeros((markers, 5)), np.empty((markers, 5, slots), np.float32),
+        np.zeros((markers, 5)),
+        np.empty((markers, 5, slots), np.float32),
         np.empty((markers, slots), np.int32),
-    )  # fmt: skip
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -78,8 +78,16 @@ def run_slide(
     n = len(springs.table)
     track, loads = np.empty((len(sensor), track_width(n))), np.empty((len(sensor), 3 * n))
     advance(
-        springs.table, springs.friction, springs.law, new_tips(n).state, t_ns, sensor,
-        np.zeros(len(t_ns)), track, loads, springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        new_tips(n).state,
+        t_ns,
+        sensor,
+        np.zeros(len(t_ns)),
+        track,
+        loads,
+        springs.spots,
+    )
     rows = slice(first - 1, None)
     return SlideRun(t_ns[first:] - t_ns[first], track[rows], loads[rows], t_ns[first] * 1e-9)

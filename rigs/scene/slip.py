@@ -51,9 +51,21 @@ def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def along_slip(  # type: ignore[no-untyped-def]
-    new_x, new_y, old_x, old_y, branch_x, branch_y, soft, damp, per_s, swerve, unit_x, unit_y,
-    quick, lag,
-):  # fmt: skip
+    new_x,
+    new_y,
+    old_x,
+    old_y,
+    branch_x,
+    branch_y,
+    soft,
+    damp,
+    per_s,
+    swerve,
+    unit_x,
+    unit_y,
+    quick,
+    lag,
+):
     """Arguments of `force_after` for a tip whose slip has the direction `unit`.
 
     Args:
@@ -72,15 +84,30 @@ def along_slip(  # type: ignore[no-untyped-def]
     rest_x, rest_y = x * unit_x + y * unit_y, y * unit_x - x * unit_y
     # the damper feels what is left of the base's speed when the tip's is taken away
     return (
-        ahead, aside, rest_x - damp * (lag + quick * ahead), rest_y, soft + damp * quick, soft,
-    )  # fmt: skip
+        ahead,
+        aside,
+        rest_x - damp * (lag + quick * ahead),
+        rest_y,
+        soft + damp * quick,
+        soft,
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def first_slip(  # type: ignore[no-untyped-def]
-    moved_x, moved_y, unit_x, unit_y, slides, bent, bending, shortening, compliance, pressed,
-    pressing, rough,
-):  # fmt: skip
+    moved_x,
+    moved_y,
+    unit_x,
+    unit_y,
+    slides,
+    bent,
+    bending,
+    shortening,
+    compliance,
+    pressed,
+    pressing,
+    rough,
+):
     """Slip and bend at which the search begins, and the longest plausible slip, mm.
 
     `slides` and `bent` are the predicted ones. A tip that slips much farther than its base moved
@@ -94,8 +121,10 @@ def first_slip(  # type: ignore[no-untyped-def]
     after = bent + (change if known else 0.0)
     far = 2.0 * max(moved, _MARCH_MM)
     return (
-        slip if slip > 0.0 else 0.0, after if after > 0.0 else 0.0, far if rough else np.inf,
-    )  # fmt: skip
+        slip if slip > 0.0 else 0.0,
+        after if after > 0.0 else 0.0,
+        far if rough else np.inf,
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -131,9 +160,24 @@ def force_after(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def slip_step(  # type: ignore[no-untyped-def]
-    slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending,
-    shortening, compliance, grip, grip_slope, quick, weak,
-):  # fmt: skip
+    slip,
+    bent,
+    ahead,
+    aside,
+    rest_x,
+    rest_y,
+    soft_x,
+    soft_y,
+    pressed,
+    pressing,
+    bending,
+    shortening,
+    compliance,
+    grip,
+    grip_slope,
+    quick,
+    weak,
+):
     """One Newton step towards the slip that leaves the force on the friction cone.
 
     Args:
@@ -161,16 +205,19 @@ def slip_step(  # type: ignore[no-untyped-def]
     miss = bent + compliance * spring - stretch
     by_bend = ((unit_x * cosine + unit_y * sine) * slope - grip * normal_slope) * per_open
     steepness = (
-        by_bend * cosine + unit_x * soft_x + secant * sine * (unit_x * sine - unit_y * cosine)
+        by_bend * cosine
+        + unit_x * soft_x
+        + secant * sine * (unit_x * sine - unit_y * cosine)
         + grip_slope * normal
-    )  # fmt: skip
+    )
     change = (force - grip * normal - by_bend * miss) / steepness
     bend = -(miss + cosine * change) * per_open
     # the next changes would be of the order of the squares of these: rounding
     found = (
-        abs(change) <= CLOSE * stretch and abs(bend) <= CLOSE * stretch
+        abs(change) <= CLOSE * stretch
+        and abs(bend) <= CLOSE * stretch
         and abs(change) * quick <= _CLOSE_SPEED * weak
-    )  # fmt: skip
+    )
     slip, bent = slip + change, bent + bend
     # what friction holds pulls along the slip
     hopeful = steepness > 0.0 and slip >= 0.0 and bent >= 0.0 and force_x > 0.0
@@ -179,9 +226,25 @@ def slip_step(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def march_to_slip(  # type: ignore[no-untyped-def]
-    guess, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening,
-    compliance, field, i, path, quick, lag, law,
-):  # fmt: skip
+    guess,
+    ahead,
+    aside,
+    rest_x,
+    rest_y,
+    soft_x,
+    soft_y,
+    pressed,
+    pressing,
+    bending,
+    shortening,
+    compliance,
+    field,
+    i,
+    path,
+    quick,
+    lag,
+    law,
+):
     """Return the first slip after which friction holds the force, and the bend, mm.
 
     Steps forward until the force is below the limit, then regula falsi.
@@ -200,9 +263,19 @@ def march_to_slip(  # type: ignore[no-untyped-def]
         stretch = np.sqrt(left * left + aside * aside)
         bent = bend_for(stretch, bent, bending, shortening, compliance, pressed, pressing)
         force_x, force_y, normal = force_after(
-            slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending,
+            slip,
+            bent,
+            ahead,
+            aside,
+            rest_x,
+            rest_y,
+            soft_x,
+            soft_y,
+            pressed,
+            pressing,
+            bending,
             shortening,
-        )  # fmt: skip
+        )
         grip, _ = grip_at(field, i, path + slip)
         grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
         over = np.sqrt(force_x * force_x + force_y * force_y) - grip * normal
@@ -315,7 +388,7 @@ def predicted_speed(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[n
     ahead = slid_s / (slid_s + earlier_s)
     weight, lag = (
         (11.0 / 6.0, earlier / 3.0 - 7.0 / 6.0 * speed) if even else (1.0 + ahead, -ahead * speed)
-    )  # fmt: skip
+    )
     weight, lag = (weight, lag) if known else (1.0, 0.0)
     slides = (2.0 * speed - earlier) * slid_s if known and even else -1.0
     return weight * per_s, lag, slides

@@ -29,9 +29,25 @@ LEVELS = (1, 2, 3)
 # arrays, because numba counts references at each access to an array inside a tuple
 LAYOUT_X, LAYOUT_Y, GAP, ALONG, BENDING, COMPLIANCE, ACROSS, SHORTER = range(8)
 (
-    PLACE_X, PLACE_Y, BASE_X, BASE_Y, BRANCH_X, BRANCH_Y, FORCE_X, FORCE_Y,
-    NORMAL, NORMAL_BRANCH, INDENTATION, BENT, PATH, SLIPPED, MODE, SPEED, SLID_S, EARLIER,
-) = range(18)  # fmt: skip
+    PLACE_X,
+    PLACE_Y,
+    BASE_X,
+    BASE_Y,
+    BRANCH_X,
+    BRANCH_Y,
+    FORCE_X,
+    FORCE_Y,
+    NORMAL,
+    NORMAL_BRANCH,
+    INDENTATION,
+    BENT,
+    PATH,
+    SLIPPED,
+    MODE,
+    SPEED,
+    SLID_S,
+    EARLIER,
+) = range(18)
 
 
 class Law(NamedTuple):

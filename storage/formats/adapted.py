@@ -90,9 +90,12 @@ def _opened(
     for trial in found.trials:
         with ExitStack() as stack:
             made = ForeignTrial(
-                trial.id, trial.source, lambda: iter(()), "as its files have them",
+                trial.id,
+                trial.source,
+                lambda: iter(()),
+                "as its files have them",
                 campaign=campaign,
-            )  # fmt: skip
+            )
             if trial.id not in existing:
                 try:
                     made = _Opening(found, trial, stack, salvage).open(made)
@@ -120,33 +123,41 @@ class AdaptedCampaign:
         """Keep the adapter, which may differ from one before in how the data are analysed."""
         found = self.found
         about: Json = {
-            "from": found.folder.path.name, "format": ADAPTER, ADAPTER: found.adapter.adapter,
+            "from": found.folder.path.name,
+            "format": ADAPTER,
+            ADAPTER: found.adapter.adapter,
             "when": now(),
-        }  # fmt: skip
+        }
         if campaign.begun:
             self._check(campaign)
             about = campaign.info.get(IMPORTED, about)
         info: CampaignInfo = {
-            "name": campaign.name, "simulated": found.adapter.simulated,
-            "experiment": found.adapter.experiment, IMPORTED: about,
-        }  # fmt: skip
+            "name": campaign.name,
+            "simulated": found.adapter.simulated,
+            "experiment": found.adapter.experiment,
+            IMPORTED: about,
+        }
         campaign.update(info, self.text, _RIG)
 
     def _check(self, campaign: Campaign) -> None:
         if ADAPTER not in campaign.info.get(IMPORTED, {}):
             raise InputError(
-                "--name", "", campaign.name,
+                "--name",
+                "",
+                campaign.name,
                 "is a campaign that did not come by an adapter; choose another name",
-            )  # fmt: skip
+            )
         kept = load_adapter(campaign.protocol_file).of_the_trials()
         new = self.found.adapter.of_the_trials()
         differing = [key for key in new if new[key] != kept.get(key)]
         if differing:
             raise InputError(
-                self.found.file, differing[0], None,
+                self.found.file,
+                differing[0],
+                None,
                 f"differs from the adapter of campaign '{campaign.name}' (in "
                 f"{', '.join(differing)}), whose trials would not be alike; choose another --name",
-            )  # fmt: skip
+            )
 
 
 def _device(clock: StreamClock | None) -> DeviceRecord:
@@ -165,9 +176,7 @@ def _device(clock: StreamClock | None) -> DeviceRecord:
 def _geometry(markers: Markers | None) -> Json:
     if markers is None:
         return {}
-    return {
-        "px_per_mm": markers.px_per_mm, "skin_mm": markers.places_mm, "centre": markers.centre
-    }  # fmt: skip
+    return {"px_per_mm": markers.px_per_mm, "skin_mm": markers.places_mm, "centre": markers.centre}
 
 
 @dataclass
@@ -289,9 +298,12 @@ class _Opening:
             return made
         self.unknown += [what for what in foreign.unknown if what != "condition"]
         made = replace(
-            made, triggers=foreign.triggers, lost=foreign.lost, packets=foreign.packets,
+            made,
+            triggers=foreign.triggers,
+            lost=foreign.lost,
+            packets=foreign.packets,
             salvage=foreign.salvage,
-        )  # fmt: skip
+        )
         # what the same file holds besides, unless the adapter names another file of it
         parts = self.found.adapter.streams
         if foreign.frames is not None and parts.frames is None:
@@ -402,9 +414,10 @@ class _Opening:
         ns = self._line_ns(time.ns, clock, span)
         if not span[0] <= ns <= span[1]:
             raise time.row.error(
-                time.column, f"lies outside of the recording of trial {self.trial.id}, which is "
+                time.column,
+                f"lies outside of the recording of trial {self.trial.id}, which is "
                 f"from {span[0] / 1e9:g} to {span[1] / 1e9:g} s",
-            )  # fmt: skip
+            )
         return ns
 
     def _given(self, span: tuple[int, int]) -> Given | None:
@@ -432,9 +445,12 @@ class _Opening:
             clock_error = known.uncertainty_ns
             error = None if clock_error is None else error + clock_error
         return Given(
-            source=label.source, spans=spans, incipient_ns=incipient, gross_ns=gross,
+            source=label.source,
+            spans=spans,
+            incipient_ns=incipient,
+            gross_ns=gross,
             uncertainty_ns=error,
-        )  # fmt: skip
+        )
 
     def _steps(self, span: tuple[int, int], found: tuple[int, int]) -> tuple[Step, ...]:
         motion = self.found.adapter.motion
@@ -442,10 +458,12 @@ class _Opening:
         start, end = (self._line_ns(ns, motion.clock, span) for ns in found)
         if not span[0] <= start < end <= span[1]:
             raise InputError(
-                self.found.file, "motion.start", motion.start,
+                self.found.file,
+                "motion.start",
+                motion.start,
                 f"to {motion.end}: lies outside of the recording of trial {self.trial.id}, which "
                 f"is from {span[0] / 1e9:g} to {span[1] / 1e9:g} s",
-            )  # fmt: skip
+            )
         # without poses the motion's times are on the time line
         arm = self.clocks.get("arm")
         line = IDENTITY if arm is None else arm.map

@@ -149,9 +149,11 @@ def _wholes(
         some = next(iter(trials.values()))
         missing = next(name for name in wanted if name not in some)
         raise InputError(
-            file, "labels.class", template,
+            file,
+            "labels.class",
+            template,
             f"{{{missing}}} is no field of the trials; they have {', '.join(sorted(some))}",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -159,9 +161,11 @@ def _class_name(name: str, file: str | Path, key: str, value: object) -> str:
     name = name.strip()
     if not name or len(name) > _MOST_NAME or not name.isprintable():
         raise InputError(
-            file, key, value, f"gives the class {name[:40]!r}; a name is 1 to {_MOST_NAME} "
-            "printable characters",
-        )  # fmt: skip
+            file,
+            key,
+            value,
+            f"gives the class {name[:40]!r}; a name is 1 to {_MOST_NAME} printable characters",
+        )
     return name
 
 
@@ -191,9 +195,11 @@ def _rows(
     for (id_, fields), of_trial in zip(trials.items(), names, strict=True):
         if len(of_trial) > 1:
             raise InputError(
-                file, f"{key}.file", part.file, f"fits several files for trial {id_}: "
-                f"{', '.join(of_trial[:_SOME])}",
-            )  # fmt: skip
+                file,
+                f"{key}.file",
+                part.file,
+                f"fits several files for trial {id_}: {', '.join(of_trial[:_SOME])}",
+            )
         if of_trial:
             rows = read_rows(folder, of_trial[0])
             _check_columns(part, key, file, rows)
@@ -212,15 +218,19 @@ def _check_columns(part: GivenOnsets | GivenSpans, key: str, file: Path, rows: l
         named |= {f"{key}.gross": [] if part.gross is None else [part.gross]}
     else:
         named |= {
-            f"{key}.start": [part.start], f"{key}.end": [part.end], f"{key}.class": [part.name]
-        }  # fmt: skip
+            f"{key}.start": [part.start],
+            f"{key}.end": [part.end],
+            f"{key}.class": [part.name],
+        }
     for where, columns in named.items():
         for column in columns:
             if rows and column not in there:
                 raise InputError(
-                    file, where, column,
+                    file,
+                    where,
+                    column,
                     f"is no column of {rows[0].place}; there are {', '.join(sorted(there))}",
-                )  # fmt: skip
+                )
 
 
 def _matched(
@@ -242,15 +252,18 @@ def _matched(
             value = tuple(fill(template, fields) for template in part.match.values())
         except KeyError as error:
             raise InputError(
-                file, f"{key}.match", part.match,
+                file,
+                f"{key}.match",
+                part.match,
                 f"{{{error.args[0]}}} is no field of trial {id_}; it has "
                 f"{', '.join(sorted(fields))}",
-            ) from None  # fmt: skip
+            ) from None
         used.add(value)
         if value in by_value:
             found[id_] = by_value[value]
-    if left := [row for value, of_value in by_value.items() if value not in used
-                for row in of_value]:  # fmt: skip
+    if left := [
+        row for value, of_value in by_value.items() if value not in used for row in of_value
+    ]:
         some = ", ".join(
             f"row {row.number} ({', '.join(row.values.get(c, '') for c in part.match)})"
             for row in left[:_SOME]
@@ -273,9 +286,11 @@ def _onsets(part: GivenOnsets, rows: list[Row]) -> FoundLabel | None:
         return None
     if len(rows) > 1:
         raise InputError(
-            rows[0].place, f"row {rows[1].number}", None,
+            rows[0].place,
+            f"row {rows[1].number}",
+            None,
             f"is of the same trial as row {rows[0].number}; keep one of them",
-        )  # fmt: skip
+        )
     row = rows[0]
     incipient = _time(row, part.incipient, part.unit)
     gross = None if part.gross is None else _time(row, part.gross, part.unit)
@@ -286,9 +301,12 @@ def _onsets(part: GivenOnsets, rows: list[Row]) -> FoundLabel | None:
             gross.column, f"lies before {incipient.column} = {row.values[incipient.column]}"
         )
     return FoundLabel(
-        row.place.rpartition("/")[2], incipient=incipient, gross=gross, clock=part.clock,
+        row.place.rpartition("/")[2],
+        incipient=incipient,
+        gross=gross,
+        clock=part.clock,
         uncertainty_ns=_uncertainty_ns(part),
-    )  # fmt: skip
+    )
 
 
 def _spans(part: GivenSpans, rows: list[Row], adapter: Adapter) -> FoundLabel | None:
@@ -315,9 +333,11 @@ def _spans(part: GivenSpans, rows: list[Row], adapter: Adapter) -> FoundLabel | 
     if not spans:
         return None
     label = FoundLabel(
-        rows[0].place.rpartition("/")[2], spans=tuple(spans), clock=part.clock,
+        rows[0].place.rpartition("/")[2],
+        spans=tuple(spans),
+        clock=part.clock,
         uncertainty_ns=_uncertainty_ns(part),
-    )  # fmt: skip
+    )
     return label if adapter.experiment == CLASSES else _slip(label, part)
 
 

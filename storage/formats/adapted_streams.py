@@ -272,7 +272,7 @@ def read_frames(
     Raises:
         FormatError: a file cannot be right.
         InputError: the file of times cannot be right.
-    """  # fmt: skip
+    """
     images = _images(folder, names, part, paths)
     first = next(images(), None)
     if first is None:

@@ -128,9 +128,13 @@ class _Finding:
         self._check_factors(drafts)
         streams = self._streams(drafts)
         labels = find_labels(
-            self._adapter, self._file, self._folder,
-            {draft.built_in["id"]: draft.all for draft in drafts}, self.file_of_all, self.lookup,
-        )  # fmt: skip
+            self._adapter,
+            self._file,
+            self._folder,
+            {draft.built_in["id"]: draft.all for draft in drafts},
+            self.file_of_all,
+            self.lookup,
+        )
         self._warnings += labels.warnings
         trials, left_out = [], {}
         for draft, files in zip(drafts, streams, strict=True):
@@ -147,9 +151,11 @@ class _Finding:
                 self._used.update(names)
             there = {key: names for key, names in files.items() if names}
             label = labels.by_trial.get(id_)
-            trials.append(AdaptedTrial(
-                id_, draft.source, draft.fields, self._condition(draft), there, label, missing
-            ))  # fmt: skip
+            trials.append(
+                AdaptedTrial(
+                    id_, draft.source, draft.fields, self._condition(draft), there, label, missing
+                )
+            )
         if not trials:
             key = next(iter(self._needed or streams[0]))
             self._none(f"streams.{key}.files", None)
@@ -162,9 +168,13 @@ class _Finding:
         ]
         skipped += [Skipped(source, reason) for source, reason in left_out.items()]
         return AdaptedSet(
-            self._adapter, self._file, self._folder, tuple(trials),
-            (*skipped, *self._folder.skipped), tuple(self._warnings),
-        )  # fmt: skip
+            self._adapter,
+            self._file,
+            self._folder,
+            tuple(trials),
+            (*skipped, *self._folder.skipped),
+            tuple(self._warnings),
+        )
 
     @property
     def _needed(self) -> tuple[str, ...]:
@@ -233,8 +243,9 @@ class _Finding:
     def file_of_all(self, text: str, key: str) -> str:
         """Return the one file that a pattern without fields fits."""
         pattern = parse_pattern(text)
-        found = [name for name in self._folder.names if self._folder.match(pattern, name)
-                 is not None]  # fmt: skip
+        found = [
+            name for name in self._folder.names if self._folder.match(pattern, name) is not None
+        ]
         if not found:
             self._none(key, text)
         if len(found) > 1:
@@ -328,18 +339,20 @@ class _Finding:
         for draft, id_ in zip(drafts, unique_names(texts), strict=True):
             if (other := sources.setdefault(id_, draft.source)) != draft.source:
                 raise self._error(
-                    "trials.id", template, f"gives {other} and {draft.source} one id, {id_}; put "
-                    "more fields into it",
-                )  # fmt: skip
+                    "trials.id",
+                    template,
+                    f"gives {other} and {draft.source} one id, {id_}; put more fields into it",
+                )
             draft.built_in["id"] = id_
 
     def _check_factors(self, drafts: list[_Draft]) -> None:
         for name, factor in self._adapter.factors.items():
             if not any(factor.field in draft.all for draft in drafts):
                 raise self._error(
-                    f"factors.{name}.field", factor.field,
+                    f"factors.{name}.field",
+                    factor.field,
                     _unknown(factor.field, drafts[0].all, drafts[0].source),
-                )  # fmt: skip
+                )
 
     def _condition(self, draft: _Draft) -> dict[str, str]:
         condition = {}
@@ -356,9 +369,11 @@ class _Finding:
                     finite = False
                 if not finite:
                     raise self._error(
-                        f"factors.{name}", text, f"must be a number of {factor.unit} in "
+                        f"factors.{name}",
+                        text,
+                        f"must be a number of {factor.unit} in "
                         f"{draft.source}; or leave out the unit",
-                    )  # fmt: skip
+                    )
                 text = f"{text} {factor.unit}"
             condition[name] = text if factor.unit else "_".join(text.split())
         return condition

@@ -134,10 +134,15 @@ def _dsec_trial(
     simulated: bool,
 ) -> ForeignTrial:
     return ForeignTrial(
-        name, path.name, events, "the event camera's own clock, us", triggers=triggers,
-        simulated=simulated, unknown=("sync grade", "poses", "motion", "condition", "frames"),
+        name,
+        path.name,
+        events,
+        "the event camera's own clock, us",
+        triggers=triggers,
+        simulated=simulated,
+        unknown=("sync grade", "poses", "motion", "condition", "frames"),
         notes=_open_note(path),
-    )  # fmt: skip
+    )
 
 
 def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
@@ -217,11 +222,14 @@ def _lab_trial(
     size: tuple[int, int] | None,
 ) -> ForeignTrial:
     return ForeignTrial(
-        name, path.name, events, "unknown; seconds as the file has them, rounded to us",
+        name,
+        path.name,
+        events,
+        "unknown; seconds as the file has them, rounded to us",
         lambda: size,
         unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
         notes=_open_note(path),
-    )  # fmt: skip
+    )
 
 
 def _piece(columns: Mapping[str, Rows]) -> int:
@@ -350,9 +358,13 @@ def write_dsec(
         file.attrs["simulated"] = np.int64(simulated)
 
         def put(name: str, values: Any) -> None:
-            file.create_dataset(name, data=values, chunks=(1 << 16,) if len(values) else None,
-                                maxshape=(None,) if len(values) else None,
-                                **(packing if len(values) else {}))  # fmt: skip
+            file.create_dataset(
+                name,
+                data=values,
+                chunks=(1 << 16,) if len(values) else None,
+                maxshape=(None,) if len(values) else None,
+                **(packing if len(values) else {}),
+            )
 
         put("events/x", events.x)
         put("events/y", events.y)

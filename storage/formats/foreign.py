@@ -309,9 +309,11 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -
     if columns[2].dtype.kind == "i" and len(columns[2]) and columns[2].min() == -1:
         columns[2] = np.where(columns[2] == -1, 0, columns[2])
     limits = (
-        (OUTSIDE, MOST_PX), (OUTSIDE, MOST_PX), (UNKNOWN_POLARITY, 2),
+        (OUTSIDE, MOST_PX),
+        (OUTSIDE, MOST_PX),
+        (UNKNOWN_POLARITY, 2),
         (NO_TIME.format("events"), LATEST_US),
-    )  # fmt: skip
+    )
     good, left_out = None, Counter[str]()
     for column, (reason, most) in zip(columns, limits, strict=True):
         if not len(column) or column.dtype.kind == "b":

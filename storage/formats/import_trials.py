@@ -155,9 +155,11 @@ def import_trials(
                     raise trial.error
                 if trial.name in imported:
                     raise InputError(
-                        origin, "", None,
+                        origin,
+                        "",
+                        None,
                         f"holds two files for the trial {trial.name}; import them one by one",
-                    )  # fmt: skip
+                    )
                 trial, found = _take_whole(store, campaign, trial, kind, salvage)
             except (FormatError, InputError) as error:
                 if isinstance(error, FormatError):
@@ -188,9 +190,7 @@ def import_trials(
     if first_error is not None and not imported and not skipped:
         raise label_error or first_error
     result = {"campaign": name, "imported": imported, "there": skipped, **counts}
-    further = {
-        "salvaged": salvaged, "left_out": left_out, "failed": failed, "warnings": warnings
-    }  # fmt: skip
+    further = {"salvaged": salvaged, "left_out": left_out, "failed": failed, "warnings": warnings}
     return result | {key: found for key, found in further.items() if found}
 
 
@@ -210,9 +210,7 @@ class _Imported:
                 )
             return
         about = {"from": self.origin.name, "format": self.kind, "when": now()}
-        info: CampaignInfo = {
-            "name": campaign.name, "simulated": self.simulated, IMPORTED: about
-        }  # fmt: skip
+        info: CampaignInfo = {"name": campaign.name, "simulated": self.simulated, IMPORTED: about}
         text = f"# Imported: there is no protocol.\nimported: {json_text(self.kind).strip()}\n"
         campaign.update(info, text, text.replace("protocol", "rig file"))
 
@@ -313,26 +311,32 @@ class _Content:
             return
         if resolution > MOST_RESOLUTION_US:
             self._fail(
-                f"{stream}_time_resolution_us", resolution, MOST_RESOLUTION_US,
+                f"{stream}_time_resolution_us",
+                resolution,
+                MOST_RESOLUTION_US,
                 f"the times of {stream} have steps of {resolution:,.6g} us, for their type is too "
                 "short for such large numbers or has no fractions; floats of 64 bits, or times "
                 "counted from the recording's start, would be right",
-            )  # fmt: skip
+            )
         if ends[0] == ends[1]:
             self._fail(f"{stream}_times", "one time", None, f"all {rows:,} {what} have one time")
         elif stream == EVENTS_KIND and rows >= _FEW:
             rate = rows * 1e9 / (ends[1] - ends[0])
             if rate > _MOST_RATE:
                 self._fail(
-                    "events_rate", rate, _MOST_RATE,
+                    "events_rate",
+                    rate,
+                    _MOST_RATE,
                     f"{rate:,.3g} events a second are more than a camera sends; are the times in "
                     "another unit?",
-                )  # fmt: skip
+                )
             elif rows >= _MOST_ALIKE * distinct:
                 self._fail(
-                    "events_distinct_times", float(distinct), rows / _MOST_ALIKE,
+                    "events_distinct_times",
+                    float(distinct),
+                    rows / _MOST_ALIKE,
                     f"{rows:,} events have {distinct:,} different times; were the times rounded?",
-                )  # fmt: skip
+                )
 
     def check_images(self, stream: str, alike: int) -> None:
         """Check that frames change; `alike` of them equal the one before."""

@@ -21,8 +21,14 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _FAULTS = (
-    ValueError, KeyError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError,
-)  # fmt: skip
+    ValueError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    TokenError,
+    RecursionError,
+    MemoryError,
+)
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, Any]:

@@ -240,10 +240,12 @@ def _several(path: Path, name: str, files: Sequence[str]) -> ForeignTrial:
     They are mostly one recording in two formats, which must not count twice.
     """
     error = InputError(
-        path, "", None,
+        path,
+        "",
+        None,
         f"holds {len(files)} files for the trial {name}: {', '.join(files)}; keep one of them, "
         "rename the others, or import one format alone: sliplab import KIND PATH",
-    )  # fmt: skip
+    )
     return broken(name, ", ".join(files), error)
 
 
@@ -258,9 +260,14 @@ def name_of(stem: str) -> str:
     plain = text
     if not text.isascii():
         plain = slugify(
-            text, entities=False, decimal=False, hexadecimal=False, lowercase=False, separator="_",
+            text,
+            entities=False,
+            decimal=False,
+            hexadecimal=False,
+            lowercase=False,
+            separator="_",
             regex_pattern=_UNSAFE.pattern,
-        )  # fmt: skip
+        )
     plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", plain)).lstrip("=,._+-").rstrip(".")
     if _RESERVED.fullmatch(plain):
         plain = f"trial_{plain}"

@@ -30,10 +30,12 @@ class CampaignTexts:
             campaign.update(info, self.protocol, self.rig)
         elif campaign.info != info:
             raise InputError(
-                "--name", "", campaign.name,
+                "--name",
+                "",
+                campaign.name,
                 f"has another protocol or rig than {source}; choose another name, and "
                 "import one campaign at a time",
-            )  # fmt: skip
+            )
 
 
 def check_arrays(data: bytes) -> None:

@@ -155,9 +155,11 @@ def _from_csv(place: str, text: str) -> list[Row]:
                 continue
             if len(cells) != len(columns):
                 raise InputError(
-                    place, f"row {reader.line_num}", None,
+                    place,
+                    f"row {reader.line_num}",
+                    None,
                     f"has {len(cells)} cells below a heading of {len(columns)} columns",
-                )  # fmt: skip
+                )
             values = {
                 column: cell.strip()
                 for column, cell in zip(columns, cells, strict=True)
@@ -247,10 +249,16 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str,
     def read(**types: Any) -> pd.DataFrame:
         # all columns: with some of them alone pandas drops the cells that a row has too many
         return pd.read_csv(
-            io.BytesIO(data), sep=r"\s+" if spaces else separator, header=None,
-            names=range(width), index_col=False, skiprows=int(headed), low_memory=False,
-            encoding="utf-8-sig", **types,
-        )  # fmt: skip
+            io.BytesIO(data),
+            sep=r"\s+" if spaces else separator,
+            header=None,
+            names=range(width),
+            index_col=False,
+            skiprows=int(headed),
+            low_memory=False,
+            encoding="utf-8-sig",
+            **types,
+        )
 
     line = 0
     while True:
@@ -289,9 +297,10 @@ def _cells(lines: list[str], separator: str) -> list[str]:
     """Return the cells of the first row; none where there is no row."""
     spaces = separator == " "
     rows = csv.reader(
-        (line.strip() if spaces else line.rstrip("\r") for line in lines), delimiter=separator,
+        (line.strip() if spaces else line.rstrip("\r") for line in lines),
+        delimiter=separator,
         skipinitialspace=spaces,
-    )  # fmt: skip
+    )
     try:
         return [cell.strip() for cell in next(rows, [])]
     except csv.Error as error:

@@ -214,9 +214,11 @@ def listing_problem(
         return None
     listed = [about, *read_manifests(remote, campaign, "quarantine").values()]
     known = {
-        item.sha256 for found in listed if isinstance(found, Manifest)
+        item.sha256
+        for found in listed
+        if isinstance(found, Manifest)
         for item in found.files.values()
-    }  # fmt: skip
+    }
     sizes = remote.sizes(objects_folder(campaign))
     unknown = {sha: size for sha, size in sizes.items() if sha not in known}
     marked = read_manifests(remote, campaign, "withdrawn")

@@ -78,9 +78,12 @@ def check_url(url: str) -> str:
     if parts.username or parts.password or parts.query or parts.fragment:
         shown = f"{parts.scheme}://.../{parts.path.lstrip('/')}"
         raise InputError(
-            "URL", "", shown, "must not contain keys, passwords or options: put them into the "
+            "URL",
+            "",
+            shown,
+            "must not contain keys, passwords or options: put them into the "
             "environment or fsspec's configuration",
-        )  # fmt: skip
+        )
     if "::" in url or ".." in parts.path.split("/"):
         raise InputError("URL", "", url, "must name one location, without '::' and '..'")
     return url.rstrip("/")
@@ -106,9 +109,14 @@ class Remote:
         except ImportError as error:
             kind = urlsplit(self.url).scheme
             raise InputError(
-                "URL", "", self.url, f"needs a package that is not installed ({error}); for s3: "
-                "`pip install 'sliplab[s3]'`" if kind == "s3" else f"cannot be used: {error}",
-            ) from None  # fmt: skip
+                "URL",
+                "",
+                self.url,
+                f"needs a package that is not installed ({error}); for s3: "
+                "`pip install 'sliplab[s3]'`"
+                if kind == "s3"
+                else f"cannot be used: {error}",
+            ) from None
         except ValueError as error:
             raise InputError("URL", "", self.url, f"cannot be used: {error}") from None
         self._root = str(root).rstrip("/")

@@ -40,9 +40,14 @@ from sliplab.storage.schema.evaluation import (
 )
 
 Outcome = Literal[
-    "detected_first", "late", "missed", "false_early", "without_onsets", "not_evaluated",
+    "detected_first",
+    "late",
+    "missed",
+    "false_early",
+    "without_onsets",
+    "not_evaluated",
     "not_taken",
-]  # fmt: skip
+]
 """By a trial's incipient detection; every trial of a plan has exactly one."""
 GrossOutcome = Literal["detected", "late", "missed", "false_early", "without_onsets"]
 Known = Number | None

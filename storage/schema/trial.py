@@ -40,13 +40,15 @@ Map = Annotated[
     ClockMap,
     PlainValidator(_clock_map),
     PlainSerializer(ClockMap.to_json),
-    WithJsonSchema({
-        "type": "object",
-        "properties": dict.fromkeys(("device_ns", "reference_ns", "drift"), _INTEGERS),
-        "required": ["device_ns", "reference_ns", "drift"],
-        "additionalProperties": False,
-    }),
-]  # fmt: skip
+    WithJsonSchema(
+        {
+            "type": "object",
+            "properties": dict.fromkeys(("device_ns", "reference_ns", "drift"), _INTEGERS),
+            "required": ["device_ns", "reference_ns", "drift"],
+            "additionalProperties": False,
+        }
+    ),
+]
 
 
 def _level(level: str) -> str:

@@ -98,10 +98,30 @@ def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
 _LONGEST = 1000
 """Characters of an expression; with what it may contain, that bounds its time and memory."""
 _ALLOWED = (
-    ast.Expression, ast.BoolOp, ast.boolop, ast.UnaryOp, ast.unaryop, ast.BinOp, ast.Add, ast.Sub,
-    ast.Mult, ast.Div, ast.FloorDiv, ast.Mod, ast.BitAnd, ast.BitOr, ast.Compare, ast.cmpop,
-    ast.Name, ast.Load, ast.Constant, ast.List, ast.Tuple, ast.Call, ast.Attribute,
-)  # fmt: skip
+    ast.Expression,
+    ast.BoolOp,
+    ast.boolop,
+    ast.UnaryOp,
+    ast.unaryop,
+    ast.BinOp,
+    ast.Add,
+    ast.Sub,
+    ast.Mult,
+    ast.Div,
+    ast.FloorDiv,
+    ast.Mod,
+    ast.BitAnd,
+    ast.BitOr,
+    ast.Compare,
+    ast.cmpop,
+    ast.Name,
+    ast.Load,
+    ast.Constant,
+    ast.List,
+    ast.Tuple,
+    ast.Call,
+    ast.Attribute,
+)
 _METHODS = frozenset(
     {"str", "startswith", "endswith", "contains", "isin", "isna", "notna", "isnull", "notnull"}
 )
@@ -136,10 +156,14 @@ def _may_stand(node: ast.AST) -> bool:
             for side in (node.left, node.right)
         )
     if isinstance(node, ast.Call):
-        return isinstance(node.func, ast.Attribute) and not node.keywords and not (
-            node.func.attr == "contains"
-            and any(_REPEATS & set(ast.unparse(each)) for each in node.args)
-        )  # fmt: skip
+        return (
+            isinstance(node.func, ast.Attribute)
+            and not node.keywords
+            and not (
+                node.func.attr == "contains"
+                and any(_REPEATS & set(ast.unparse(each)) for each in node.args)
+            )
+        )
     return not isinstance(node, ast.Attribute) or node.attr in _METHODS
 
 

@@ -52,8 +52,12 @@ FORMAT = 2
 SYNC = "sync"
 """Step whose results hold clocks that were fitted again; recordings read them there."""
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
-    "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
-)  # fmt: skip
+    "campaign.json",
+    "protocol.yaml",
+    "rig.yaml",
+    "store.json",
+    "cause.json",
+)
 REGISTRATIONS = "registrations"
 """Folder of a campaign's registrations (`storage.trials.registration`)."""
 IMPORTED: Final = "imported"

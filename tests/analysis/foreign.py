@@ -77,17 +77,29 @@ def commit_foreign(
     span = origin.get("span_ns", (0, 1_000_000_000))
     writer = campaign.begin(trial, None, 100)
     writer.add_events(events)
-    record = TrialRecord.model_validate({
-        "format": 1, "trial": trial, "campaign": campaign.name, "experiment": experiment,
-        "role": "imported", "block": 0, "repetition": 0, "attempt": 0,
-        "condition": dict(origin.get("condition", {})), "simulated": simulated,
-        "recorded_s": (span[1] - span[0]) / 1e9,
-        "counts": Counts(events=len(events), frames=0, poses=0, pulses=0),
-        "clocks": Clocks(reference="event camera", events=clock),
-        "quality": Quality(passed=True), "geometry": Geometry(event_px=event_px),
-        "imported": {
-            "format": "adapter", "from": trial, "span_ns": span,
-            **{key: value for key, value in origin.items() if key != "condition"},
-        },
-    })  # fmt: skip
+    record = TrialRecord.model_validate(
+        {
+            "format": 1,
+            "trial": trial,
+            "campaign": campaign.name,
+            "experiment": experiment,
+            "role": "imported",
+            "block": 0,
+            "repetition": 0,
+            "attempt": 0,
+            "condition": dict(origin.get("condition", {})),
+            "simulated": simulated,
+            "recorded_s": (span[1] - span[0]) / 1e9,
+            "counts": Counts(events=len(events), frames=0, poses=0, pulses=0),
+            "clocks": Clocks(reference="event camera", events=clock),
+            "quality": Quality(passed=True),
+            "geometry": Geometry(event_px=event_px),
+            "imported": {
+                "format": "adapter",
+                "from": trial,
+                "span_ns": span,
+                **{key: value for key, value in origin.items() if key != "condition"},
+            },
+        }
+    )
     writer.commit(record, Provenance.model_validate({"imported": "now", "from": trial}))

@@ -56,9 +56,14 @@ def describe(
     """Write what a collection under a protocol writes of its campaign."""
     text = load_rig_file(Path(rig))[1]
     info: Any = {
-        "name": where.name, "simulated": True, "experiment": "kinematic", "rig": rig,
-        "rig_hash": rig_hash(text), "enabled": list(enable), "collection_hash": "",
-    }  # fmt: skip
+        "name": where.name,
+        "simulated": True,
+        "experiment": "kinematic",
+        "rig": rig,
+        "rig_hash": rig_hash(text),
+        "enabled": list(enable),
+        "collection_hash": "",
+    }
     where.update(info, yaml.safe_dump(data), text)
 
 

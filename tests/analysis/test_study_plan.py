@@ -23,8 +23,14 @@ def test_seconds_stand_in_the_order_of_the_steps_and_grow_with_the_work() -> Non
     slides, falls = len(SLIDES.plan.trials), len(FALLS.plan.trials)
     plain = StudyPlan([SLIDES, FALLS]).expected(0)
     assert list(plain) == [
-        "collect pilot", "collect pilot_gravity", "sync", "label", "train", "evaluate", "report",
-    ]  # fmt: skip
+        "collect pilot",
+        "collect pilot_gravity",
+        "sync",
+        "label",
+        "train",
+        "evaluate",
+        "report",
+    ]
     assert plain["collect pilot"] == pytest.approx(4.0 + 0.3 * slides)
     assert plain["label"] == pytest.approx(4.0 + 0.2 * (slides + falls))
     assert plain["report"] == 4.0

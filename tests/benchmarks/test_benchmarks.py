@@ -33,39 +33,85 @@ TINY: dict[str, dict[str, Any]] = {
 }
 PROMISED = {
     "orchestration": {
-        "loop_ms", "batched_ms", "per_trial_ms", "bluesky_ms", "bluesky_plan_ms",
-        "catalogue_build_s", "catalogue_100k_s", "memory_growth_mb", "server_growth_mb",
+        "loop_ms",
+        "batched_ms",
+        "per_trial_ms",
+        "bluesky_ms",
+        "bluesky_plan_ms",
+        "catalogue_build_s",
+        "catalogue_100k_s",
+        "memory_growth_mb",
+        "server_growth_mb",
     },
     "storage": {
-        "write_m_events_per_s", "read_m_events_per_s", "window_30ms_ms", "bytes_per_event",
-        "frames_per_s_800", "pickle_write_m_events_per_s", "pickle_read_m_events_per_s",
-        "pickle_window_30ms_ms", "pickle_bytes_per_event", "aedat4_write_m_events_per_s",
-        "aedat4_read_m_events_per_s", "aedat4_window_30ms_ms", "aedat4_bytes_per_event",
-        "aedat4_own_read_m_events_per_s", "aedat4_own_read_ratio",
+        "write_m_events_per_s",
+        "read_m_events_per_s",
+        "window_30ms_ms",
+        "bytes_per_event",
+        "frames_per_s_800",
+        "pickle_write_m_events_per_s",
+        "pickle_read_m_events_per_s",
+        "pickle_window_30ms_ms",
+        "pickle_bytes_per_event",
+        "aedat4_write_m_events_per_s",
+        "aedat4_read_m_events_per_s",
+        "aedat4_window_30ms_ms",
+        "aedat4_bytes_per_event",
+        "aedat4_own_read_m_events_per_s",
+        "aedat4_own_read_ratio",
     },
     "scene": {
-        "contact_8_s", "ns_per_event", "ns_per_event_busy", "x_circuit", "x_circuit_low_pass",
-        "event_time_p95_us", "readout_p95_us",
+        "contact_8_s",
+        "ns_per_event",
+        "ns_per_event_busy",
+        "x_circuit",
+        "x_circuit_low_pass",
+        "event_time_p95_us",
+        "readout_p95_us",
     },
     "clocks": {
-        "worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95",
-        "index_worst_error_us", "nearest_worst_error_us", "pyxdf_worst_error_us",
+        "worst_error_us",
+        "accepted_share",
+        "wrong_accepted",
+        "fit_ms",
+        "coverage_95",
+        "index_worst_error_us",
+        "nearest_worst_error_us",
+        "pyxdf_worst_error_us",
     },
     "clock_kinds": {
-        "good_wrong", "good_refused_share", "good_coverage_95", "other_trial_wrong",
-        "jump_1ms_at_end_wrong", "lost_30_on_both_refused_share", "kink_0.2ppm_coverage_95",
+        "good_wrong",
+        "good_refused_share",
+        "good_coverage_95",
+        "other_trial_wrong",
+        "jump_1ms_at_end_wrong",
+        "lost_30_on_both_refused_share",
+        "kink_0.2ppm_coverage_95",
     },
     "acquisition": {
-        "frames_lost", "events_lost", "pulses_lost", "memory_growth_mb", "saturation_x_realtime",
-        "encode_s_per_trial", "frames_per_s", "dropped_on_purpose", "dropped_noticed",
+        "frames_lost",
+        "events_lost",
+        "pulses_lost",
+        "memory_growth_mb",
+        "saturation_x_realtime",
+        "encode_s_per_trial",
+        "frames_per_s",
+        "dropped_on_purpose",
+        "dropped_noticed",
     },
     "labels": {
-        "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
+        "x_blob_detector",
+        "x_best_opencv",
+        "centroid_diff_px",
+        "decode_track_x_realtime",
         "aruco_x_realtime",
     },
     "fewer": {
-        "shuffled_worst_claim_wrong_percent", "adaptive_worst_claim_wrong_percent",
-        "shuffled_true_trials_percent", "adaptive_true_trials_percent", "adaptive_over_shuffled",
+        "shuffled_worst_claim_wrong_percent",
+        "adaptive_worst_claim_wrong_percent",
+        "shuffled_true_trials_percent",
+        "adaptive_true_trials_percent",
+        "adaptive_over_shuffled",
     },
     "statements": {
         "median of a time, blocks differ by 50 %: wrong_percent",
@@ -73,13 +119,15 @@ PROMISED = {
         "median of a time, drift of 100 %; adaptive: wrong_percent",
         "16 clusters, 50% of the variance between worlds: held_percent",
     },
-}  # fmt: skip
+}
 
 
 MARKS = {
-    "acquisition": pytest.mark.realtime, "scene": pytest.mark.long, "fewer": pytest.mark.long,
+    "acquisition": pytest.mark.realtime,
+    "scene": pytest.mark.long,
+    "fewer": pytest.mark.long,
     "statements": pytest.mark.long,
-}  # fmt: skip
+}
 """The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
 campaigns."""
 
@@ -132,9 +180,13 @@ def test_ratios_are_of_pairs() -> None:
 def a_result(name: str, day: str, **figures: float | None) -> dict[str, Any]:
     machine = {"cpu": "some", "cores": 2, "memory_gb": 8.0, "os": "an OS"}
     return {
-        "name": name, "figures": figures, "versions": {"python": "3"}, "machine": machine,
-        "seed": 1, "day": day,
-    }  # fmt: skip
+        "name": name,
+        "figures": figures,
+        "versions": {"python": "3"},
+        "machine": machine,
+        "seed": 1,
+        "day": day,
+    }
 
 
 def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
@@ -151,8 +203,10 @@ def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
     assert "| b_mb | 1,234 |  |" in text
     assert "| c_ms | - |  |" in text
     assert [line for line in text.splitlines() if line.startswith("## ")] == [
-        "## storage", "## scene", "## clocks",
-    ]  # fmt: skip
+        "## storage",
+        "## scene",
+        "## clocks",
+    ]
     assert "**Run 1**: 2026-01-02, some, 2 cores" in text
     assert "**Run 2**: 2026-01-01, some, 2 cores" in text
     assert text.index("As run 2.") > text.index("## clocks")

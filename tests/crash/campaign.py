@@ -25,11 +25,14 @@ WITH_VIDEO = {
     "streams": {
         "side": {"kind": "events", "mock": {"width": 160, "height": 120, "px_per_mm": 3.5}},
         "back": {
-            "kind": "frames", "scale_px_per_mm": 4, "region_px": [64, 64],
-            "mock": {"px_per_mm": 4}, "timing": {"resolution_us": 0},
+            "kind": "frames",
+            "scale_px_per_mm": 4,
+            "region_px": [64, 64],
+            "mock": {"px_per_mm": 4},
+            "timing": {"resolution_us": 0},
         },
     },
-}  # fmt: skip
+}
 """The rig of trials with a video, which has a further camera of either kind, too."""
 
 
@@ -116,8 +119,16 @@ def wrong_at_the_end(
     found += [f"{name}: is missing" for name in sorted(whole.keys() - there.keys())]
     found += [f"{p.path}: {p.what}" for p in verify(Store.open(store))]
     campaign = store / "campaigns" / NAME
-    wanted = {"protocol.yaml", "rig.yaml", "campaign.json", "checksums.json",
-              "trials", "incoming", "quarantine", "bench"}  # fmt: skip
+    wanted = {
+        "protocol.yaml",
+        "rig.yaml",
+        "campaign.json",
+        "checksums.json",
+        "trials",
+        "incoming",
+        "quarantine",
+        "bench",
+    }
     for folder, names in ((store, {"store.json", ".lock", "campaigns"}), (campaign, wanted)):
         strangers = {path.name for path in folder.iterdir()} - names
         found += [f"{folder / name}: is litter" for name in sorted(strangers)]

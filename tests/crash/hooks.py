@@ -38,11 +38,18 @@ _SIGNATURES: dict[str, tuple[type, ...]] = {
     "copy_file_range": (_INT, _POINTER, _INT, _POINTER, _SIZE, _INT),
     "writev": (_INT, _POINTER, _INT),
     "pwritev": (_INT, _POINTER, _INT, _LONG),
-}  # fmt: skip
+}
 _WIDE = {"pwrite", "open", "openat", "ftruncate", "sendfile", "pwritev"}
 _AT_FDCWD, _AT_REMOVEDIR = -100, 0x200
-_KINDS = {"pwrite": "write", "openat": "open", "fdatasync": "fsync", "renameat": "rename",
-          "unlinkat": "unlink", "mkdirat": "mkdir", "ftruncate": "truncate"}  # fmt: skip
+_KINDS = {
+    "pwrite": "write",
+    "openat": "open",
+    "fdatasync": "fsync",
+    "renameat": "rename",
+    "unlinkat": "unlink",
+    "mkdirat": "mkdir",
+    "ftruncate": "truncate",
+}
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -200,23 +207,32 @@ def _path(folder: object, name: object) -> str:
 
 class _Header(ctypes.Structure):
     _fields_ = [
-        ("type", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("offset", ctypes.c_uint64),
-        ("vaddr", ctypes.c_uint64), ("paddr", ctypes.c_uint64), ("filesz", ctypes.c_uint64),
-        ("memsz", ctypes.c_uint64), ("align", ctypes.c_uint64),
-    ]  # fmt: skip
+        ("type", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("offset", ctypes.c_uint64),
+        ("vaddr", ctypes.c_uint64),
+        ("paddr", ctypes.c_uint64),
+        ("filesz", ctypes.c_uint64),
+        ("memsz", ctypes.c_uint64),
+        ("align", ctypes.c_uint64),
+    ]
 
 
 class _Object(ctypes.Structure):
     _fields_ = [
-        ("base", ctypes.c_uint64), ("name", ctypes.c_char_p),
-        ("headers", ctypes.POINTER(_Header)), ("count", ctypes.c_uint16),
-    ]  # fmt: skip
+        ("base", ctypes.c_uint64),
+        ("name", ctypes.c_char_p),
+        ("headers", ctypes.POINTER(_Header)),
+        ("count", ctypes.c_uint16),
+    ]
 
 
 class _Relocation(ctypes.Structure):
     _fields_ = [
-        ("offset", ctypes.c_uint64), ("info", ctypes.c_uint64), ("addend", ctypes.c_int64),
-    ]  # fmt: skip
+        ("offset", ctypes.c_uint64),
+        ("info", ctypes.c_uint64),
+        ("addend", ctypes.c_int64),
+    ]
 
 
 _PT_DYNAMIC = 2

@@ -31,12 +31,19 @@ PHASES = ("campaign", "trial", "motion")
 MODULES = {
     f"sliplab.{name}"
     for name in (
-        "flows.collecting.session", "flows.planning.run_request", "storage.files",
-        "storage.trials.checksums", "storage.trials.control", "storage.trials.store",
-        "storage.trials.frame_writer", "storage.trials.hdf5_writer", "storage.trials.lock",
-        "storage.trials.recovery", "storage.trials.writer",
+        "flows.collecting.session",
+        "flows.planning.run_request",
+        "storage.files",
+        "storage.trials.checksums",
+        "storage.trials.control",
+        "storage.trials.store",
+        "storage.trials.frame_writer",
+        "storage.trials.hdf5_writer",
+        "storage.trials.lock",
+        "storage.trials.recovery",
+        "storage.trials.writer",
     )
-}  # fmt: skip
+}
 """Modules whose lines are counted."""
 MORE = {1: 0.5, 2: 0.3, 10: 0.2}
 """Number of signals, with its probability."""

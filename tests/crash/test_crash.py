@@ -21,12 +21,22 @@ pytestmark = pytest.mark.programs
 )
 def test_a_short_crash_test(part: str, kills: int, trials: int, every: int, step: int) -> None:
     options = [
-        "--kills", str(kills), "--trials", str(trials), "--every", str(every), "--step", str(step),
-    ]  # fmt: skip
+        "--kills",
+        str(kills),
+        "--trials",
+        str(trials),
+        "--every",
+        str(every),
+        "--step",
+        str(step),
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "tests.crash", "--only", part, "--seed", "3", *options],
-        cwd=ROOT, capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     found = json.loads(done.stdout)
     assert found[part]["wrong"] == []
     assert done.returncode == 0

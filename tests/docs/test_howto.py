@@ -64,8 +64,11 @@ def test_a_trial_is_read_without_sliplab_as_with_it(tmp_path: Path) -> None:
     for recording in campaign.recordings():
         done = subprocess.run(
             [sys.executable, tmp_path / "alone.py", recording.folder, tmp_path / "read.npz"],
-            capture_output=True, text=True, timeout=60, check=True,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        )
         with np.load(tmp_path / "read.npz") as read, recording.open() as reader:
             events, poses = recording.events(), reader.poses()
             for name in "xyp":

@@ -20,14 +20,36 @@ from tests.docs.walk import run
 pytestmark = pytest.mark.programs
 
 ORDER = (
-    "plan", "schema", "rigs", "check", "register", "trials", "verify", "migrate", "sync", "teach",
-    "calibrate", "export", "import", "push", "pull", "skip", "again",
-)  # fmt: skip
+    "plan",
+    "schema",
+    "rigs",
+    "check",
+    "register",
+    "trials",
+    "verify",
+    "migrate",
+    "sync",
+    "teach",
+    "calibrate",
+    "export",
+    "import",
+    "push",
+    "pull",
+    "skip",
+    "again",
+)
 """Cheap pages, in an order in which each finds its inputs."""
 ELSEWHERE = (
-    "--rig loopback", "--dask", "s3://", "--follow", "--pilot", "KIND", "lab-pickles", "--help",
+    "--rig loopback",
+    "--dask",
+    "s3://",
+    "--follow",
+    "--pilot",
+    "KIND",
+    "lab-pickles",
+    "--help",
     "--stamp",
-)  # fmt: skip
+)
 """Needs a rig in real time, other machines, a running campaign or claims, a time-stamping
 authority, or stands for a word."""
 

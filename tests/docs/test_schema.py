@@ -96,10 +96,12 @@ EVERY = [False, pytest.param(True, marks=pytest.mark.long)]
 @pytest.mark.parametrize(
     ("kind", "pattern"),
     [
-        ("trial", "campaigns/*/trials/*/record.json"), ("label", "derived/labels/*/*.json"),
-        ("evaluation", "derived/evaluation/*.json"), ("summary", "report/summary.json"),
+        ("trial", "campaigns/*/trials/*/record.json"),
+        ("label", "derived/labels/*/*.json"),
+        ("evaluation", "derived/evaluation/*.json"),
+        ("summary", "report/summary.json"),
     ],
-)  # fmt: skip
+)
 def test_nothing_is_refused_in_a_document_that_its_reader_takes(
     older: Path, kind: str, pattern: str, every: bool
 ) -> None:

@@ -42,9 +42,13 @@ def run(line: str, folder: Path) -> Done:
         words = ["python", "-m", *words, *_OFFLINE, "--target", str(folder)]
     words[0] = sys.executable if words[0] == "python" else words[0]
     ended = subprocess.run(
-        words, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
-        text=True, timeout=120,
-    )  # fmt: skip
+        words,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     return Done(ended.returncode, ended.stdout, ended.stderr)
 
 

@@ -30,8 +30,10 @@ class Lab:
         for name in ("rig.yaml", "protocol.yaml"):
             shutil.copy(source / name, self.folder)
         self._environment = {
-            **os.environ, "PYTHONPATH": str(site), "SLIPLAB_RUNTIME": str(folder / "runtime"),
-        }  # fmt: skip
+            **os.environ,
+            "PYTHONPATH": str(site),
+            "SLIPLAB_RUNTIME": str(folder / "runtime"),
+        }
         self._call(sys.executable, "-m", "pip", "install", *_OFFLINE, "--target", site, source)
 
     def __call__(self, *commands: Sequence[str]) -> list[Any]:
@@ -47,9 +49,13 @@ class Lab:
 
     def _call(self, *words: object) -> str:
         done = subprocess.run(
-            [str(word) for word in words], cwd=self.folder, env=self._environment,
-            capture_output=True, text=True, timeout=LIMIT_S,
-        )  # fmt: skip
+            [str(word) for word in words],
+            cwd=self.folder,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_S,
+        )
         assert done.returncode == 0, f"{words}\n{done.stdout}{done.stderr}"
         return done.stdout
 
@@ -57,8 +63,11 @@ class Lab:
 def checkout() -> str:
     """State of the checkout, with untracked and ignored files, but for what Python leaves."""
     status = subprocess.run(
-        ["git", "status", "--porcelain", "--ignored"], cwd=ROOT, capture_output=True, text=True,
+        ["git", "status", "--porcelain", "--ignored"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
         check=True,
-    ).stdout  # fmt: skip
+    ).stdout
     left = ("__pycache__", ".pytest_cache", ".hypothesis", "build/", ".egg-info", "_cache/")
     return "\n".join(line for line in status.splitlines() if not any(x in line for x in left))

@@ -34,9 +34,11 @@ SIZE = 64, 48
 def some_events(first_us: int = 1_000_000, count: int = 200, step_us: int = 500) -> EventChunk:
     at = np.arange(count)
     return EventChunk(
-        (at % SIZE[0]).astype(np.uint16), (at % SIZE[1]).astype(np.uint16),
-        (at % 2).astype(np.uint8), first_us + at.astype(np.int64) * step_us,
-    )  # fmt: skip
+        (at % SIZE[0]).astype(np.uint16),
+        (at % SIZE[1]).astype(np.uint16),
+        (at % 2).astype(np.uint8),
+        first_us + at.astype(np.int64) * step_us,
+    )
 
 
 def gathered(camera: EventCamera, count: int) -> tuple[EventChunk, list[int]]:
@@ -257,9 +259,11 @@ class HalDevice:
 
     def __getattr__(self, name: str) -> Any:
         kinds = {
-            "get_i_event_cd_decoder": self.cd, "get_i_event_ext_trigger_decoder": self.edges,
-            "get_i_events_stream": self, "get_i_events_stream_decoder": self,
-        }  # fmt: skip
+            "get_i_event_cd_decoder": self.cd,
+            "get_i_event_ext_trigger_decoder": self.edges,
+            "get_i_events_stream": self,
+            "get_i_events_stream_decoder": self,
+        }
         if not name.startswith("get_i_"):
             raise AttributeError(name)
         return lambda: kinds.get(name, self.plain)
@@ -330,8 +334,9 @@ def test_a_camera_is_read_by_the_makers_library(
     for _ in range(2):  # its times begin anew with each start
         camera.start()
         device.due += [
-            buffer(first, (1, 1_010_000, 0), (0, 1_015_000, 0)), buffer(second, (1, 1_020_000, 5)),
-        ]  # fmt: skip
+            buffer(first, (1, 1_010_000, 0), (0, 1_015_000, 0)),
+            buffer(second, (1, 1_020_000, 5)),
+        ]
         found, pulses = gathered(camera, 400)
         assert same(found, EventChunk.joined([first, second]))
         assert pulses == [1_010_000_000]  # neither the falling edge nor another input's

@@ -47,19 +47,34 @@ def rows(decoder: Decoder, *parts: bytes) -> list[tuple[int, int, int, int]]:
 
 
 STREAM = words(
-    (ADDR_Y, 9), (ADDR_X, 1),  # before any time: dropped
-    (TIME_HIGH, 2), (ADDR_Y, 100), (ADDR_X, 5),  # the low part is 0 until it is sent
-    (TIME_LOW, 7), (ADDR_X, ON | 6),
-    (BASE_X, ON | 20), (VECT_12, 0b1000_0000_0001), (VECT_12, 0b10), (VECT_8, 0b1000_0000),
-    (ADDR_X, 3), (VECT_8, 0b1),  # a single event leaves the vector's column where it was
-    (TIME_HIGH, 3), (ADDR_Y, 101), (VECT_8, 0b1),
-)  # fmt: skip
+    (ADDR_Y, 9),
+    (ADDR_X, 1),  # before any time: dropped
+    (TIME_HIGH, 2),
+    (ADDR_Y, 100),
+    (ADDR_X, 5),  # the low part is 0 until it is sent
+    (TIME_LOW, 7),
+    (ADDR_X, ON | 6),
+    (BASE_X, ON | 20),
+    (VECT_12, 0b1000_0000_0001),
+    (VECT_12, 0b10),
+    (VECT_8, 0b1000_0000),
+    (ADDR_X, 3),
+    (VECT_8, 0b1),  # a single event leaves the vector's column where it was
+    (TIME_HIGH, 3),
+    (ADDR_Y, 101),
+    (VECT_8, 0b1),
+)
 EVENTS = [
-    (8192, 5, 100, 0), (8199, 6, 100, 1),
-    (8199, 20, 100, 1), (8199, 31, 100, 1), (8199, 33, 100, 1), (8199, 51, 100, 1),
-    (8199, 3, 100, 0), (8199, 52, 100, 1),
+    (8192, 5, 100, 0),
+    (8199, 6, 100, 1),
+    (8199, 20, 100, 1),
+    (8199, 31, 100, 1),
+    (8199, 33, 100, 1),
+    (8199, 51, 100, 1),
+    (8199, 3, 100, 0),
+    (8199, 52, 100, 1),
     (12288, 60, 101, 1),
-]  # fmt: skip
+]
 
 
 def test_words_mean_what_the_maker_says() -> None:
@@ -83,8 +98,10 @@ def test_triggers_have_an_input_an_edge_and_a_time() -> None:
     data = np.array([TIME_HIGH << 28 | 10, *cd], "<u4").tobytes()
     two = Evt2Decoder().decode(data)
     assert (two.events.t_us.tolist(), two.events.x.tolist(), two.events.y.tolist()) == (
-        [643], [40], [50],
-    )  # fmt: skip
+        [643],
+        [40],
+        [50],
+    )
     assert (two.trigger_us.tolist(), two.trigger_id.tolist()) == ([706], [4])
     assert two.trigger_up.tolist() == [True]
 
@@ -114,10 +131,13 @@ def by_faery(path: Path) -> list[tuple[int, int, int, int]]:
     whole = np.concatenate(packets)
     return list(
         zip(
-            whole["t"].tolist(), whole["x"].tolist(), whole["y"].tolist(),
-            whole["on"].astype(int).tolist(), strict=True,
+            whole["t"].tolist(),
+            whole["x"].tolist(),
+            whole["y"].tolist(),
+            whole["on"].astype(int).tolist(),
+            strict=True,
         )
-    )  # fmt: skip
+    )
 
 
 def random_evt3(rng: np.random.Generator, count: int) -> bytes:

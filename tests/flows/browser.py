@@ -13,9 +13,15 @@ import pytest
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 _CHROMIUM = "/usr/bin/chromium"
 _ARGUMENTS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
 needs_browser = pytest.mark.skipif(
     not (Path(_CHROMIUM).exists() and shutil.which(_CHROMIUM)),
     reason=f"no browser at {_CHROMIUM} (Debian's package chromium)",

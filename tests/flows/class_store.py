@@ -27,19 +27,28 @@ def adapter(epochs: int = 1, **changes: Any) -> dict[str, Any]:
         "about": {"licence": "CC0", "made by": "a test"},
         "experiment": "classes",
         "trials": {"files": "{part}_{object}_*.npy"},
-        "streams": {"events": {"format": "counts", "axes": ["taxel", "polarity", "step"],
-                               "step_ms": 10}},
+        "streams": {
+            "events": {"format": "counts", "axes": ["taxel", "polarity", "step"], "step_ms": 10}
+        },
         "labels": {"class": "{object}"},
         "split": {"given": "part"},
         "analysis": {
-            "windows": {"length_ms": LENGTH_MS, "step_ms": 10, "polarity": "both",
-                        "taxels": TAXELS},
-            "network": {"conv1_channels": 8, "conv1_kernel": 1, "conv2_channels": 16,
-                        "conv2_kernel": 1},
+            "windows": {
+                "length_ms": LENGTH_MS,
+                "step_ms": 10,
+                "polarity": "both",
+                "taxels": TAXELS,
+            },
+            "network": {
+                "conv1_channels": 8,
+                "conv1_kernel": 1,
+                "conv2_channels": 16,
+                "conv2_kernel": 1,
+            },
             "training": {"epochs": epochs, "batch": 4, "mirror": False, "seeds": [0, 1]},
         },
         **changes,
-    }  # fmt: skip
+    }
 
 
 def events(rng: np.random.Generator, number: int, classes: int, begin_ms: int = 0) -> EventChunk:
@@ -54,9 +63,11 @@ def events(rng: np.random.Generator, number: int, classes: int, begin_ms: int = 
     t_us = np.sort(rng.integers(0, LENGTH_MS * 1000, len(taxel))) + begin_ms * 1000
     mixed = rng.permutation(len(taxel))
     return EventChunk(
-        taxel[mixed].astype(np.uint16), np.zeros(len(taxel), np.uint16),
-        polarity[mixed].astype(np.uint8), t_us,
-    )  # fmt: skip
+        taxel[mixed].astype(np.uint16),
+        np.zeros(len(taxel), np.uint16),
+        polarity[mixed].astype(np.uint8),
+        t_us,
+    )
 
 
 def add_trial(
@@ -79,10 +90,12 @@ def add_trial(
         for start, end, shown in spans
     ]
     origin = {
-        "unknown": ["clocks"], "fields": dict(fields), "condition": dict(condition or {}),
+        "unknown": ["clocks"],
+        "fields": dict(fields),
+        "condition": dict(condition or {}),
         "span_ns": (0, max(end for _, end, _ in spans) * 1_000_000),
         "given": {"source": "file name", "spans": given},
-    }  # fmt: skip
+    }
     commit_foreign(campaign, name, chunk, origin, (TAXELS, 1), simulated=simulated)
 
 
@@ -122,9 +135,12 @@ def class_store(
         for part, count in each.items():
             for k in range(count):
                 add_trial(
-                    campaign, f"{part}_{name.replace(' ', '-')}_{k}",
-                    events(rng, number, len(classes)), [(0, LENGTH_MS, name)],
-                    fields={"part": part}, condition={"force": f"{1 + k % 2} N"},
+                    campaign,
+                    f"{part}_{name.replace(' ', '-')}_{k}",
+                    events(rng, number, len(classes)),
+                    [(0, LENGTH_MS, name)],
+                    fields={"part": part},
+                    condition={"force": f"{1 + k % 2} N"},
                     simulated=simulated,
-                )  # fmt: skip
+                )
     return store

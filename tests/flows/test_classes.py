@@ -140,10 +140,15 @@ def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> 
     folder = judged.folder / "report"
     page = (folder / "index.html").read_text()
     for text in (
-        "Classification report", "Objects touched by a skin of six taxels", "CC0", "clocks",
-        "How early a class is known", f"sliplab train {judged.folder}",
-        "logistic regression on each", "Guessing gives 20.0 %",
-    ):  # fmt: skip
+        "Classification report",
+        "Objects touched by a skin of six taxels",
+        "CC0",
+        "clocks",
+        "How early a class is known",
+        f"sliplab train {judged.folder}",
+        "logistic regression on each",
+        "Guessing gives 20.0 %",
+    ):
         assert text in page, text
     assert "simulated" not in page.split("</style>")[1].lower()
     written = read_json(folder / "summary.json")

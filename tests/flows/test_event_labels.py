@@ -31,8 +31,9 @@ def take(rig: str, folder: Path, protocol: str = "pilot", **factors: list[float]
     data = yaml.safe_load((ROOT / "protocols" / f"{protocol}.yaml").read_text())
     for name, values in factors.items():
         data["collection"]["factors"][name] = {
-            **data["collection"]["factors"][name], "values": values
-        }  # fmt: skip
+            **data["collection"]["factors"][name],
+            "values": values,
+        }
     path = folder / "protocol.yaml"
     path.write_text(yaml.safe_dump(data))
     collect(make_request(path, ROOT / "rigs" / f"{rig}.yaml", folder / "store"))
@@ -125,12 +126,9 @@ def test_tracks_are_near_the_truth(slides: list[Recording]) -> None:
     for recording in slides:
         found, frames = by_events(recording), label_recording(recording, Labelling())
         seen = np.stack(
-            [
-                np.interp(found.t_ns, frames.frame_ns, column)
-                for column in frames.displacement_px.T
-            ],
+            [np.interp(found.t_ns, frames.frame_ns, column) for column in frames.displacement_px.T],
             axis=1,
-        )  # fmt: skip
+        )
         moving = (found.t_ns > frames.start_ns)[:, None] & (seen < 4.0)
         off = (found.displacement_px - seen)[moving]
         # a px is 0.05 mm

@@ -99,9 +99,7 @@ def test_it_is_judged_once_a_version_and_written_down(
     for module in (holdout, figures):
         monkeypatch.setattr(module, "version", lambda name: "99.0")
     later = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert [each.version for each in later.result.evaluations] == [
-        line.version, "99.0"
-    ]  # fmt: skip
+    assert [each.version for each in later.result.evaluations] == [line.version, "99.0"]
     asked = measure_holdout(store, campaigns, 3, again=True, seeds=SEEDS)
     assert len(asked.result.evaluations) == 3
     kept, now = first.result.to_json(), later.result.to_json()
@@ -135,22 +133,43 @@ def test_the_file_has_these_keys(store: Store) -> None:
     assert json_text(HoldoutResult.load(path).to_json()) == path.read_text()
     found = shape_of(read_json(path))
     assert list(found) == [
-        "evaluations", "false_alarms", "key", "kinematic", "model", "protocol_seed", "rows",
-        "simulated", "skin_seed", "trials", "windows",
-    ]  # fmt: skip
+        "evaluations",
+        "false_alarms",
+        "key",
+        "kinematic",
+        "model",
+        "protocol_seed",
+        "rows",
+        "simulated",
+        "skin_seed",
+        "trials",
+        "windows",
+    ]
     assert found["evaluations"] == [
         {"at": "str", "model": "str", "strict": "float", "version": "str"}
     ]
     assert found["windows"] == {
         "accuracy": {"argmax": "float", "margin": "float", "n": "int", "strict": "float"},
-        "argmax": SHARE, "balance": BY_CLASS, "confusion": [["int"]], "precision": BY_CLASS,
-        "recall": BY_CLASS, "strict": SHARE,
-    }  # fmt: skip
+        "argmax": SHARE,
+        "balance": BY_CLASS,
+        "confusion": [["int"]],
+        "precision": BY_CLASS,
+        "recall": BY_CLASS,
+        "strict": SHARE,
+    }
     assert list(found["kinematic"]) == ["latency_ms", "lead_ms", "trials", "without_onsets"]
     assert list(found["rows"][0]) == [
-        "campaign", "condition", "detected_gross_ns", "detected_incipient_ns", "end_ns",
-        "experiment", "gross_ns", "incipient_ns", "latency", "trial",
-    ]  # fmt: skip
+        "campaign",
+        "condition",
+        "detected_gross_ns",
+        "detected_incipient_ns",
+        "end_ns",
+        "experiment",
+        "gross_ns",
+        "incipient_ns",
+        "latency",
+        "trial",
+    ]
     numbers = ("key", "model", "protocol_seed", "simulated", "skin_seed", "trials")
     types = ["str", "str", "int", "bool", "int", "int"]
     assert [found[name] for name in numbers] == types

@@ -218,8 +218,9 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     """Of frames, the time to the first slip; there is no rate of events."""
     slides = tiny()
     slides["collection"]["references"] = {
-        "every": 2, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
-    }  # fmt: skip
+        "every": 2,
+        "condition": {"depth": 2.4, "speed": 1.6, "direction": 0},
+    }
     rig = yaml.safe_load((ROOT / "rigs" / "rehearsal.yaml").read_text())
     rig["extends"] = str(ROOT / "rigs" / rig["extends"])
     path = write(tmp_path / "rig.yaml", {**rig, "name": "frames", "cameras": ["frames"]})

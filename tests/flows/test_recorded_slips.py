@@ -65,12 +65,18 @@ def other_labs_folder(store: Store, item: Collected, folder: Path) -> None:
             return "" if time_ns is None else f"{int(clock.to_device(time_ns)) / 1000:.3f}"
 
         start, end = recording.motion_ns
-        rows.append({
-            "trial": f"slide {len(rows) + 1}", "file": Path(file).name,
-            "direction": item.describe(trial)["direction"].split()[0], "part": trial.split,
-            "incipient_us": camera_us(label.incipient_ns), "gross_us": camera_us(label.gross_ns),
-            "start_us": camera_us(start), "end_us": camera_us(end),
-        })  # fmt: skip
+        rows.append(
+            {
+                "trial": f"slide {len(rows) + 1}",
+                "file": Path(file).name,
+                "direction": item.describe(trial)["direction"].split()[0],
+                "part": trial.split,
+                "incipient_us": camera_us(label.incipient_ns),
+                "gross_us": camera_us(label.gross_ns),
+                "start_us": camera_us(start),
+                "end_us": camera_us(end),
+            }
+        )
     pd.DataFrame(rows).to_csv(folder / "trials.csv", index=False)
 
 
@@ -80,8 +86,9 @@ def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
     other_labs_folder(here, item, tmp_path / "theirs")
     (tmp_path / "adapter.yaml").write_text(ADAPTER)
     there = tmp_path / "there"
-    taken = answer("import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs",
-                    "--store", there)  # fmt: skip
+    taken = answer(
+        "import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs", "--store", there
+    )
     assert len(taken["imported"]) == 4
     for step in ("label", "train", "evaluate", "report"):
         assert answer(step, there)["done"] > 0
@@ -139,12 +146,13 @@ def filmed(recording: Recording, folder: Path) -> dict[str, Any]:
     return {
         **yaml.safe_load(VIDEO),
         "markers": {
-            "places_mm": [list(place) for place in geometry.skin_mm], "centre": geometry.centre,
+            "places_mm": [list(place) for place in geometry.skin_mm],
+            "centre": geometry.centre,
             "px_per_mm": geometry.px_per_mm,
         },
         "motion": {"start": start, "end": end, "unit": "ns"},
         "analysis": {"labelling": {"rule": "paper"}},
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.long

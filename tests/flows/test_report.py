@@ -52,10 +52,26 @@ from tests.protocols.test_plugin import installed
 __all__ = ["installed"]  # a fixture
 Json = dict[str, Any]
 UNITLESS = {
-    "trial", "name", "row", "class", "detector", "stride", "true class", "tightest gate", "windows",
-    "failed attempts", "place in the plan", "epoch", "side", "simulated", "family", "variant",
-    "on the front", "precision", "width",
-}  # fmt: skip
+    "trial",
+    "name",
+    "row",
+    "class",
+    "detector",
+    "stride",
+    "true class",
+    "tightest gate",
+    "windows",
+    "failed attempts",
+    "place in the plan",
+    "epoch",
+    "side",
+    "simulated",
+    "family",
+    "variant",
+    "on the front",
+    "precision",
+    "width",
+}
 
 
 @pytest.fixture(scope="module")
@@ -107,19 +123,32 @@ def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
 
 
 FOUND = {
-    "latency_incipient_ms": 90.0, "latency_gross_ms": 40.0, "lead_ms": 900.0,
-    "missed_incipient": False, "missed_gross": False, "false_early_incipient": False,
-    "false_early_gross": False, "late_incipient_ms": None, "late_gross_ms": None,
-}  # fmt: skip
+    "latency_incipient_ms": 90.0,
+    "latency_gross_ms": 40.0,
+    "lead_ms": 900.0,
+    "missed_incipient": False,
+    "missed_gross": False,
+    "false_early_incipient": False,
+    "false_early_gross": False,
+    "late_incipient_ms": None,
+    "late_gross_ms": None,
+}
 
 
 def judged(**changed: Any) -> TrialScore:
     """An evaluated trial."""
     row = {
-        "campaign": "g", "experiment": "gravity", "trial": "t", "condition": {},
-        "incipient_ns": 10**9, "gross_ns": 2 * 10**9, "end_ns": 3 * 10**9,
-        "detected_incipient_ns": 1, "detected_gross_ns": 2, "latency": {**FOUND, **changed},
-    }  # fmt: skip
+        "campaign": "g",
+        "experiment": "gravity",
+        "trial": "t",
+        "condition": {},
+        "incipient_ns": 10**9,
+        "gross_ns": 2 * 10**9,
+        "end_ns": 3 * 10**9,
+        "detected_incipient_ns": 1,
+        "detected_gross_ns": 2,
+        "latency": {**FOUND, **changed},
+    }
     return TrialScore.model_validate(row)
 
 
@@ -134,9 +163,7 @@ def test_what_became_of_a_trial() -> None:
     assert trial_outcome(judged(false_early_gross=True)).gross == "false_early"
     assert trial_outcome(judged(missed_gross=True)).gross == "missed"
     none = trial_outcome(judged().model_copy(update={"latency": None, "gross_ns": None}))
-    assert (none.outcome, none.gross, none.lead_ms) == (
-        "without_onsets", "without_onsets", None
-    )  # fmt: skip
+    assert (none.outcome, none.gross, none.lead_ms) == ("without_onsets", "without_onsets", None)
     found = trial_intervals([trial_outcome(judged()), trial_outcome(judged(lead_ms=1000.0)), none])
     assert found.lead_ms.n == 2
     half = 12.7062047 * 50  # Student's t of two trials
@@ -168,8 +195,17 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
     assert len(names) == text.count("<figure") == len(set(names))
     assert sorted(path.stem for path in (folder / "figures").iterdir()) == sorted(names)
     assert sorted(path.stem for path in (folder / "data").iterdir()) == sorted(names)
-    assert {"trial", "confusion", "outputs", "latency-kinematic", "gravity-incipient",
-            "gravity-gross", "labels", "clocks", "quality-tiny"} <= set(names)  # fmt: skip
+    assert {
+        "trial",
+        "confusion",
+        "outputs",
+        "latency-kinematic",
+        "gravity-incipient",
+        "gravity-gross",
+        "labels",
+        "clocks",
+        "quality-tiny",
+    } <= set(names)
     for name in names:
         svg = (folder / "figures" / f"{name}.svg").read_text()
         assert svg in text
@@ -249,8 +285,9 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     grouped = failure_section(store.folder, late)  # one cause, each by how much in its own row
     assert grouped.causes == [("gross late", 2)]
     assert [line[1].split(", ")[1] for line in grouped.table.rows] == [
-        "359 ms after it ended", "579 ms after it ended"
-    ]  # fmt: skip
+        "359 ms after it ended",
+        "579 ms after it ended",
+    ]
     none = render_section(failure_section(store.folder, [fine]), simulated=True)[1]
     assert "0 of 1 evaluated trials failed in some way." in none
     assert "<table" not in none
@@ -260,33 +297,66 @@ def scene() -> Json:
     """Numbers of the shape that `sliplab tradeoff --scene` writes."""
     error = {**dict.fromkeys(ERRORS, 0.5), "early_p95_us": 3.0}
     variants = [
-        {"family": family, "name": name, "level": "L3", "step_ms": step, "path": "cubic",
-         "rows_per_s": 500, "wall_s": 0.2, "error": error}
+        {
+            "family": family,
+            "name": name,
+            "level": "L3",
+            "step_ms": step,
+            "path": "cubic",
+            "rows_per_s": 500,
+            "wall_s": 0.2,
+            "error": error,
+        }
         for family, name, step in (("levels", "L3", 2), ("cubic", "4", 4))
-    ]  # fmt: skip
+    ]
     choice = {"level": "L1", "reason": "enough"}
     windows = {
-        "samples": dict.fromkeys(CLASSES, 9), "silent_share": dict.fromkeys(CLASSES, 0.1),
-        "events_per_s": dict.fromkeys(PHASES, 1e3), "hold_share": 0.5, "ceiling": 0.8,
-    }  # fmt: skip
+        "samples": dict.fromkeys(CLASSES, 9),
+        "silent_share": dict.fromkeys(CLASSES, 0.1),
+        "events_per_s": dict.fromkeys(PHASES, 1e3),
+        "hold_share": 0.5,
+        "ceiling": 0.8,
+    }
     return {
-        "simulated": True, "protocol": "tiny", "rig": "r", "rig_step_ms": 2, "trials": ["a"],
-        "variants": variants, "seeds": error, "levels": {},
+        "simulated": True,
+        "protocol": "tiny",
+        "rig": "r",
+        "rig_step_ms": 2,
+        "trials": ["a"],
+        "variants": variants,
+        "seeds": error,
+        "levels": {},
         "choice": {"measured": choice, "closed_form": choice, "agree": True},
-        "windows": windows, "left_out": [],
-    }  # fmt: skip
+        "windows": windows,
+        "left_out": [],
+    }
 
 
 def detector() -> Json:
     """Numbers of the shape that the report's section on trade-offs reads."""
     rows = [
-        {"length_ms": 30, "step_ms": 1, "pool_px": 20, "width": 1.0, "precision": "as trained",
-         "stride_ms": 30, "smoothing": 4, "margin": 2.0, "front": paper, "paper": paper,
-         "test": {"strict": [0.9, 0.92], "mean_ms": [90.0, late], "p95_ms": [200.0, 210.0],
-                  "false_early_either": [0.0, 0.01], "lost_either": [0.0, 0.0]},
-         "work": {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]}}
+        {
+            "length_ms": 30,
+            "step_ms": 1,
+            "pool_px": 20,
+            "width": 1.0,
+            "precision": "as trained",
+            "stride_ms": 30,
+            "smoothing": 4,
+            "margin": 2.0,
+            "front": paper,
+            "paper": paper,
+            "test": {
+                "strict": [0.9, 0.92],
+                "mean_ms": [90.0, late],
+                "p95_ms": [200.0, 210.0],
+                "false_early_either": [0.0, 0.01],
+                "lost_either": [0.0, 0.0],
+            },
+            "work": {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]},
+        }
         for paper, late in ((True, 100.0), (False, None))
-    ]  # fmt: skip
+    ]
     return {"simulated": True, "rows": rows}
 
 
@@ -294,10 +364,20 @@ def detector() -> Json:
 def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) -> None:
     shutil.copytree(store.folder, tmp_path / "store")
     other = Store.open(tmp_path / "store")
-    skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81,
-            "recall": {"no_slip": 0.8, "incipient": 0.8, "gross": None}}  # fmt: skip
-    results = {"skin 101": skin, "depth 2.4 mm": {**skin, "seen": 0.9},
-               "speed 1 mm/s": {"left out": "no train trials"}}  # fmt: skip
+    skin = {
+        "share": 0.8,
+        "low": 0.7,
+        "high": 0.9,
+        "n": 100,
+        "trials": 4,
+        "argmax": 0.81,
+        "recall": {"no_slip": 0.8, "incipient": 0.8, "gross": None},
+    }
+    results = {
+        "skin 101": skin,
+        "depth 2.4 mm": {**skin, "seen": 0.9},
+        "speed 1 mm/s": {"left out": "no train trials"},
+    }
     found = {
         "generalisation": {"simulated": True, "results": results},
         "scene": scene(),
@@ -383,22 +463,30 @@ def test_an_evaluation_without_figures_by_each_onset_is_shown(store: Store, tmp_
 
 def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
     rows = [
-        ReferenceTrial(trial=str(k), place=1 + 10 * k, hold_events_per_s=1000.0 + 2 * k,
-                       first_slip_ms=None if k else 900.0)
+        ReferenceTrial(
+            trial=str(k),
+            place=1 + 10 * k,
+            hold_events_per_s=1000.0 + 2 * k,
+            first_slip_ms=None if k else 900.0,
+        )
         for k in range(8)
-    ]  # fmt: skip
+    ]
     found = campaign.wear(rows)
     slope = found["hold_events_per_s"].percent_per_100_trials
     assert slope == pytest.approx(100 * 20.0 / 1007.0)
     assert found["hold_events_per_s"].low == pytest.approx(slope)
     assert found["first_slip_ms"].to_json() == {
-        "n": 1, "percent_per_100_trials": None, "low": None, "high": None
-    }  # fmt: skip
+        "n": 1,
+        "percent_per_100_trials": None,
+        "low": None,
+        "high": None,
+    }
     data = short()
     data["collection"]["factors"]["direction"]["values"] = [0, 120]
     data["collection"]["references"] = {
-        "every": 1, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
-    }  # fmt: skip
+        "every": 1,
+        "condition": {"depth": 2.4, "speed": 1.6, "direction": 0},
+    }
     data["collection"]["maintenance"]["rezero"]["touches"] = 3
     run_request = make_request(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
     collect(run_request)
@@ -421,10 +509,19 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     zeros = [record.depth_zero_mm or 0.0 for record in records]
     sds = list(dict.fromkeys(record.depth_zero_sd_mm or 0.0 for record in records))
     sd = (sum(sd**2 for sd in sds) / len(sds)) ** 0.5
-    assert section.tables[0].rows == [[
-        "tiny", str(len(sds)), "3", f"{zeros[0]:+.3f}", f"{zeros[-1]:+.3f}",
-        f"{min(zeros):+.3f}", f"{max(zeros):+.3f}", f"{sd:.3f}", f"{sd / 3**0.5:.3f}",
-    ]]  # fmt: skip
+    assert section.tables[0].rows == [
+        [
+            "tiny",
+            str(len(sds)),
+            "3",
+            f"{zeros[0]:+.3f}",
+            f"{zeros[-1]:+.3f}",
+            f"{min(zeros):+.3f}",
+            f"{max(zeros):+.3f}",
+            f"{sd:.3f}",
+            f"{sd / 3**0.5:.3f}",
+        ]
+    ]
     assert 0.0 < sd < 0.05
     words = "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
     assert words in render_section(section, simulated=True)[1]
@@ -462,16 +559,25 @@ def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store
     (first, *_) = [row for row in summary.trials if row.experiment == "gravity"]
     rng = np.random.default_rng(1)
     ours, theirs = (
-        summary.model_copy(update={"trials": tuple(
-            first.model_copy(update={
-                "trial": str(k), "outcome": "detected_first", "gross": "detected",
-                "latency_incipient_ms": late + noise, "latency_gross_ms": 50.0 + 400 * noise,
-                "lead_ms": None if k == 3 else 900.0 - noise,
-            })
-            for k, noise in enumerate(rng.normal(0, 10, 40))
-        )})
+        summary.model_copy(
+            update={
+                "trials": tuple(
+                    first.model_copy(
+                        update={
+                            "trial": str(k),
+                            "outcome": "detected_first",
+                            "gross": "detected",
+                            "latency_incipient_ms": late + noise,
+                            "latency_gross_ms": 50.0 + 400 * noise,
+                            "lead_ms": None if k == 3 else 900.0 - noise,
+                        }
+                    )
+                    for k, noise in enumerate(rng.normal(0, 10, 40))
+                )
+            }
+        )
         for late in (120.0, 80.0)
-    )  # fmt: skip
+    )
     ours = several_seeds(ours, (0.9, 0.8))
     theirs = several_seeds(theirs, *((share, share) for share in (0.88, 0.90, 0.91)))
     theirs = theirs.model_copy(update={"versions": {**theirs.versions, "numpy": "0"}})
@@ -505,13 +611,18 @@ def test_compared_medians_count_late_detections(store: Store) -> None:
         rows = []
         for k in range(40):
             late = k < lost
-            rows.append(first.model_copy(update={
-                "trial": str(k), "outcome": "late" if late else "detected_first",
-                "gross": "missed" if late else "detected",
-                "latency_gross_ms": None if late else 50.0,
-                "latency_incipient_ms": None if late else 100.0 + k,
-                "lead_ms": None if late else 900.0 - k,
-            }))  # fmt: skip
+            rows.append(
+                first.model_copy(
+                    update={
+                        "trial": str(k),
+                        "outcome": "late" if late else "detected_first",
+                        "gross": "missed" if late else "detected",
+                        "latency_gross_ms": None if late else 50.0,
+                        "latency_incipient_ms": None if late else 100.0 + k,
+                        "lead_ms": None if late else 900.0 - k,
+                    }
+                )
+            )
         return summary.model_copy(update={"trials": tuple(rows)})
 
     found = {row.name: row for row in compare(with_lost(10), with_lost(0)).figures}
@@ -537,10 +648,11 @@ def several_times(summary: Summary, *medians_ms: float) -> Summary:
         each.append(SeedTimes(seed=seed, chosen=not seed, latency_ms=latency, lead_ms=lead))
     own = gravity.model_copy(
         update={
-            "latency_ms": each[0].latency_ms, "lead_ms": each[0].lead_ms,
+            "latency_ms": each[0].latency_ms,
+            "lead_ms": each[0].lead_ms,
             "by_seed": tuple(each) if len(each) > 1 else (),
         }
-    )  # fmt: skip
+    )
     return summary.model_copy(update={"gravity": own})
 
 

@@ -47,8 +47,12 @@ def test_every_step_did_its_work(ran: tuple[list[RunRequest], Outcome]) -> None:
     _, outcome = ran
     assert [item["committed"] for item in outcome.collected] == [6, 2]
     assert [(step["step"], step["done"]) for step in outcome.steps] == [
-        ("sync", 8), ("label", 8), ("train", 2), ("evaluate", 1), ("report", 1),
-    ]  # fmt: skip
+        ("sync", 8),
+        ("label", 8),
+        ("train", 2),
+        ("evaluate", 1),
+        ("report", 1),
+    ]
 
 
 def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[RunRequest], Outcome]) -> None:
@@ -86,9 +90,9 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest]
     kinematic = summary["kinematic"]
     assert set(kinematic["accuracy"]) == {"argmax", "strict", "margin", "n"}
     assert np.shape(kinematic["confusion"]) == (3, 4)
-    assert set(kinematic["precision"]) == set(kinematic["recall"]) == {
-        "no_slip", "incipient", "gross"
-    }  # fmt: skip
+    assert (
+        set(kinematic["precision"]) == set(kinematic["recall"]) == {"no_slip", "incipient", "gross"}
+    )
     for kind in ("incipient", "gross"):
         latency = kinematic["latency_ms"][kind]
         counted = (latency[name] for name in ("n", "missed", "late", "false_early"))
@@ -107,8 +111,12 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest]
         assert held["apart_ms"]["incipient"]["max_abs"] <= 10.0  # a frame, by noise
     assert summary["sync"]["grade"] == "hardware trigger"
     assert summary["quality"] == {
-        "planned": 8, "committed": 8, "retaken": 0, "quarantined": 0, "interrupted": 0
-    }  # fmt: skip
+        "planned": 8,
+        "committed": 8,
+        "retaken": 0,
+        "quarantined": 0,
+        "interrupted": 0,
+    }
     assert {"collect tiny", "label", "train", "evaluate", "report"} <= set(summary["timing_s"])
     assert set(summary["protocols"]) == {"tiny", "tiny_gravity"}
     assert summary["seeds"]["network"] == [0]
@@ -160,8 +168,12 @@ def test_another_margin_is_evaluation_and_report_only(
     outcome = study(run_requests)
     done = [(step["step"], step["done"]) for step in outcome.steps]
     assert done == [
-        ("sync", 0), ("label", 0), ("train", 0), ("evaluate", 1), ("report", 1),
-    ]  # fmt: skip
+        ("sync", 0),
+        ("label", 0),
+        ("train", 0),
+        ("evaluate", 1),
+        ("report", 1),
+    ]
     assert before == {path: path.stat().st_mtime_ns for path in counts.iterdir()}
     assert summary_json(store)["detection"]["tiny"]["margin"] == 3.0
     study(ran[0])  # back to what the other tests know
@@ -305,8 +317,10 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
         make_request(write(tmp_path / "g.yaml", gravity), rig_path, store.folder),
     ]
     assert [(s["step"], s["done"]) for s in study(run_requests).steps][2:] == [
-        ("train", 0), ("evaluate", 1), ("report", 1),
-    ]  # fmt: skip
+        ("train", 0),
+        ("evaluate", 1),
+        ("report", 1),
+    ]
     # kept predictions are not made again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
     summary = summary_json(store)
@@ -342,18 +356,20 @@ def test_a_margin_by_option_is_not_kept(ran: tuple[list[RunRequest], Outcome]) -
 
 
 def test_the_same_seed_gives_the_same_summary(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path,
+    ran: tuple[list[RunRequest], Outcome],
+    tmp_path: Path,
+    rig_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.setattr(parallel_map, "START_S", 0.0)  # all in processes, and still the same
     run_requests = [
         make_request(Path(run_request.plan.file), rig_path, tmp_path / "store")
         for run_request in ran[0]
     ]
     study(run_requests)
-    first, second = (summary_json(Store.open(folder)) for folder in (
-        store_of(ran).folder, tmp_path / "store"
-    ))  # fmt: skip
+    first, second = (
+        summary_json(Store.open(folder)) for folder in (store_of(ran).folder, tmp_path / "store")
+    )
     for summary in (first, second):
         summary.pop("timing_s")
     assert json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)

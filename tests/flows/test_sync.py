@@ -88,8 +88,10 @@ def test_a_refit_equals_the_record_and_changes_nothing(store: Store) -> None:
     known = result["campaigns"]["tiny"]
     assert (known["trials"], known["refitted"], known["refused"]) == (3, 3, 0)
     assert {name: device["grade"] for name, device in known["devices"].items()} == {
-        "events": "trigger input", "frames": "hardware trigger", "arm": "digital input"
-    }  # fmt: skip
+        "events": "trigger input",
+        "frames": "hardware trigger",
+        "arm": "digital input",
+    }
     json.dumps(result, allow_nan=False)
 
 
@@ -201,9 +203,12 @@ def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
 def test_the_page_has_every_figure_and_stands_alone(store: Store) -> None:
     text = Path(sync(store, collected(store))["page"]).read_text()
     for name in (
-        "Residuals over a trial", "Drift over the campaign", "Pulses and frames",
-        "Uncertainty of events against frames and arm", "The worst trials",
-    ):  # fmt: skip
+        "Residuals over a trial",
+        "Drift over the campaign",
+        "Pulses and frames",
+        "Uncertainty of events against frames and arm",
+        "The worst trials",
+    ):
         assert f"<h2>{name}" in text
     assert text.count("<figure>") == text.count(">simulated</text>") == 4
     for unit in ("residual (µs)", "drift (ppm)", "uncertainty (µs)", "missed pulses", "lost"):
@@ -224,8 +229,10 @@ def test_processors_may_differ_in_the_last_digit() -> None:
     }
     assert same_clocks(clock, near)
     for change in (
-        {"grade": "b"}, {"drift_ppm": 12.50001}, {"map": {"device_ns": [6], "drift": [10**13]}},
-    ):  # fmt: skip
+        {"grade": "b"},
+        {"drift_ppm": 12.50001},
+        {"map": {"device_ns": [6], "drift": [10**13]}},
+    ):
         assert not same_clocks(clock, {**clock, **change})
     assert not same_clocks(clock, {"grade": "a"})
 
@@ -241,8 +248,10 @@ def test_the_command_prints_a_table_and_one_object(
     found = json.loads(capsys.readouterr().out)
     assert (found["step"], found["simulated"], found["fresh"]) == ("sync", True, 3)
     assert found["campaigns"]["tiny"]["devices"]["arm"]["pulses"].keys() == {
-        "missed", "late", "spurious"
-    }  # fmt: skip
+        "missed",
+        "late",
+        "spurious",
+    }
 
 
 def test_a_store_without_a_campaign_says_what_to_do(

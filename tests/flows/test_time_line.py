@@ -105,9 +105,13 @@ def test_every_accepted_trial_agrees_with_the_truth(
         fault for fault in BAD if fault["device"] != "arm" or timing.get("arm") != "host time"
     ]
     work, campaign = session(
-        tmp_path, slides(), {**EXACT, **timing}, clocks=DRIFTING, faults=faults,
-        frame_camera={"level": "tracks"}
-    )  # fmt: skip
+        tmp_path,
+        slides(),
+        {**EXACT, **timing},
+        clocks=DRIFTING,
+        faults=faults,
+        frame_camera={"level": "tracks"},
+    )
     take_all(work)
     recordings = list(campaign.recordings())
     assert len(recordings) == 3

@@ -43,10 +43,17 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     label(store, campaigns)
     rejected, recording = list(campaigns[0].of_split("test"))[-1]
     decide(
-        store, "first", rejected.id, "reject",
-        label=Labels(store).key(campaigns[0], recording), old=Onsets(), new=Onsets(), seen=0,
-        who="a person", why="the skin was dirty",
-    )  # fmt: skip
+        store,
+        "first",
+        rejected.id,
+        "reject",
+        label=Labels(store).key(campaigns[0], recording),
+        old=Onsets(),
+        new=Onsets(),
+        seen=0,
+        who="a person",
+        why="the skin was dirty",
+    )
     train(store, campaigns, reviewed=True)
     return store
 

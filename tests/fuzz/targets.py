@@ -287,7 +287,7 @@ def pickle_seeds() -> dict[str, bytes]:
         "times": [1700000000.25 + i for i in range(20)],
         "array": np.arange(20.0).reshape(4, 5),
         "mixed": {"a": [1, 2.5, "x", None, True], "b": (1, (2, 3)), "c": np.float32(2), "d": b"x"},
-    }  # fmt: skip
+    }
     return {
         f"{name}-{protocol}": pickle.dumps(value, protocol)
         for name, value in values.items()

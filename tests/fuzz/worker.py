@@ -23,11 +23,33 @@ from tests.fuzz.targets import Target, targets
 MEMORY = 2 << 30
 """Address space that a worker may take beyond what it has when it begins."""
 _FORBIDDEN = (
-    "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "subprocess.",
-    "pty.", "socket.connect", "socket.bind", "ctypes.dlopen", "shutil.rmtree", "urllib.", "ftplib.",
-    "http.", "smtplib.", "pickle.find_class", "os.remove", "os.rename", "os.rmdir", "os.chmod",
-    "os.symlink", "os.link", "os.mkdir", "shutil.move", "shutil.copyfile",
-)  # fmt: skip
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.fork",
+    "os.forkpty",
+    "subprocess.",
+    "pty.",
+    "socket.connect",
+    "socket.bind",
+    "ctypes.dlopen",
+    "shutil.rmtree",
+    "urllib.",
+    "ftplib.",
+    "http.",
+    "smtplib.",
+    "pickle.find_class",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.chmod",
+    "os.symlink",
+    "os.link",
+    "os.mkdir",
+    "shutil.move",
+    "shutil.copyfile",
+)
 
 
 def case(found: list[Target], seed: int, number: int) -> tuple[Target, str, bytes]:

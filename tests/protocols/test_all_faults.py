@@ -32,22 +32,29 @@ def faults(tmp_path: Path, *changes: tuple[str, str]) -> dict[str, str]:
 
 def test_faults_of_keys_in_several_sections_are_all_reported(tmp_path: Path) -> None:
     found = faults(
-        tmp_path, ("epochs: 8", "epoks: 8"), ("repetitions: 1", "repetitions: yes"),
-        ("order: shuffled", "order: shufled"), ("speed: 2 mm/s}", "speed: 2 kg}"),
-    )  # fmt: skip
+        tmp_path,
+        ("epochs: 8", "epoks: 8"),
+        ("repetitions: 1", "repetitions: yes"),
+        ("order: shuffled", "order: shufled"),
+        ("speed: 2 mm/s}", "speed: 2 kg}"),
+    )
     assert {
-        "analysis.training.epoks", "collection.repetitions", "collection.order",
+        "analysis.training.epoks",
+        "collection.repetitions",
+        "collection.order",
         "collection.motion[1].speed",
-    } <= found.keys()  # fmt: skip
+    } <= found.keys()
     assert "did you mean 'epochs'?" in found["analysis.training.epoks"]
     assert "did you mean 'shuffled'?" in found["collection.order"]
 
 
 def test_faults_of_text_keys_and_rules_are_reported_together(tmp_path: Path) -> None:
     found = faults(
-        tmp_path, ("seed: 20264", "seed: *seed"), ("repetitions: 1", "repetitions: 1\n  order: x"),
+        tmp_path,
+        ("seed: 20264", "seed: *seed"),
+        ("repetitions: 1", "repetitions: 1\n  order: x"),
         ("epochs: 8", "epochs: many"),
-    )  # fmt: skip
+    )
     assert "aliases are not supported" in found["collection.seed"]
     assert "duplicate key" in found["collection.order"]
     assert found["analysis.training.epochs"] == "must be a whole number"
@@ -55,9 +62,11 @@ def test_faults_of_text_keys_and_rules_are_reported_together(tmp_path: Path) -> 
 
 def test_faults_of_rules_over_several_keys_are_reported_together(tmp_path: Path) -> None:
     found = faults(
-        tmp_path, ("speed: $speed, direction", "speed: $sped, direction"),
-        ("strata: [depth, speed]", "strata: [deep, dir]"), ("depth: 3.6 mm", "depth: 2.6 mm"),
-    )  # fmt: skip
+        tmp_path,
+        ("speed: $speed, direction", "speed: $sped, direction"),
+        ("strata: [depth, speed]", "strata: [deep, dir]"),
+        ("depth: 3.6 mm", "depth: 2.6 mm"),
+    )
     assert found["collection.motion[3].speed"].endswith("did you mean 'speed'?")
     assert {"analysis.split.strata[0]", "analysis.split.strata[1]"} <= found.keys()
     assert "exceeds collection.limits.depth" in found["collection.factors.depth.values[1]"]
@@ -89,8 +98,10 @@ def test_faults_of_a_rig_file_name_the_file_that_has_them(tmp_path: Path) -> Non
         load_rig_file(above)
     found = {each.key: Path(each.file).name for each in caught.value.faults}
     assert found == {
-        "limits.depht": "below.yaml", "sensor": "below.yaml", "mock.scene.levl": "above.yaml",
-    }  # fmt: skip
+        "limits.depht": "below.yaml",
+        "sensor": "below.yaml",
+        "mock.scene.levl": "above.yaml",
+    }
 
 
 def test_all_limits_of_a_rig_that_a_plan_exceeds_are_reported(tmp_path: Path) -> None:

@@ -433,11 +433,13 @@ NUMBERS: dict[tuple[Any, ...], list[Any]] = {
     ("analysis", "detection", "margin_grid"): [[1, INFINITE], [1, 1e12], [False, 2]],
     ("analysis", "detection", "false_early_rate"): [True, INFINITE, float("nan")],
     ("analysis", "detection", "compare"): [
-        {"train_trials": 10**12}, {"rates": [float("nan")]}, {"rates": [False]}
+        {"train_trials": 10**12},
+        {"rates": [float("nan")]},
+        {"rates": [False]},
     ],
     ("protocol",): [True],
     (COLLECTION, "recording", "sync_rate"): [True, INFINITE],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("path", NUMBERS, ids=lambda path: ".".join(map(str, path)))
@@ -514,12 +516,43 @@ def test_protocols_in_stores_are_held_to_the_rules_of_their_day(
 
 PLACE = "a-place-for-text"
 TEXTS = [
-    "yes", "no", "~", "2026-11-23", "2026-02-30", "12:30", "0x10", "1e12", "1.0e+12", ".inf",
-    "-.inf", ".nan", "-1", "[]", "[2.5, {a: 0.5}]", "{a: 0.5}", "!include x", "!!set {a}", "*a",
-    "<<", "&a 5", '"\\e[31mred"', '"\\x9b31m"', '"\\u202Ered"', "2,5", "2,5 mm", "\u221210 mm",
-    "5 \u00b5m", "1,000 mm", "$sped", "$", "1 um", "''", "'a: b'", "99999999999999999999",
+    "yes",
+    "no",
+    "~",
+    "2026-11-23",
+    "2026-02-30",
+    "12:30",
+    "0x10",
+    "1e12",
+    "1.0e+12",
+    ".inf",
+    "-.inf",
+    ".nan",
+    "-1",
+    "[]",
+    "[2.5, {a: 0.5}]",
+    "{a: 0.5}",
+    "!include x",
+    "!!set {a}",
+    "*a",
+    "<<",
+    "&a 5",
+    '"\\e[31mred"',
+    '"\\x9b31m"',
+    '"\\u202Ered"',
+    "2,5",
+    "2,5 mm",
+    "\u221210 mm",
+    "5 \u00b5m",
+    "1,000 mm",
+    "$sped",
+    "$",
+    "1 um",
+    "''",
+    "'a: b'",
+    "99999999999999999999",
     "1000000 m",
-]  # fmt: skip
+]
 SHIPPED: dict[str, dict[str, Any]] = {
     name: yaml.safe_load((ROOT / "protocols" / f"{name}.yaml").read_text())
     for name in ("kinematic", "gravity", "disturbance")

@@ -29,8 +29,11 @@ def written(folder: Path, data: dict[str, Any], **collection: Any) -> Path:
         ({"claims": []}, "claims", "must have at least 1 item"),
         ({"claims": [{**CLAIM, "figure": "led"}]}, "claims[0].figure", "'lead'"),
         ({"claims": [{**CLAIM, "statistic": "mean"}]}, "claims[0].statistic", "'median'"),
-        ({"claims": [{"figure": "accuracy", "statistic": "p05", "within": "1 %"}]},
-         "claims[0].statistic", "'mean'"),
+        (
+            {"claims": [{"figure": "accuracy", "statistic": "p05", "within": "1 %"}]},
+            "claims[0].statistic",
+            "'mean'",
+        ),
         ({"claims": [{**CLAIM, "at_most": "1 s"}]}, "claims[0]", "exactly one of"),
         ({"claims": [{"figure": "lead"}]}, "claims[0]", "exactly one of"),
         ({"claims": [{**CLAIM, "at_least": "360"}]}, "claims[0].at_least", "unit"),
@@ -39,8 +42,11 @@ def written(folder: Path, data: dict[str, Any], **collection: Any) -> Path:
         ({"claims": [{**CLAIM, "statistic": "p50"}]}, "claims[0].statistic", "must be 'median'"),
         ({"claims": [{**CLAIM, "statistic": "p94"}]}, "claims[0].statistic", "'p95'"),
         ({"claims": [{**CLAIM, "between": None}]}, "claims[0].between", "empty"),
-        ({"claims": [CLAIM, SHARE, {**CLAIM, "at_least": "0.36 s"}]}, "claims[2]",
-         "is the same as claims[0]"),
+        (
+            {"claims": [CLAIM, SHARE, {**CLAIM, "at_least": "0.36 s"}]},
+            "claims[2]",
+            "is the same as claims[0]",
+        ),
         ({"claims": [CLAIM], "block": None}, "block", "empty"),
         ({"claims": [CLAIM], "most": None}, "most", "empty"),
         ({"claims": [CLAIM], "most": 35}, "most", "at least 36"),
@@ -48,16 +54,28 @@ def written(folder: Path, data: dict[str, Any], **collection: Any) -> Path:
         ({"claims": [CLAIM], "error": 0.51}, "error", "0.5"),
         ({"claims": [CLAIM], "least": 10, "most": 9}, "most", "at least"),
         ({"claims": [CLAIM], "repetitions": 0}, "repetitions", "1"),
-        ({"claims": [{**CLAIM, "between": {"factor": "dept", "levels": [2.4, 2.8]}}]},
-         "claims[0].between.factor", "depth"),
-        ({"claims": [{**CLAIM, "between": {"factor": "depth", "levels": [2.4, 2.5]}}]},
-         "claims[0].between.levels[1]", "2.4 mm, 2.8 mm, 3.4 mm"),
-        ({"claims": [{**CLAIM, "between": {"factor": "depth", "levels": [2.4, 2.4]}}]},
-         "claims[0].between.levels", "different"),
-        ({"claims": [{**CLAIM, "between": {"factor": "depth", "levels": []}}]},
-         "claims[0].between.levels[0]", "missing"),
+        (
+            {"claims": [{**CLAIM, "between": {"factor": "dept", "levels": [2.4, 2.8]}}]},
+            "claims[0].between.factor",
+            "depth",
+        ),
+        (
+            {"claims": [{**CLAIM, "between": {"factor": "depth", "levels": [2.4, 2.5]}}]},
+            "claims[0].between.levels[1]",
+            "2.4 mm, 2.8 mm, 3.4 mm",
+        ),
+        (
+            {"claims": [{**CLAIM, "between": {"factor": "depth", "levels": [2.4, 2.4]}}]},
+            "claims[0].between.levels",
+            "different",
+        ),
+        (
+            {"claims": [{**CLAIM, "between": {"factor": "depth", "levels": []}}]},
+            "claims[0].between.levels[0]",
+            "missing",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_meant_is_refused_with_its_key(
     tmp_path: Path, small: dict[str, Any], stopping: dict[str, Any], key: str, right: str
 ) -> None:
@@ -142,24 +160,47 @@ def test_least_blocks_of_each_statistic() -> None:
     ("collection", "stopping", "lacks"),
     [
         ({"repetitions": 6}, {}, None),
-        ({"repetitions": 5}, {}, "the plan has 5, so it cannot be called: collection.repetitions = "
-         "5 must be at least 6, or collection.stopping.block must be at most 35"),
+        (
+            {"repetitions": 5},
+            {},
+            "the plan has 5, so it cannot be called: collection.repetitions = "
+            "5 must be at least 6, or collection.stopping.block must be at most 35",
+        ),
         ({"repetitions": 1}, {"block": 6}, None),
-        ({"repetitions": 1}, {"block": 36}, "collection.repetitions = 1 must be at least 6, or "
-         "collection.stopping.block = 36 must be at most 7"),
-        ({"repetitions": 9}, {"most": 200}, "the plan has 5, so it cannot be called: "
-         "collection.stopping.most = 200 must be at least 216"),
+        (
+            {"repetitions": 1},
+            {"block": 36},
+            "collection.repetitions = 1 must be at least 6, or "
+            "collection.stopping.block = 36 must be at most 7",
+        ),
+        (
+            {"repetitions": 9},
+            {"most": 200},
+            "the plan has 5, so it cannot be called: "
+            "collection.stopping.most = 200 must be at least 216",
+        ),
         ({"repetitions": 9}, {"most": 216}, None),
-        ({"repetitions": 9}, {"most": 216, "repetitions": 4}, "the plan has 4, so it cannot be "
-         "called: collection.stopping.most = 216 must be at least 288"),
+        (
+            {"repetitions": 9},
+            {"most": 216, "repetitions": 4},
+            "the plan has 4, so it cannot be "
+            "called: collection.stopping.most = 216 must be at least 288",
+        ),
         ({"repetitions": 3, "order": "adaptive"}, {}, None),
-        ({"repetitions": 2, "order": "adaptive"}, {}, "the plan has 4, so it cannot be called: "
-         "collection.repetitions = 2 must be at least 3, or collection.choice.batch = 12 must be "
-         "at most 8"),
-        ({"repetitions": 3, "order": "adaptive"}, {"most": 95},
-         "collection.stopping.most = 95 must be at least 96"),
+        (
+            {"repetitions": 2, "order": "adaptive"},
+            {},
+            "the plan has 4, so it cannot be called: "
+            "collection.repetitions = 2 must be at least 3, or collection.choice.batch = 12 must "
+            "be at most 8",
+        ),
+        (
+            {"repetitions": 3, "order": "adaptive"},
+            {"most": 95},
+            "collection.stopping.most = 95 must be at least 96",
+        ),
     ],
-)  # fmt: skip
+)
 def test_warning_of_claim_with_too_few_blocks_names_key_and_remedy(
     tmp_path: Path,
     small: dict[str, Any],

@@ -110,8 +110,9 @@ def test_no_context_is_as_if_the_section_were_not_there(tmp_path: Path) -> None:
 def test_a_serial_number_is_text(tmp_path: Path) -> None:
     data = with_context(sensor={"values": ["0042", "NT-7.b"], "changeover": "person"})
     assert {plan.describe(t)["sensor"] for plan in [plan_of(data, tmp_path)] for t in plan} == {
-        "0042", "NT-7.b",
-    }  # fmt: skip
+        "0042",
+        "NT-7.b",
+    }
 
 
 def test_levels_that_nobody_changes_are_noted(tmp_path: Path) -> None:

@@ -30,8 +30,11 @@ def loaded(*words: str) -> list[str]:
     """Run a command in a new process; return the modules of plug-ins that it loads."""
     done = subprocess.run(
         [sys.executable, "-c", LOADED, json.dumps(words)],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     found: list[str] = json.loads(done.stdout.splitlines()[-1])
     return found
 

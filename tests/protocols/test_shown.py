@@ -21,10 +21,27 @@ from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 
 SECRETS = [
-    "password", "passwrd", "pasword", "passord", "paswrd", "Passwort", "pass", "pwd", "passphrase",
-    "secret", "secrt", "client_secret", "token", "tokn", "api_key", "apiKey", "key", "auth",
-    "credentials", "AWS_SECRET_ACCESS_KEY",
-]  # fmt: skip
+    "password",
+    "passwrd",
+    "pasword",
+    "passord",
+    "paswrd",
+    "Passwort",
+    "pass",
+    "pwd",
+    "passphrase",
+    "secret",
+    "secrt",
+    "client_secret",
+    "token",
+    "tokn",
+    "api_key",
+    "apiKey",
+    "key",
+    "auth",
+    "credentials",
+    "AWS_SECRET_ACCESS_KEY",
+]
 
 
 @pytest.mark.parametrize("name", SECRETS)
@@ -117,10 +134,19 @@ def test_long_text_is_shown_at_once() -> None:
 @pytest.mark.parametrize(
     "value",
     [
-        "hunter2", "'hunter2'", '"hunter2"', "|-\n    hunter2\n    hunter2", ">\n    hunter2",
-        "hunter2 hunter2", "!!str hunter2", "12345", "[hunter2, 1]", "{a: hunter2}", "&x hunter2",
+        "hunter2",
+        "'hunter2'",
+        '"hunter2"',
+        "|-\n    hunter2\n    hunter2",
+        ">\n    hunter2",
+        "hunter2 hunter2",
+        "!!str hunter2",
+        "12345",
+        "[hunter2, 1]",
+        "{a: hunter2}",
+        "&x hunter2",
     ],
-)  # fmt: skip
+)
 def test_a_file_without_its_secrets(value: str) -> None:
     text = f"# a rig\narm:\n  passwrd: {value}\n  port: 5  # kept\nlist: [{{token: {'7' * 9}}}]\n"
     assert mask_secrets(text) == (

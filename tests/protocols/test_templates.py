@@ -15,9 +15,12 @@ from tests.conftest import ROOT, SMALL
 from tests.protocols.planning import plan_of, refused
 
 KINEMATIC = {
-    "template": "kinematic", "depth": "$depth", "distance": "9 mm", "speed": "$speed",
+    "template": "kinematic",
+    "depth": "$depth",
+    "distance": "9 mm",
+    "speed": "$speed",
     "direction": "$direction",
-}  # fmt: skip
+}
 
 
 def small(motion: Any, *unused: str) -> dict[str, Any]:
@@ -75,7 +78,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
     "out of range": ({"press": "-1 mm/s"}, "press", "must be more than 0 mm/s"),
     "over a limit": ({"depth": "4 mm", "speed": "$depth2"}, "speed", "unknown factor $depth2"),
     "too fast": ({"travel": "51 mm/s"}, "travel", "exceeds collection.limits.speed"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", WRONG)

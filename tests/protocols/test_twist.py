@@ -60,15 +60,24 @@ def test_opposite_angles_are_two_conditions(tmp_path: Path) -> None:
         ({"limits": {"twist": "30 deg"}}, "collection.factors.angle.values[0]", "twist = 30"),
         ({"limits": {"twist": None}}, "collection.limits.twist", "is needed"),
         ({"limits": {"twist_speed": "5 deg/s"}}, "collection.factors.speed.values[1]", "is over"),
-        ({"factors": {"angle": {"unit": "deg", "values": [0]}}},
-         "collection.factors.angle.values[0]", "must not be 0"),
-        ({"factors": {"speed": {"unit": "deg/s", "values": [-4]}}},
-         "collection.factors.speed.values[0]", "more than 0 deg/s in collection.motion.speed"),
-        ({"factors": {"speed": {"unit": "mm/s", "values": [4]}}},
-         "collection.factors.speed.unit", "must be deg/s where $speed stands"),
+        (
+            {"factors": {"angle": {"unit": "deg", "values": [0]}}},
+            "collection.factors.angle.values[0]",
+            "must not be 0",
+        ),
+        (
+            {"factors": {"speed": {"unit": "deg/s", "values": [-4]}}},
+            "collection.factors.speed.values[0]",
+            "more than 0 deg/s in collection.motion.speed",
+        ),
+        (
+            {"factors": {"speed": {"unit": "mm/s", "values": [4]}}},
+            "collection.factors.speed.unit",
+            "must be deg/s where $speed stands",
+        ),
         ({"plate": {"mass": "0.2 kg"}}, "collection.motion", "cannot twist on a sliding plate"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_twist_is_named(change: Any, key: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         changed(tmp_path, **change)

@@ -68,15 +68,21 @@ def test_every_unit_has_a_dimension_and_an_exact_factor() -> None:
 
 def test_a_unit_becomes_text_that_a_file_name_may_hold() -> None:
     assert [file_text(unit) for unit in ("mm", "mm/s", "percent", "deg/s", None)] == [
-        "mm", "mmps", "pct", "degps", "",
-    ]  # fmt: skip
+        "mm",
+        "mmps",
+        "pct",
+        "degps",
+        "",
+    ]
 
 
 def in_micrometres(collection: dict[str, Any]) -> None:
     collection["factors"]["depth"] = {"unit": "um", "values": [2400, 2800, 3400]}
     collection["factors"]["speed"] = {
-        "unit": "cm/s", "range": {"from": 0.06, "to": 0.16, "step": 0.1}, "optional": [0.1],
-    }  # fmt: skip
+        "unit": "cm/s",
+        "range": {"from": 0.06, "to": 0.16, "step": 0.1},
+        "optional": [0.1],
+    }
 
 
 def test_a_factor_may_be_in_any_unit_of_its_dimension(tmp_path: Path) -> None:
@@ -84,8 +90,10 @@ def test_a_factor_may_be_in_any_unit_of_its_dimension(tmp_path: Path) -> None:
 
     def in_millimetres(collection: dict[str, Any]) -> None:
         collection["factors"]["speed"] = {
-            "unit": "mm/s", "range": {"from": 0.6, "to": 1.6, "step": 1}, "optional": [1],
-        }  # fmt: skip
+            "unit": "mm/s",
+            "range": {"from": 0.6, "to": 1.6, "step": 1},
+            "optional": [1],
+        }
 
     same = changed(tmp_path, in_millimetres)
     plan = changed(tmp_path, in_micrometres)
@@ -161,7 +169,7 @@ def test_nothing_is_imported_until_a_unit_is_unknown(
         ("UNITS = {'mm': ('length', '2')}", "{module}:UNITS", "mm: is a unit already"),
         ("UNITS = {'hPa': ('pressure', '0.1')}", "{module}:UNITS", "pressure: has no unit of fac"),
     ],
-)  # fmt: skip
+)
 def test_a_broken_package_is_named_in_one_line(
     text: str, target: str, says: str, install: Any, tmp_path: Path
 ) -> None:
@@ -202,9 +210,13 @@ def test_the_schema_for_editors_knows_units_of_packages(install: Any, tmp_path: 
         "print(json.dumps(file_schema('protocol')))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT,
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
         timeout=120,
-    )  # fmt: skip
+    )
     models = json.loads(done.stdout)["definitions"]
     assert "inch" in models["Factor"]["properties"]["unit"]["enum"]
     assert "|inch)" in json.dumps(models["Press"]["properties"]["depth"])

@@ -155,9 +155,11 @@ def test_a_sensor_in_another_unit_is_refused_and_closed(install: Install, tmp_pa
 def test_a_camera_that_delivers_another_grade_is_refused(install: Install, tmp_path: Path) -> None:
     install("lab_camera", CAMERA, "lab_camera = lab_camera:DRIVER")
     back = {
-        "kind": "frames", "scale_px_per_mm": 4, "region_px": [64, 48],
+        "kind": "frames",
+        "scale_px_per_mm": 4,
+        "region_px": [64, 48],
         "device": {"driver": "lab_camera"},
-    }  # fmt: skip
+    }
     triggered = real_rig(tmp_path, {"back": back}).streams["back"]
     with pytest.raises(RigError, match=r"write streams.back.timing.grade: host arrival"):
         built("back", triggered)
@@ -206,10 +208,11 @@ def test_two_devices_are_not_one(
         ({**SIDE, "mock": {}}, "streams.side.mock", "has no meaning with driver: devices"),
         (
             {**SIDE, "device": {**usb("B"), "noise_filter_us": 0}},
-            "streams.side.device.noise_filter_us", "must be",
+            "streams.side.device.noise_filter_us",
+            "must be",
         ),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_device_is_named_by_its_key(
     stream: dict[str, Any], key: str, text: str, tmp_path: Path
 ) -> None:

@@ -57,9 +57,10 @@ def test_a_scene_without_relaxation_needs_less(rig: RigFile) -> None:
 
 def test_a_rough_scene_hides_even_large_deflection(rig: RigFile) -> None:
     rough = changed(
-        rig, skin={"relaxation_share": 0.0, "base_normal_n_per_m": 40.0},
+        rig,
+        skin={"relaxation_share": 0.0, "base_normal_n_per_m": 40.0},
         friction={"static_excess": 0.0, "path_variation": 0.3},
-    )  # fmt: skip
+    )
     assert choose_level(rough, plan_of("pilot")).level == 1
 
 

@@ -39,23 +39,30 @@ def _without(*path: str) -> Change:
 CASES: dict[str, tuple[Change, str, str]] = {
     "devices on a mock": (_set("driver", to="mock"), "devices", "no meaning with driver: mock"),
     "a scene on a real rig": (
-        _set("driver", to="devices"), "mock", "no meaning with driver: devices",
+        _set("driver", to="devices"),
+        "mock",
+        "no meaning with driver: devices",
     ),
     "a loopback without a scene": (_without("mock"), "mock", "is needed by driver: loopback"),
     "a loopback without drivers": (
-        _without("devices"), "devices", "is needed by driver: loopback",
+        _without("devices"),
+        "devices",
+        "is needed by driver: loopback",
     ),
     "a real rig without drivers": (
         _both(_set("driver", to="devices"), _without("mock"), _without("devices")),
-        "devices", "is needed by driver: devices",
+        "devices",
+        "is needed by driver: devices",
     ),
     "a real rig without a sync box": (
         _both(_set("driver", to="devices"), _without("mock")),
-        "devices.sync_box.port", "name its serial port",
+        "devices.sync_box.port",
+        "name its serial port",
     ),
     "another exposure than the scene's": (
         _set("devices", "frame_camera", "exposure_us", to=1000),
-        "devices.frame_camera.exposure_us", "must be 2000",
+        "devices.frame_camera.exposure_us",
+        "must be 2000",
     ),
     "an exposure longer than the camera's period": (
         _set("devices", "frame_camera", "rate_hz", to=1000),
@@ -64,22 +71,28 @@ CASES: dict[str, tuple[Change, str, str]] = {
     ),
     "an output that is an input": (
         _set("devices", "frame_camera", "exposure_line", to="Line1"),
-        "devices.frame_camera.exposure_line", "is already used as an input: trigger_line",
+        "devices.frame_camera.exposure_line",
+        "is already used as an input: trigger_line",
     ),
     "ticks on the line of the code": (
         _set("devices", "frame_camera", "sync_line", to=1),
-        "devices.frame_camera.sync_line", "must differ from trigger_line",
+        "devices.frame_camera.sync_line",
+        "must differ from trigger_line",
     ),
     "frames that no fake times so": (
         _set("timing", "frames", to="exposure line"),
-        "timing.frames", "must be hardware trigger",
+        "timing.frames",
+        "must be hardware trigger",
     ),
     "tracks in place of pictures": (
         _set("mock", "frame_camera", "level", to="tracks"),
-        "mock.frame_camera.level", "must be video",
+        "mock.frame_camera.level",
+        "must be video",
     ),
     "an arm that is none": (
-        _set("devices", "arm", "driver", to="kuka"), "devices.arm.driver", "one of ur, abb",
+        _set("devices", "arm", "driver", to="kuka"),
+        "devices.arm.driver",
+        "one of ur, abb",
     ),
     "a setting of another make": (
         _set("devices", "arm", "egm_port", to=6510),
@@ -87,17 +100,21 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "known here: driver, host",
     ),
     "an arm without limits": (
-        _without("devices", "arm", "limits"), "devices.arm.limits", "is missing",
+        _without("devices", "arm", "limits"),
+        "devices.arm.limits",
+        "is missing",
     ),
     "limits the wrong way round": (
         _set("devices", "arm", "limits", "low_mm", to=[-20, 30, -70]),
-        "devices.arm.limits.low_mm", "y is not below high_mm",
+        "devices.arm.limits.low_mm",
+        "y is not below high_mm",
     ),
     "a line that no camera has": (
         _set("devices", "frame_camera", "sync_line", to=9),
-        "devices.frame_camera.sync_line", "less than or equal to 8",
+        "devices.frame_camera.sync_line",
+        "less than or equal to 8",
     ),
-}  # fmt: skip
+}
 
 
 def load(data: dict[str, Any], path: Path) -> Any:
@@ -162,32 +179,60 @@ def _arm(**change: Any) -> Change:
 
 
 HOSTS = [
-    "192.168.1", "192.168.1.", "10", "192.168..10", "192.168.1.256", "192.168.1.10.5", "1.2.3.04",
-    "192.168.1.x", "192.168.1.10:30004", "0.0.0.0", "255.255.255.255", "224.0.0.1", "ur5-", "-ur5",
-    "ur5..lab", ".", "ur5 lab", "", "\u0661\u0669\u0662.168.1.10",
-]  # fmt: skip
+    "192.168.1",
+    "192.168.1.",
+    "10",
+    "192.168..10",
+    "192.168.1.256",
+    "192.168.1.10.5",
+    "1.2.3.04",
+    "192.168.1.x",
+    "192.168.1.10:30004",
+    "0.0.0.0",
+    "255.255.255.255",
+    "224.0.0.1",
+    "ur5-",
+    "-ur5",
+    "ur5..lab",
+    ".",
+    "ur5 lab",
+    "",
+    "\u0661\u0669\u0662.168.1.10",
+]
 MILLIMETRES = "write millimetres"
 UNITS: dict[str, tuple[Change, str, str]] = {
     "a tool centre in metres": (
-        _arm(tool__tcp_mm=[0, 0, 0.12]), "tool.tcp_mm", f"{MILLIMETRES}, such as [0, 0, 120]",
+        _arm(tool__tcp_mm=[0, 0, 0.12]),
+        "tool.tcp_mm",
+        f"{MILLIMETRES}, such as [0, 0, 120]",
     ),
     "a centre of mass in metres": (
-        _arm(tool__centre_of_mass_mm=[0, 0.01, 0.05]), "tool.centre_of_mass_mm", MILLIMETRES,
+        _arm(tool__centre_of_mass_mm=[0, 0.01, 0.05]),
+        "tool.centre_of_mass_mm",
+        MILLIMETRES,
     ),
     "a turn in radians": (
-        _arm(tool__tcp_rotvec_deg=[0, 3.1416, 0]), "tool.tcp_rotvec_deg", "write degrees",
+        _arm(tool__tcp_rotvec_deg=[0, 3.1416, 0]),
+        "tool.tcp_rotvec_deg",
+        "write degrees",
     ),
     "a box in metres": (
         _arm(limits__low_mm=[-0.4, -0.6, 0], limits__high_mm=[0.4, -0.2, 0.5]),
-        "limits.low_mm", MILLIMETRES,
+        "limits.low_mm",
+        MILLIMETRES,
     ),
     "a plate in metres": (
-        _arm(limits__plate={
-            "centre_mm": [0.4, 0, 0.3], "right_mm": [0.4, 0.06, 0.3], "above_mm": [0.4, 0, 0.36],
-        }),
-        "limits.plate.right_mm", MILLIMETRES,
+        _arm(
+            limits__plate={
+                "centre_mm": [0.4, 0, 0.3],
+                "right_mm": [0.4, 0.06, 0.3],
+                "above_mm": [0.4, 0, 0.36],
+            }
+        ),
+        "limits.plate.right_mm",
+        MILLIMETRES,
     ),
-}  # fmt: skip
+}
 
 
 def _real(tmp_path: Path, change: Change) -> Path:

@@ -89,19 +89,44 @@ def test_files_may_extend_files_that_extend(base: Path) -> None:
 @pytest.mark.parametrize(
     ("own", "inherited", "file", "key", "says"),
     [
-        ("mock: {event_camera: {noise_hz: -1}}", "", "child.yaml",
-         "mock.event_camera.noise_hz", "greater than or equal to 0"),
-        ("mock: {arm: {latency_us: 5}}", "mock: {seed: 1, event_camera: {noise_hz: -1}}",
-         "mock.yaml", "mock.event_camera.noise_hz", "greater than or equal to 0"),
+        (
+            "mock: {event_camera: {noise_hz: -1}}",
+            "",
+            "child.yaml",
+            "mock.event_camera.noise_hz",
+            "greater than or equal to 0",
+        ),
+        (
+            "mock: {arm: {latency_us: 5}}",
+            "mock: {seed: 1, event_camera: {noise_hz: -1}}",
+            "mock.yaml",
+            "mock.event_camera.noise_hz",
+            "greater than or equal to 0",
+        ),
         ("limits: {depht: 3 mm}", "", "child.yaml", "limits.depht", "did you mean 'depth'"),
-        ("limits: {depth: 3 mm}", "limits: {depth: 4 mm, speed: 5 kg, reach: 15 mm}", "mock.yaml",
-         "limits.speed", "mm/s"),
-        ("frame_camera: {scale_px_per_mm: 12}", "", "child.yaml", "frame_camera.scale_px_per_mm",
-         "must be mock.frame_camera.px_per_mm = 20"),
-        ("calibration: {contact_plane: {centre: [a, 0 mm, 0 mm]}}", "", "child.yaml",
-         "calibration.contact_plane.centre[0]", "number with a unit"),
+        (
+            "limits: {depth: 3 mm}",
+            "limits: {depth: 4 mm, speed: 5 kg, reach: 15 mm}",
+            "mock.yaml",
+            "limits.speed",
+            "mm/s",
+        ),
+        (
+            "frame_camera: {scale_px_per_mm: 12}",
+            "",
+            "child.yaml",
+            "frame_camera.scale_px_per_mm",
+            "must be mock.frame_camera.px_per_mm = 20",
+        ),
+        (
+            "calibration: {contact_plane: {centre: [a, 0 mm, 0 mm]}}",
+            "",
+            "child.yaml",
+            "calibration.contact_plane.centre[0]",
+            "number with a unit",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_fault_is_blamed_on_the_file_that_has_it(
     own: str, inherited: str, file: str, key: str, says: str, base: Path
 ) -> None:
@@ -176,9 +201,14 @@ def test_what_ships_is_the_mock_rig_but_for_one_thing_each() -> None:
 
 @pytest.mark.parametrize(
     ("protocol", "side"),
-    [("kinematic", 832), ("gravity", 832), ("disturbance", 832), ("pilot", 720),
-     ("pilot_gravity", 832)],
-)  # fmt: skip
+    [
+        ("kinematic", 832),
+        ("gravity", 832),
+        ("disturbance", 832),
+        ("pilot", 720),
+        ("pilot_gravity", 832),
+    ],
+)
 def test_regions_in_pixels(protocol: str, side: int) -> None:
     rig, _ = load_rig_file(Path("mock"))
     assert rig.frame_px(load_plan(ROOT / "protocols" / f"{protocol}.yaml")) == (side, side)

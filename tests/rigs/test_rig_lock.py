@@ -61,9 +61,13 @@ def test_simulated_rigs_need_none(folder: Path) -> None:
 def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER], cwd=ROOT, text=True, env=environment,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-    )  # fmt: skip
+        [sys.executable, "-c", HOLDER],
+        cwd=ROOT,
+        text=True,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
     assert holder.stdout is not None
     assert holder.stdin is not None
     try:
@@ -72,8 +76,10 @@ def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) ->
             pass
         for part in (
             "the arm at 192.168.1.10 (rig ur5) is in use by another program ",
-            f"(pid {holder.pid} of ", "`sliplab", "for the store /data/study, since 20",
-        ):  # fmt: skip
+            f"(pid {holder.pid} of ",
+            "`sliplab",
+            "for the store /data/study, since 20",
+        ):
             assert part in str(refused.value)
         holder.kill()
         holder.wait(timeout=60)

@@ -33,8 +33,9 @@ def test_a_plan_within_the_pilot_leaves_nothing() -> None:
 
 def test_a_plan_that_goes_deeper_or_faster_says_by_how_much() -> None:
     less = RECORD | {
-        "depth_mm": {"least": 2.4, "most": 3.0}, "speed_mm_s": {"least": 1.0, "most": 1.6}
-    }  # fmt: skip
+        "depth_mm": {"least": 2.4, "most": 3.0},
+        "speed_mm_s": {"least": 1.0, "most": 1.6},
+    }
     twin = TwinRecord.model_validate(less)
     assert list(warnings(twin, load_plan(Path("pilot")))) == [
         "depth 2.4 to 3.4 mm in contact; the twin was fitted on 2.4 to 3 mm",

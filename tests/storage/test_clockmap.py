@@ -34,9 +34,11 @@ def half_up(value: Fraction) -> int:
 
 
 @given(
-    anchor=TIMES, image=SPANS, drift=DRIFTS,
+    anchor=TIMES,
+    image=SPANS,
+    drift=DRIFTS,
     spans=st.lists(SPANS, min_size=1, max_size=20) | st.lists(HOURS, min_size=1, max_size=20),
-)  # fmt: skip
+)
 def test_every_time_is_the_exact_one_rounded(
     anchor: int, image: int, drift: int, spans: list[int]
 ) -> None:
@@ -49,9 +51,7 @@ def test_every_time_is_the_exact_one_rounded(
     assert clock.to_reference(np.array(times * 9, np.int64)).tolist() == expected * 9
 
 
-@given(
-    anchor=TIMES, image=SPANS, drift=DRIFTS, spans=st.lists(NINE_YEARS, min_size=1, max_size=20)
-)  # fmt: skip
+@given(anchor=TIMES, image=SPANS, drift=DRIFTS, spans=st.lists(NINE_YEARS, min_size=1, max_size=20))
 def test_there_and_back_is_within_a_nanosecond(
     anchor: int, image: int, drift: int, spans: list[int]
 ) -> None:

@@ -72,8 +72,9 @@ def test_kernels_of_earlier_versions_are_deleted(tmp_path: Path) -> None:
         run(tmp_path, twice=twice)
     folders = sorted(it.name for it in (tmp_path / "__pycache__").glob("kernels-*"))
     assert [name.rpartition("-")[0] for name in folders] == [
-        "kernels-made_callee", "kernels-made_caller",
-    ]  # fmt: skip
+        "kernels-made_callee",
+        "kernels-made_caller",
+    ]
 
 
 def test_a_folder_that_is_named_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,8 +54,12 @@ def test_worker_does_not_run_the_script_again(how: str, tmp_path: Path) -> None:
     script = [str(tmp_path / "script.py")] if how == "file" else ["-m", "script"]
     done = subprocess.run(
         [sys.executable, *script, str(tmp_path / "log")],
-        cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     words = ["3", "in a process", "0", "rule", "Detector", "Detector"]
     assert done.stdout.splitlines() == words

@@ -63,22 +63,24 @@ def fill(
 def record(trial: str, **changes: Any) -> TrialRecord:
     """A record that fits what `fill` writes."""
     clock = {"map": IDENTITY, "uncertainty_ns": 1000.0}
-    return TrialRecord.model_validate({
-        "trial": trial,
-        "campaign": "c",
-        "experiment": "kinematic",
-        "role": "measured",
-        "block": 0,
-        "repetition": 1,
-        "attempt": 0,
-        "condition": {"depth": "2.4 mm", "side": "left"},
-        "simulated": True,
-        "recorded_s": 1.0,
-        "counts": {"events": 1000, "frames": 12, "poses": 10, "pulses": 10},
-        "clocks": {"reference": "sync box", "events": clock, "arm": clock, "frames": clock},
-        "quality": {"passed": True, "gates": {}},
-        **changes,
-    })  # fmt: skip
+    return TrialRecord.model_validate(
+        {
+            "trial": trial,
+            "campaign": "c",
+            "experiment": "kinematic",
+            "role": "measured",
+            "block": 0,
+            "repetition": 1,
+            "attempt": 0,
+            "condition": {"depth": "2.4 mm", "side": "left"},
+            "simulated": True,
+            "recorded_s": 1.0,
+            "counts": {"events": 1000, "frames": 12, "poses": 10, "pulses": 10},
+            "clocks": {"reference": "sync box", "events": clock, "arm": clock, "frames": clock},
+            "quality": {"passed": True, "gates": {}},
+            **changes,
+        }
+    )
 
 
 def campaign(folder: Path, name: str = "c") -> Campaign:

@@ -46,9 +46,11 @@ def confusion_map(matrix: Array, classes: Sequence[str], *, simulated: bool) -> 
         axes.set_yticks(places, named, fontsize=small)
         turned = max(map(len, named)) > 2 or many > WRITTEN
         axes.set_xticks(
-            [*places, many], [*named, "undecided"], fontsize=small,
+            [*places, many],
+            [*named, "undecided"],
+            fontsize=small,
             rotation=90 if turned else 0,
-        )  # fmt: skip
+        )
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         axes.set_xlabel("predicted class")
@@ -71,9 +73,13 @@ def accuracy_by_length(rows: Sequence[LengthShare], chance: float, *, simulated:
         shares = [math.nan if row.share is None else 100 * row.share for row in rows]
         known = [row for row in rows if row.low is not None and row.high is not None]
         axes.fill_between(
-            [row.ms for row in known], [100 * (row.low or 0.0) for row in known],
-            [100 * (row.high or 0.0) for row in known], color=BLUE, alpha=0.18, lw=0,
-        )  # fmt: skip
+            [row.ms for row in known],
+            [100 * (row.low or 0.0) for row in known],
+            [100 * (row.high or 0.0) for row in known],
+            color=BLUE,
+            alpha=0.18,
+            lw=0,
+        )
         axes.plot(ms, shares, "o-", color=BLUE, ms=4, lw=1.4)
         axes.axhline(100 * chance, color=GREY, lw=0.9, ls="--")
         axes.set_xlim(0, 1.02 * ms[-1])

@@ -65,17 +65,29 @@ def uncertainty_by_trial(
         figure, axes = plt.subplots(figsize=(WIDTH, 2.8))
         for (name, (numbers, values)), (colour, mark) in zip(devices.items(), marks, strict=False):
             axes.plot(
-                numbers, values, mark, color=colour, ms=2.5, mew=0, alpha=0.6, label=name,
+                numbers,
+                values,
+                mark,
+                color=colour,
+                ms=2.5,
+                mew=0,
+                alpha=0.6,
+                label=name,
                 rasterized=len(numbers) >= 250,
-            )  # fmt: skip
+            )
         axes.set_yscale("log")
         axes.margins(y=0.35)
         for place, (name, first) in enumerate(starts.items()):
             axes.axvline(first, color=GREY, lw=0.6)
             axes.annotate(  # below each other: a small campaign is narrower than its name
-                f" {name}", (first, 1), xycoords=("data", "axes fraction"), fontsize=7, va="top",
-                xytext=(0, -8 * place), textcoords="offset points",
-            )  # fmt: skip
+                f" {name}",
+                (first, 1),
+                xycoords=("data", "axes fraction"),
+                fontsize=7,
+                va="top",
+                xytext=(0, -8 * place),
+                textcoords="offset points",
+            )
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_locator(NullLocator())
@@ -148,9 +160,14 @@ def residuals(devices: Sequence[Residuals], *, simulated: bool) -> str:
             )
             axes.plot(middle, median, color=colour, lw=1.4, label="median of all trials")
             axes.plot(
-                device.worst_s, device.worst_us, ".", color="black", ms=3, mew=0,
+                device.worst_s,
+                device.worst_us,
+                ".",
+                color="black",
+                ms=3,
+                mew=0,
                 label="worst trial",
-            )  # fmt: skip
+            )
             axes.axhline(0, color=GREY, lw=0.6)
             axes.set_title(f"{device.title}; worst trial {device.worst}", fontsize=8)
             axes.set_ylabel("residual (µs)")
@@ -191,9 +208,14 @@ def over_trials(
             handles |= dict(zip(names, shown, strict=True))
         for name, first in campaigns.items():
             grid[0, 0].annotate(
-                name, (first - 0.5, 1.0), xycoords=("data", "axes fraction"), fontsize=8,
-                color=GREY, xytext=(3, 3), textcoords="offset points",
-            )  # fmt: skip
+                name,
+                (first - 0.5, 1.0),
+                xycoords=("data", "axes fraction"),
+                fontsize=8,
+                color=GREY,
+                xytext=(3, 3),
+                textcoords="offset points",
+            )
         # whole trials: round a single one the names would be far outside, and nothing fit
         numbers = [x for panel in panels for _, xs, _ in panel.series.values() for x in xs]
         if numbers:
@@ -213,16 +235,27 @@ def _panel(axes: Any, panel: OverTrials) -> None:
         panel.series.items(), offsets, strict=True
     ):
         axes.plot(
-            np.asarray(numbers) + offset, values, MARKS.get(device, "D"), ms=4, mew=0, alpha=0.75,
-            color=colour_of(device), label=name, rasterized=len(numbers) > DENSE,
-        )  # fmt: skip
+            np.asarray(numbers) + offset,
+            values,
+            MARKS.get(device, "D"),
+            ms=4,
+            mew=0,
+            alpha=0.75,
+            color=colour_of(device),
+            label=name,
+            rasterized=len(numbers) > DENSE,
+        )
     for gate in panel.gates:
         # gates of the same height alternate, so that both colours are seen
         begin = 4 * list(panel.series).index(gate.device)
         axes.plot(
-            [gate.first - 0.5, gate.last + 0.5], [gate.value] * 2, ls=(begin, (4, 4)), lw=1.4,
-            color=colour_of(gate.device), label=f"gate of {gate.device}",
-        )  # fmt: skip
+            [gate.first - 0.5, gate.last + 0.5],
+            [gate.value] * 2,
+            ls=(begin, (4, 4)),
+            lw=1.4,
+            color=colour_of(gate.device),
+            label=f"gate of {gate.device}",
+        )
     axes.set_ylabel(panel.label)
     if panel.logarithmic:
         axes.set_yscale("log")

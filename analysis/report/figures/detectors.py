@@ -52,8 +52,13 @@ def latency_over_rate(panels: Mapping[str, Mapping[str, Curve]], *, simulated: b
                 axes.plot(
                     [rate for rate, _ in there],
                     [late for _, late in there],
-                    mark, ls=dashes, ms=3.5, lw=1, color=colour, label=name,
-                )  # fmt: skip
+                    mark,
+                    ls=dashes,
+                    ms=3.5,
+                    lw=1,
+                    color=colour,
+                    label=name,
+                )
             axes.set_title(title)
             axes.set_xlabel("false early, validation trials (%)")
             axes.set_ylim(bottom=0)

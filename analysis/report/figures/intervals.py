@@ -69,10 +69,16 @@ def by_condition(
                 note = panel.notes.get(row, "" if len(there) else "none")
                 if note:
                     axes.annotate(
-                        note, (1, place), xycoords=("axes fraction", "data"), fontsize=7,
-                        color=GREY, va="center", ha="left", xytext=(2, 0),
+                        note,
+                        (1, place),
+                        xycoords=("axes fraction", "data"),
+                        fontsize=7,
+                        color=GREY,
+                        va="center",
+                        ha="left",
+                        xytext=(2, 0),
                         textcoords="offset points",
-                    )  # fmt: skip
+                    )
             for place in breaks:
                 axes.axhline(place - 0.5, color=GREY, lw=0.4)
             if panel.zero:
@@ -89,9 +95,15 @@ def by_condition(
             if not any(len(panel.values.get(row, ())) for row in rows):
                 axes.set_xticks([])  # no scale is read where nothing is drawn
                 axes.annotate(
-                    "none", (0.5, 0.5), xycoords="axes fraction", fontsize=8, color=GREY,
-                    ha="center", va="center", backgroundcolor="white",
-                )  # fmt: skip
+                    "none",
+                    (0.5, 0.5),
+                    xycoords="axes fraction",
+                    fontsize=8,
+                    color=GREY,
+                    ha="center",
+                    va="center",
+                    backgroundcolor="white",
+                )
         grid[0][0].set_yticks(range(len(rows)), list(rows))
         return svg_text(figure, simulated)
 
@@ -137,9 +149,15 @@ def shares(
         place = 0
         for title, found in groups.items():
             axes.annotate(
-                title, (0, place), xycoords=("axes fraction", "data"), fontsize=8,
-                weight="bold", va="center", xytext=(3, 0), textcoords="offset points",
-            )  # fmt: skip
+                title,
+                (0, place),
+                xycoords=("axes fraction", "data"),
+                fontsize=8,
+                weight="bold",
+                va="center",
+                xytext=(3, 0),
+                textcoords="offset points",
+            )
             for item in found:
                 place += 1
                 names.append(item.name)
@@ -153,9 +171,13 @@ def shares(
         if line is not None:
             axes.axvline(100 * line[0], color=GREY, lw=0.9, ls="--", label=line[1])
             axes.legend(
-                loc="upper right", fontsize=7.5, bbox_to_anchor=(1, 1.0),
-                frameon=True, framealpha=1.0, edgecolor="none",
-            )  # fmt: skip
+                loc="upper right",
+                fontsize=7.5,
+                bbox_to_anchor=(1, 1.0),
+                frameon=True,
+                framealpha=1.0,
+                edgecolor="none",
+            )
         axes.set_yticks(places, names, fontsize=8)
         axes.set_ylim(place - 0.3, -0.7)
         axes.set_xlabel(label)
@@ -224,13 +246,18 @@ def lowered_and_raised(
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(
-            1, len(panels), figsize=(WIDTH, 0.3 * max(len(rows), 3) + 1.5),
-            sharey=True, squeeze=False,
-        )  # fmt: skip
+            1,
+            len(panels),
+            figsize=(WIDTH, 0.3 * max(len(rows), 3) + 1.5),
+            sharey=True,
+            squeeze=False,
+        )
         for axes, panel in zip(grid[0], panels, strict=True):
             axes.axvline(0, color=GREY, lw=0.8)
-            styles = ((panel.lower, -0.16, ORANGE, "v", "less"),
-                      (panel.higher, 0.16, BLUE, "^", "more"))  # fmt: skip
+            styles = (
+                (panel.lower, -0.16, ORANGE, "v", "less"),
+                (panel.higher, 0.16, BLUE, "^", "more"),
+            )
             for values, off, colour, marker, word in styles:
                 for place, row in enumerate(rows):
                     found = values.get(row)
@@ -239,9 +266,13 @@ def lowered_and_raised(
                     if found.span is not None:
                         axes.plot(found.span, [place + off] * 2, color=colour, lw=1.1)
                     axes.plot(
-                        found.change, place + off, marker, color=colour, ms=4.5,
+                        found.change,
+                        place + off,
+                        marker,
+                        color=colour,
+                        ms=4.5,
                         label=f"{percent:.0f} % {word}",
-                    )  # fmt: skip
+                    )
             axes.set_title(panel.note, fontsize=7.5, color=GREY)
             axes.set_xlabel(panel.label, fontsize=8)
             axes.tick_params(axis="x", labelsize=7.5)
@@ -250,6 +281,7 @@ def lowered_and_raised(
                 axes.axhline(place + 0.5, color=GREY, lw=0.2)
         grid[0][0].set_yticks(range(len(rows)), list(rows), fontsize=8)
         handles = dict(zip(*reversed(grid[0][0].get_legend_handles_labels()), strict=True))
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2,
-                      fontsize=7.5)  # fmt: skip
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=7.5
+        )
         return svg_text(figure, simulated)

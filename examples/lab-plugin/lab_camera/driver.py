@@ -93,9 +93,14 @@ class LabCamera:
         """Return what the camera said of itself. Raises RigError: it is gone."""
         self._buffer.check_fault()
         return DeviceHealth(
-            device=DEVICE, model="lab camera", serial=self._serial, firmware=UNKNOWN,
-            temperature_c=None, clock="its own, 1 us", notes=(f"{self.width} x {self.height} px",),
-        )  # fmt: skip
+            device=DEVICE,
+            model="lab camera",
+            serial=self._serial,
+            firmware=UNKNOWN,
+            temperature_c=None,
+            clock="its own, 1 us",
+            notes=(f"{self.width} x {self.height} px",),
+        )
 
     # ----------------------------------------------------------------------------------------
 

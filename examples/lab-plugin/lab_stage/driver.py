@@ -135,9 +135,13 @@ class LabStage(ThreadedArm):
         """Return the controller's own description. Raises ArmFault: no connection, no answer."""
         model, serial, firmware = (*self._ask("HELLO").split(), "", "", "")[:3]
         return DeviceHealth(
-            device="arm", model=model, serial=serial, firmware=firmware, temperature_c=None,
+            device="arm",
+            model=model,
+            serial=serial,
+            firmware=firmware,
+            temperature_c=None,
             clock="its own, 1 us",
-        )  # fmt: skip
+        )
 
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path` and return at once.
@@ -311,9 +315,12 @@ class LabStage(ThreadedArm):
         try:
             t_us, x, y, z, state, level = rest.split(" ")
             sample = Sample(
-                int(t_us) * 1000, time.monotonic_ns(), (float(x), float(y), float(z)),
-                self._settings.tool_rotvec_deg, level == "1",
-            )  # fmt: skip
+                int(t_us) * 1000,
+                time.monotonic_ns(),
+                (float(x), float(y), float(z)),
+                self._settings.tool_rotvec_deg,
+                level == "1",
+            )
             says = STATES[state]
         except (ValueError, KeyError):
             raise ValueError(f"it sent '{line}', which is no pose") from None

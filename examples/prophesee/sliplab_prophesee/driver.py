@@ -86,15 +86,22 @@ class Prophesee:
         with self._changed:
             self._check_fault()
         return DeviceHealth(
-            device=DEVICE, model=f"Prophesee {self._source.name}", serial=self._source.serial,
-            firmware=UNKNOWN, temperature_c=None, clock="its own, 1 us",
+            device=DEVICE,
+            model=f"Prophesee {self._source.name}",
+            serial=self._source.serial,
+            firmware=UNKNOWN,
+            temperature_c=None,
+            clock="its own, 1 us",
             notes=(f"{self.width} x {self.height} px", self._settings.where),
-        )  # fmt: skip
+        )
 
     def describe(self) -> Json:
         """Return the source that was read."""
-        return {"source": self._settings.source, "sensor": self._source.name,
-                "serial": self._source.serial}  # fmt: skip
+        return {
+            "source": self._settings.source,
+            "sensor": self._source.name,
+            "serial": self._source.serial,
+        }
 
     # ----------------------------------------------------------------------------------------
 

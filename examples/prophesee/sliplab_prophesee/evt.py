@@ -177,16 +177,22 @@ class Evt3Decoder:
         which, bit = np.nonzero(bits)
         at = carrying[which]
         events = EventChunk(
-            (column[at] + bit).astype(np.uint16), row[at].astype(np.uint16),
-            up[at].astype(np.uint8), t_us[at],
-        )  # fmt: skip
+            (column[at] + bit).astype(np.uint16),
+            row[at].astype(np.uint16),
+            up[at].astype(np.uint8),
+            t_us[at],
+        )
 
         reached = int((value[base[-1]] & 0x7FF) + passed[-1] + size[-1] - passed[base[-1]])
         polarity = int(value[base[-1]]) & 0x800
         self._state = np.array(
-            [TIME_LOW << 12 | int(low[-1]), ADDR_Y << 12 | int(row[-1]),
-             BASE_X << 12 | polarity | min(reached, 0x7FF)], np.uint16,
-        )  # fmt: skip
+            [
+                TIME_LOW << 12 | int(low[-1]),
+                ADDR_Y << 12 | int(row[-1]),
+                BASE_X << 12 | polarity | min(reached, 0x7FF),
+            ],
+            np.uint16,
+        )
         triggered = kind == EXT_TRIGGER
         edge = value[triggered]
         return Decoded(events, t_us[triggered], edge >> 8, (edge & 1).astype(bool))
@@ -217,9 +223,11 @@ class Evt2Decoder:
         seen, triggered = kind < 2, kind == EXT_TRIGGER
         place, edge = value[seen], value[triggered]
         events = EventChunk(
-            (place >> 11 & 0x7FF).astype(np.uint16), (place & 0x7FF).astype(np.uint16),
-            kind[seen].astype(np.uint8), t_us[seen],
-        )  # fmt: skip
+            (place >> 11 & 0x7FF).astype(np.uint16),
+            (place & 0x7FF).astype(np.uint16),
+            kind[seen].astype(np.uint8),
+            t_us[seen],
+        )
         return Decoded(events, t_us[triggered], edge >> 8 & 0x1F, (edge & 1).astype(bool))
 
 
@@ -256,11 +264,13 @@ class Evt3Encoder:
         sort = np.repeat([0, 1, 2], [len(ticks), m, n])[order]
         t_us = t_us[order]
         row = np.concatenate([np.full(len(ticks) + m, -1), events.y.astype(np.int64)])[order]
-        column = np.concatenate([
-            np.zeros(len(ticks), np.int64),
-            np.full(m, trigger << 8 | 1),
-            events.x.astype(np.int64) | events.p.astype(np.int64) << 11,
-        ])[order]  # fmt: skip
+        column = np.concatenate(
+            [
+                np.zeros(len(ticks), np.int64),
+                np.full(m, trigger << 8 | 1),
+                events.x.astype(np.int64) | events.p.astype(np.int64) << 11,
+            ]
+        )[order]
 
         low = t_us & 0xFFF
         before = np.concatenate([[self._low], low[:-1]])
@@ -268,11 +278,14 @@ class Evt3Encoder:
         words = np.zeros((len(t_us), 3), np.int64)
         words[:, 0] = TIME_LOW << 12 | low
         words[:, 1] = ADDR_Y << 12 | row
-        words[:, 2] = np.choose(sort, [
-            TIME_HIGH << 12 | (t_us >> 12 & 0xFFF),
-            EXT_TRIGGER << 12 | column,
-            ADDR_X << 12 | column,
-        ])  # fmt: skip
+        words[:, 2] = np.choose(
+            sort,
+            [
+                TIME_HIGH << 12 | (t_us >> 12 & 0xFFF),
+                EXT_TRIGGER << 12 | column,
+                ADDR_X << 12 | column,
+            ],
+        )
         happens, seen = sort > 0, sort == 2
         rows = row[seen]
         turned = np.concatenate([[self._row], rows[:-1]]) != rows

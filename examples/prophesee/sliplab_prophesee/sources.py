@@ -235,10 +235,12 @@ class CameraSource:
         # the library's own memory, which it uses again
         self._events.append(
             EventChunk(
-                found["x"].astype(np.uint16), found["y"].astype(np.uint16),
-                found["p"].astype(np.uint8), found["t"].astype(np.int64),
+                found["x"].astype(np.uint16),
+                found["y"].astype(np.uint16),
+                found["p"].astype(np.uint8),
+                found["t"].astype(np.int64),
             )
-        )  # fmt: skip
+        )
 
     def _take_edges(self, found: Any) -> None:
         self._edges.append(np.array(found))

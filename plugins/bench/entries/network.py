@@ -56,9 +56,15 @@ class Spiking(WindowDetector):
             for part in (scenes, validation)
         )
         self.fitted = training.fit(
-            train.windows, train.y, val.windows, val.y, settings.network, settings.windows,
-            settings.training, settings.training.seeds[0],
-        )  # fmt: skip
+            train.windows,
+            train.y,
+            val.windows,
+            val.y,
+            settings.network,
+            settings.windows,
+            settings.training,
+            settings.training.seeds[0],
+        )
         self._net = training.restore(self.fitted)
         self._engine = Engine(self._net, settings.windows.cells)
         rows = np.random.default_rng(0).permutation(len(val))[:COUNTED]

@@ -88,8 +88,12 @@ def request(
         text = f"has none in {protocol}; a protocol with nuisances is needed (docs/stress.md)"
         raise InputError("--protocol", "collection.nuisances", None, text)
     if collection.experiment != "kinematic":
-        raise InputError("--protocol", "collection.experiment", collection.experiment,
-                         "must be kinematic: slips are judged by slides")  # fmt: skip
+        raise InputError(
+            "--protocol",
+            "collection.experiment",
+            collection.experiment,
+            "must be kinematic: slips are judged by slides",
+        )
     if taken.plan.protocol.analysis.windows != item.settings.windows:
         text = f"must be those of the campaign '{item.name}', on which the networks were trained"
         raise InputError("--protocol", "analysis.windows", str(protocol), text)
@@ -121,10 +125,14 @@ def measure_stress(asked: Request) -> StressRecord:
             if stride not in known:
                 known[stride] = _predicted(disturbed, campaign, trials, judged.model, stride)
             rows = [
-                (it, stress.outcome(stress.alarms(tuned.detector, tuned.levels.incipient, p),
-                                    it.slip, tolerance))
+                (
+                    it,
+                    stress.outcome(
+                        stress.alarms(tuned.detector, tuned.levels.incipient, p), it.slip, tolerance
+                    ),
+                )
                 for it, p in known[stride]
-            ]  # fmt: skip
+            ]
             detectors.append(stress.stressed(judged.title, tuned.name, stride, rows))
         accuracy += _accuracy(judged.title, judged.model, labels, campaign, trials)
     first = trials[0][1].record
@@ -159,9 +167,12 @@ def _stress_trial(
     name, strength = section.applied(dict(trial.condition))
     true = references_of(recording, label).get("true")
     return StressTrial(
-        name, float(strength), recorded_span(recording)[0], slip,
+        name,
+        float(strength),
+        recorded_span(recording)[0],
+        slip,
         None if true is None else true.slip.incipient_ns,
-    )  # fmt: skip
+    )
 
 
 Trials = list[tuple[Trial, Recording, StressTrial]]
@@ -202,6 +213,10 @@ def _accuracy(
         if found.share is not None and found.low is not None and found.high is not None:
             strict = Rate(value=found.share, low=found.low, high=found.high)
         yield StressAccuracy(
-            network=title, nuisance=name, strength=strength, windows=int(there.sum()),
-            trials=found.trials, strict=strict,
-        )  # fmt: skip
+            network=title,
+            nuisance=name,
+            strength=strength,
+            windows=int(there.sum()),
+            trials=found.trials,
+            strict=strict,
+        )

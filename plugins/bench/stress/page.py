@@ -19,9 +19,13 @@ from sliplab.plugins.bench.stress.judging import ALL
 from sliplab.storage.schema.evaluation import Rate
 
 COLUMNS = (
-    "detector", "clean trials (95 %)", "false alarms an hour (95 %)", "missed slips",
-    "latency, median (ms)", "from physical onset (ms)",
-)  # fmt: skip
+    "detector",
+    "clean trials (95 %)",
+    "false alarms an hour (95 %)",
+    "missed slips",
+    "latency, median (ms)",
+    "from physical onset (ms)",
+)
 
 
 def title(detector: StressDetector) -> str:
@@ -32,9 +36,13 @@ def title(detector: StressDetector) -> str:
 def cells(name: str, it: StressFigures) -> list[str]:
     """Return figures as cells, see `COLUMNS`."""
     return [
-        name, _span(it.clean), _hourly(it.per_hour), f"{it.missed} of {it.trials}",
-        number(it.latency_ms, 0), number(it.latency_true_ms, 0),
-    ]  # fmt: skip
+        name,
+        _span(it.clean),
+        _hourly(it.per_hour),
+        f"{it.missed} of {it.trials}",
+        number(it.latency_ms, 0),
+        number(it.latency_true_ms, 0),
+    ]
 
 
 def of(detector: StressDetector, nuisance: str, strength: float | None = None) -> StressFigures:

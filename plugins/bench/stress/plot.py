@@ -35,9 +35,14 @@ def clean_trials(
         axes.imshow(100.0 * share, vmin=0, vmax=100, cmap="YlGnBu", aspect="auto")
         for (row, column), value in np.ndenumerate(share):
             axes.text(
-                column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=7.5,
+                column,
+                row,
+                f"{100 * value:.0f}",
+                ha="center",
+                va="center",
+                fontsize=7.5,
                 color="white" if value > 0.6 else "black",
-            )  # fmt: skip
+            )
         name_cells(axes, [title for title, _ in detectors], names, "", "")
         axes.tick_params(axis="x", labelrotation=45, labelsize=8)
         axes.tick_params(axis="y", labelsize=8)
@@ -56,9 +61,13 @@ def by_strength(
     lines = -(-len(names) // columns)
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(
-            lines, columns, figsize=(1.35 * WIDTH, 1.45 * lines + 0.5), sharex=True, sharey=True,
+            lines,
+            columns,
+            figsize=(1.35 * WIDTH, 1.45 * lines + 0.5),
+            sharex=True,
+            sharey=True,
             squeeze=False,
-        )  # fmt: skip
+        )
         for axes, name in zip(grid.flat, names, strict=False):
             for colour, (network, found) in zip(PALETTE, rows.items(), strict=False):
                 ours = [

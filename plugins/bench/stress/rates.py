@@ -38,7 +38,11 @@ def stress_alarms(record: StressRecord | None, network: str) -> dict[str, AlarmR
         if name is not None and figures.strength is None:
             rate = figures.per_hour
             found[name] = AlarmRate(
-                alarms=figures.false_alarms, hours=figures.hold_h, value=rate.value,
-                low=rate.low, high=rate.high, clusters=figures.trials,
-            )  # fmt: skip
+                alarms=figures.false_alarms,
+                hours=figures.hold_h,
+                value=rate.value,
+                low=rate.low,
+                high=rate.high,
+                clusters=figures.trials,
+            )
     return found

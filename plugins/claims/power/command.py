@@ -45,7 +45,9 @@ def power(
     draws: Annotated[
         int | None,
         typer.Option(
-            "--draws", min=10, max=10_000,
+            "--draws",
+            min=10,
+            max=10_000,
             help="Campaigns to draw; default: 100, and 20 with order: adaptive.",
         ),
     ] = None,
@@ -81,7 +83,7 @@ def power(
         bool, typer.Option("--no-training", help="Leave the learning curve out.")
     ] = False,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Say after how many trials a protocol's claims are called, by a pilot's labelled trials."""
     from sliplab.flows.steps import prepare_store
     from sliplab.storage.remote.mirror import open_store

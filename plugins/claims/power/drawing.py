@@ -65,9 +65,10 @@ class Drawing:
         return Drawn(
             tuple(None if it.look is None else int(looks[it.look]) for it in found.claims),
             tuple(it.state for it in found.claims),
-            len(found.evidence.taken), found.ended,
+            len(found.evidence.taken),
+            found.ended,
             self._widths(found) if number < LINES else (),
-        )  # fmt: skip
+        )
 
     def _widths(self, found: Course) -> tuple[WidthLine, ...]:
         """Return the widths of each claim along a campaign, at some of its looks."""

@@ -147,10 +147,14 @@ def judging_model(plan: Plan, model: Path | None) -> Path | None:
         model = Path(plan.file).parent / stopping.model
     if model is None or not model.is_file():
         raise InputError(
-            "--model", "", model,
-            "is no file" if model is not None else "is needed: a claim is about a network's "
+            "--model",
+            "",
+            model,
+            "is no file"
+            if model is not None
+            else "is needed: a claim is about a network's "
             "output; name the file of a trained one, such as STORE/models/seed0.pt",
-        )  # fmt: skip
+        )
     return model.resolve()
 
 
@@ -204,10 +208,12 @@ def request(
     if len(pilot) < FEWEST:
         which = "test trials" if own else "trials"
         raise InputError(
-            "--store", "", str(store.folder),
+            "--store",
+            "",
+            str(store.folder),
             f"has {len(pilot)} {which} of the experiment '{experiment}', and at least {FEWEST} are "
             "needed: collect a pilot first",
-        )  # fmt: skip
+        )
     adaptive = plan.protocol.collection.adaptive is not None
     count = drawn or (ADAPTIVE_CAMPAIGNS if adaptive else CAMPAIGNS)
     judge = figures.Judge(plan.protocol.analysis, model)
@@ -299,21 +305,21 @@ def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
     stale = stale_trials(asked.store, figures.STEP, work)
     run_trials(asked.store, figures.STEP, "figures", stale, figures.kept_figures)
     made = [
-        TrialFigures.model_validate(
-            Derived.of(asked.store, figures.STEP, item.name).read(trial.id)
-        )
+        TrialFigures.model_validate(Derived.of(asked.store, figures.STEP, item.name).read(trial.id))
         for item, trial, _ in asked.pilot
-    ]  # fmt: skip
+    ]
     values: dict[str, F64] = {}
     for claim in claims:
         values[claim.figure] = np.array([each.of(claim.figure) for each in made])
         known = int((~np.isnan(values[claim.figure])).sum())
         if known < FEWEST:
             raise InputError(
-                "--store", "", str(asked.store.folder),
+                "--store",
+                "",
+                str(asked.store.folder),
                 f"has the figure {claim.figure} of {known} of {len(made)} trials, and at least "
                 f"{FEWEST} are needed: the others' labels lack an onset",
-            )  # fmt: skip
+            )
     blocks = [(item.name, trial.block) for item, trial, _ in asked.pilot]
     numbers = {block: number for number, block in enumerate(dict.fromkeys(blocks))}
     number = np.array([numbers[block] for block in blocks], np.int64)
@@ -382,9 +388,7 @@ def learning_curve(asked: Request) -> tuple[Learning | None, list[str]]:
         found = dict(_accuracies(asked, train, validation, test))
     orders = range(_orders(asked.classifier))
     counts = np.array([found[0, share][0] for share in learning.SHARES], np.float64)
-    accuracy = np.array(
-        [[found[order, share][1] for share in learning.SHARES] for order in orders]
-    )  # fmt: skip
+    accuracy = np.array([[found[order, share][1] for share in learning.SHARES] for order in orders])
     title = TITLES[asked.classifier]
     return learning.learning_of(title, counts, accuracy, planned), []
 
@@ -430,9 +434,15 @@ def network_accuracy(
     from sliplab.analysis.networks import training
 
     fitted = training.fit(
-        train.windows, train.y, validation.windows, validation.y, settings.network,
-        settings.windows, settings.training, settings.training.seeds[0],
-    )  # fmt: skip
+        train.windows,
+        train.y,
+        validation.windows,
+        validation.y,
+        settings.network,
+        settings.windows,
+        settings.training,
+        settings.training.seeds[0],
+    )
     return learning.by_trial(
         strict_hits(training.predict_counts(fitted, test.windows), test.y), test.trial
     )

@@ -68,9 +68,12 @@ def share_of(train: SampleSet, share: float, order: int) -> tuple[int, SampleSet
     chosen = ranked[: max(round(share * len(ranked)), 1)]
     rows = np.flatnonzero(np.isin(train.trial, chosen)).astype(np.int64)
     part = SampleSet(
-        train.windows.take(rows), train.y[rows], train.trial[rows], train.start_ns[rows],
+        train.windows.take(rows),
+        train.y[rows],
+        train.trial[rows],
+        train.start_ns[rows],
         train.trials,
-    )  # fmt: skip
+    )
     return len(chosen), part
 
 
@@ -107,10 +110,18 @@ def learning_of(classifier: str, trials: F64, accuracy: F64, planned: int) -> Le
     curve = fit_curve(trials, 1.0 - mean)
     line = _points(at, 1.0 - curve.error(at), lines)
     return Learning(
-        classifier=classifier, test_trials=tested, points=_points(trials, mean, means),
-        floor=curve.floor, scale=curve.scale, exponent=curve.exponent, planned=planned,
-        expected=line[-1].accuracy, low=line[-1].low, high=line[-1].high, line=line[:-1],
-    )  # fmt: skip
+        classifier=classifier,
+        test_trials=tested,
+        points=_points(trials, mean, means),
+        floor=curve.floor,
+        scale=curve.scale,
+        exponent=curve.exponent,
+        planned=planned,
+        expected=line[-1].accuracy,
+        low=line[-1].low,
+        high=line[-1].high,
+        line=line[:-1],
+    )
 
 
 def _points(trials: F64, accuracy: F64, drawn: F64) -> tuple[CurvePoint, ...]:

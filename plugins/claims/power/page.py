@@ -28,11 +28,14 @@ def rows(record: PowerRecord) -> list[list[str]]:
     """Return claims as rows below `COLUMNS`, and all of them together."""
     found = [
         [
-            it.claim, *_trials(it.trials, record), *(percent(x, 0) for x in (it.holds, it.refuted)),
-            percent(it.never, 0), _repetitions(it, record),
+            it.claim,
+            *_trials(it.trials, record),
+            *(percent(x, 0) for x in (it.holds, it.refuted)),
+            percent(it.never, 0),
+            _repetitions(it, record),
         ]
         for it in record.claims
-    ]  # fmt: skip
+    ]
     together = [*_trials(record.together, record), "–", "–", percent(record.never, 0), "–"]
     return [*found, [TOGETHER, *together]]
 

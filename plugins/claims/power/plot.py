@@ -33,10 +33,14 @@ def decisions(rows: Mapping[str, Sequence[int | None]], planned: int, *, simulat
             share = np.concatenate([np.arange(len(ends) + 1), [len(ends)]]) / len(trials)
             last = k == len(rows) - 1 and len(rows) > 1
             axes.step(
-                x, 100.0 * share, where="post", label=title, lw=2.0 if last else 1.2,
+                x,
+                100.0 * share,
+                where="post",
+                label=title,
+                lw=2.0 if last else 1.2,
                 color="black" if last else PALETTE[k % len(PALETTE)],
                 ls="--" if k >= len(PALETTE) and not last else "-",
-            )  # fmt: skip
+            )
         axes.set_xlim(0, planned)
         axes.set_ylim(-2, 102)
         axes.set_xlabel("trials taken")
@@ -76,9 +80,13 @@ def learning_curve(curve: Learning, *, simulated: bool) -> str:
         for it in curve.points:
             axes.plot([it.trials] * 2, [100.0 * it.low, 100.0 * it.high], color="black", lw=1.2)
         axes.plot(
-            [it.trials for it in curve.points], [100.0 * it.accuracy for it in curve.points],
-            "o", color="black", ms=4, label="trained",
-        )  # fmt: skip
+            [it.trials for it in curve.points],
+            [100.0 * it.accuracy for it in curve.points],
+            "o",
+            color="black",
+            ms=4,
+            label="trained",
+        )
         axes.axvline(curve.planned, color=GREY, lw=0.9, ls="--", label="whole plan")
         axes.set_xscale("log")
         ticks = sorted({*(it.trials for it in curve.points), curve.planned})

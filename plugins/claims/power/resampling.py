@@ -231,10 +231,12 @@ class Pilot:
     ) -> dict[str, F64]:
         count = len(self.conditions)
         kinds: dict[tuple[Level, ...], int] = {}
-        kind = np.array([
-            kinds.setdefault(tuple(condition[axis.name] for axis in self.axes), len(kinds))
-            for condition in conditions
-        ])  # fmt: skip
+        kind = np.array(
+            [
+                kinds.setdefault(tuple(condition[axis.name] for axis in self.axes), len(kinds))
+                for condition in conditions
+            ]
+        )
         own = [tuple(condition[axis.name] for axis in self.axes) for condition in self.conditions]
         code, places = self._coded([*own, *kinds], rng)
         far = np.abs(places[count:, None] - places[None, :count]).sum(axis=2)
@@ -334,10 +336,11 @@ def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis
         if not all(name in condition for condition in conditions):
             if name in compared:
                 raise KeyedError(
-                    f"collection.factors.{name}", None,
+                    f"collection.factors.{name}",
+                    None,
                     "is compared by a claim, and the pilot does not vary it: take some trials of "
                     "both levels",
-                )  # fmt: skip
+                )
             if len(levels[name]) > 1:
                 notes.append(f"the pilot lacks the factor {name}: no effect of it is assumed")
             continue
@@ -353,9 +356,7 @@ def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis
     return tuple(axes), notes
 
 
-def _unknown(
-    axis: Axis, factor: Factor, levels: Sequence[Level], compared: bool
-) -> Iterator[str]:  # fmt: skip
+def _unknown(axis: Axis, factor: Factor, levels: Sequence[Level], compared: bool) -> Iterator[str]:
     """Yield what to say of levels that the pilot lacks.
 
     Raises:
@@ -367,10 +368,11 @@ def _unknown(
         by_chance = isinstance(level, str) and not axis.numeric and not compared
         if not axis.knows(level) and not by_chance:
             raise KeyedError(
-                f"collection.factors.{axis.name}", factor.text(level),
+                f"collection.factors.{axis.name}",
+                factor.text(level),
                 f"lies outside of the pilot's levels, {there}: take some trials there, or leave "
                 "this level out",
-            )  # fmt: skip
+            )
     if lacking:
         texts = ", ".join(map(factor.text, lacking))
         how = "taken to lie between" if axis.numeric else "each taken for one of"

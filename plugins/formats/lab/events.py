@@ -177,14 +177,26 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
     )
     condition, repetition = named_condition(pair.stem)
     return ForeignTrial(
-        name, names, all_events, "unknown; ms as the files have them, rounded to us",
+        name,
+        names,
+        all_events,
+        "unknown; ms as the files have them, rounded to us",
         lambda: next((shape[::-1] for shape in shapes), None),
-        condition=condition, repetition=repetition,
+        condition=condition,
+        repetition=repetition,
         notes=lambda: (note,) if doubtful else (),
         about={"resolution": "ms as stored; order within one time is lost"},
-        unknown=("epoch", "units of the condition", "sync grade", "poses", "motion", "frames",
-                 "polarity map", *missing),
-    )  # fmt: skip
+        unknown=(
+            "epoch",
+            "units of the condition",
+            "sync grade",
+            "poses",
+            "motion",
+            "frames",
+            "polarity map",
+            *missing,
+        ),
+    )
 
 
 def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, Any]:

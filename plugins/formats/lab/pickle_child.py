@@ -28,9 +28,20 @@ _MAX_BITS = 512
 _PLAIN = frozenset({type(None), bool, int, float, str, bytes, bytearray})
 _TYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|O8?|\?)")
 _STRUCT = {
-    "b1": "?", "?": "?", "i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I",
-    "i8": "q", "u8": "Q", "f2": "e", "f4": "f", "f8": "d",
-}  # fmt: skip
+    "b1": "?",
+    "?": "?",
+    "i1": "b",
+    "u1": "B",
+    "i2": "h",
+    "u2": "H",
+    "i4": "i",
+    "u4": "I",
+    "i8": "q",
+    "u8": "Q",
+    "f2": "e",
+    "f4": "f",
+    "f8": "d",
+}
 """numpy's types by their codes in `struct`; objects have none."""
 
 
@@ -292,8 +303,10 @@ def main() -> None:
     """Answer the pickle on standard input. Arguments: memory in bytes, processor time in s."""
     memory, seconds = map(int, sys.argv[1:3])
     for kind, most in (
-        (resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds), (resource.RLIMIT_CORE, 0)
-    ):  # fmt: skip
+        (resource.RLIMIT_AS, memory),
+        (resource.RLIMIT_CPU, seconds),
+        (resource.RLIMIT_CORE, 0),
+    ):
         _, hard = resource.getrlimit(kind)
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))

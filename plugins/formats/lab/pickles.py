@@ -67,15 +67,19 @@ def parse_pickle(data: bytes, path: str | Path, before: int = 0) -> Any:
     at, text = found
     if kind == "refused":
         raise InputError(
-            path, f"byte {before + at}", None,
+            path,
+            f"byte {before + at}",
+            None,
             f"holds {text}; only {_KINDS} are read from a pickle, nothing was run",
-        )  # fmt: skip
+        )
     fault = DamagedFile if at or not data else InputError
     raise fault(
-        path, f"byte {before + at}", None,
+        path,
+        f"byte {before + at}",
+        None,
         f"is no whole pickle: {text}; a file as Python's pickle.dump writes it is read, with "
         f"{_KINDS} in it",
-    )  # fmt: skip
+    )
 
 
 def in_child(data: bytes, seconds: int) -> bytes:

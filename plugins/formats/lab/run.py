@@ -161,11 +161,16 @@ def with_run(trial: ForeignTrial, stem: str, run: Path | None) -> ForeignTrial:
     unknown += ["clock of frames"] if frames is not None and trial.frames is None else []
     unknown += [f"clock of {name}" for name in forces]
     return replace(
-        trial, about=about, frames=frames, frame_px=size, unknown=tuple(unknown),
+        trial,
+        about=about,
+        frames=frames,
+        frame_px=size,
+        unknown=tuple(unknown),
         cameras={**trial.cameras, **{n: read for n, (read, _) in cameras.items() if read}},
-        streams={**trial.streams, **forces}, resolution_us={**trial.resolution_us, **resolution},
+        streams={**trial.streams, **forces},
+        resolution_us={**trial.resolution_us, **resolution},
         notes=lambda: (*trial.notes(), *dict.fromkeys(notes)),
-    )  # fmt: skip
+    )
 
 
 def _meta(run: Path, notes: list[str]) -> Json:
@@ -219,10 +224,11 @@ def _untimed(run: Path, stem: str) -> list[str]:
     folders = (run, run / VIDEOS_FOLDER)
     found = (
         path
-        for folder in folders if folder.is_dir()
+        for folder in folders
+        if folder.is_dir()
         for path in sorted(folder.iterdir())
         if path.stem.endswith(f"_{stem}") and path.suffix in _VIDEO_ENDINGS
-    )  # fmt: skip
+    )
     cameras = _cameras(run)
     return [path.name for path in found if path.stem.removesuffix(f"_{stem}") not in cameras]
 

@@ -60,8 +60,15 @@ _MOST_RECORD, _MOST_CHUNK, _MOST_KEPT = 1 << 28, 1 << 28, 1 << 30
 _FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI"), 2
 """Kind and length of a footer's record, places of the summary and of its index, checksum."""
 _FAULTS = (
-    struct.error, OverflowError, ValueError, KeyError, RuntimeError, MemoryError, OSError, EOFError,
-)  # fmt: skip
+    struct.error,
+    OverflowError,
+    ValueError,
+    KeyError,
+    RuntimeError,
+    MemoryError,
+    OSError,
+    EOFError,
+)
 """What the `mcap` library raises, besides its own errors, where a file is damaged."""
 _MOST_MESSAGES = 1 << 62
 _SCHEMAS = ("ros2msg", "ros2idl", "ros1msg")
@@ -347,16 +354,30 @@ def _ours(path: Path, found: _Found) -> ForeignTrial:
         if found.topics[topic] == ros2.IMAGE
     }
     original = Original(
-        record, _document(found, PROVENANCE, Provenance),
-        {key: _column(parts) for key, parts in found.columns.items()}, events, frames,
-        {key[1].split("/")[1]: parts[0].unit for key, parts in found.columns.items()
-         if key[1].startswith("streams/") and key[1].endswith("/value")},
-        rate_hz, label, found.attached.get(LABEL_ARRAYS), sync,
-    )  # fmt: skip
+        record,
+        _document(found, PROVENANCE, Provenance),
+        {key: _column(parts) for key, parts in found.columns.items()},
+        events,
+        frames,
+        {
+            key[1].split("/")[1]: parts[0].unit
+            for key, parts in found.columns.items()
+            if key[1].startswith("streams/") and key[1].endswith("/value")
+        },
+        rate_hz,
+        label,
+        found.attached.get(LABEL_ARRAYS),
+        sync,
+    )
     return ForeignTrial(
-        record.trial, path.name, events.get("events", lambda: iter(())), "the trial's time line",
-        simulated=record.simulated, original=original, campaign=_campaign(path, found),
-    )  # fmt: skip
+        record.trial,
+        path.name,
+        events.get("events", lambda: iter(())),
+        "the trial's time line",
+        simulated=record.simulated,
+        original=original,
+        campaign=_campaign(path, found),
+    )
 
 
 def _json(found: _Found, name: str) -> Json:

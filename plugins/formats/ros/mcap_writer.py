@@ -210,9 +210,13 @@ class _Trial:
     def _events(self, name: str) -> Iterator[Message]:
         size = self._size(name)
         channel = self._channel(
-            f"/{name}", ros2.EVENTS, clock="event packets: the camera's; stamp: the time line",
-            camera=name, width=str(size[0]), height=str(size[1]),
-        )  # fmt: skip
+            f"/{name}",
+            ros2.EVENTS,
+            clock="event packets: the camera's; stamp: the time line",
+            camera=name,
+            width=str(size[0]),
+            height=str(size[1]),
+        )
         for seq, chunk in enumerate(_packets(self.recording, name)):
             (t_ns,) = self._line(name, chunk.t_us[:1] * 1000).tolist()
             yield t_ns, channel, ros2.event_packet(t_ns, name, size, seq, chunk)

@@ -18,9 +18,11 @@ from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.streams import U8, EventChunk
 
 EVENTS, IMAGE, POSE, WRENCH = (
-    "event_camera_msgs/msg/EventPacket", "sensor_msgs/msg/Image",
-    "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped",
-)  # fmt: skip
+    "event_camera_msgs/msg/EventPacket",
+    "sensor_msgs/msg/Image",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/WrenchStamped",
+)
 PULSE, PHASE, ONSET, SCALAR, COLUMN = (
     f"sliplab_msgs/msg/{name}" for name in ("Pulse", "Phase", "Onset", "Scalar", "Column")
 )

@@ -141,9 +141,11 @@ class Original:
         for chunk in self._events(EVENTS_KIND):
             writer.add_events(chunk)
         for group, add in (
-            ("event_pulses", writer.add_event_pulses), ("arm_pulses", writer.add_arm_pulses),
-            ("sync_pulses", writer.add_sync_pulses), ("exposures", writer.add_exposures),
-        ):  # fmt: skip
+            ("event_pulses", writer.add_event_pulses),
+            ("arm_pulses", writer.add_arm_pulses),
+            ("sync_pulses", writer.add_sync_pulses),
+            ("exposures", writer.add_exposures),
+        ):
             if f"{group}/t" in data:
                 add(PulseChunk(data[f"{group}/t"]))
         for group, add_reads in (

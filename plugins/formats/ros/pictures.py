@@ -20,9 +20,11 @@ _BRIGHTNESS = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 """Place of the brightness in each pair of bytes, by encoding."""
 _COLOURS = {"mono": 1, "bgr": 3, "rgb": 3, "bgra": 4, "rgba": 4}
 _BAYER = {
-    "bayer_rggb": cv2.COLOR_BayerRGGB2BGR, "bayer_bggr": cv2.COLOR_BayerBGGR2BGR,
-    "bayer_gbrg": cv2.COLOR_BayerGBRG2BGR, "bayer_grbg": cv2.COLOR_BayerGRBG2BGR,
-}  # fmt: skip
+    "bayer_rggb": cv2.COLOR_BayerRGGB2BGR,
+    "bayer_bggr": cv2.COLOR_BayerBGGR2BGR,
+    "bayer_gbrg": cv2.COLOR_BayerGBRG2BGR,
+    "bayer_grbg": cv2.COLOR_BayerGRBG2BGR,
+}
 _CHANNELS = {**_COLOURS, **dict.fromkeys(_BAYER, 1)}
 """Numbers of a pixel by encoding, whose name continues with their bits: 8 or 16."""
 

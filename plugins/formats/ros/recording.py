@@ -163,11 +163,15 @@ def recording(path: Path, name: str, source: Source) -> ForeignTrial:
             made["triggers"], inputs = triggers_of(edges)
             about["left_out"] = [*about.get("left_out", ()), *inputs]
     return ForeignTrial(
-        name, path.name, lambda: iter(()) if events is None else _events(events), _epoch(events),
-        about=about, unknown=("sync grade", "poses", "motion", "condition"),
+        name,
+        path.name,
+        lambda: iter(()) if events is None else _events(events),
+        _epoch(events),
+        about=about,
+        unknown=("sync grade", "poses", "motion", "condition"),
         notes=lambda: (*told, *(line for topic in taken for line in topic.warnings())),
         **made,
-    )  # fmt: skip
+    )
 
 
 def _first(

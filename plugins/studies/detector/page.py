@@ -27,10 +27,21 @@ from sliplab.plugins.studies.plot import (
 MOST_ROWS = 40
 """Most rows of the front on the page; the table as CSV has all."""
 COLUMNS = (
-    "network", "precision", "stride (ms)", "windows", "margin (spikes)", "strict (%)",
-    "mean latency (ms)", "95 % (ms)", "false early (%)", "missed or late (%)", "µs a window",
-    "in a batch", "operations a window (1000)", "operations/s (million)",
-)  # fmt: skip
+    "network",
+    "precision",
+    "stride (ms)",
+    "windows",
+    "margin (spikes)",
+    "strict (%)",
+    "mean latency (ms)",
+    "95 % (ms)",
+    "false early (%)",
+    "missed or late (%)",
+    "µs a window",
+    "in a batch",
+    "operations a window (1000)",
+    "operations/s (million)",
+)
 TERMINAL = ("", "network", "stride", "rule", "strict", "latency", "early", "missed or late")
 _LATENCY, _OPERATIONS = "mean incipient latency (ms)", "synaptic operations/s (million)"
 _TIME = "computing time (ms a second, one thread)"
@@ -142,8 +153,14 @@ def _factors(comparisons: Comparisons) -> Table:
             shown = [format_difference(found[name], *how) for name, how in compared.items()]
         means = [spread(row.test["strict"], 100, 1), spread(row.test["mean_ms"], 1, 0)]
         table.append([f"{FACTORS[item['factor']]}: {_level(item)}", *means, *shown])
-    columns = ("factor", "strict (%)", "mean latency (ms)", "strict, difference",
-               "latency, difference", "false early, difference")  # fmt: skip
+    columns = (
+        "factor",
+        "strict (%)",
+        "mean latency (ms)",
+        "strict, difference",
+        "latency, difference",
+        "false early, difference",
+    )
     return Table(columns, table)
 
 
@@ -156,10 +173,11 @@ def _cross(rows: Sequence[Row]) -> Table:
             f"{scaled(mean(row.work['synaptic_operations_per_s']), 1e6)} M/s",
         ]
         for row in rows
-        if row.precision == "trained" and row.rule == "chosen"
+        if row.precision == "trained"
+        and row.rule == "chosen"
         and row.stride_ms == row.setting.length_ms
         and (row.setting.step_ms, row.setting.width) == (1, 1)
-    }  # fmt: skip
+    }
     lengths, pools = (sorted({key[k] for key in there}) for k in (0, 1))
     table = [
         [f"{length} ms", *(", ".join(there.get((length, pool), ["–"])) for pool in pools)]

@@ -168,10 +168,14 @@ class _Truth:
         counted = counted_stride(length_ms, self.finest_ms)
         every = stride_ms // counted
         none = np.full((len(SMOOTHINGS), len(self.margins), 2), NEVER, np.int64)
-        found = np.stack([
-            sweep(counts[::every], ends[::every], SMOOTHINGS, self.margins) if len(ends) else none
-            for counts, ends in trial_counts(arrays, precision, counted)
-        ])  # fmt: skip
+        found = np.stack(
+            [
+                sweep(counts[::every], ends[::every], SMOOTHINGS, self.margins)
+                if len(ends)
+                else none
+                for counts, ends in trial_counts(arrays, precision, counted)
+            ]
+        )
         return tuple(found[part] for part in self.parts)
 
     def choose(self, each: Sequence[Detections]) -> list[tuple[int, int]]:
@@ -240,13 +244,18 @@ def _rows(
             own = precision == PRECISIONS[0] and rule == RULES[0]
             rows.append(
                 Row(
-                    setting, precision, stride, rule, SMOOTHINGS[pair[0]], truth.margins[pair[1]],
+                    setting,
+                    precision,
+                    stride,
+                    rule,
+                    SMOOTHINGS[pair[0]],
+                    truth.margins[pair[1]],
                     setting == PAPER and stride == PAPER.length_ms and own,
                     [one["seed"] for one in figures],
                     *_figures(truth, pair, [one["precisions"][precision] for one in figures], each),
                     _work([one["precisions"][precision] for one in figures], 1000 / stride),
                 )
-            )  # fmt: skip
+            )
     return rows
 
 

@@ -337,12 +337,18 @@ class DetectorSearch:
             advance(1.0 / run.training.epochs, note)
 
         fitted = training.fit(
-            train.windows, train.y, validation.windows, validation.y,
-            run.network, run.windows, run.training, run.seed,
+            train.windows,
+            train.y,
+            validation.windows,
+            validation.y,
+            run.network,
+            run.windows,
+            run.training,
+            run.seed,
             on_epoch=on_epoch,
             on_state=partial(write_bytes, state),
             state=state.read_bytes() if state.exists() else None,
-        )  # fmt: skip
+        )
         model_file.save(path, fitted)
         state.unlink(missing_ok=True)
         return fitted

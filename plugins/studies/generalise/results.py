@@ -49,8 +49,15 @@ from sliplab.storage.trials.store import Store
 STEP, FILE, TABLE, VERSION = "generalisation", "results.json", "results.md", 1
 SPLITS = ("train", "validation", "test")
 VALIDATION = 0.15
-COLUMNS = ["left out, or other skin", "trials", "windows", "strict (%)", "95 %", "argmax (%)",
-           "seen (%)"]  # fmt: skip
+COLUMNS = [
+    "left out, or other skin",
+    "trials",
+    "windows",
+    "strict (%)",
+    "95 %",
+    "argmax (%)",
+    "seen (%)",
+]
 
 I64 = npt.NDArray[np.int64]
 
@@ -75,14 +82,16 @@ class TrialSamples:
 
     def without(self, factor: str, level: str) -> dict[str, I64]:
         """Return the samples of each part of the split that leaves a level out: their places."""
-        parts = np.array([
-            "test"
-            if condition.get(factor) == level
-            else "validation"
-            if hash_integer("generalisation", trial) < VALIDATION * 2**63
-            else "train"
-            for trial, condition in zip(self.ids, self.conditions, strict=True)
-        ])  # fmt: skip
+        parts = np.array(
+            [
+                "test"
+                if condition.get(factor) == level
+                else "validation"
+                if hash_integer("generalisation", trial) < VALIDATION * 2**63
+                else "train"
+                for trial, condition in zip(self.ids, self.conditions, strict=True)
+            ]
+        )
         of_sample = parts[self.samples.trial]
         return {part: np.flatnonzero(of_sample == part) for part in SPLITS}
 
@@ -107,12 +116,18 @@ def train_without(
     x, y, trial = trials.samples.windows, trials.samples.y, trials.samples.trial
     train, validation, test = rows["train"], rows["validation"], rows["test"]
     fitted = training.fit(
-        x.take(train), y[train], x.take(validation), y[validation],
-        settings.network, settings.windows, settings.training, settings.training.seeds[0],
+        x.take(train),
+        y[train],
+        x.take(validation),
+        y[validation],
+        settings.network,
+        settings.windows,
+        settings.training,
+        settings.training.seeds[0],
         on_epoch=on_epoch,
         on_state=partial(write_bytes, state),
         state=state.read_bytes() if state.exists() else None,
-    )  # fmt: skip
+    )
     state.unlink(missing_ok=True)
     counts = training.predict_counts(fitted, x.take(test))
     unseen = score_windows(counts, y[test], trial[test])

@@ -57,8 +57,9 @@ def skin_section(
         item = Share(name, row.share, row.low, row.high)
         groups.setdefault(group, []).append(item)
         span = "–" if item.low is None else f"{percent(item.low)} to {percent(item.high)}"
-        rows.append([name, str(row.trials), str(row.n), percent(item.value), span,
-                     percent(row.seen)])  # fmt: skip
+        rows.append(
+            [name, str(row.trials), str(row.n), percent(item.value), span, percent(row.seen)]
+        )
     figure = None
     if groups:
         drawn = [item for of in groups.values() for item in of]
@@ -74,9 +75,12 @@ def _make(data: ReportData) -> SkinSection | None:
         return None
     kinematic = data.summary.kinematic
     return skin_section(
-        RESULT.read(data.store), RESULT.command(data.store), kinematic.accuracy.strict,
-        seed_words(kinematic.seeds), simulated=data.simulated,
-    )  # fmt: skip
+        RESULT.read(data.store),
+        RESULT.command(data.store),
+        kinematic.accuracy.strict,
+        seed_words(kinematic.seeds),
+        simulated=data.simulated,
+    )
 
 
 def _key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:

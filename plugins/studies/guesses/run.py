@@ -91,9 +91,11 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
         if name not in there:
             known = ", ".join(GUESSES)
             raise InputError(
-                "GUESS", "", name,
+                "GUESS",
+                "",
+                name,
                 f"must be a non-zero parameter of the scene, such as {known}",
-            )  # fmt: skip
+            )
     settings = (Setting(), *lower_and_higher(guesses))
     tasks = [
         Task(setting.name, work.key(setting), partial(measure_setting, work, setting, scenes))

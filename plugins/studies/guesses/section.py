@@ -76,27 +76,37 @@ def _made(found: SensitivityResults, command: str) -> SensitivitySection:
     share = 100 * found.change
     panels = [
         ChangePanel(
-            f"{FIGURES[key]}\n({_change_unit(key)})", lower[key], higher[key],
+            f"{FIGURES[key]}\n({_change_unit(key)})",
+            lower[key],
+            higher[key],
             f"as it is: {_value(key, unchanged[key])}",
         )
-        for key in DRAWN if unchanged[key] is not None
-    ]  # fmt: skip
+        for key in DRAWN
+        if unchanged[key] is not None
+    ]
     svg = lowered_and_raised(list(names), panels, simulated=True, percent=share)
     rows = [
         [
             name,
-            *(" / ".join(_at(key, unchanged[key], side[key].get(name)) for side in (lower, higher))
-              for key in FIGURES),
+            *(
+                " / ".join(
+                    _at(key, unchanged[key], side[key].get(name)) for side in (lower, higher)
+                )
+                for key in FIGURES
+            ),
         ]
         for name in names
-    ]  # fmt: skip
+    ]
     first = [AS_IT_IS, *(_value(key, unchanged[key], unit=False) for key in FIGURES)]
     return SensitivitySection(
-        command, share, len(base.trials),
+        command,
+        share,
+        len(base.trials),
         Figure(svg, name="guesses", data=_data(list(names), lower, higher)),
-        Table(("guess", *(f"{text} ({UNITS[key]})" for key, text in FIGURES.items())),
-              [first, *rows]),
-    )  # fmt: skip
+        Table(
+            ("guess", *(f"{text} ({UNITS[key]})" for key, text in FIGURES.items())), [first, *rows]
+        ),
+    )
 
 
 def _scale(key: str) -> float:

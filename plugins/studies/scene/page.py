@@ -31,14 +31,30 @@ ERRORS = {
 }
 CONTACT_ONLY = ("first_slip_ms", "centre_slip_ms", "flipped")
 COLUMNS = (
-    "variant", "rows/s", "wall (ms)", "first slip (ms)", "centre (ms)", "event median (µs)",
-    "95 % until gross (µs)", "95 % (µs)", "unmatched", "labels", "samples L1",
-)  # fmt: skip
+    "variant",
+    "rows/s",
+    "wall (ms)",
+    "first slip (ms)",
+    "centre (ms)",
+    "event median (µs)",
+    "95 % until gross (µs)",
+    "95 % (µs)",
+    "unmatched",
+    "labels",
+    "samples L1",
+)
 TERMINAL = ("variant", "wall (ms)", "first slip (ms)", "event median (µs)", "labels", "samples L1")
 SENSITIVITY_COLUMNS = (
-    "parameter", "value", "first slip (ms)", "first slip (%)", "incipient lasts (%)",
-    "hold (%)", "loading (%)", "incipient (%)", "gross (%)",
-)  # fmt: skip
+    "parameter",
+    "value",
+    "first slip (ms)",
+    "first slip (%)",
+    "incipient lasts (%)",
+    "hold (%)",
+    "loading (%)",
+    "incipient (%)",
+    "gross (%)",
+)
 
 Result = Mapping[str, Any]
 Error = Mapping[str, float | None]
@@ -129,8 +145,13 @@ def tradeoff_rows(result: Result) -> list[list[str]]:
     for title, row in table_rows(result):
         wall_s, error = row["wall_s"], row["error"]
         wall = "–" if wall_s is None else f"{1e3 * wall_s:.3g}"
-        times = ("first_slip_ms", "centre_slip_ms", "event_median_us", "early_p95_us",
-                 "event_p95_us")  # fmt: skip
+        times = (
+            "first_slip_ms",
+            "centre_slip_ms",
+            "event_median_us",
+            "early_p95_us",
+            "event_p95_us",
+        )
         shares = ("unmatched", "flipped", "tensor_l1")
         cells = [*(_short(error[key]) for key in times), *(_share(error[key]) for key in shares)]
         rows.append([title, number(row["rows_per_s"], 0), wall, *cells])
@@ -168,12 +189,14 @@ def sensitivity_rows(data: Result) -> list[list[str]]:
             return " / ".join(_signed(v[phase] if v is not None and phase else v) for v in values)
 
         names = ("first_slip_ms", "first_slip_percent", "incipient_percent")
-        rows.append([
-            row["parameter"].split(".", 1)[-1],
-            "–" if row["value"] is None else f"{row['value']:g}",
-            *(cell(name) for name in names),
-            *(cell("percent", phase) for phase in PHASES),
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["parameter"].split(".", 1)[-1],
+                "–" if row["value"] is None else f"{row['value']:g}",
+                *(cell(name) for name in names),
+                *(cell("percent", phase) for phase in PHASES),
+            ]
+        )
     return rows
 
 

@@ -101,12 +101,16 @@ def tradeoff_scene(
             "rig_step_ms": stated,
             "trials": [job.trial.id for job in jobs],
             **scene_numbers(
-                families, wall_s, done, closed, plan.protocol.analysis.windows,
+                families,
+                wall_s,
+                done,
+                closed,
+                plan.protocol.analysis.windows,
                 {"level": planned.name, "reason": planned.reason},
             ),
             "needs": {} if rig.twin is None else rig.twin.needs,
             "left_out": page.left_out(falls, sum(form is not None for form in closed), len(jobs)),
-        }  # fmt: skip
+        }
         if sensitivity:
             result["sensitivity"] = measure_sensitivity(rig, plan, bar.advance, each)
     folder.mkdir(parents=True, exist_ok=True)

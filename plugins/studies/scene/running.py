@@ -44,10 +44,14 @@ def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:
             return None
         onsets = np.array(
             retraction_onsets(
-                skin_of(rig.scene), rig.scene.scene.friction.kinetic, mass_kg, pressed.depth_mm,
-                pulled.speed_mm_s, rig.scene.scene.plate.gravity_m_s2,
+                skin_of(rig.scene),
+                rig.scene.scene.friction.kinetic,
+                mass_kg,
+                pressed.depth_mm,
+                pulled.speed_mm_s,
+                rig.scene.scene.plate.gravity_m_s2,
             )
-        )  # fmt: skip
+        )
     seconds = perf_counter() - start
     first, last = (round(float(t) * 1e9) if np.isfinite(t) else None for t in onsets)
     return ClosedForm((first, last), seconds)

@@ -89,11 +89,15 @@ def _slide_onsets(
     at = next(step.to for step in steps if isinstance(step, Move) and step.phase == "press")
     to = next(step.to for step in steps if isinstance(step, Move) and step.phase == "slide")
     done = run_slide(
-        springs_of(mock, skin_of(mock), seed), slide.depth_mm, slide.speed_mm_s,
+        springs_of(mock, skin_of(mock), seed),
+        slide.depth_mm,
+        slide.speed_mm_s,
         math.degrees(math.atan2(to.y_mm - at.y_mm, to.x_mm - at.x_mm)),
-        length_mm=at.distance_mm(to), press_mm_s=slide.press_mm_s, settled_s=slide.settled_s,
+        length_mm=at.distance_mm(to),
+        press_mm_s=slide.press_mm_s,
+        settled_s=slide.settled_s,
         step_mm=STEP_MM,
-    )  # fmt: skip
+    )
     slipped = done.slipped_s
     first = float(np.nanmin(slipped)) if np.isfinite(slipped).any() else math.nan
     return first, float(slipped[0]) - first

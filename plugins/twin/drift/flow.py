@@ -43,15 +43,24 @@ from sliplab.storage.trials.store import Store, StoreError
 
 FRICTION = "scene.friction.kinetic"
 """The parameter that a limit is for."""
-MADE = frozenset({
-    "scene.friction.papilla_scatter", "scene.skin.layer_step_mm", "scene.skin.height_scatter_mm",
-    "scene.skin.position_scatter_mm", "event_camera.threshold_sigma", "arm.vibration_hz",
-})  # fmt: skip
+MADE = frozenset(
+    {
+        "scene.friction.papilla_scatter",
+        "scene.skin.layer_step_mm",
+        "scene.skin.height_scatter_mm",
+        "scene.skin.position_scatter_mm",
+        "event_camera.threshold_sigma",
+        "arm.vibration_hz",
+    }
+)
 """What was drawn when skin, pixels and arm were made: it does not change in a campaign."""
-STIFFNESSES = frozenset({
-    "scene.skin.youngs_modulus_mpa", "scene.skin.base_normal_n_per_m",
-    "scene.skin.base_tangential_n_per_m",
-})  # fmt: skip
+STIFFNESSES = frozenset(
+    {
+        "scene.skin.youngs_modulus_mpa",
+        "scene.skin.base_normal_n_per_m",
+        "scene.skin.base_tangential_n_per_m",
+    }
+)
 """Without forces only friction over these is seen."""
 
 
@@ -127,9 +136,14 @@ def read_references(store: Store, item: Collected) -> References:
 
 
 def fit_drift(
-    store: Store, item: Collected, references: References, rig: RigFile, worlds: int,
-    spread: float, seed: int,
-) -> tuple[OneSpecimen, list[Drift]]:  # fmt: skip
+    store: Store,
+    item: Collected,
+    references: References,
+    rig: RigFile,
+    worlds: int,
+    spread: float,
+    seed: int,
+) -> tuple[OneSpecimen, list[Drift]]:
     """Fit every reference of a campaign; return the prior, and its parameters' drift in order."""
     guess = guess_of(rig)
     first = references.trials[0]
@@ -147,9 +161,16 @@ def fit_drift(
 
 
 def calibrate_drift(
-    store: Store, item: Collected, rig: RigFile, out: Path, *, worlds: int, spread: float,
-    seed: int, limit_percent: float | None = None,
-) -> DriftFit:  # fmt: skip
+    store: Store,
+    item: Collected,
+    rig: RigFile,
+    out: Path,
+    *,
+    worlds: int,
+    spread: float,
+    seed: int,
+    limit_percent: float | None = None,
+) -> DriftFit:
     """Fit a campaign's references one by one; write `drift.html` and `drift.json`.
 
     Args:
@@ -209,19 +230,29 @@ def parameter_drift(
     change = [_percent(span * slope) for slope in (line.slope, line.low, line.high)]
     relative = found.values - line.start
     return ParameterDrift(
-        key=it.key, title=it.title, unit=it.unit, identified=found.identified,
+        key=it.key,
+        title=it.title,
+        unit=it.unit,
+        identified=found.identified,
         start=float(np.exp(line.start)),
-        percent_per_100_trials=percent[0], low=percent[1], high=percent[2],
-        change_percent=change[0], change_low=change[1], change_high=change[2],
+        percent_per_100_trials=percent[0],
+        low=percent[1],
+        high=percent[2],
+        change_percent=change[0],
+        change_low=change[1],
+        change_high=change[2],
         changed=found.identified and line.p < 0.05 / together,
         references=tuple(
             ReferenceFit(
-                trial=trial.id, place=trial.index + 1, factor=float(np.exp(value)),
-                low=float(np.exp(value - 1.96 * error)), high=float(np.exp(value + 1.96 * error)),
+                trial=trial.id,
+                place=trial.index + 1,
+                factor=float(np.exp(value)),
+                low=float(np.exp(value - 1.96 * error)),
+                high=float(np.exp(value + 1.96 * error)),
             )
             for trial, value, error in zip(trials, relative, found.errors, strict=True)
         ),
-    )  # fmt: skip
+    )
 
 
 def beyond(it: ParameterDrift, limit_percent: float) -> bool:

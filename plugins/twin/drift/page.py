@@ -15,11 +15,12 @@ def row(it: ParameterDrift) -> list[str]:
     """Return an identified parameter as a row below `HEADER`."""
     start = f"{it.start:,.0f}" if it.start >= 1000.0 else f"{it.start:.3g}"
     return [
-        it.title, f"{start} {it.unit}".strip(),
+        it.title,
+        f"{start} {it.unit}".strip(),
         _percent(it.percent_per_100_trials, it.low, it.high),
         _percent(it.change_percent, it.change_low, it.change_high),
         "yes" if it.changed else "no",
-    ]  # fmt: skip
+    ]
 
 
 def _percent(middle: float, low: float, high: float) -> str:

@@ -169,8 +169,10 @@ def requests(wanted: Gap) -> dict[TrainedOn, list[RunRequest]]:
     for file, values in zip(drawn, samples, strict=True):
         write_drawn(wanted.rig, values, file)
     rigs: dict[TrainedOn, list[Path]] = {
-        "twin": [wanted.rig], "drawn": drawn, "assumed": [wanted.assumed],
-    }  # fmt: skip
+        "twin": [wanted.rig],
+        "drawn": drawn,
+        "assumed": [wanted.assumed],
+    }
     try:
         return {
             name: [

@@ -15,9 +15,18 @@ TITLES = {
     "assumed": "the rig file as it was",
 }
 COLUMNS = (
-    "trained on", "trials", "validation (%)", "accuracy (%)", "95 %", "behind (points)", "95 %",
-    "F1 (%)", "slides: incipient, gross (ms)", "gravity: lead (ms)", "disturbance: lead (ms)",
-)  # fmt: skip
+    "trained on",
+    "trials",
+    "validation (%)",
+    "accuracy (%)",
+    "95 %",
+    "behind (points)",
+    "95 %",
+    "F1 (%)",
+    "slides: incipient, gross (ms)",
+    "gravity: lead (ms)",
+    "disturbance: lead (ms)",
+)
 LATENCIES = 8
 """Column of the first latency; on a page the others would not fit beside them."""
 
@@ -53,14 +62,17 @@ def cells(it: GapNetwork) -> list[str]:
     strict, slides = it.windows.strict, it.experiments["kinematic"].latency_ms
     less = it.behind
     return [
-        _title(it), str(it.trials), _points(it.validation), _points(strict.share),
+        _title(it),
+        str(it.trials),
+        _points(it.validation),
+        _points(strict.share),
         _span(strict.low, strict.high),
         "–" if less is None else _points(less.share),
         "–" if less is None else _span(less.low, less.high),
         _points(it.f1),
         f"{number(slides.incipient.median, 0)}, {number(slides.gross.median, 0)}",
         *(number(it.experiments[name].lead_ms.median, 0) for name in ("gravity", "disturbance")),
-    ]  # fmt: skip
+    ]
 
 
 def _title(it: GapNetwork) -> str:

@@ -131,11 +131,18 @@ def measure_needs(
     left, cheapest = _cheapest(judged, spare, found, against)
     rows = [
         EffectNeed(
-            title=effect.title, verdict=it.verdict, shown_by=it.shown_by, loss=it.loss, low=it.low,
-            high=it.high, limit=it.limit, time=times[effect], left_out=effect in left,
+            title=effect.title,
+            verdict=it.verdict,
+            shown_by=it.shown_by,
+            loss=it.loss,
+            low=it.low,
+            high=it.high,
+            limit=it.limit,
+            time=times[effect],
+            left_out=effect in left,
         )
         for effect, it in found.items()
-    ]  # fmt: skip
+    ]
     rows += [EffectNeed(title=it.title, verdict="not in the scene") for it in lacking(scene)]
     rows += [
         EffectNeed(title=title, verdict="not shown", shown_by=trials)

@@ -174,11 +174,18 @@ class FakeNetFt:
         """Return the configuration page."""
         force, torque = self._units
         parts = {
-            "runstat": "0x00000000", "prodname": "fake Net F/T", "setserial": "FT00000",
-            "setfwver": "2.0", "setuserfilter": self.filter_number, "cfgcpf": COUNTS_PER_N,
-            "cfgcpt": COUNTS_PER_NM, "scfgfu": force, "scfgtu": torque, "comrdte": "Enabled",
+            "runstat": "0x00000000",
+            "prodname": "fake Net F/T",
+            "setserial": "FT00000",
+            "setfwver": "2.0",
+            "setuserfilter": self.filter_number,
+            "cfgcpf": COUNTS_PER_N,
+            "cfgcpt": COUNTS_PER_NM,
+            "scfgfu": force,
+            "scfgtu": torque,
+            "comrdte": "Enabled",
             "comrdtrate": self.rate_hz,
-        }  # fmt: skip
+        }
         body = "".join(f"<{name}>{value}</{name}>" for name, value in parts.items())
         return f'<?xml version="1.0"?><netft>{body}</netft>'.encode()
 

@@ -22,9 +22,15 @@ HEADER = 0x1234
 REQUEST = struct.Struct(">HHI")
 STOP, STREAM, SET_BIAS = 0x0000, 0x0002, 0x0042
 SEQUENCES = struct.Struct(">III")
-RECORD = np.dtype([
-    ("rdt", ">u4"), ("ft", ">u4"), ("status", ">u4"), ("force", ">i4", 3), ("torque", ">i4", 3),
-])  # fmt: skip
+RECORD = np.dtype(
+    [
+        ("rdt", ">u4"),
+        ("ft", ">u4"),
+        ("status", ">u4"),
+        ("force", ">i4", 3),
+        ("torque", ">i4", 3),
+    ]
+)
 ERROR, MONITOR = 1 << 31, 1 << 16
 """Any error; and the latch of a condition that somebody set on the sensor, which is none."""
 BITS = {
@@ -41,9 +47,16 @@ BITS = {
 PAGE, RATE_PAGE, FILTER_PAGE = "netftapi2.xml", "comm.cgi?comrdtrate=", "setting.cgi?setuserfilter="
 NEWTONS = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605, "klbf": 4448.2216152605, "kgf": 9.80665}
 NEWTON_METRES = {
-    "N-m": 1.0, "Nm": 1.0, "N-mm": 1e-3, "Nmm": 1e-3, "kN-m": 1e3, "kNm": 1e3,
-    "lbf-in": 0.1129848290276167, "lbf-ft": 1.3558179483314004, "kgf-cm": 0.0980665,
-}  # fmt: skip
+    "N-m": 1.0,
+    "Nm": 1.0,
+    "N-mm": 1e-3,
+    "Nmm": 1e-3,
+    "kN-m": 1e3,
+    "kNm": 1e3,
+    "lbf-in": 0.1129848290276167,
+    "lbf-ft": 1.3558179483314004,
+    "kgf-cm": 0.0980665,
+}
 
 
 def request(command: int, count: int = 0) -> bytes:

@@ -12,8 +12,16 @@ from sliplab.rigs.core.device_settings import DriverSettings
 Angle = Annotated[float, Field(ge=-360, le=360)]
 Filter = Literal[0, 5, 8, 18, 35, 73, 152, 326, 838]
 FILTER_NUMBERS: dict[int, int] = {
-    0: 0, 838: 1, 326: 2, 152: 3, 73: 4, 35: 5, 18: 6, 8: 7, 5: 8,
-}  # fmt: skip
+    0: 0,
+    838: 1,
+    326: 2,
+    152: 3,
+    73: 4,
+    35: 5,
+    18: 6,
+    8: 7,
+    5: 8,
+}
 """Numbers by which the sensor's web page names its low-pass filters, by their cut-off in Hz."""
 
 

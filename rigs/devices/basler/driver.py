@@ -170,9 +170,13 @@ class BaslerCamera:
         # pylon keeps no reference, so deregister the listener before it is deleted
         self._listener = Listener()
         self.device.RegisterCameraEventHandler(
-            self._listener, _END_OF_EXPOSURE, 1, pylon.RegistrationMode_Append,
-            pylon.Cleanup_None, pylon.CameraEventAvailability_Mandatory,
-        )  # fmt: skip
+            self._listener,
+            _END_OF_EXPOSURE,
+            1,
+            pylon.RegistrationMode_Append,
+            pylon.Cleanup_None,
+            pylon.CameraEventAvailability_Mandatory,
+        )
         self.nodes.put("ExposureEnd", "EventSelector")
         self.nodes.put("On", "EventNotification")
 

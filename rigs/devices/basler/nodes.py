@@ -203,13 +203,20 @@ _CHOICES = (
     ("TestPattern", _OFF),
 )
 _SWITCHES = (
-    "ReverseX", "ReverseY", "LUTEnable", "BslMultipleROIColumnsEnable", "BslMultipleROIRowsEnable",
-)  # fmt: skip
+    "ReverseX",
+    "ReverseY",
+    "LUTEnable",
+    "BslMultipleROIColumnsEnable",
+    "BslMultipleROIRowsEnable",
+)
 """Switches that are turned off."""
 _SCALES = (
-    "BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical",
+    "BinningHorizontal",
+    "BinningVertical",
+    "DecimationHorizontal",
+    "DecimationVertical",
     "BslScalingFactor",
-)  # fmt: skip
+)
 """Factors that are set to 1: the rig file's scale applies to the sensor's full resolution."""
 _NUMBERS = (
     ("BlackLevel", 0.0),
@@ -225,14 +232,33 @@ _LINE_TIMES = ("BslInputFilterTime", "BslInputHoldOffTime", "LineDebouncerTime")
 """Delays of an input, us, which are set to 0."""
 _RATES = ("BslResultingAcquisitionFrameRate", "ResultingFrameRate")
 _READ_BACK = (
-    *(name for name, _ in _CHOICES), *_SWITCHES, *_SCALES, *(name for name, _ in _NUMBERS),
-    "PixelFormat", "Gain", "ExposureTime", "ExposureTimeAbs", "AcquisitionFrameRateEnable",
-    "AcquisitionFrameRate", "AcquisitionFrameRateAbs", *_RATES, "BinningHorizontalMode",
-    "BinningVerticalMode", "BslColorSpace", "BslLightSourcePreset", "BslSaturation", "BslHue",
-    "ColorTransformationEnable", "BslSensorBitDepthMode", "BslConversionGainMode",
-    "SensorShutterMode", "SensorReadoutMode", "BslStaticDefectPixelCorrectionMode",
-    "DeviceLinkThroughputLimitMode", "DeviceLinkThroughputLimit",
-)  # fmt: skip
+    *(name for name, _ in _CHOICES),
+    *_SWITCHES,
+    *_SCALES,
+    *(name for name, _ in _NUMBERS),
+    "PixelFormat",
+    "Gain",
+    "ExposureTime",
+    "ExposureTimeAbs",
+    "AcquisitionFrameRateEnable",
+    "AcquisitionFrameRate",
+    "AcquisitionFrameRateAbs",
+    *_RATES,
+    "BinningHorizontalMode",
+    "BinningVerticalMode",
+    "BslColorSpace",
+    "BslLightSourcePreset",
+    "BslSaturation",
+    "BslHue",
+    "ColorTransformationEnable",
+    "BslSensorBitDepthMode",
+    "BslConversionGainMode",
+    "SensorShutterMode",
+    "SensorReadoutMode",
+    "BslStaticDefectPixelCorrectionMode",
+    "DeviceLinkThroughputLimitMode",
+    "DeviceLinkThroughputLimit",
+)
 _OF_TRIGGER = ("TriggerMode", "TriggerSource", "TriggerActivation", "TriggerDelay")
 _OF_LINE = ("LineMode", "LineInverter", "LineSource", *_LINE_TIMES)
 

@@ -11,9 +11,15 @@ from sliplab.rigs.core.address import Host
 from sliplab.rigs.core.device_settings import DriverSettings
 
 Readout = Literal[
-    "constant 100", "constant 200", "constant 500", "constant 1000",
-    "variable 2000", "variable 5000", "variable 10000", "variable 15000",
-]  # fmt: skip
+    "constant 100",
+    "constant 200",
+    "constant 500",
+    "constant 1000",
+    "variable 2000",
+    "variable 5000",
+    "variable 10000",
+    "variable 15000",
+]
 """Read-out modes that drop no events by design, by their names in dv-processing 2.0.4."""
 
 

@@ -285,12 +285,25 @@ def configure(camera: Any, settings: UsbCamera) -> None:
 
 
 _READ_BACK = (
-    "CropArea", "SubSampleHorizontal", "SubSampleVertical", "DualBinning", "Flatten",
-    "FlipHorizontal", "FlipVertical", "GlobalHold", "GlobalReset", "ReadoutFPS",
-    "ContrastThresholdOn", "ContrastThresholdOff", "DetectorRisingEdges", "DetectorFallingEdges",
-    "GeneratorInjectTriggerOnRisingEdge", "GeneratorInjectTriggerOnFallingEdge",
-    "TimeInterval", "TimestampOffset",
-)  # fmt: skip
+    "CropArea",
+    "SubSampleHorizontal",
+    "SubSampleVertical",
+    "DualBinning",
+    "Flatten",
+    "FlipHorizontal",
+    "FlipVertical",
+    "GlobalHold",
+    "GlobalReset",
+    "ReadoutFPS",
+    "ContrastThresholdOn",
+    "ContrastThresholdOff",
+    "DetectorRisingEdges",
+    "DetectorFallingEdges",
+    "GeneratorInjectTriggerOnRisingEdge",
+    "GeneratorInjectTriggerOnFallingEdge",
+    "TimeInterval",
+    "TimestampOffset",
+)
 """Settings that affect recorded data, by the names of the library's `get...` methods."""
 
 

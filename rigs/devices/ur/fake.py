@@ -43,25 +43,45 @@ _UINT32 = {"robot_status_bits", "safety_status_bits", "runtime_state"}
 _INT32 = {"robot_mode", "safety_mode"}
 _UINT64 = {"actual_digital_input_bits", "actual_digital_output_bits"}
 _SCALARS = {
-    "timestamp", "actual_execution_time", "speed_scaling", "target_speed_fraction",
-    "actual_momentum", "actual_main_voltage", "actual_robot_voltage", "actual_robot_current",
+    "timestamp",
+    "actual_execution_time",
+    "speed_scaling",
+    "target_speed_fraction",
+    "actual_momentum",
+    "actual_main_voltage",
+    "actual_robot_voltage",
+    "actual_robot_current",
     "payload",
-}  # fmt: skip
+}
 _VECTORS = {
     "joint_mode": "VECTOR6INT32",
     "payload_cog": "VECTOR3D",
     "actual_tool_accelerometer": "VECTOR3D",
     **dict.fromkeys(
         (
-            "actual_TCP_force", "actual_TCP_pose", "actual_TCP_speed", "actual_current",
-            "actual_joint_voltage", "actual_q", "actual_qd", "ft_raw_wrench",
-            "joint_control_output", "joint_temperatures", "payload_inertia", "target_TCP_pose",
-            "target_TCP_speed", "target_current", "target_moment", "target_q", "target_qd",
-            "target_qdd", "external_force_torque",
+            "actual_TCP_force",
+            "actual_TCP_pose",
+            "actual_TCP_speed",
+            "actual_current",
+            "actual_joint_voltage",
+            "actual_q",
+            "actual_qd",
+            "ft_raw_wrench",
+            "joint_control_output",
+            "joint_temperatures",
+            "payload_inertia",
+            "target_TCP_pose",
+            "target_TCP_speed",
+            "target_current",
+            "target_moment",
+            "target_q",
+            "target_qd",
+            "target_qdd",
+            "external_force_torque",
         ),
         "VECTOR6D",
     ),
-}  # fmt: skip
+}
 _UNKNOWN, _IN_USE = "NOT_FOUND", "IN_USE"
 """The controller's error answers in place of a type."""
 _LAYOUT = TYPES | {"VECTOR3D": "3d", "VECTOR6INT32": "6i"}

@@ -91,9 +91,10 @@ class Capture:
         top, left = (
             (whole - part) // 2
             for whole, part in (
-                (self._settings.height_px, height), (self._settings.width_px, width),
+                (self._settings.height_px, height),
+                (self._settings.width_px, width),
             )
-        )  # fmt: skip
+        )
         with self._lock:
             self._ready.clear()
             self._region = slice(top, top + height), slice(left, left + width)
@@ -116,9 +117,12 @@ class Capture:
                 np.stack([image for image, *_ in frames]) if frames else _NO_IMAGES,
                 np.array([number for _, number, _ in frames], np.int64),
                 np.array([host_ns for *_, host_ns in frames], np.int64),
-                self._fault, self._stall.waited_s(self._seen), self._grabbed > 0, self._grabbed,
+                self._fault,
+                self._stall.waited_s(self._seen),
+                self._grabbed > 0,
+                self._grabbed,
                 self._overflowed,
-            )  # fmt: skip
+            )
 
     def grabbed(self) -> int:
         """Return the number of frames since the start."""
@@ -185,11 +189,12 @@ def configure(device: Any, settings: UvcSettings) -> Json:
         ("rate_hz", cv2.CAP_PROP_FPS, settings.rate_hz, RATE_OFF * settings.rate_hz),
         ("auto_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL, 0.0),
         (
-            "exposure_us", cv2.CAP_PROP_EXPOSURE,
+            "exposure_us",
+            cv2.CAP_PROP_EXPOSURE,
             round(settings.exposure_us / EXPOSURE_UNIT_US),
             EXPOSURE_OFF * settings.exposure_us / EXPOSURE_UNIT_US,
         ),
-    ]  # fmt: skip
+    ]
     if settings.gain is not None:
         wanted.append(("gain", cv2.CAP_PROP_GAIN, settings.gain, 0.5))
     if settings.focus is not None:

@@ -44,8 +44,11 @@ def views(lens: str) -> list[Corners]:
 def test_the_board_that_is_printed_is_the_one_that_is_simulated() -> None:
     simulated = BoardPrint()
     assert (BOARD.columns, BOARD.rows, BOARD.square_mm, BOARD.marker_mm) == (
-        simulated.columns, simulated.rows, simulated.square_mm, simulated.marker_mm,
-    )  # fmt: skip
+        simulated.columns,
+        simulated.rows,
+        simulated.square_mm,
+        simulated.marker_mm,
+    )
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -130,8 +133,10 @@ def test_boards_that_do_not_lean_are_refused() -> None:
     flat = views("straight")[0]
     with pytest.raises(BoardError, match=r"lean"):
         fit_lens([flat] * 6, BOARD, SIZE)
-    places = [BoardPlace((x, y, 0.0), (0, 0), s) for x, y, s in
-              ((0, 0, 0), (-14, 8, 5), (14, -8, -5), (-14, -8, 90), (14, 8, 180))]  # fmt: skip
+    places = [
+        BoardPlace((x, y, 0.0), (0, 0), s)
+        for x, y, s in ((0, 0, 0), (-14, 8, 5), (14, -8, -5), (-14, -8, 90), (14, 8, 180))
+    ]
     seen = [find_corners(picture("straight", place), BOARD) for place in places]
     with pytest.raises(BoardError, match=r"lean"):
         fit_lens(seen, BOARD, SIZE)

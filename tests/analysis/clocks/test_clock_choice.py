@@ -48,9 +48,11 @@ def bent(rng: np.random.Generator, deviations: float, place: float) -> Train:
     scatter = (place**3 * (1 - place) ** 3 / 3) ** 0.5
     turn = float(rng.choice([-1, 1])) * deviations * JITTER_NS / pulses**0.5 / scatter
     return make_train(
-        rng, seconds=SECONDS, tick=TICK_NS,
+        rng,
+        seconds=SECONDS,
+        tick=TICK_NS,
         clock=lambda sent, _: turn * np.maximum(sent / sent[-1] - place, 0.0),
-    )  # fmt: skip
+    )
 
 
 NOISES: dict[str, Noise] = {
@@ -78,9 +80,7 @@ def test_a_straight_clock_gets_a_straight_line(noise: str, count: int) -> None:
     assert straight / trains >= 0.80
 
 
-@given(
-    seed=st.integers(0, 2**32 - 1), place=st.floats(0.1, 0.9), deviations=st.floats(7, 300)
-)  # fmt: skip
+@given(seed=st.integers(0, 2**32 - 1), place=st.floats(0.1, 0.9), deviations=st.floats(7, 300))
 def test_a_bent_clock_gets_a_bent_line_or_is_refused(
     seed: int, place: float, deviations: float
 ) -> None:

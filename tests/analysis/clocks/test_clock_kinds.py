@@ -59,9 +59,11 @@ def test_a_jump_taken_for_a_bend_is_within_the_stated_uncertainty(seed: int) -> 
 def test_a_jump_that_a_bend_explains_better_by_chance_is_stated(seed: int) -> None:
     """A tenth of a short train is so few pulses that a change of drift may explain them better."""
     made = make_train(
-        np.random.default_rng([11, seed]), seconds=20.0, tick=50_000_000,
+        np.random.default_rng([11, seed]),
+        seconds=20.0,
+        tick=50_000_000,
         clock=lambda sent, _: np.where(sent > 0.1 * sent[-1], 2e4, 0.0),
-    )  # fmt: skip
+    )
     fit = fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
     vouched = (made.true >= fit.first_ns) & (made.true <= fit.last_ns)
     error = np.abs(fit.map.to_reference(made.true) - made.sent)[vouched].max()

@@ -23,9 +23,16 @@ def fitted(device: Ints, reference: Ints, **limits: float) -> ClockFit | str:
 def issued(rng: np.random.Generator) -> tuple[Ints, Ints, Ints]:
     """A train as bad as a trial may have: stamps, reference, true device times."""
     made = trains(
-        rng, rng.uniform(20, 60), rng.uniform(-200, 200), int(rng.integers(-DAY_NS, DAY_NS)),
-        5_000, rng.uniform(0, 0.2), 0.05, 0.05, 0.05,
-    )  # fmt: skip
+        rng,
+        rng.uniform(20, 60),
+        rng.uniform(-200, 200),
+        int(rng.integers(-DAY_NS, DAY_NS)),
+        5_000,
+        rng.uniform(0, 0.2),
+        0.05,
+        0.05,
+        0.05,
+    )
     return made.device, made.reference, made.true_device
 
 

@@ -45,8 +45,9 @@ def test_levels_let_through_what_is_allowed_and_are_the_lowest(
     def early(incipient: float, gross: float) -> tuple[int, int]:
         scored = outcomes(trials, Levels(incipient, gross), EARLY)
         return (
-            sum(t.false_early_incipient for t in scored), sum(t.false_early_gross for t in scored)
-        )  # fmt: skip
+            sum(t.false_early_incipient for t in scored),
+            sum(t.false_early_gross for t in scored),
+        )
 
     assert max(early(levels.incipient, levels.gross)) <= allowed
     below = np.nextafter(levels.incipient, -np.inf)
@@ -58,8 +59,9 @@ def test_levels_let_through_what_is_allowed_and_are_the_lowest(
 def test_a_level_by_hand() -> None:
     # windows end at 30, 60, .. ms, the onset is at 120: those that end before 90 are too early
     trials = [
-        judged([1, 5, 9, 9, 9, 9, 9, 9, 9], [0] * 9), judged([2, 3, 9, 9, 9, 9, 9, 9, 9], [0] * 9)
-    ]  # fmt: skip
+        judged([1, 5, 9, 9, 9, 9, 9, 9, 9], [0] * 9),
+        judged([2, 3, 9, 9, 9, 9, 9, 9, 9], [0] * 9),
+    ]
     assert set_levels(trials, 0, EARLY).incipient == 5
     assert set_levels(trials, 1, EARLY).incipient == 3
 
@@ -81,10 +83,16 @@ def test_a_share_is_a_whole_number_of_trials(rate: float, trials: int, allowed: 
 
 def scored(latency: float | None, early: bool = False) -> TrialLatency:
     return TrialLatency(
-        latency_incipient_ms=latency, latency_gross_ms=None, lead_ms=None, late_incipient_ms=None,
-        late_gross_ms=None, missed_incipient=latency is None and not early, missed_gross=True,
-        false_early_incipient=early, false_early_gross=False,
-    )  # fmt: skip
+        latency_incipient_ms=latency,
+        latency_gross_ms=None,
+        lead_ms=None,
+        late_incipient_ms=None,
+        late_gross_ms=None,
+        missed_incipient=latency is None and not early,
+        missed_gross=True,
+        false_early_incipient=early,
+        false_early_gross=False,
+    )
 
 
 def test_a_missed_onset_is_late_and_a_false_one_is_left_out() -> None:
@@ -110,8 +118,11 @@ def test_the_quickest_pair_within_the_bound_is_chosen() -> None:
     choice = choose_smoothing(trials, ask, "validation")
     assert (choice.smoothing, choice.margin, choice.false_early) == (1, 5.0, 0)
     assert (choice.split, choice.trials, choice.allowed, choice.median_ms) == (
-        "validation", 2, 0, 30.0
-    )  # fmt: skip
+        "validation",
+        2,
+        0,
+        30.0,
+    )
     after = settled(ask, choice)
     assert (after.smoothing, after.margin, after.smoothing_grid) == (1, 5.0, (1, 4))
     assert settled(ask, None) is ask

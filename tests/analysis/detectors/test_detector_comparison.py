@@ -96,9 +96,7 @@ def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparis
     assert other is not None
     for mine, theirs in zip(compared.detectors, other.detectors, strict=True):
         for a, b in zip(mine.rates, theirs.rates, strict=True):
-            assert (a.levels, a.choice, a.validation) == (
-                b.levels, b.choice, b.validation
-            )  # fmt: skip
+            assert (a.levels, a.choice, a.validation) == (b.levels, b.choice, b.validation)
 
 
 def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> None:
@@ -111,9 +109,12 @@ def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> 
 
     of = parts()
     found = compare(
-        Parts(seen(of.train), seen(of.validation), seen(of.test)), WINDOWS, SETTINGS, 10,
+        Parts(seen(of.train), seen(of.validation), seen(of.test)),
+        WINDOWS,
+        SETTINGS,
+        10,
         WINDOWS.steps,
-    )  # fmt: skip
+    )
     assert found is not None
     for mine, theirs in zip(found.detectors, compared.detectors, strict=True):
         assert mine.curve == theirs.curve

@@ -98,9 +98,11 @@ def test_the_third_state_needs_two_windows() -> None:
 def test_rates_come_from_durations() -> None:
     # 30 windows without slip in three trials, left in two; 10 of incipient slip, left in one
     trials = [
-        np.repeat([0, 1, 2], [10, 4, 5]), np.repeat([0, 1], [12, 6]), np.zeros(8, int),
+        np.repeat([0, 1, 2], [10, 4, 5]),
+        np.repeat([0, 1], [12, 6]),
+        np.zeros(8, int),
         np.empty(0, int),
-    ]  # fmt: skip
+    ]
     chain = fit_chain(trials, 3)
     np.testing.assert_allclose(chain.leave, [(2 + 1) / (30 + 2), (1 + 1) / (10 + 2)])
 

@@ -208,8 +208,10 @@ def test_a_quiet_scene_is_judged_by_the_clock() -> None:
     assert live.advance(5000) == []
     made = live.advance(5000 + 3 * LENGTH_US)
     assert [(item.start_us, item.events, item.by_event) for item in made] == [
-        (5000, 0, False), (9000, 0, False), (13000, 0, False),
-    ]  # fmt: skip
+        (5000, 0, False),
+        (9000, 0, False),
+        (13000, 0, False),
+    ]
     assert not np.concatenate(network.seen).any()
     assert made[0].last_event_us is None
     assert live.advance(12000) == []  # time does not go back
@@ -269,9 +271,11 @@ def test_a_clock_that_falls_back_is_another_clock() -> None:
 
 def test_counts_stop_at_255_whatever_the_pieces() -> None:
     many = EventChunk(
-        np.full(400, 30, np.uint16), np.full(400, 20, np.uint16), np.ones(400, np.uint8),
+        np.full(400, 30, np.uint16),
+        np.full(400, 20, np.uint16),
+        np.ones(400, np.uint8),
         np.arange(400, dtype=np.int64),
-    )  # fmt: skip
+    )
     network = Network()
     live = detector(network)
     for begin in range(0, 400, 90):
@@ -289,10 +293,12 @@ def test_what_is_wrong_is_refused() -> None:
     with pytest.raises(ValueError, match="outside 60 x 50"):
         detector(Network()).push(
             EventChunk(
-                np.array([60], np.uint16), np.array([0], np.uint16), np.array([1], np.uint8),
+                np.array([60], np.uint16),
+                np.array([0], np.uint16),
+                np.array([1], np.uint8),
                 np.array([0]),
             )
-        )  # fmt: skip
+        )
     with pytest.raises(ValueError, match="expected integers"):
         StepRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
 

@@ -38,14 +38,16 @@ def reference(
 
 def decided(incipient_ms: int | None, references: References, gross_ms: int = 1550) -> Decided:
     found = None if incipient_ms is None else START + incipient_ms * MS
-    return Decided(Found(found, None if found is None else START + gross_ms * MS),
-                   references, TOLERANCE)  # fmt: skip
+    return Decided(
+        Found(found, None if found is None else START + gross_ms * MS), references, TOLERANCE
+    )
 
 
 LATE_LABEL: References = {
-    "paper": reference(1000), "change_point": reference(902, 1400, (899, 905)),
+    "paper": reference(1000),
+    "change_point": reference(902, 1400, (899, 905)),
     "true": reference(900, 1400),
-}  # fmt: skip
+}
 
 
 def test_a_decision_between_the_onsets_is_false_early_by_one_and_a_latency_by_the_other() -> None:
@@ -135,10 +137,15 @@ def label(rule: str = "paper", **changed: Any) -> TrialLabel:
     onsets = {"paper": (310, 450), "change_point": (260, 400)}
     none = {"incipient": None, "gross": None}
     parts = {
-        name: {"incipient_ns": a * MS, "gross_ns": b * MS, "doubts": none, "first_marker": 1,
-               "per_marker_ns": [b * MS, a * MS]}
+        name: {
+            "incipient_ns": a * MS,
+            "gross_ns": b * MS,
+            "doubts": none,
+            "first_marker": 1,
+            "per_marker_ns": [b * MS, a * MS],
+        }
         for name, (a, b) in onsets.items()
-    }  # fmt: skip
+    }
     parts["change_point"] |= {"low_ns": [399 * MS, 258 * MS], "high_ns": [401 * MS, 263 * MS]}
     return TrialLabel.model_validate(
         {**parts[rule], **parts, "rule": rule, "end_ns": 600 * MS, **changed}
@@ -209,18 +216,32 @@ def test_the_labels_own_rule_is_as_every_other_figure_has_it(
 
 def test_an_evaluation_of_before_has_no_figures_by_reference(tmp_path: Path) -> None:
     latency = {
-        "mean": None, "std": None, "median": None, "p95": None, "min": None, "max": None,
-        "n": 0, "missed": 0, "late": 0, "false_early": 0,
-    }  # fmt: skip
+        "mean": None,
+        "std": None,
+        "median": None,
+        "p95": None,
+        "min": None,
+        "max": None,
+        "n": 0,
+        "missed": 0,
+        "late": 0,
+        "false_early": 0,
+    }
     trials = {
-        "false_early_before_ms": [], "false_early_rate": {"value": 0, "low": 0, "high": 1},
-        "median_with_missed_ms": None, "latency_ms": {"incipient": latency, "gross": latency},
+        "false_early_before_ms": [],
+        "false_early_rate": {"value": 0, "low": 0, "high": 1},
+        "median_with_missed_ms": None,
+        "latency_ms": {"incipient": latency, "gross": latency},
         "lead_ms": {**latency, "detected_first": 0},
-    }  # fmt: skip
+    }
     older = {
-        "asked": 0.02, "allowed": 0, "choice": 4, "levels": {"incipient": 1.0, "gross": None},
-        "validation": trials, "test": trials,
-    }  # fmt: skip
+        "asked": 0.02,
+        "allowed": 0,
+        "choice": 4,
+        "levels": {"incipient": 1.0, "gross": None},
+        "validation": trials,
+        "test": trials,
+    }
     read = DetectorRate.model_validate(older)
     assert read.by_reference == {}
     assert read.to_json() == older

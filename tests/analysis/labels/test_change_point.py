@@ -21,9 +21,15 @@ Slip = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def slip(
-    at: float, rng: np.random.Generator, *, speed: float = 0.2, jerk: float = 0.0,
-    wander: float = 0.02, exposure: float = 0.2, n: int = 100,
-) -> Slip:  # fmt: skip
+    at: float,
+    rng: np.random.Generator,
+    *,
+    speed: float = 0.2,
+    jerk: float = 0.0,
+    wander: float = 0.02,
+    exposure: float = 0.2,
+    n: int = 100,
+) -> Slip:
     """Times, offsets and their standard deviation of a marker that lets go at frame `at`.
 
     Its velocity wanders from there on; a place is the mean over the exposure (shares of a frame).

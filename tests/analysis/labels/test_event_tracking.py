@@ -124,9 +124,11 @@ def test_noise_is_no_layout() -> None:
     draw = np.random.default_rng(1)
     n = 20_000
     noise = EventChunk(
-        draw.integers(0, 640, n).astype(np.uint16), draw.integers(0, 480, n).astype(np.uint16),
-        draw.integers(0, 2, n).astype(np.uint8), np.sort(draw.integers(0, 300_000, n)),
-    )  # fmt: skip
+        draw.integers(0, 640, n).astype(np.uint16),
+        draw.integers(0, 480, n).astype(np.uint16),
+        draw.integers(0, 2, n).astype(np.uint8),
+        np.sort(draw.integers(0, 300_000, n)),
+    )
     assert find_discs(noise, DOWN, SIZE) is None
     assert find_discs(kept(noise, noise.t_us < 1000), DOWN, SIZE) is None
 

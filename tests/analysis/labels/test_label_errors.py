@@ -24,9 +24,14 @@ def held(slips_px: list[float | None], start_ms: int | None, end_ms: int) -> dic
         for at in (None if start_ms is None else start_ms * MS, end_ms * MS)
     )
     return {
-        **label(), "rule": "paper", "reference": "hold_start", "paper": start, "change_point": end,
-        "references": {"hold_start": start, "hold_end": end}, "hold_slip_px": slips_px,
-    }  # fmt: skip
+        **label(),
+        "rule": "paper",
+        "reference": "hold_start",
+        "paper": start,
+        "change_point": end,
+        "references": {"hold_start": start, "hold_end": end},
+        "hold_slip_px": slips_px,
+    }
 
 
 def test_slips_in_the_hold_are_counted_and_their_size_told(tmp_path: Path) -> None:
@@ -44,8 +49,11 @@ def test_slips_in_the_hold_are_counted_and_their_size_told(tmp_path: Path) -> No
     assert (found.trials, found.slipped, found.limit_px) == (4, 1, 1.0)
     assert found.most_px == 7.5
     assert found.apart_ms.incipient.to_json() == {
-        "n": 3, "median": 10.0, "median_abs": 10.0, "max_abs": 1780.0
-    }  # fmt: skip
+        "n": 3,
+        "median": 10.0,
+        "median_abs": 10.0,
+        "max_abs": 1780.0,
+    }
     assert found.apart_ms.gross.max_abs == 0.0
 
 
@@ -67,5 +75,6 @@ def test_a_label_is_held_against_the_truth_of_its_own_reference(
     other |= {"reference": "hold_end", "paper": other["references"]["hold_end"]}
     derived.write(made.ids[1], made.keys[made.ids[1]], other)
     assert distances(made.store, [made.item])["paper"] == {
-        "incipient": [5.0, 4.0], "gross": [2.0, 0.0]
-    }  # fmt: skip
+        "incipient": [5.0, 4.0],
+        "gross": [2.0, 0.0],
+    }

@@ -38,9 +38,11 @@ def places(
         at[..., 1] += sunk[:, None]
     at += draw.normal(0, noise, at.shape)
     track = PlateTrack(
-        np.stack([np.full(N, 400.0), 400.0 + sunk], -1), np.full((N, 4, 2), np.nan),
-        np.ones(N, np.bool_), np.full(N, 0.01),
-    )  # fmt: skip
+        np.stack([np.full(N, 400.0), 400.0 + sunk], -1),
+        np.full((N, 4, 2), np.nan),
+        np.ones(N, np.bool_),
+        np.full(N, 0.01),
+    )
     sigma = np.full((N, M), max(noise, 1e-6))
     return Places(at, sigma, np.ones((N, M)), track if plate else None)
 
@@ -48,9 +50,14 @@ def places(
 def label(seen: Places, **settings: Any) -> Label:
     frame_ns = np.arange(N, dtype=np.int64) * FRAME_NS
     return label_places(
-        seen, frame_ns, (START * FRAME_NS, N * FRAME_NS), Labelling(**settings), centre=0,
-        exposure_ns=2_000_000, source="tracks",
-    )  # fmt: skip
+        seen,
+        frame_ns,
+        (START * FRAME_NS, N * FRAME_NS),
+        Labelling(**settings),
+        centre=0,
+        exposure_ns=2_000_000,
+        source="tracks",
+    )
 
 
 def crossing(label: Label, reference: str) -> float:

@@ -44,17 +44,24 @@ def test_decisions_count_only_when_asked(made: Reviewable) -> None:
         assert reviewed.read(made.item, made.recording(trial)).gross_ns == label()["gross_ns"]
         assert reviewed.key(made.item, made.recording(trial)) == made.keys[trial]
     assert reviewed.states([made.item]) == {
-        "open": 9, "accepted": 1, "adjusted": 1, "rejected": 1, "stale": 0
-    }  # fmt: skip
+        "open": 9,
+        "accepted": 1,
+        "adjusted": 1,
+        "rejected": 1,
+        "stale": 0,
+    }
 
 
 def test_keys_follow_from_the_onsets_that_were_decided(made: Reviewable) -> None:
     labels, trial = Labels(made.store, reviewed=True), made.ids[0]
     keys = [labels.key(made.item, made.recording(trial))]
     for verdict, new in (
-        ("adjust", ADJUSTED), ("adjust", Onsets(300_000_000, 500_000_001)), ("adjust", ADJUSTED),
-        ("reject", Onsets()), ("accept", Onsets()),
-    ):  # fmt: skip
+        ("adjust", ADJUSTED),
+        ("adjust", Onsets(300_000_000, 500_000_001)),
+        ("adjust", ADJUSTED),
+        ("reject", Onsets()),
+        ("accept", Onsets()),
+    ):
         made.decide(trial, verdict, new)  # type: ignore[arg-type]  # of the two verdicts
         keys.append(labels.key(made.item, made.recording(trial)))
     assert keys[0] == keys[5] == made.keys[trial]

@@ -68,8 +68,9 @@ def test_a_share_of_windows_is_held_as_often_as_said(a: int, b: int, n: int) -> 
     assert as_said(coverage(measure, a / (a + b), n))
 
 
-@pytest.mark.parametrize(("statistic", "n"), [("median", 6), ("median", 12), ("median", 132),
-                                              ("p95", 72), ("p95", 132)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("statistic", "n"), [("median", 6), ("median", 12), ("median", 132), ("p95", 72), ("p95", 132)]
+)
 def test_a_quantile_is_held_as_often_as_said(statistic: str, n: int) -> None:
     truth = stats.gamma.ppf({"median": 0.5, "p95": 0.95}[statistic], 4, scale=25)
     found = coverage(lambda rng: interval(rng.gamma(4, 25, n), statistic), truth, n)
@@ -295,9 +296,12 @@ def test_median_of_worlds_knows_that_their_values_are_alike() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.lists(st.tuples(st.sampled_from([10.0, 20.0, 30.0, 40.0, np.inf]), st.integers(0, 7)),
-             min_size=1, max_size=60)
-)  # fmt: skip
+    st.lists(
+        st.tuples(st.sampled_from([10.0, 20.0, 30.0, 40.0, np.inf]), st.integers(0, 7)),
+        min_size=1,
+        max_size=60,
+    )
+)
 def test_interval_of_a_median_of_ties_holds_it(rows: list[tuple[float, int]]) -> None:
     values = np.array([value for value, _ in rows])
     span = median_interval(values, [world for _, world in rows])

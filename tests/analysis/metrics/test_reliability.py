@@ -29,8 +29,14 @@ def test_the_usual_margins_begin_a_row_and_the_last_is_open() -> None:
     counts = np.stack([leads, np.zeros(8, int), np.zeros(8, int)], axis=1)
     rows = by_lead(counts, np.zeros(8, int), np.arange(8))
     assert [(r.lead, r.to, r.n) for r in rows] == [
-        (0, 0, 1), (1, 1, 1), (2, 2, 1), (6, 7, 1), (8, 11, 1), (64, 95, 1), (96, None, 2),
-    ]  # fmt: skip
+        (0, 0, 1),
+        (1, 1, 1),
+        (2, 2, 1),
+        (6, 7, 1),
+        (8, 11, 1),
+        (64, 95, 1),
+        (96, None, 2),
+    ]
 
 
 def test_temperature_has_a_closed_form_for_one_kind_of_lead() -> None:

@@ -48,16 +48,23 @@ def papers(
 
     def neurons() -> IAFSqueeze:
         return IAFSqueeze(
-            num_timesteps=steps, spike_fn=SingleSpike, reset_fn=MembraneReset(),
+            num_timesteps=steps,
+            spike_fn=SingleSpike,
+            reset_fn=MembraneReset(),
             spike_threshold=torch.tensor(threshold),
-        )  # fmt: skip
+        )
 
     net = nn.Sequential(
-        nn.Conv2d(1, 4, 5, padding=2, bias=False), neurons(),
-        nn.Conv2d(4, 6, 3, stride=2, padding=1, bias=False), neurons(),
-        nn.Flatten(), nn.Linear(6 * (cells // 2) ** 2, 16), neurons(),
-        nn.Linear(16, outputs), neurons(),
-    )  # fmt: skip
+        nn.Conv2d(1, 4, 5, padding=2, bias=False),
+        neurons(),
+        nn.Conv2d(4, 6, 3, stride=2, padding=1, bias=False),
+        neurons(),
+        nn.Flatten(),
+        nn.Linear(6 * (cells // 2) ** 2, 16),
+        neurons(),
+        nn.Linear(16, outputs),
+        neurons(),
+    )
     return rounded(net, step)
 
 
@@ -139,12 +146,17 @@ def test_pools_leaks_and_sinabs_default_neurons(tmp_path: Path) -> None:
     torch.manual_seed(1)
     multi = {"spike_fn": MultiSpike, "reset_fn": MembraneSubtract()}
     net = nn.Sequential(
-        nn.Conv2d(1, 4, 3, padding=1), IAFSqueeze(num_timesteps=STEPS, min_v_mem=-1.0, **multi),
-        SumPool2d(2), nn.Conv2d(4, 4, (3, 3)),
+        nn.Conv2d(1, 4, 3, padding=1),
+        IAFSqueeze(num_timesteps=STEPS, min_v_mem=-1.0, **multi),
+        SumPool2d(2),
+        nn.Conv2d(4, 4, (3, 3)),
         LIFSqueeze(tau_mem=15.0, num_timesteps=STEPS, norm_input=False, **multi),
-        nn.AvgPool2d(2), nn.MaxPool2d(2, 1), nn.Flatten(), nn.Linear(4, 5),
+        nn.AvgPool2d(2),
+        nn.MaxPool2d(2, 1),
+        nn.Flatten(),
+        nn.Linear(4, 5),
         IAFSqueeze(num_timesteps=STEPS, **multi),
-    )  # fmt: skip
+    )
     rounded(net, 0.1)
     both = {"spikes": "multi", "reset": "subtract"}
     layers = [
@@ -239,37 +251,50 @@ ENTRIES: dict[str, tuple[str, torch.Tensor | None, str]] = {
     "biases in a column": ("5.bias", torch.ones(16, 1), r"= \[16, 1\]: must have the shape \[16\]"),
     "a bias without a shape": ("5.bias", torch.tensor(1.0), r"= \[\]: must have the shape \[16\]"),
     "a bias that is NaN": (
-        "7.bias", torch.tensor([0, NAN, 1]), r"= \[3\]: 1 of its 3 values are NaN, infinite",
+        "7.bias",
+        torch.tensor([0, NAN, 1]),
+        r"= \[3\]: 1 of its 3 values are NaN, infinite",
     ),
     "a bias too large": (
-        "7.bias", torch.tensor([0, 1e300, -INF], dtype=torch.float64), "2 of its 3 values",
+        "7.bias",
+        torch.tensor([0, 1e300, -INF], dtype=torch.float64),
+        "2 of its 3 values",
     ),
     "a convolution's biases": ("2.bias", torch.ones(4), r"= \[4\]: must have the shape \[6\]"),
     "a convolution's NaN": ("0.bias", torch.full((4,), NAN), "4 of its 4 values"),
     "weights that are NaN": ("5.weight", torch.full((16, 216), NAN), r"= \[16, 216\]: 3456 of its"),
     "weights that are infinite": ("0.weight", torch.full((4, 1, 5, 5), INF), "100 of its 100"),
     "weights for two channels": (
-        "0.weight", torch.ones(4, 2, 5, 5),
+        "0.weight",
+        torch.ones(4, 2, 5, 5),
         r"= \[4, 2, 5, 5\]: takes 2 inputs, but layers\[0\] is given 1 channels, \[1, 12, 12\]",
     ),
     "a row of weights": (
-        "5.weight", torch.ones(216), r"= \[216\]: layers\[5\] takes .* \(outputs, inputs\)"
+        "5.weight",
+        torch.ones(216),
+        r"= \[216\]: layers\[5\] takes .* \(outputs, inputs\)",
     ),
     "no outputs": ("5.weight", torch.ones(0, 216), r"= \[0, 216\]: layers\[5\] takes weights"),
     "complex weights": (
-        "5.weight", torch.ones(16, 216, dtype=torch.complex64), "must be a plain tensor of real",
+        "5.weight",
+        torch.ones(16, 216, dtype=torch.complex64),
+        "must be a plain tensor of real",
     ),
     "sparse weights": ("5.weight", torch.ones(16, 216).to_sparse(), "must be a plain tensor"),
     "missing weights": ("5.weight", None, r": is missing, and layers\[5\] takes it; .*: 7\.w"),
     "a surplus entry": ("9.weight", torch.ones(3, 3), r"= \[3, 3\]: no layer of the description"),
     "a threshold that is NaN": ("1.spike_threshold", torch.tensor(NAN), "1 of its 1 values"),
     "a threshold below zero": (
-        "1.spike_threshold", torch.tensor(-1.0), r"= \[\]: is -1 and must be above zero",
+        "1.spike_threshold",
+        torch.tensor(-1.0),
+        r"= \[\]: is -1 and must be above zero",
     ),
     "a threshold for each": (
-        "1.spike_threshold", torch.ones(4), r"= \[4\]: must be one number for all neurons",
+        "1.spike_threshold",
+        torch.ones(4),
+        r"= \[4\]: must be one number for all neurons",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", ENTRIES)

@@ -51,9 +51,12 @@ def test_probabilities_are_those_of_scikit_learn() -> None:
     train, validation = samples(300, 5), samples(100, 6)
     ours = marker_net.fit(train, validation, seed=9)
     model = MLPClassifier(
-        (marker_net.HIDDEN,), alpha=marker_net.RIDGE, batch_size=marker_net.BATCH,
-        learning_rate_init=marker_net.LEARNING_RATE, random_state=9,
-    )  # fmt: skip
+        (marker_net.HIDDEN,),
+        alpha=marker_net.RIDGE,
+        batch_size=marker_net.BATCH,
+        learning_rate_init=marker_net.LEARNING_RATE,
+        random_state=9,
+    )
     z = np.arcsinh(train.x.reshape(len(train), -1).astype(float))
     for _ in range(ours.chosen_epoch):
         model.partial_fit(z, train.y, classes=[0, 1, 2])
@@ -91,9 +94,12 @@ def test_a_damaged_file_is_refused(net: marker_net.MarkerNet, tmp_path: Path, ha
 def test_too_few_samples_are_named() -> None:
     some = samples(60, 1)
     two = MarkerSamples(
-        some.x[some.y < 2], some.y[some.y < 2], some.trial[some.y < 2],
-        some.newest_ns[some.y < 2], some.trials,
-    )  # fmt: skip
+        some.x[some.y < 2],
+        some.y[some.y < 2],
+        some.trial[some.y < 2],
+        some.newest_ns[some.y < 2],
+        some.trials,
+    )
     with pytest.raises(ValueError, match="no training samples of gross"):
         marker_net.fit(two, some, seed=0)
     with pytest.raises(ValueError, match="no validation samples"):

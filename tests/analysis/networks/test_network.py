@@ -75,8 +75,11 @@ def test_default_sizes_fit_the_chip() -> None:
     assert list(plain) == [f"{name}.weight" for name in WEIGHTED]
     # on the chip a fully connected layer is a convolution over all of its input
     for ins, outs, kernel, stride, padding, side in (
-        (1, 8, 5, 1, 2, 20), (8, 16, 3, 2, 1, 20), (16, 32, 10, 1, 0, 10), (32, 3, 1, 1, 0, 1),
-    ):  # fmt: skip
+        (1, 8, 5, 1, 2, 20),
+        (8, 16, 3, 2, 1, 20),
+        (16, 32, 10, 1, 0, 10),
+        (32, 3, 1, 1, 0, 1),
+    ):
         said = validate_memory_mapping_speck(
             ins, outs, (kernel,) * 2, (stride,) * 2, (padding,) * 2, (side,) * 2
         )

@@ -297,9 +297,12 @@ def test_any_number_of_classes(classes: int, outputs: int) -> None:
     """Of taxels, 78 channels of one cell, over 250 steps; and of a square crop."""
     for windows, share in ((TAXELS, 0.13), (TINY, 0.3)):
         network = Network(
-            conv1_channels=9, conv2_channels=7, hidden=11, outputs_per_class=outputs,
+            conv1_channels=9,
+            conv2_channels=7,
+            hidden=11,
+            outputs_per_class=outputs,
             weight_scale=(1.0, 3.0, 4.0, 3.0),
-        )  # fmt: skip
+        )
         net = on_own_grid(biased(build(network, windows, 4, classes), 4))
         x = sparse(5, windows, classes, share)
         expected = spike_counts(net, x)

@@ -233,9 +233,12 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
 @pytest.mark.parametrize("windows", [TINY, TAXELS], ids=["crop", "taxels"])
 def test_gradients_of_any_number_of_classes(classes: int, windows: Windows) -> None:
     network = Network(
-        conv1_channels=9, conv2_channels=7, hidden=11, outputs_per_class=2,
+        conv1_channels=9,
+        conv2_channels=7,
+        hidden=11,
+        outputs_per_class=2,
         weight_scale=(1.0, 3.0, 4.0, 3.0),
-    )  # fmt: skip
+    )
     net = on_own_grid(biased(build(network, windows, 3, classes), 3))
     x = sparse(4, windows, 5, 0.13 if windows is TAXELS else 0.3)
     y = torch.arange(4) * 7 % classes

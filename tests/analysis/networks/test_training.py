@@ -333,10 +333,20 @@ def damaged(path: Path, kind: str, good: bytes) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        "empty", "half", "one bit", "not torch", "other zip", "code", "pickle", "other format",
-        "other content", "key missing", "wrong shape", "wrong setting",
+        "empty",
+        "half",
+        "one bit",
+        "not torch",
+        "other zip",
+        "code",
+        "pickle",
+        "other format",
+        "other content",
+        "key missing",
+        "wrong shape",
+        "wrong setting",
     ],
-)  # fmt: skip
+)
 def test_a_damaged_or_foreign_file_is_refused_by_name(
     kind: str, fitted: Fitted, tmp_path: Path
 ) -> None:
@@ -451,10 +461,15 @@ def touches(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def test_other_classes_are_learned_from_taxels(tmp_path: Path) -> None:
     states: list[bytes] = []
     found = fit(
-        *touches(200, 0), *touches(50, 1), NETWORK, SKIN,
-        TRAINING.model_copy(update={"epochs": 8, "patience": 8}), 0, classes=OBJECTS,
+        *touches(200, 0),
+        *touches(50, 1),
+        NETWORK,
+        SKIN,
+        TRAINING.model_copy(update={"epochs": 8, "patience": 8}),
+        0,
+        classes=OBJECTS,
         on_state=states.append,
-    )  # fmt: skip
+    )
     x, y = touches(100, 2)
     counts = predict_counts(found, x)
     assert counts.shape == (100, 5)
@@ -463,9 +478,15 @@ def test_other_classes_are_learned_from_taxels(tmp_path: Path) -> None:
     assert strict is not None
     assert strict > 0.6  # chance is 0.2
     again = fit(
-        *touches(200, 0), *touches(50, 1), NETWORK, SKIN, found.training, 0, classes=OBJECTS,
+        *touches(200, 0),
+        *touches(50, 1),
+        NETWORK,
+        SKIN,
+        found.training,
+        0,
+        classes=OBJECTS,
         state=states[2],
-    )  # fmt: skip
+    )
     assert again.history == found.history
     save(tmp_path / "a.pt", found)
     read = load(tmp_path / "a.pt")
@@ -473,9 +494,15 @@ def test_other_classes_are_learned_from_taxels(tmp_path: Path) -> None:
     np.testing.assert_array_equal(predict_counts(read, x), counts)
     with pytest.raises(ValueError, match="shape"):
         fit(
-            *touches(200, 0), *touches(50, 1), NETWORK, SKIN, found.training, 0,
-            classes=(*OBJECTS, "pen"), state=states[2],
-        )  # fmt: skip
+            *touches(200, 0),
+            *touches(50, 1),
+            NETWORK,
+            SKIN,
+            found.training,
+            0,
+            classes=(*OBJECTS, "pen"),
+            state=states[2],
+        )
 
 
 def test_models_of_slip_do_not_name_their_classes(fitted: Fitted, tmp_path: Path) -> None:

@@ -113,12 +113,11 @@ def page(tmp_path: Path) -> str:
     set_aside(tmp_path, "r=3", {"sync_unvouched_s": beyond})
     lost = {"value": 3, "limit": 0, "passed": False}
     set_aside(tmp_path, "r=4", {"frames_lost": lost})
-    campaigns = [Folder(name, Campaign(where)) for name, where in (
-        ("wired", tmp_path), ("unwired", tmp_path / "none")
-    )]  # fmt: skip
-    trials = {
-        "wired": made("wired", 120, wired=True), "unwired": made("unwired", 60, wired=False)
-    }  # fmt: skip
+    campaigns = [
+        Folder(name, Campaign(where))
+        for name, where in (("wired", tmp_path), ("unwired", tmp_path / "none"))
+    ]
+    trials = {"wired": made("wired", 120, wired=True), "unwired": made("unwired", 60, wired=False)}
     return render(cast("list[Collected]", campaigns), trials, simulated=False)
 
 

@@ -39,10 +39,12 @@ def figures(
     *incipient_ms: int | None, references: Mapping[Name, OnsetReference]
 ) -> dict[str, OnsetFigures]:
     """Decisions on trials with the same onsets; those of gross slip at 1550 ms."""
-    return judge_by_reference([
-        Decided(Found(None if at is None else at * MS, 1550 * MS), references, 30 * MS)
-        for at in incipient_ms
-    ])  # fmt: skip
+    return judge_by_reference(
+        [
+            Decided(Found(None if at is None else at * MS, 1550 * MS), references, 30 * MS)
+            for at in incipient_ms
+        ]
+    )
 
 
 def summary(
@@ -51,19 +53,24 @@ def summary(
     """A summary of these rows alone; a network of another title has those of the store's own."""
     scores = tuple(
         DetectorScores.model_construct(
-            name=name, stride_ms=30, curve=(),
-            rates=(DetectorRate.model_construct(allowed=0, by_reference={}),
-                   DetectorRate.model_construct(allowed=2, by_reference=dict(of))),
+            name=name,
+            stride_ms=30,
+            curve=(),
+            rates=(
+                DetectorRate.model_construct(allowed=0, by_reference={}),
+                DetectorRate.model_construct(allowed=2, by_reference=dict(of)),
+            ),
         )
         for name, of in detectors.items()
-    )  # fmt: skip
+    )
     kinematic = Kinematic.model_construct(by_reference=dict(own))
     other = Network.model_construct(title="preset: paper", kinematic=kinematic)
     compared = DetectorComparison.model_construct(detectors=scores, carried=None)
     found: Any = Summary.model_construct(
-        kinematic=kinematic, networks={"preset-paper": other},
+        kinematic=kinematic,
+        networks={"preset-paper": other},
         detectors=compared if scores else None,
-    )  # fmt: skip
+    )
     return found  # type: ignore[no-any-return]
 
 
@@ -95,8 +102,9 @@ def test_every_decider_has_a_row_for_each_onset_and_the_sentence_adds_them_up() 
     assert rows[6][2] == "4 (40 to 100 %)"
     assert rows[8][:5] == ["4 (0)", "49", "1 (1 to 81 %)", "0, 0", "2 of 4"]
     assert section.explained == [
-        Explained("change point", 6, 4), Explained("true (simulated)", 6, 4)
-    ]  # fmt: skip
+        Explained("change point", 6, 4),
+        Explained("true (simulated)", 6, 4),
+    ]
     text = shown(section)
     assert (
         "4 of 6 false early detections by the 2-pixel onset, all rows together, come at or after "
@@ -111,8 +119,10 @@ def test_real_data_name_no_true_onset() -> None:
     section = onset_section(summary(own, {}))
     assert section is not None
     assert [row[1] for row in section.table.rows[:3]] == [
-        "2 pixels (paper)", "change point", "2 pixels (paper)"
-    ]  # fmt: skip
+        "2 pixels (paper)",
+        "change point",
+        "2 pixels (paper)",
+    ]
     text = shown(section, simulated=False)
     assert "simulat" not in text
     assert "allow" not in text

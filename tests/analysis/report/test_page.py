@@ -32,16 +32,26 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
     "by_condition": (
         lambda simulated: by_condition(
             ROWS,
-            [Panel("lead (ms)", {ROWS[0]: [360.0, 420.0]}, zero="gross slip",
-                   published=(360.0, "paper's smallest"), notes={ROWS[0]: "2 missed"})],
-            simulated=simulated, breaks=[1],
+            [
+                Panel(
+                    "lead (ms)",
+                    {ROWS[0]: [360.0, 420.0]},
+                    zero="gross slip",
+                    published=(360.0, "paper's smallest"),
+                    notes={ROWS[0]: "2 missed"},
+                )
+            ],
+            simulated=simulated,
+            breaks=[1],
         ),
         ("lead (ms)", *ROWS, "0: gross slip", "dotted: paper's smallest", "2 missed", "none"),
     ),
     "shares": (
         lambda simulated: shares(
             {"depth": [Share("2.4 mm", 0.9, 0.85, 0.95), Share("2.6 mm", None, None, None)]},
-            "windows classified correctly (%)", simulated=simulated, line=(0.92, "all"),
+            "windows classified correctly (%)",
+            simulated=simulated,
+            line=(0.92, "all"),
         ),
         ("windows classified correctly (%)", "depth", "2.4 mm", "2.6 mm", "all"),
     ),
@@ -57,7 +67,8 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
     ),
     "references": (
         lambda simulated: campaign.references(
-            [1, 5], {"events (1/s)": [10.0, 11.0], "first slip (ms)": [None, 900.0]},
+            [1, 5],
+            {"events (1/s)": [10.0, 11.0], "first slip (ms)": [None, 900.0]},
             simulated=simulated,
         ),
         ("events (1/s)", "first slip (ms)"),
@@ -71,7 +82,8 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
     "labels": (
         lambda simulated: trials.label_uncertainty(
             {"paper's rule": {"incipient": [1.0, 4.0], "gross": [2.0]}},
-            {"incipient": [3.0], "gross": []}, simulated=simulated,
+            {"incipient": [3.0], "gross": []},
+            simulated=simulated,
         ),
         ("distance from the truth (ms)", "width of its 95 % interval (ms)"),
     ),
@@ -86,7 +98,7 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
         ),
         ("work (µs/s)", "latency (ms)", "Pareto front", "paper's settings"),
     ),
-}  # fmt: skip
+}
 
 
 def render(*sections: Content, simulated: bool = False) -> str:
@@ -110,9 +122,11 @@ def test_a_figures_data_are_columns_with_units() -> None:
     text = csv_text({"trial": ["a, b", "c"], "latency (ms)": [1.5, None, 2.5]}, simulated=True)
     rows = list(csv.reader(io.StringIO(text)))
     assert rows == [
-        ["trial", "latency (ms)", "simulated"], ["a, b", "1.5", "yes"], ["c", "", "yes"],
+        ["trial", "latency (ms)", "simulated"],
+        ["a, b", "1.5", "yes"],
+        ["c", "", "yes"],
         ["", "2.5", "yes"],
-    ]  # fmt: skip
+    ]
     assert csv_text({"x (s)": [1]}, simulated=False).splitlines() == ["x (s),simulated", "1,no"]
 
 

@@ -37,30 +37,43 @@ def seeds(*strict: float) -> Seeds:
 
 
 def outcome(experiment: str, lead_ms: float | None, gross: str) -> TrialOutcome:
-    return TrialOutcome.model_validate({
-        "campaign": "c", "experiment": experiment, "trial": f"{experiment} {lead_ms}",
-        "outcome": "missed" if lead_ms is None else "detected_first", "gross": gross,
-        "duration_ms": 900.0, "latency_incipient_ms": None if lead_ms is None else 90.0,
-        "latency_gross_ms": 20.0 if gross == "detected" else None, "lead_ms": lead_ms,
-    })  # fmt: skip
+    return TrialOutcome.model_validate(
+        {
+            "campaign": "c",
+            "experiment": experiment,
+            "trial": f"{experiment} {lead_ms}",
+            "outcome": "missed" if lead_ms is None else "detected_first",
+            "gross": gross,
+            "duration_ms": 900.0,
+            "latency_incipient_ms": None if lead_ms is None else 90.0,
+            "latency_gross_ms": 20.0 if gross == "detected" else None,
+            "lead_ms": lead_ms,
+        }
+    )
 
 
 def latency(row: TrialOutcome) -> TrialLatency:
     return TrialLatency(
-        latency_incipient_ms=row.latency_incipient_ms, latency_gross_ms=row.latency_gross_ms,
-        lead_ms=row.lead_ms, late_incipient_ms=None,
+        latency_incipient_ms=row.latency_incipient_ms,
+        latency_gross_ms=row.latency_gross_ms,
+        lead_ms=row.lead_ms,
+        late_incipient_ms=None,
         late_gross_ms=500.0 if row.gross == "late" else None,
-        missed_incipient=row.outcome == "missed", missed_gross=row.gross == "missed",
-        false_early_incipient=False, false_early_gross=row.gross == "false_early",
-    )  # fmt: skip
+        missed_incipient=row.outcome == "missed",
+        missed_gross=row.gross == "missed",
+        false_early_incipient=False,
+        false_early_gross=row.gross == "false_early",
+    )
 
 
 def figures(rows: Sequence[TrialOutcome]) -> dict[str, Any]:
     scored = [latency(row) for row in rows]
     return {
-        "trials": len(rows), "latency_ms": summarise_latency(scored),
-        "lead_ms": summarise_lead(scored), "by_seed": (),
-    }  # fmt: skip
+        "trials": len(rows),
+        "latency_ms": summarise_latency(scored),
+        "lead_ms": summarise_lead(scored),
+        "by_seed": (),
+    }
 
 
 def summary(alarms: dict[str, AlarmRate], of_seeds: Seeds) -> Summary:
@@ -68,18 +81,23 @@ def summary(alarms: dict[str, AlarmRate], of_seeds: Seeds) -> Summary:
     slides += [outcome("kinematic", None, "false_early")]
     falls = [outcome("gravity", lead, "late") for lead in (71.0, 560.0, 611.0, 700.0)]
     kinematic = Kinematic.model_construct(
-        accuracy=Accuracy(argmax=0.91, strict=0.9, margin=0.8, n=450), seeds=of_seeds,
-        interval=Share(share=0.9, low=0.8, high=0.95, n=450, trials=3), false_alarms=alarms,
+        accuracy=Accuracy(argmax=0.91, strict=0.9, margin=0.8, n=450),
+        seeds=of_seeds,
+        interval=Share(share=0.9, low=0.8, high=0.95, n=450, trials=3),
+        false_alarms=alarms,
         **figures(slides),
-    )  # fmt: skip
+    )
     gravity = Experiment.model_construct(**figures(falls))
     preset = Network.model_construct(
         title="", preset="paper", gravity=Experiment.model_construct(**figures(falls[2:]))
     )
     return Summary.model_construct(
-        kinematic=kinematic, gravity=gravity, trials=(*slides, *falls),
-        disturbance=Experiment.model_construct(**figures([])), networks={"paper": preset},
-    )  # fmt: skip
+        kinematic=kinematic,
+        gravity=gravity,
+        trials=(*slides, *falls),
+        disturbance=Experiment.model_construct(**figures([])),
+        networks={"paper": preset},
+    )
 
 
 QUIET = {"quiet": alarm_rate([1, 1, 0], [0.01, 0.01, 0.005])}
@@ -150,8 +168,10 @@ def test_median_of_half_lost_detections_is_none() -> None:
 
 def test_no_interval_reaches_below_what_can_be() -> None:
     rows = [outcome("gravity", lead, "detected") for lead in (10.0, 20.0, 900.0)]
-    rows = [row.model_copy(update={"latency_gross_ms": ms})
-            for row, ms in zip(rows, (-20.0, 0.0, 200.0), strict=True)]  # fmt: skip
+    rows = [
+        row.model_copy(update={"latency_gross_ms": ms})
+        for row, ms in zip(rows, (-20.0, 0.0, 200.0), strict=True)
+    ]
     found = trial_intervals(rows, [Detection(false_early_ms=30)])
     assert found.lead_ms.mean is not None
     assert found.lead_ms.mean[0] == 0.0

@@ -21,9 +21,14 @@ def made(strict: tuple[float, ...], argmax: tuple[float, ...]) -> tuple[WorkSect
     """The section of a network with these accuracies, and a rival's; and its words."""
     layers = {"conv1": 10.0, "all": 10.0}
     work = WindowWork(
-        synaptic_operations=layers, dense_multiply_adds={"conv1": 100, "all": 100}, share=0.1,
-        spikes={"iaf1": 3.0}, rates={"iaf1": 0.01}, events=7.0, n=5,
-    )  # fmt: skip
+        synaptic_operations=layers,
+        dense_multiply_adds={"conv1": 100, "all": 100},
+        share=0.1,
+        spikes={"iaf1": 3.0},
+        rates={"iaf1": 0.01},
+        events=7.0,
+        n=5,
+    )
     mean = Spread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
     each = tuple(
         SeedScores(
@@ -43,10 +48,12 @@ def made(strict: tuple[float, ...], argmax: tuple[float, ...]) -> tuple[WorkSect
         )
     found = work_section(
         Kinematic.model_construct(
-            work=work, seeds=Seeds(each=each, spread={"strict": mean}), beside={},
+            work=work,
+            seeds=Seeds(each=each, spread={"strict": mean}),
+            beside={},
             trained_baselines=rivals,
         )
-    )  # fmt: skip
+    )
     assert found is not None
     return found, " ".join(render_section(found, simulated=True)[1].split())
 

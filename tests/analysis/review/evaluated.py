@@ -78,12 +78,17 @@ class Evaluated(Reviewable):
         slip = true_slip(label)
         tolerance = round(RULE.false_early_ms * MS)
         return TrialScore(
-            campaign=NAME, experiment="kinematic", trial=trial, condition={},
-            incipient_ns=label.incipient_ns, gross_ns=label.gross_ns,
+            campaign=NAME,
+            experiment="kinematic",
+            trial=trial,
+            condition={},
+            incipient_ns=label.incipient_ns,
+            gross_ns=label.gross_ns,
             end_ns=None if slip is None else slip.end_ns,
-            detected_incipient_ns=found.incipient_ns, detected_gross_ns=found.gross_ns,
+            detected_incipient_ns=found.incipient_ns,
+            detected_gross_ns=found.gross_ns,
             latency=None if slip is None else score_trial(found, slip, tolerance),
-        )  # fmt: skip
+        )
 
     def evaluate(self, latencies_ms: Sequence[float]) -> list[TrialScore]:
         """Keep an evaluation in which detections of test trials come so long after either onset.
@@ -109,28 +114,48 @@ class Evaluated(Reviewable):
         hits = window_groups.strict_hits(counts, test.y)
         by_onset = DeviationByOnset(incipient=NOTHING, gross=NOTHING)
         kept = Evaluation(
-            format=evaluations.FORMAT, seed=0, trials=tuple(rows), experiments=summaries(rows),
+            format=evaluations.FORMAT,
+            seed=0,
+            trials=tuple(rows),
+            experiments=summaries(rows),
             windows=WindowScores(
                 **dict(classification.score(counts, test.y, 2.0)),
-                interval=window_groups.share(hits, test.trial), reliability=(),
+                interval=window_groups.share(hits, test.trial),
+                reliability=(),
                 calibration=Calibration(
                     temperature=None, ece=None, cross_entropy=None, uncalibrated=None
                 ),
-                by_factor={}, by_tenth={}, no_slip=NoSlip(hold=NO_SHARE, loading=NO_SHARE),
-                by_trial=(), seeds=Seeds(each=(), spread={}), work=None, baselines={}, beside={},
+                by_factor={},
+                by_tenth={},
+                no_slip=NoSlip(hold=NO_SHARE, loading=NO_SHARE),
+                by_trial=(),
+                seeds=Seeds(each=(), spread={}),
+                work=None,
+                baselines={},
+                beside={},
                 samples=SampleCounts(train=len(train), test=len(test)),
             ),
             label_error_ms=LabelErrors(rule="paper", **dict(by_onset)),
             label_rules_ms=RuleErrors(
-                paper=by_onset, change_point=by_onset, apart=by_onset,
+                paper=by_onset,
+                change_point=by_onset,
+                apart=by_onset,
                 papillae=Coverage(**dict(NOTHING), coverage=None),
             ),
-            detection={NAME: RULE}, choices={NAME: None}, detectors=None,
-        )  # fmt: skip
+            detection={NAME: RULE},
+            choices={NAME: None},
+            detectors=None,
+        )
         Derived.of(self.store, evaluations.STEP).write(evaluations.NAME, "e", kept)
         Derived.of(self.store, windows.STEP).write(
-            windows.NAME, "e", {},
-            {"counts": counts, "y": test.y, "trial": test.trial,
-             "trials": np.array(test.trials, np.str_).reshape(-1, 2)},
-        )  # fmt: skip
+            windows.NAME,
+            "e",
+            {},
+            {
+                "counts": counts,
+                "y": test.y,
+                "trial": test.trial,
+                "trials": np.array(test.trials, np.str_).reshape(-1, 2),
+            },
+        )
         return rows

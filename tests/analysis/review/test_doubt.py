@@ -45,8 +45,12 @@ def doubts(made: Reviewable) -> dict[str, LabelDoubt]:
 
 
 def onsets(incipient: int | None, gross: int | None, **others: Any) -> dict[str, Any]:
-    return {"incipient_ns": incipient, "gross_ns": gross, "per_marker_ns": [GROSS, INCIPIENT],
-            **others}  # fmt: skip
+    return {
+        "incipient_ns": incipient,
+        "gross_ns": gross,
+        "per_marker_ns": [GROSS, INCIPIENT],
+        **others,
+    }
 
 
 def test_the_label_is_what_the_fixture_says() -> None:
@@ -63,9 +67,12 @@ def test_rules_disagree_only_beyond_what_like_trials_do(made: Reviewable) -> Non
         before += 60 * MS if trial == odd else 0
         sharp = {"first_marker": 1, "low_ns": [0, 0], "high_ns": [0, 0]}
         relabel(
-            made, trial, rule="change_point", paper=onsets(INCIPIENT + before, GROSS + before),
+            made,
+            trial,
+            rule="change_point",
+            paper=onsets(INCIPIENT + before, GROSS + before),
             change_point=onsets(INCIPIENT, GROSS, **sharp),
-        )  # fmt: skip
+        )
     found = doubts(made)
     assert {name for name, doubt in found.items() if doubt.there} == {odd}
     spread = found[odd].spread_ms
@@ -82,8 +89,11 @@ def test_a_marker_whose_place_is_vague_spreads_its_crossing(made: Reviewable) ->
     sigma[:, 0] = 0.5
     vague, sharp = made.ids[:2]
     for trial, known in ((vague, sigma), (sharp, np.full_like(sigma, 0.001))):
-        arrays = {"frame_ns": frame_times(), "sigma_px": known,
-                  "displacement_px": displacements().astype(np.float32)}  # fmt: skip
+        arrays = {
+            "frame_ns": frame_times(),
+            "sigma_px": known,
+            "displacement_px": displacements().astype(np.float32),
+        }
         times = list(label()["per_marker_ns"])
         paper = {"incipient_ns": INCIPIENT, "gross_ns": GROSS, "per_marker_ns": times}
         data = {**label(), "reference": "hold_end", "paper": paper}
@@ -104,8 +114,13 @@ def test_a_change_point_has_its_own_interval(made: Reviewable) -> None:
     sharp, wide = made.ids[:2]
     papers = {"incipient_ns": [0, 400 * MS], "gross_ns": [0, 400 * MS]}
     for trial, half in ((sharp, 2 * MS), (wide, 30 * MS)):
-        slips = onsets(INCIPIENT, GROSS, first_marker=1, low_ns=[GROSS, INCIPIENT - half],
-                       high_ns=[GROSS, INCIPIENT + half])  # fmt: skip
+        slips = onsets(
+            INCIPIENT,
+            GROSS,
+            first_marker=1,
+            low_ns=[GROSS, INCIPIENT - half],
+            high_ns=[GROSS, INCIPIENT + half],
+        )
         relabel(made, trial, rule="change_point", change_point=slips, intervals=papers)
     found = doubts(made)
     assert found[sharp].spread_ms == {"incipient": 0.0, "gross": 0.0}

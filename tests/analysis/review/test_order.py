@@ -35,8 +35,11 @@ def order(made: Evaluated) -> ReviewOrder:
 
 
 def figure(found: ReviewOrder, name: str) -> Figure:
-    (one,) = [figure for figure in found.figures if (figure.name, figure.experiment) == (
-        name, "kinematic")]  # fmt: skip
+    (one,) = [
+        figure
+        for figure in found.figures
+        if (figure.name, figure.experiment) == (name, "kinematic")
+    ]
     return one
 
 
@@ -122,8 +125,9 @@ def test_changes_are_those_of_an_evaluation_made_again(made: Evaluated, case: st
     elif case == "drops out":
         made.change(trial, flags=["knocked"])
     else:
-        made.change(trial, incipient_ns=None, gross_ns=None,
-                    doubts={"incipient": GRAVE, "gross": GRAVE})  # fmt: skip
+        made.change(
+            trial, incipient_ns=None, gross_ns=None, doubts={"incipient": GRAVE, "gross": GRAVE}
+        )
         if case == "comes and moves":
             made.widen(trial, 45.0, 45.0)
     latencies = np.random.default_rng(3).uniform(-40, 140, len(made.tests)).tolist()
@@ -141,8 +145,10 @@ def test_changes_are_those_of_an_evaluation_made_again(made: Evaluated, case: st
     for draw in range(0, DRAWS, 10):
         onsets = {"incipient_ns": None, "gross_ns": None}
         if drawn.usable[draw]:
-            onsets = {"incipient_ns": int(drawn.incipient_ns[draw]),
-                      "gross_ns": int(drawn.gross_ns[draw])}  # fmt: skip
+            onsets = {
+                "incipient_ns": int(drawn.incipient_ns[draw]),
+                "gross_ns": int(drawn.gross_ns[draw]),
+            }
         again = moved_rows(made, rows, place, full.model_copy(update=onsets))
         after = summaries(again)["kinematic"]
         seen.add(again[place].latency is None)
@@ -184,8 +190,7 @@ def test_training_trials_move_training_and_nothing_else(made: Evaluated) -> None
     gone, moved, come = made.trained[:3]
     made.change(gone, flags=["knocked"])
     made.widen(moved, 30.0, 0.0)
-    made.change(come, incipient_ns=None, gross_ns=None,
-                doubts={"incipient": GRAVE, "gross": GRAVE})  # fmt: skip
+    made.change(come, incipient_ns=None, gross_ns=None, doubts={"incipient": GRAVE, "gross": GRAVE})
     made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
     found = order(made)
     shares = {item.trial: item.moves[0].change for item in found.trials}

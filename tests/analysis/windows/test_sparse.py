@@ -42,8 +42,10 @@ def test_dense_there_and_back(x: np.ndarray, data: st.DataObject) -> None:
 def test_mirrored_is_reversed(x: np.ndarray, data: st.DataObject) -> None:
     found = SparseWindows.of(x)
     how = data.draw(hnp.arrays(np.uint8, len(x), elements=st.integers(0, 3)))
-    expected = [one[..., :: (-1 if k & 2 else 1), :: (-1 if k & 1 else 1)]
-                for one, k in zip(x, how, strict=True)]  # fmt: skip
+    expected = [
+        one[..., :: (-1 if k & 2 else 1), :: (-1 if k & 1 else 1)]
+        for one, k in zip(x, how, strict=True)
+    ]
     mirrored = found.mirrored(how)
     np.testing.assert_array_equal(mirrored.dense(), np.reshape(expected, x.shape))
     again = SparseWindows.of(mirrored.dense())  # entries stand in order, as they are listed

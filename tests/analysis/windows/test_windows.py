@@ -63,9 +63,16 @@ def naive(
     base=st.sampled_from([0, -5_000, 2**53 // 1000, 2**62]),
 )
 def test_counts_are_the_naive_histogram(
-    seed: int, count: int, steps: int, step_ms: int, pool: int, cells: int, polarity: Any,
-    spare: tuple[int, int], base: int,
-) -> None:  # fmt: skip
+    seed: int,
+    count: int,
+    steps: int,
+    step_ms: int,
+    pool: int,
+    cells: int,
+    polarity: Any,
+    spare: tuple[int, int],
+    base: int,
+) -> None:
     crop = max(20, pool * cells) // pool * pool
     if crop < 20:
         crop += pool
@@ -105,11 +112,19 @@ def test_a_window_is_half_open(t: int, step: int | None) -> None:
 @pytest.mark.parametrize(
     ("x", "y", "cell"),
     [
-        (119, 240, None), (120, 40, (0, 0)), (139, 59, (0, 0)), (140, 59, (0, 1)),
-        (139, 60, (1, 0)), (519, 439, (19, 19)), (520, 439, None), (519, 440, None),
-        (320, 39, None), (0, 0, None), (639, 479, None),
+        (119, 240, None),
+        (120, 40, (0, 0)),
+        (139, 59, (0, 0)),
+        (140, 59, (0, 1)),
+        (139, 60, (1, 0)),
+        (519, 439, (19, 19)),
+        (520, 439, None),
+        (519, 440, None),
+        (320, 39, None),
+        (0, 0, None),
+        (639, 479, None),
     ],
-)  # fmt: skip
+)
 def test_the_crop_is_centred_and_half_open(x: int, y: int, cell: tuple[int, int] | None) -> None:
     sample = one(x, y, 1, 0)
     assert sample.sum() == (cell is not None)

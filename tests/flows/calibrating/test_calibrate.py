@@ -78,13 +78,16 @@ def error_of(frame: PlateFrame) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("moved_mm", "leant_mm"),
     [
-        (0.5, 1.5), (-1.5, 0.0), pytest.param(1.2, 0.0, marks=pytest.mark.long),
+        (0.5, 1.5),
+        (-1.5, 0.0),
+        pytest.param(1.2, 0.0, marks=pytest.mark.long),
         pytest.param(0.0, 0.0, marks=pytest.mark.long),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_plane_is_mended(tmp_path: Path, moved_mm: float, leant_mm: float) -> None:
-    found = teach.teach_plane(session(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0,
-                              QUICK, 2)  # fmt: skip
+    found = teach.teach_plane(
+        session(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0, QUICK, 2
+    )
     off, turned = error_of(taught(found))
     assert off < 0.12
     assert turned < 0.5
@@ -316,9 +319,12 @@ def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFi
     ],
 )
 def test_wrong_input_is_exit_2_and_moves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[object, ...], says: str,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[object, ...],
+    says: str,
+) -> None:
     path = lab(tmp_path)
     (tmp_path / "empty").mkdir()
     places = {"LAB": path, "FOLDER": tmp_path / "empty"}
@@ -460,9 +466,12 @@ def test_check_refuses_what_is_missing_or_old(tmp_path: Path) -> None:
 
 def test_an_arm_that_is_stopped_stays_so(tmp_path: Path) -> None:
     """Nothing here unlocks anything."""
-    here = session(lab(tmp_path, mock=(
-        "  faults: [{kind: arm_protective_stop, trial: 1, at_s: 2, since: trial}]\n"
-    )))  # fmt: skip
+    here = session(
+        lab(
+            tmp_path,
+            mock=("  faults: [{kind: arm_protective_stop, trial: 1, at_s: 2, since: trial}]\n"),
+        )
+    )
     with pytest.raises(RigError, match="protective stop"):
         teach.teach_zero(here, QUICK, 1, False)
     assert here.rig.arm.state() is ArmState.PROTECTIVE_STOP

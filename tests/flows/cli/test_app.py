@@ -148,9 +148,14 @@ def test_a_stopped_collection_goes_on_to_the_same_data(
     log = tmp_path / "messages"
     with log.open("w") as messages:
         process = subprocess.Popen(
-            [*SLIPLAB, *command], cwd=ROOT, env=environment, text=True, start_new_session=True,
-            stdout=subprocess.DEVNULL, stderr=messages,
-        )  # fmt: skip
+            [*SLIPLAB, *command],
+            cwd=ROOT,
+            env=environment,
+            text=True,
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=messages,
+        )
     trials, aside = (store / "campaigns" / "tiny" / name for name in ("trials", "incoming"))
     try:
         wait_for(

@@ -37,9 +37,14 @@ def collecting(protocol: Path, store: Path, log: Path) -> Iterator[subprocess.Po
     environment.pop("PREFECT_HOME", None)
     with log.open("w") as messages:
         process = subprocess.Popen(
-            [*SLIPLAB, *map(str, command)], cwd=ROOT, env=environment, text=True,
-            start_new_session=True, stdout=subprocess.DEVNULL, stderr=messages,
-        )  # fmt: skip
+            [*SLIPLAB, *map(str, command)],
+            cwd=ROOT,
+            env=environment,
+            text=True,
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=messages,
+        )
     try:
         yield process
     finally:
@@ -169,9 +174,13 @@ def test_stop_signals_nothing_but_a_collection(script: str, tmp_path: Path) -> N
     store = Store.create(tmp_path / "s")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
-        [sys.executable, "-c", script, store.folder / ".lock"], cwd=ROOT, env=environment,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", script, store.folder / ".lock"],
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert process.stdout is not None
     assert process.stdin is not None
     try:

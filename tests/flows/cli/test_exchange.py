@@ -46,8 +46,12 @@ def test_in_and_out(tmp_path: Path, sliplab: Any) -> None:
     code, reported, _ = sliplab("import", path, "--store", store, "--name", "a", "--json")
     assert code == 0
     assert json.loads(reported) == {
-        "campaign": "a", "imported": ["slide"], "there": [], "events": 50, "frames": 0,
-    }  # fmt: skip
+        "campaign": "a",
+        "imported": ["slide"],
+        "there": [],
+        "events": 50,
+        "frames": 0,
+    }
     code, reported, said = sliplab("verify", store, "--json")
     assert (code, json.loads(reported)["whole"]) == (0, 1)
     code, reported, said = sliplab("trials", store, "--output", tmp_path / "t.parquet")

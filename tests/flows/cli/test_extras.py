@@ -53,8 +53,12 @@ def run(code: str, extras: tuple[str, ...], *arguments: object) -> subprocess.Co
     missing = ",".join(module for extra in extras for module in EXTRAS[extra])
     return subprocess.run(
         [sys.executable, "-c", code, missing, *map(str, arguments)],
-        capture_output=True, text=True, cwd=ROOT, env={**os.environ}, timeout=300,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ},
+        timeout=300,
+    )
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,21 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     "collect": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
     **dict.fromkeys(
         (
-            "sync", "label", "train", "evaluate", "report", "generalise", "guesses", "trials",
-            "holdout", "verify", "migrate", "pause", "resume", "stop", "review",
+            "sync",
+            "label",
+            "train",
+            "evaluate",
+            "report",
+            "generalise",
+            "guesses",
+            "trials",
+            "holdout",
+            "verify",
+            "migrate",
+            "pause",
+            "resume",
+            "stop",
+            "review",
         ),
         (("ROOM/nowhere",), "ROOM/nowhere", None, None),
     ),
@@ -50,7 +63,10 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     "import": (("ROOM/nowhere", "--store", "ROOM/i", "--name", "n"), "ROOM/nowhere", None, None),
     "export": (("ROOM/nowhere", "x", "--output", "ROOM/o"), "ROOM/nowhere", None, None),
     "publish": (
-        ("ROOM/nowhere", "--as", "croissant", "--output", "ROOM/o"), "ROOM/nowhere", None, None,
+        ("ROOM/nowhere", "--as", "croissant", "--output", "ROOM/o"),
+        "ROOM/nowhere",
+        None,
+        None,
     ),
     "view": (("ROOM/nowhere", "x"), "ROOM/nowhere", None, None),
     "detect": (("--rig", "mock", "--model", "ROOM/nowhere"), "ROOM/nowhere", None, None),
@@ -65,15 +81,20 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
         (("--rig", "ROOM/nowhere"), "ROOM/nowhere", None, None),
     ),
     "calibrate scene": (
-        ("ROOM/nowhere", "--rig", "mock", "--out", "ROOM/t.yaml"), "ROOM/nowhere", None, None,
+        ("ROOM/nowhere", "--rig", "mock", "--out", "ROOM/t.yaml"),
+        "ROOM/nowhere",
+        None,
+        None,
     ),
     "calibrate drift": (("ROOM/nowhere", "--rig", "mock"), "ROOM/nowhere", None, None),
     "calibrate gap": (
         ("ROOM/nowhere", "--rig", "t.yaml", "--protocol", "pilot", "--out", "ROOM/g"),
-        "ROOM/nowhere", None, None,
+        "ROOM/nowhere",
+        None,
+        None,
     ),
     "calibrate board": (("--out", "ROOM/x.doc"), None, "--out", "ROOM/x.doc"),
-}  # fmt: skip
+}
 
 
 def commands() -> Iterator[str]:
@@ -240,9 +261,16 @@ def test_an_arm_that_does_not_stop_is_said_to_whoever_pressed_ctrl_c(
 
 
 @pytest.mark.parametrize(
-    ("command", "of_trials"), [("plan", False), ("register", False), ("power", False),
-                               ("verify", False), ("collect", True), ("label", True)],
-)  # fmt: skip
+    ("command", "of_trials"),
+    [
+        ("plan", False),
+        ("register", False),
+        ("power", False),
+        ("verify", False),
+        ("collect", True),
+        ("label", True),
+    ],
+)
 def test_interrupted_command_names_trials_only_where_it_resumes_them(
     command: str, of_trials: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

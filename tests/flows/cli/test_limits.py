@@ -46,9 +46,12 @@ main()
 )
 def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", STARTED, which, str(limit), "plan", *PLAN, "--json"], cwd=ROOT,
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+        [sys.executable, "-c", STARTED, which, str(limit), "plan", *PLAN, "--json"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     error = json.loads(done.stdout)["error"]
     assert (done.returncode, error["exit_code"]) == (1, 1)
     assert error["message"].startswith(message)
@@ -72,7 +75,7 @@ def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -
         (OSError(errno.ENOSPC, "No space left on device"), "its disk is full"),
         (OSError(errno.ENOSPC, "", "/a/from", None, "/tmp/to"), "/tmp/to: its disk is full"),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("hidden", [False, True])
 def test_what_has_run_out_is_said(
     raised: Exception, message: str, hidden: bool, monkeypatch: pytest.MonkeyPatch
@@ -179,9 +182,12 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
 ) -> None:
     """HDF5 crashed it at its exit: collect ended with a segmentation fault, not with exit 1."""
     done = subprocess.run(
-        [sys.executable, "-c", FULL, tmp_path / "data.h5", how], cwd=ROOT, text=True,
-        capture_output=True, timeout=120,
-    )  # fmt: skip
+        [sys.executable, "-c", FULL, tmp_path / "data.h5", how],
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        timeout=120,
+    )
     assert (done.returncode, done.stdout) == (0, f"{said}\n"), done.stderr
 
 
@@ -210,9 +216,12 @@ program.main()
 def limited(how: str) -> subprocess.Popen[str]:
     """Run a command that crashes, waits or ends, under a limit of memory."""
     return subprocess.Popen(
-        [sys.executable, "-c", CRASH, how, "--json"], cwd=ROOT, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+        [sys.executable, "-c", CRASH, how, "--json"],
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 def test_a_library_that_crashes_for_want_of_memory_ends_in_one_line() -> None:

@@ -95,10 +95,13 @@ def test_problems_are_told_and_exit_with_1(sliplab: Sliplab, made: Path, tmp_pat
     assert (code, seen["ok"], seen["whole"]) == (1, False, 0)
     assert "is missing" in seen["problems"][0]["what"]
     for words in (
-        ("push", store, "lab"), ("push", store, "s3://me:hunter2@lab/x"),
-        ("pull", "nonsense://lab", tmp_path / "x"), ("verify", url, "--quarantine"),
-        ("push", store, url, "--campaign", "other"), ("label", store, "--dask", "nonsense"),
-    ):  # fmt: skip
+        ("push", store, "lab"),
+        ("push", store, "s3://me:hunter2@lab/x"),
+        ("pull", "nonsense://lab", tmp_path / "x"),
+        ("verify", url, "--quarantine"),
+        ("push", store, url, "--campaign", "other"),
+        ("label", store, "--dask", "nonsense"),
+    ):
         code, out, reported = sliplab(*words)
         assert code == 2, reported
         assert out["error"]["message"] in reported

@@ -150,9 +150,10 @@ def test_registered_campaign_that_is_not_reported_is_named(tmp_path: Path) -> No
 
 def test_another_protocol_or_an_imported_campaign_is_refused(tmp_path: Path) -> None:
     store, protocol = tmp_path / "store", write(tmp_path / "p.yaml", short())
-    assert here(
-        "collect", protocol, "--rig", "rehearsal", "--store", store, "--trials", 1
-    ).returncode == 0  # fmt: skip
+    assert (
+        here("collect", protocol, "--rig", "rehearsal", "--store", store, "--trials", 1).returncode
+        == 0
+    )
     answer("export", store, "tiny", "--output", tmp_path / "out")
     answer("import", tmp_path / "out", "--store", store, "--name", "theirs")
     data = short()
@@ -205,10 +206,21 @@ def authority(tmp_path: Path) -> Path:
     folder = tmp_path / "authority"
     folder.mkdir()
     openssl(
-        folder, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "key.pem", "-out",
-        "authority.pem", "-subj", "/CN=test", "-addext",
+        folder,
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-keyout",
+        "key.pem",
+        "-out",
+        "authority.pem",
+        "-subj",
+        "/CN=test",
+        "-addext",
         "extendedKeyUsage=critical,timeStamping",
-    )  # fmt: skip
+    )
     (folder / "serial").write_text("01\n")
     (folder / "tsa.cnf").write_text(
         "[tsa]\ndefault_tsa = own\n[own]\nserial = serial\nsigner_cert = authority.pem\n"

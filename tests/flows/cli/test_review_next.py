@@ -34,14 +34,19 @@ def test_the_order_as_an_object_and_as_a_table(made: Evaluated) -> None:
     done = here(*words, "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert list(found) == [
-        "trials", "to_decide", "simulated", "in_doubt", "next", "gains", "notes"
-    ]  # fmt: skip
+    assert list(found) == ["trials", "to_decide", "simulated", "in_doubt", "next", "gains", "notes"]
     assert (found["simulated"], found["in_doubt"], found["to_decide"]) == (True, 2, 109)
     (first,) = found["next"]
     assert list(first) == [
-        "campaign", "trial", "split", "spread_ms", "unusable", "score", "moves", "reasons"
-    ]  # fmt: skip
+        "campaign",
+        "trial",
+        "split",
+        "spread_ms",
+        "unusable",
+        "score",
+        "moves",
+        "reasons",
+    ]
     assert first["spread_ms"] == {"incipient": 60.0, "gross": 0.0}
     assert first["score"] == first["moves"][0]["of_interval"] > 0
     assert found["gains"][0]["left"] < found["gains"][0]["label_width"]

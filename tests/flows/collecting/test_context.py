@@ -45,8 +45,9 @@ def test_skins_and_temperatures_go_through_every_step(tmp_path: Path) -> None:
     plan = answer("plan", protocol, "--rig", rig)
     assert plan["count"] == 8
     assert plan["stretches"] == [[0, 1], [2, 3], [4, 5], [6, 7]]
-    prompts = [task["prompt"] for trial in plan["trials"] for task in trial["before"]
-               if task["by_person"]]  # fmt: skip
+    prompts = [
+        task["prompt"] for trial in plan["trials"] for task in trial["before"] if task["by_person"]
+    ]
     assert prompts.count("set skin to ridged") == 1
     assert prompts.count("set operator to anna") == 0
     collected = answer("collect", protocol, "--rig", rig, "--store", store)

@@ -172,7 +172,7 @@ SEEN: list[tuple[dict[str, Any], str]] = [
     ({"kind": DRIFT, "device": "event_camera", "ppm": 2000}, "sync_uncertainty_events_s"),
     ({"kind": DRIFT, "device": "sync_box", "ppm": -2000}, "sync_uncertainty_frames_s"),
     ({"kind": "pulses_late", "count": 30, "device": "arm"}, "sync_uncertainty_arm_s"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(

@@ -145,9 +145,13 @@ def test_references_of_a_skin_that_wears_stop_a_campaign(per_m: float, tmp_path:
     data["collection"]["references"] = {"every": 1, "condition": condition}
     data["collection"]["gates"]["reference"] = {"event_rate": "90 %", "friction": "10 %"}
     work, campaign = session(
-        tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS,
+        tmp_path / "a",
+        data,
+        TIMING,
+        force={},
+        frame_camera=TRACKS,
         faults=[{"kind": "skin_wear", "per_m": per_m}],
-    )  # fmt: skip
+    )
     run_request = make_request(
         tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
     )
@@ -208,8 +212,12 @@ def test_a_rig_without_a_sensor_says_nothing_of_forces(tmp_path: Path) -> None:
 
 def test_a_clock_that_jumps_back_is_refused_and_the_trial_taken_again(tmp_path: Path) -> None:
     fault = {
-        "kind": "clock_jump", "device": "force_sensor", "seconds": -2.0, "at_s": 0.5, "trial": 2,
-    }  # fmt: skip
+        "kind": "clock_jump",
+        "device": "force_sensor",
+        "seconds": -2.0,
+        "at_s": 0.5,
+        "trial": 2,
+    }
     work, campaign = session(
         tmp_path / "a", short(), TIMING, force={}, frame_camera=TRACKS, faults=[fault]
     )
@@ -227,10 +235,11 @@ def test_figures_are_of_the_right_stretches() -> None:
     force[2500:, 2] = 9.0  # after the end
     found = force_figures(t_ns, force, (100_000_000, 1_000_000_000, 2_400_000_000))
     assert found == {
-        "normal_peak_n": 2.0, "normal_hold_n": 2.0,
+        "normal_peak_n": 2.0,
+        "normal_hold_n": 2.0,
         "tangential_peak_n": pytest.approx(0.7, abs=0.01),
         "friction_peak": pytest.approx(0.35, abs=0.005),
-    }  # fmt: skip
+    }
     assert force_figures(t_ns, force, (5_000_000_000, 6_000_000_000, 7_000_000_000)) == {}
 
 
@@ -284,8 +293,9 @@ def test_the_force_may_rule(labelled: Store) -> None:
     label, _ = label_results(recording, settings)
     assert label.force is not None
     assert (label.incipient_ns, label.gross_ns) == (
-        label.force.incipient_ns, label.force.gross_ns,
-    )  # fmt: skip
+        label.force.incipient_ns,
+        label.force.gross_ns,
+    )
     assert set(label.per_marker_ns) == {-1}
 
 
@@ -326,8 +336,11 @@ def to_force(**press: Any) -> dict[str, Any]:
     factors["load"] = {**factors.pop("depth"), "values": [1.0, 2.0], "unit": "N"}
     factors["direction"]["values"] = [0]
     data["collection"]["motion"][1] = {
-        "phase": "press", "force": "$load", "speed": "1 mm/s", **press,
-    }  # fmt: skip
+        "phase": "press",
+        "force": "$load",
+        "speed": "1 mm/s",
+        **press,
+    }
     return data
 
 

@@ -65,10 +65,13 @@ HEARD = {
     "rate_hz": 50,
     "timing": {"grade": "host arrival", "delay": {"shortest_us": 3000, "longest_us": 9000}},
     "mock": {
-        "px_per_mm": 4, "rate_hz": 50, "level": "tracks",
-        "latency_us": 4000, "arrival_jitter_us": 4000,
+        "px_per_mm": 4,
+        "rate_hz": 50,
+        "level": "tracks",
+        "latency_us": 4000,
+        "arrival_jitter_us": 4000,
     },
-}  # fmt: skip
+}
 WARM = {
     "kind": "scalar",
     "unit": "degC",
@@ -83,9 +86,14 @@ WRIST = {
 TWIN = {"kind": "events", "mock": {}}
 """As the rig's first event camera, with pixels and a clock of its own."""
 ALL = {
-    "side": SIDE, "twin": TWIN, "back": BACK, "free": FREE, "heard": HEARD, "wrist": WRIST,
+    "side": SIDE,
+    "twin": TWIN,
+    "back": BACK,
+    "free": FREE,
+    "heard": HEARD,
+    "wrist": WRIST,
     "warm": WARM,
-}  # fmt: skip
+}
 
 
 def session(
@@ -128,9 +136,14 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_every_stream_is_stored_and_counted(taken: Recording) -> None:
     record = taken.record
     assert {name: stream.kind for name, stream in record.streams.items()} == {
-        "side": "events", "twin": "events", "back": "frames", "free": "frames", "heard": "frames",
-        "wrist": "wrench", "warm": "scalar",
-    }  # fmt: skip
+        "side": "events",
+        "twin": "events",
+        "back": "frames",
+        "free": "frames",
+        "heard": "frames",
+        "wrist": "wrench",
+        "warm": "scalar",
+    }
     seconds = record.recorded_s
     side, back = record.streams["side"], record.streams["back"]
     assert side.rows == len(taken.events(stream="side")) > 1000
@@ -170,9 +183,7 @@ def test_every_clock_holds_its_uncertainty_against_the_truth(taken: Recording) -
         # the true clock is a straight line; within the stretch of the pulses
         pairs, clock = np.array(truth[name]), clocks[name]
         shares = np.array([0.25, 0.5, 0.75])
-        device, reference = (
-            pairs[0, k] + shares * (pairs[-1, k] - pairs[0, k]) for k in (0, 1)
-        )  # fmt: skip
+        device, reference = (pairs[0, k] + shares * (pairs[-1, k] - pairs[0, k]) for k in (0, 1))
         mapped = np.asarray(clock.map.to_reference(np.round(device).astype(np.int64)))
         error = np.abs(mapped - reference)
         assert error.max() <= (clock.uncertainty_ns or 0)
@@ -246,9 +257,12 @@ def test_gates_and_catalogue_know_them(taken: Recording) -> None:
     gates = taken.record.quality.gates
     assert {f"sync_uncertainty_{name}_s" for name in ALL} <= gates.keys()
     assert {
-        "event_gap_side_s", "event_burst_side", "frames_lost_back", "frames_lost_free",
+        "event_gap_side_s",
+        "event_burst_side",
+        "frames_lost_back",
+        "frames_lost_free",
         "frames_lost_heard",
-    } <= gates.keys()  # fmt: skip
+    } <= gates.keys()
     assert all(gate.passed for gate in gates.values())
     row = catalogue(Store.open(taken.folder.parents[3])).iloc[0]
     assert row["side_events"] == taken.record.streams["side"].rows
@@ -400,37 +414,44 @@ def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
         ({"side": {"kind": "events"}}, "streams.side.mock", "is needed by driver: mock"),
         (
             {"side": {**SIDE, "device": {"driver": "dvxplorer"}}},
-            "streams.side.device", "has no meaning with driver: mock",
+            "streams.side.device",
+            "has no meaning with driver: mock",
         ),
         (
             {"side": {**SIDE, "mock": {"pixels": 5}}},
-            "streams.side.mock.pixels", "unknown key",
+            "streams.side.mock.pixels",
+            "unknown key",
         ),
         (
             {"side": {**SIDE, "timing": {"grade": "host arrival"}}},
-            "streams.side.timing.grade", "must be trigger input",
+            "streams.side.timing.grade",
+            "must be trigger input",
         ),
         (
             {"back": {**BACK, "region_px": [160, 2000]}},
-            "streams.back.region_px", "exceeds mock.height = 1200",
+            "streams.back.region_px",
+            "exceeds mock.height = 1200",
         ),
         ({"back": {**BACK, "scale_px_per_mm": 5}}, "streams.back.scale_px_per_mm", "must be mock"),
         ({"free": {**FREE, "rate_hz": None}}, "streams.free.rate_hz", "is needed with"),
         ({"back": {**BACK, "rate_hz": 50}}, "streams.back.rate_hz", "has no meaning with"),
         (
             {"side": {**SIDE, "timing": {"drift_ppm": 50, "jitter_us": 1}}},
-            "mock.clocks.pulse_jitter_us", "must be at most streams.side.timing.jitter_us = 1",
+            "mock.clocks.pulse_jitter_us",
+            "must be at most streams.side.timing.jitter_us = 1",
         ),
         (
             {"side": {**SIDE, "timing": {"drift_ppm": 20}}},
-            "streams.side.mock.clock_ppm", "must be at most timing.drift_ppm = 20",
+            "streams.side.mock.clock_ppm",
+            "must be at most timing.drift_ppm = 20",
         ),
         (
             {"warm": {**WARM, "timing": {"delay": {"shortest_us": 0, "longest_us": 2000}}}},
-            "streams.warm.mock.arrival_jitter_us", "must be at most 1000",
+            "streams.warm.mock.arrival_jitter_us",
+            "must be at most 1000",
         ),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_stream_is_named_by_its_key(
     changes: dict[str, Any], key: str, text: str, tmp_path: Path
 ) -> None:
@@ -475,9 +496,16 @@ def test_the_events_of_a_further_camera_are_exported_by_its_name(
     for form in ("aedat4", "dsec"):
         folder = tmp_path / form
         found = answer(
-            "export", store, taken.trial_id, "--output", folder, "--format", form,
-            "--stream", "side",
-        )  # fmt: skip
+            "export",
+            store,
+            taken.trial_id,
+            "--output",
+            folder,
+            "--format",
+            form,
+            "--stream",
+            "side",
+        )
         assert found["events"] == taken.record.streams["side"].rows
         assert found["triggers"] == taken.record.streams["side"].pulses
         (path,) = folder.glob(f"*.{'h5' if form == 'dsec' else form}")
@@ -556,9 +584,17 @@ def test_a_publication_has_their_files_and_describes_their_columns(
 ) -> None:
     folder = tmp_path / "published"
     answer(
-        "publish", taken.folder.parents[3], "--as", "croissant", "--output", folder,
-        "--licence", "CC-BY-4.0", "--creator", "Somebody",
-    )  # fmt: skip
+        "publish",
+        taken.folder.parents[3],
+        "--as",
+        "croissant",
+        "--output",
+        folder,
+        "--licence",
+        "CC-BY-4.0",
+        "--creator",
+        "Somebody",
+    )
     (trial,) = (folder / "campaigns" / "tiny" / "trials").iterdir()
     assert (trial / "stream-back.mkv").read_bytes() == taken.video("back").read_bytes()  # type: ignore[union-attr]
     assert (trial / "stream-side.h5").is_file()

@@ -99,19 +99,44 @@ class Case:
 
 CASES = [
     Case("arm", "protective stop", "protective stop", "unlock the stop at the pendant", 0.05),
-    Case("arm", "link cut", "may still move: check power and network",
-         "its own watchdog ends a move after 1 s", 1 / WATCHDOG_HZ),
-    Case("arm", "silence", "may still move: check power and network",
-         "its own watchdog ends a move after 1 s", 1 / WATCHDOG_HZ),
-    Case("frame_camera", "unplug", "frame camera: the camera was unplugged", "plug it in",
-         0.1 + POLL_S + STOP_S),
-    Case("event_camera", "stall", "event camera: sent no event and no pulse", "check cable",
-         1.0 + POLL_S + STOP_S),
-    Case("event_camera", "unplug", "event camera: the connection is lost", "check its cable",
-         POLL_S + STOP_S),
+    Case(
+        "arm",
+        "link cut",
+        "may still move: check power and network",
+        "its own watchdog ends a move after 1 s",
+        1 / WATCHDOG_HZ,
+    ),
+    Case(
+        "arm",
+        "silence",
+        "may still move: check power and network",
+        "its own watchdog ends a move after 1 s",
+        1 / WATCHDOG_HZ,
+    ),
+    Case(
+        "frame_camera",
+        "unplug",
+        "frame camera: the camera was unplugged",
+        "plug it in",
+        0.1 + POLL_S + STOP_S,
+    ),
+    Case(
+        "event_camera",
+        "stall",
+        "event camera: sent no event and no pulse",
+        "check cable",
+        1.0 + POLL_S + STOP_S,
+    ),
+    Case(
+        "event_camera",
+        "unplug",
+        "event camera: the connection is lost",
+        "check its cable",
+        POLL_S + STOP_S,
+    ),
     Case("sync_box", "reset", "sync box: .*restarted", "start the trial again", POLL_S + STOP_S),
     Case("sync_box", "unplug", "sync box: the connection broke", "Plug it in", POLL_S + STOP_S),
-]  # fmt: skip
+]
 
 
 FIRST = {("arm", "protective stop"), ("arm", "link cut"), ("sync_box", "unplug")}

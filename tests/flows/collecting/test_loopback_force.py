@@ -143,8 +143,9 @@ def test_a_trial_has_the_arms_own_wrench_by_its_clock(
     assert verify(Store.open(by_the_arm.store)) == []
     clock = live.record.clocks.streams["force"]
     assert (clock.grade, clock.uncertainty_ns) == (
-        "arm clock", live.record.clocks.arm.uncertainty_ns,
-    )  # fmt: skip
+        "arm clock",
+        live.record.clocks.arm.uncertainty_ns,
+    )
     assert (live.record.devices or {})["force_sensor"] == {"dropped": 0}
     agree(live, by_the_arm, tmp_path)
     # stamped by the controller: what came 20 ms late is not dated late
@@ -177,8 +178,11 @@ def test_the_arm_presses_to_a_force_through_the_wire(
     run_request: RunRequest = request.getfixturevalue(sensor)
     data = wide()
     data["collection"]["motion"][1] = {
-        "phase": "press", "force": "1 N", "depth": "3 mm", "speed": "1 mm/s",
-    }  # fmt: skip
+        "phase": "press",
+        "force": "1 N",
+        "depth": "3 mm",
+        "speed": "1 mm/s",
+    }
     data["collection"]["factors"].pop("depth")
     live = request_in(tmp_path / "live", data, run_request.store.parent.parent / "rig.yaml")
     with stage_of(live.rig) as stage, at_work(live, stage) as (work, campaign):

@@ -26,20 +26,27 @@ def usb_rig(folder: Path) -> Path:
         "extends": str(ROOT / "rigs" / "loopback.yaml"),
         "name": "loopback",
         "frame_camera": {
-            "scale_px_per_mm": 10, "width_px": 640, "height_px": 480, "rate_hz": RATE_HZ
+            "scale_px_per_mm": 10,
+            "width_px": 640,
+            "height_px": 480,
+            "rate_hz": RATE_HZ,
         },
         "timing": {"frames": "host arrival"},
         "devices": {
             "arm": {"host": own_address()},
             "frame_camera": {
-                "driver": "uvc", "width_px": 640, "height_px": 480, "rate_hz": RATE_HZ, **exposure
+                "driver": "uvc",
+                "width_px": 640,
+                "height_px": 480,
+                "rate_hz": RATE_HZ,
+                **exposure,
             },
         },
         "mock": {
             "arm": {"start_xyz_mm": [397, 0, 300]},
             "frame_camera": {"rate_hz": RATE_HZ},
         },
-    }  # fmt: skip
+    }
     return write(folder / "rig.yaml", data)
 
 

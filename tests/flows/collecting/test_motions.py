@@ -66,14 +66,24 @@ def test_slip_is_looked_for_in_all_moves_in_contact(tmp_path: Path) -> None:
 
 def test_a_campaign_keeps_its_motion_written_out(tmp_path: Path) -> None:
     motion = {
-        "template": "kinematic", "depth": "$depth", "distance": "5 mm", "speed": "$speed",
-        "direction": "90 deg", "settle": "0.5 s", "hold": "1.5 s",
-    }  # fmt: skip
+        "template": "kinematic",
+        "depth": "$depth",
+        "distance": "5 mm",
+        "speed": "$speed",
+        "direction": "90 deg",
+        "settle": "0.5 s",
+        "hold": "1.5 s",
+    }
     store = collected(tmp_path, motion)
     kept = yaml.safe_load(store.campaign("moves").protocol_file.read_text())
     assert [phase["phase"] for phase in kept["collection"]["motion"]] == [
-        "approach", "press", "hold", "slide", "release", "return",
-    ]  # fmt: skip
+        "approach",
+        "press",
+        "hold",
+        "slide",
+        "release",
+        "return",
+    ]
     # and goes on with the protocol that names the template
     make_request(tmp_path / "moves.yaml", RIG, tmp_path / "store")
 
@@ -81,9 +91,13 @@ def test_a_campaign_keeps_its_motion_written_out(tmp_path: Path) -> None:
 def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
     """The outer papillae slip first; gross slip begins with the last besides the centre one."""
     motion = {
-        "template": "press_twist", "depth": "$depth", "angle": "-40 deg", "speed": "$speed",
-        "settle": "0.5 s", "hold": "1.5 s",
-    }  # fmt: skip
+        "template": "press_twist",
+        "depth": "$depth",
+        "angle": "-40 deg",
+        "speed": "$speed",
+        "settle": "0.5 s",
+        "hold": "1.5 s",
+    }
     store = collected(tmp_path, motion, speed={"unit": "deg/s", "values": [8]})
     (recording,) = store.campaign("moves").recordings()
     assert recording.motion_phase == "twist"
@@ -117,9 +131,14 @@ def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
 def test_a_twist_of_a_ur_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
     """The real driver on its fake, which moves the sensor in the simulated scene."""
     motion = {
-        "template": "press_twist", "depth": "$depth", "angle": "40 deg", "speed": "$speed",
-        "settle": "0.5 s", "hold": "1.5 s", "press": "4 mm/s",
-    }  # fmt: skip
+        "template": "press_twist",
+        "depth": "$depth",
+        "angle": "40 deg",
+        "speed": "$speed",
+        "settle": "0.5 s",
+        "hold": "1.5 s",
+        "press": "4 mm/s",
+    }
     speed = {"unit": "deg/s", "values": [10]}
     store = collected(tmp_path, motion, rig_yaml(tmp_path), speed=speed)
     (recording,) = store.campaign("moves").recordings()

@@ -87,8 +87,9 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
     assert pauses == [3 * supervising.POLL_S]
     asked = control.requests(store)
     assert [(item.kind, item.who, item.why) for item in asked] == [
-        ("pause", "anna", "lunch"), ("resume", "ben", ""),
-    ]  # fmt: skip
+        ("pause", "anna", "lunch"),
+        ("resume", "ben", ""),
+    ]
     answers = [control.answered(store, item) for item in asked]
     assert [answer and answer["did"]["paused"] for answer in answers] == [True, False]
     assert checksums(campaign) == checksums(untouched)
@@ -113,8 +114,11 @@ def test_a_pause_that_nobody_ends_ends_the_stretch(
 def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path) -> None:
     data = short()
     data["collection"]["maintenance"]["warm_up"] = {
-        "presses": 1, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm",
-    }  # fmt: skip
+        "presses": 1,
+        "depth": "2.4 mm",
+        "speed": "2 mm/s",
+        "clearance": "5 mm",
+    }
     work, campaign, store = supervised(tmp_path / "a", data)
     done: list[str] = []
     press, touch_off = work.rig.press, work.rig.touch_off
@@ -168,8 +172,9 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     answer = control.answered(store, request)
     assert answer is not None
     assert answer["did"]["trials"] == {
-        second: "set aside", first: "is committed: left as it is",
-    }  # fmt: skip
+        second: "set aside",
+        first: "is committed: left as it is",
+    }
     (aside,) = excluded_trials(work.plan, campaign)
     assert (aside["trial"], aside["cause"], aside["by"]) == (second, "cable in the way", "anna")
     assert skipped(campaign)[second]["request"] == 1

@@ -41,9 +41,11 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
         work.take(pending_trials(work.plan, campaign))
     message = str(stopped.value)
     for part in (
-        "stopped, the disk is nearly full: 200.0 MB are free", "(by the trials so far)",
-        "200.0 MB stay in reserve", "make room, then run the same command to resume",
-    ):  # fmt: skip
+        "stopped, the disk is nearly full: 200.0 MB are free",
+        "(by the trials so far)",
+        "200.0 MB stay in reserve",
+        "make room, then run the same command to resume",
+    ):
         assert part in message
     assert len(campaign.committed()) == 2
     assert campaign.quarantined() == []
@@ -100,9 +102,11 @@ def test_references_that_drift_apart_stop_the_campaign(
     message = str(stopped.value)
     for part in (
         f"{second} has 1,234 events/s in the hold, {first} had 1,000 (+23.4 %, "
-        "gates.reference.event_rate = 20 %)", "simulated reference trials",
-        f"`sliplab again {run_request.store} {second} --why ...`", "Onsets were not compared",
-    ):  # fmt: skip
+        "gates.reference.event_rate = 20 %)",
+        "simulated reference trials",
+        f"`sliplab again {run_request.store} {second} --why ...`",
+        "Onsets were not compared",
+    ):
         assert part in message
     assert len(campaign.committed()) == 3
     # it does not go on by itself ...

@@ -86,19 +86,24 @@ def test_a_stored_trial_gives_the_offline_windows_and_decisions(stored: Recordin
         return network(window)
 
     live = LiveDetector(
-        counting, fitted.windows, rule,
+        counting,
+        fitted.windows,
+        rule,
         starts=lambda number: starts_us[number] if number < len(starts_us) else 1 << 60,
-    )  # fmt: skip
+    )
     events = stored.events()
     made = []
     for begin in range(0, len(events), 997):
         piece = slice(begin, begin + 997)
         made += live.push(
             replace(
-                events, x=events.x[piece], y=events.y[piece], p=events.p[piece],
+                events,
+                x=events.x[piece],
+                y=events.y[piece],
+                p=events.p[piece],
                 t_us=events.t_us[piece],
             )
-        )  # fmt: skip
+        )
     made += live.advance(starts_us[-1] + length_ns // 1000)
     np.testing.assert_array_equal(np.concatenate(seen), x.dense())
     assert [item.counts for item in made] == [tuple(row) for row in counts.tolist()]
@@ -217,9 +222,13 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
     data = tiny_gravity()
     data["collection"]["motion"][5] |= {"settle": "0.3 s", "duration": "0.3 s"}
     order = make_detect_request(
-        RIG, model, protocol=write(tmp_path / "g.yaml", data), trial="mass=0.165kg", reflex="stop",
+        RIG,
+        model,
+        protocol=write(tmp_path / "g.yaml", data),
+        trial="mass=0.165kg",
+        reflex="stop",
         hold_s=0.2,
-    )  # fmt: skip
+    )
     rigs: list[Rig] = []
     truth: list[dict[str, Any]] = []
 

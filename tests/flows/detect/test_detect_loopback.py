@@ -24,9 +24,13 @@ BEHIND_MS = 500.0
 
 def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
     order = make_detect_request(
-        rig_yaml(tmp_path), model_in(tmp_path), protocol=write(tmp_path / "p.yaml", short_slide()),
-        trial="", reflex="press:0.3", hold_s=0.3,
-    )  # fmt: skip
+        rig_yaml(tmp_path),
+        model_in(tmp_path),
+        protocol=write(tmp_path / "p.yaml", short_slide()),
+        trial="",
+        reflex="press:0.3",
+        hold_s=0.3,
+    )
     with stage_of(order.rig) as stage:
 
         def build(file: RigFile) -> Rig:
@@ -50,16 +54,23 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
 
 
 def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path: Path) -> None:
-    file = write(tmp_path / "gripper.yaml", {
-        "extends": str(rig_yaml(tmp_path)),
-        "name": "loopback",
-        "devices": {"gripper": {"driver": "robotiq_2f", "host": "127.0.0.1", "opening_mm": 40}},
-        "mock": {"gripper": {"opening_mm": 40}},
-    })  # fmt: skip
+    file = write(
+        tmp_path / "gripper.yaml",
+        {
+            "extends": str(rig_yaml(tmp_path)),
+            "name": "loopback",
+            "devices": {"gripper": {"driver": "robotiq_2f", "host": "127.0.0.1", "opening_mm": 40}},
+            "mock": {"gripper": {"opening_mm": 40}},
+        },
+    )
     order = make_detect_request(
-        file, model_in(tmp_path), protocol=write(tmp_path / "p.yaml", short_slide()), trial="",
-        reflex="grip:1", hold_s=0.3,
-    )  # fmt: skip
+        file,
+        model_in(tmp_path),
+        protocol=write(tmp_path / "p.yaml", short_slide()),
+        trial="",
+        reflex="grip:1",
+        hold_s=0.3,
+    )
     with stage_of(order.rig) as stage:
 
         def build(file: RigFile) -> Rig:

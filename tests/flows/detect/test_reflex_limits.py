@@ -71,12 +71,15 @@ class Drawn(NullSink):
 def fault(rng: np.random.Generator) -> dict[str, Any] | None:
     """Draw a fault of the rig, or none."""
     kinds: tuple[dict[str, Any] | None, ...] = (
-        None, None,
-        {"kind": "arm_protective_stop"}, {"kind": "device_gone", "device": "gripper"},
-        {"kind": "device_gone", "device": "arm"}, {"kind": "plate_stuck"},
+        None,
+        None,
+        {"kind": "arm_protective_stop"},
+        {"kind": "device_gone", "device": "gripper"},
+        {"kind": "device_gone", "device": "arm"},
+        {"kind": "plate_stuck"},
         {"kind": "arm_off_path", "mm": 0.3, "seconds": 0.1},
         {"kind": "papilla_sticky", "papilla": 0, "factor": 2.0},
-    )  # fmt: skip
+    )
     found = kinds[rng.integers(len(kinds))]
     if found is None or found["kind"] in ("plate_stuck", "papilla_sticky"):
         return found
@@ -93,15 +96,18 @@ def program(rng: np.random.Generator, deepest_mm: float) -> Program:
     acting = Move("retract", Position(0.0, 0.0, max(depth - way, 0.1)), speed, recorded=True)
     if rng.random() < 0.3:
         acting = Move("slide", Position(min(way, 5.0), 0.0, depth), speed, recorded=True)
-    return Program(home, (
-        PlateStep("plate", "raise", 0.0),
-        Move("press", deep, ARM_MM_S),
-        PlateStep("plate", "release", 0.02),
-        Dwell("hold", 0.05, recorded=True),
-        acting,
-        Move("release", home, ARM_MM_S),
-        PlateStep("plate", "catch", 0.0),
-    ))  # fmt: skip
+    return Program(
+        home,
+        (
+            PlateStep("plate", "raise", 0.0),
+            Move("press", deep, ARM_MM_S),
+            PlateStep("plate", "release", 0.02),
+            Dwell("hold", 0.05, recorded=True),
+            acting,
+            Move("release", home, ARM_MM_S),
+            PlateStep("plate", "catch", 0.0),
+        ),
+    )
 
 
 def reflex(
@@ -112,10 +118,13 @@ def reflex(
     assert gripper is not None
     press = kind == "press"
     return Reflex(
-        kind, deepest_mm, float(rng.uniform(0.05, 1.5)),
+        kind,
+        deepest_mm,
+        float(rng.uniform(0.05, 1.5)),
         float(rng.uniform(1.0, ARM_MM_S) if press else rng.uniform(*gripper.speed_mm_s)),
-        float(rng.uniform(gripper.force_n[0], 9.0)), 0.05,
-    )  # fmt: skip
+        float(rng.uniform(gripper.force_n[0], 9.0)),
+        0.05,
+    )
 
 
 def one_trial(number: int) -> str:

@@ -34,9 +34,12 @@ STREAM_MS, DECISION_MS = 200.0, 100.0
 
 
 def gripping(
-    model: Path, protocol: Path, folder: Path, change: dict[str, Any] | None = None,
+    model: Path,
+    protocol: Path,
+    folder: Path,
+    change: dict[str, Any] | None = None,
     reflex: str = "grip:0.4",
-) -> DetectRequest:  # fmt: skip
+) -> DetectRequest:
     """A trial on the rig with a gripper, with changes of its file."""
     file = write(folder / "rig.yaml", {"extends": str(RIG), **(change or {})})
     return make_detect_request(file, model, protocol=protocol, trial="", reflex=reflex, hold_s=0.2)
@@ -269,9 +272,19 @@ def test_the_command_says_what_was_lost_and_fails(
     gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
     file = write(tmp_path / "rig.yaml", {"extends": str(RIG), "mock": {"faults": [gone]}})
     done = here(
-        "detect", "--rig", file, "--model", model, "--protocol", protocol,
-        "--trial", "depth=2.4mm", "--reflex", "grip:0.4", "--json",
-    )  # fmt: skip
+        "detect",
+        "--rig",
+        file,
+        "--model",
+        model,
+        "--protocol",
+        protocol,
+        "--trial",
+        "depth=2.4mm",
+        "--reflex",
+        "grip:0.4",
+        "--json",
+    )
     assert done.returncode == 1
     error = json.loads(done.stdout)["error"]
     assert "event camera: does not answer" in error["message"]

@@ -67,9 +67,12 @@ def address(workers_cache: Path) -> Iterator[str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SLIPLAB_CACHE", str(workers_cache))
         with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1",
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
-        ) as cluster:  # fmt: skip
+        ) as cluster:
             yield cluster.scheduler_address
 
 
@@ -166,9 +169,13 @@ def test_a_stop_cancels_what_is_queued(tmp_path: Path, cluster: Cluster) -> None
 
 
 def test_a_pushed_store_is_labelled_where_its_trials_are_fetched(
-    taken: Path, here: dict[str, bytes], tmp_path: Path, cluster: Cluster, workers_cache: Path,
+    taken: Path,
+    here: dict[str, bytes],
+    tmp_path: Path,
+    cluster: Cluster,
+    workers_cache: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "cache"))
     url = f"file://{tmp_path}/shared"
     push(Store.open(taken), Remote(url))

@@ -65,8 +65,10 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
 def test_the_documented_commands_make_the_same_bytes(taken: Path, tmp_path: Path) -> None:
     scheduler, worker, step = documented()
     assert [scheduler[:2], worker[:2], step[:2]] == [
-        ["dask", "scheduler"], ["dask", "worker"], ["sliplab", "label"]
-    ]  # fmt: skip
+        ["dask", "scheduler"],
+        ["dask", "worker"],
+        ["sliplab", "label"],
+    ]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
@@ -91,9 +93,14 @@ def test_the_documented_commands_make_the_same_bytes(taken: Path, tmp_path: Path
     ):
         until("two workers", lambda: len(re.findall("Registered to", log.read_text())) >= 2)
         done = subprocess.run(
-            ready(step, store), env=environment, text=True, capture_output=True, timeout=180,
-            cwd=tmp_path, check=False,
-        )  # fmt: skip
+            ready(step, store),
+            env=environment,
+            text=True,
+            capture_output=True,
+            timeout=180,
+            cwd=tmp_path,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr + log.read_text()
     plain = [word for word in ready(step, alone) if word != "--dask" and port not in word]
     subprocess.run(plain, env=environment, timeout=180, check=True, capture_output=True)

@@ -203,10 +203,26 @@ def test_command_in_an_odd_environment(
     if "PREFECT_HOME" not in change:
         environment.pop("PREFECT_HOME")
     done = subprocess.run(
-        [*SLIPLAB, "collect", "pilot", "--rig", "rehearsal", "--trials", "1",
-         "--store", str(store), "--operator", "Zoë 木村", "--json"],
-        cwd=ROOT, env=environment, capture_output=True, timeout=240, check=False,
-    )  # fmt: skip
+        [
+            *SLIPLAB,
+            "collect",
+            "pilot",
+            "--rig",
+            "rehearsal",
+            "--trials",
+            "1",
+            "--store",
+            str(store),
+            "--operator",
+            "Zoë 木村",
+            "--json",
+        ],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        timeout=240,
+        check=False,
+    )
     text = done.stderr.decode()
     assert done.returncode == code, text
     assert said in text
@@ -234,8 +250,13 @@ def test_label_in_a_script_without_a_guard_collects_once(tmp_path: Path) -> None
     environment = {key: value for key, value in os.environ.items() if key != "PREFECT_HOME"}
     done = subprocess.run(
         [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "store")],
-        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["1"]
     (campaign,) = Store.open(tmp_path / "store").campaigns()

@@ -72,9 +72,13 @@ def test_every_step_goes_on_after_it_was_killed(
         runs_before, results_before = begun(), results()
         wanted = random.randrange(FILES[step])
         process = subprocess.Popen(
-            command, cwd=ROOT, env=environment, start_new_session=True,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            command,
+            cwd=ROOT,
+            env=environment,
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
 
         def far_enough() -> bool:
             if process.poll() is not None:  # noqa: B023
@@ -89,9 +93,14 @@ def test_every_step_goes_on_after_it_was_killed(
         assert process.returncode == -signal.SIGKILL, f"{step} was over before {wanted} files"
         (killed,) = begun() - runs_before
         done = subprocess.run(
-            command, cwd=ROOT, env=environment, text=True, capture_output=True, timeout=240,
+            command,
+            cwd=ROOT,
+            env=environment,
+            text=True,
+            capture_output=True,
+            timeout=240,
             check=False,
-        )  # fmt: skip
+        )
         assert done.returncode == 0, done.stderr
         assert "Prefect server" not in done.stderr
         made = json.loads(done.stdout)

@@ -29,9 +29,13 @@ LOST = "error: the result cannot be written to standard output: "
 def shell(line: str) -> subprocess.CompletedProcess[str]:
     """Run a line of bash whose last command's exit code is the line's."""
     return subprocess.run(
-        ["bash", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=120,
+        ["bash", "-c", line],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
         stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(
@@ -138,8 +142,10 @@ def test_streams_of_a_test_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_file_name_that_is_no_text_can_be_printed() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "sliplab", "plan", b"no\xffname.yaml", "--json"],
-        cwd=ROOT, capture_output=True, timeout=120,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        timeout=120,
+    )
     assert done.returncode == 2
     assert json.loads(done.stdout)["error"]["file"] == "no\udcffname.yaml"
     assert b"Traceback" not in done.stderr

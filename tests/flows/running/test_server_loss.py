@@ -50,9 +50,12 @@ class Collection:
                     *(sys.executable, "-m", "sliplab", "collect", str(protocol)),
                     *("--rig", "rehearsal", "--store", str(self.store), "--json"),
                 ],
-                cwd=ROOT, env=self._environment, start_new_session=True,
-                stdout=subprocess.DEVNULL, stderr=messages,
-            )  # fmt: skip
+                cwd=ROOT,
+                env=self._environment,
+                start_new_session=True,
+                stdout=subprocess.DEVNULL,
+                stderr=messages,
+            )
 
     @property
     def committed(self) -> int:
@@ -91,9 +94,13 @@ class Collection:
         """Run the next command; returns its messages."""
         done = subprocess.run(
             [sys.executable, "-m", "sliplab", "label", str(self.store)],
-            cwd=ROOT, env=self._environment, text=True, capture_output=True, timeout=120,
+            cwd=ROOT,
+            env=self._environment,
+            text=True,
+            capture_output=True,
+            timeout=120,
             check=True,
-        )  # fmt: skip
+        )
         return done.stderr
 
 
@@ -258,8 +265,13 @@ def test_closed_standard_streams_do_not_matter(closed: str, tmp_path: Path) -> N
     store = tmp_path / "store"
     done = subprocess.run(
         ["/bin/sh", "-c", f"exec {command} --store {store} {closed}"],
-        cwd=ROOT, env=environment, text=True, stderr=subprocess.PIPE, timeout=120, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment,
+        text=True,
+        stderr=subprocess.PIPE,
+        timeout=120,
+        check=False,
+    )
     # the result has nowhere to go where standard output is closed, which is said as a failure
     assert done.returncode == (1 if ">&-" in closed else 0), done.stderr
     assert LOST not in done.stderr
@@ -275,7 +287,12 @@ def test_a_limit_on_the_size_of_files_is_named(tmp_path: Path) -> None:
     environment.pop("PREFECT_HOME", None)
     done = subprocess.run(
         ["/bin/sh", "-c", f"ulimit -f 100; exec {command} --store {tmp_path / 'store'}"],
-        cwd=ROOT, env=environment, text=True, stderr=subprocess.PIPE, timeout=120, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment,
+        text=True,
+        stderr=subprocess.PIPE,
+        timeout=120,
+        check=False,
+    )
     assert "file size limit" in done.stderr, done.stderr
     assert time.monotonic() - began < 110

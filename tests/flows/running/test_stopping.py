@@ -184,9 +184,12 @@ def test_signal_before_or_after_the_work_is_said_in_one_line(
     script.write_text(AT_AN_EDGE)
     done = subprocess.run(
         [sys.executable, str(script), place, str(int(number)), "--version"],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
+    )
     assert done.returncode == 130, done.stderr
     assert done.stderr.startswith("interrupted")
     assert len(done.stderr.splitlines()) == 1

@@ -127,8 +127,12 @@ def serving(
     with log.open("w") as output:
         process = subprocess.Popen(
             [*command, "--name", name, "--poll", "0.3"],
-            cwd=ROOT, env=environment, stdout=output, stderr=output, start_new_session=True,
-        )  # fmt: skip
+            cwd=ROOT,
+            env=environment,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+        )
     try:
         until(
             "the service",

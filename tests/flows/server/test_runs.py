@@ -60,5 +60,6 @@ def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(tmp_path: Path) -> N
         assert len(list(trials.iterdir())) == 6
     ends = [read_json(path) for path in records.glob("*.end.json")]
     assert sorted((end["state"], end["by"]) for end in ends) == [
-        ("COMPLETED", "flow"), ("CRASHED", "service"),
-    ]  # fmt: skip
+        ("COMPLETED", "flow"),
+        ("CRASHED", "service"),
+    ]

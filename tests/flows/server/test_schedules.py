@@ -22,9 +22,13 @@ from tests.conftest import ROOT
 ROME = "Europe/Rome"
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 NIGHT: dict[str, Any] = {
-    "name": "nights", "flow": "collect", "protocol": str(ROOT / "protocols" / "pilot.yaml"),
-    "days": ["mon", "thu"], "from": "22:00", "until": "06:00",
-}  # fmt: skip
+    "name": "nights",
+    "flow": "collect",
+    "protocol": str(ROOT / "protocols" / "pilot.yaml"),
+    "days": ["mon", "thu"],
+    "from": "22:00",
+    "until": "06:00",
+}
 
 
 def write(folder: Path, *schedules: dict[str, Any], timezone: str = ROME) -> Path:
@@ -37,8 +41,10 @@ def test_the_shipped_example_is_right() -> None:
     nights, weekend, report = load_schedules(ROOT / "docs" / "schedules.yaml")
     assert (nights.flow, nights.cron) == ("collect", "0 22 * * mon,tue,wed,thu")
     assert nights.parameters == {
-        "protocol": str(ROOT / "protocols" / "kinematic.yaml"), "until": "06:00", "timezone": ROME,
-    }  # fmt: skip
+        "protocol": str(ROOT / "protocols" / "kinematic.yaml"),
+        "until": "06:00",
+        "timezone": ROME,
+    }
     assert (weekend.flow, weekend.parameters["until"]) == ("chain", "mon 06:00")
     assert (report.cron, report.active, report.parameters) == ("30 8 * * tue-sat", False, {})
 
@@ -113,10 +119,15 @@ def test_all_faults_of_all_schedules_are_named_with_the_nearest_names(tmp_path: 
     with pytest.raises(InputError) as caught:
         load_schedules(write(tmp_path, night, report, both))
     for said in (
-        "schedules[0].name = Nights!", "schedules[0].days[1] = thuu", "; did you mean 'thu'?",
-        "schedules[0].trials = 0", "schedules[1].flow = reprt", "; did you mean 'report'?",
-        "schedules[2].name = Both!", "schedules[2].cron = 0 22 * * * *: must have five fields",
-    ):  # fmt: skip
+        "schedules[0].name = Nights!",
+        "schedules[0].days[1] = thuu",
+        "; did you mean 'thu'?",
+        "schedules[0].trials = 0",
+        "schedules[1].flow = reprt",
+        "; did you mean 'report'?",
+        "schedules[2].name = Both!",
+        "schedules[2].cron = 0 22 * * * *: must have five fields",
+    ):
         assert said in caught.value.message
     with pytest.raises(InputError, match=r"is not a time zone; .*; did you mean 'Europe/Rome'\?"):
         load_schedules(write(tmp_path, NIGHT, timezone="Europe/rome"))

@@ -152,10 +152,17 @@ def test_a_run_reads_no_file_outside_the_services_folders(
     (folder / "folder").symlink_to(elsewhere.parent)
     (folder / "key.pem").write_text(SECRET)
     for given in (
-        "/proc/self/environ", "/etc/shadow", str(elsewhere), "../elsewhere0/protocol.yaml",
-        "link.yaml", "folder/protocol.yaml", "key.pem", "", "/",
+        "/proc/self/environ",
+        "/etc/shadow",
+        str(elsewhere),
+        "../elsewhere0/protocol.yaml",
+        "link.yaml",
+        "folder/protocol.yaml",
+        "key.pem",
+        "",
+        "/",
         str(elsewhere.with_name("missing.yaml")),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match=r"must be a file .yaml or .yml below ") as error:
             service.protocol(Path(given))
         assert SECRET not in str(error.value)
@@ -166,10 +173,15 @@ def test_a_run_reads_no_file_outside_the_services_folders(
 @pytest.mark.parametrize(
     "text",
     [
-        f"password: {SECRET}\n", SECRET, f"a: *{SECRET}\n", f"{SECRET}: 1\n{SECRET}: 2\n",
-        f"!{SECRET} x\n", f"? {{{SECRET}: 1}}\n: 2\n", f"protocol_of: {SECRET}\n",
+        f"password: {SECRET}\n",
+        SECRET,
+        f"a: *{SECRET}\n",
+        f"{SECRET}: 1\n{SECRET}: 2\n",
+        f"!{SECRET} x\n",
+        f"? {{{SECRET}: 1}}\n: 2\n",
+        f"protocol_of: {SECRET}\n",
     ],
-)  # fmt: skip
+)
 def test_nothing_is_quoted_of_what_is_no_protocol(
     service: Service, tmp_path: Path, text: str
 ) -> None:
@@ -270,11 +282,15 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     when = serve._prefects(
         [
             Scheduled(
-                name="nights", flow="collect", cron="0 22 * * *", timezone="Europe/Rome",
-                active=True, parameters={"protocol": "p.yaml", "until": "06:00"},
+                name="nights",
+                flow="collect",
+                cron="0 22 * * *",
+                timezone="Europe/Rome",
+                active=True,
+                parameters={"protocol": "p.yaml", "until": "06:00"},
             )
         ]
-    )  # fmt: skip
+    )
     store = Store.open(service.folder)
 
     async def register() -> None:

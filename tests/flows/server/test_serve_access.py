@@ -55,10 +55,15 @@ class Service:
     def handshake(self, path: str, **headers: str) -> int:
         """The status that answers a websocket's first request."""
         return self.ask(
-            "GET", path, Upgrade="websocket", Connection="Upgrade", Sec_WebSocket_Version="13",
+            "GET",
+            path,
+            Upgrade="websocket",
+            Connection="Upgrade",
+            Sec_WebSocket_Version="13",
             Sec_WebSocket_Key=base64.b64encode(b"0" * 16).decode(),
-            Sec_WebSocket_Protocol="prefect", **headers,
-        )[0]  # fmt: skip
+            Sec_WebSocket_Protocol="prefect",
+            **headers,
+        )[0]
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +82,12 @@ def basic(password: str) -> str:
 
 def test_a_foreign_page_gets_no_leave_to_ask(service: Service) -> None:
     status, headers, _ = service.ask(
-        "OPTIONS", "/api/deployments/filter", Origin=EVIL,
-        Access_Control_Request_Method="POST", Access_Control_Request_Headers="content-type",
-    )  # fmt: skip
+        "OPTIONS",
+        "/api/deployments/filter",
+        Origin=EVIL,
+        Access_Control_Request_Method="POST",
+        Access_Control_Request_Headers="content-type",
+    )
     assert (status, headers.get("access-control-allow-origin")) == (403, None)
 
 
@@ -141,9 +149,12 @@ def test_a_change_needs_a_token_of_its_own(service: Service) -> None:
 
 
 SOCKETS = (
-    "/api/events/in", "/api/events/out", "/api/logs/out", "/api/task_runs/subscriptions/scheduled",
+    "/api/events/in",
+    "/api/events/out",
+    "/api/logs/out",
+    "/api/task_runs/subscriptions/scheduled",
     "/api/work_pools/pool/workers/connect",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("path", SOCKETS)

@@ -63,9 +63,18 @@ def database(password: str) -> Iterator[str]:
 
     try:
         call(
-            str(BIN / "initdb"), "-D", data, "-U", "prefect", "-A", "scram-sha-256",
-            "--pwfile", str(secret), "--no-sync", "--locale=C.UTF-8",
-        )  # fmt: skip
+            str(BIN / "initdb"),
+            "-D",
+            data,
+            "-U",
+            "prefect",
+            "-A",
+            "scram-sha-256",
+            "--pwfile",
+            str(secret),
+            "--no-sync",
+            "--locale=C.UTF-8",
+        )
         options += f" -c unix_socket_directories={folder}"
         log = str(folder / "log")
         call(control_program, "start", "-w", "-s", "-D", data, "-l", log, "-o", options)

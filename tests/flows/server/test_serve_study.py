@@ -25,8 +25,9 @@ def test_only_the_whole_study_has_the_extra_disturbance() -> None:
     assert list(study_protocols(False, True).values()) == [(), (), ("disturbance=125",)]
     assert list(study_protocols(False, False).values()) == [(), (), ()]
     assert {file.stem: on for file, on in study_protocols(True, True).items()} == {
-        "pilot": (), "pilot_gravity": ()
-    }  # fmt: skip
+        "pilot": (),
+        "pilot_gravity": (),
+    }
 
 
 @pytest.mark.parametrize(("extra", "trials"), [(True, 100), (False, 80)])

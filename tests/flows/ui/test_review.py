@@ -85,12 +85,20 @@ def test_the_list_follows_the_store(made: Reviewable) -> None:
 
 
 def test_doubts_are_told_once_and_gravest_first() -> None:
-    data = {"incipient_ns": None, "gross_ns": None, "end_ns": 1, "markers_lost": 2, "plate_lost": 1,
-            "doubts": {"incipient": None, "gross": "hidden"}}  # fmt: skip
+    data = {
+        "incipient_ns": None,
+        "gross_ns": None,
+        "end_ns": 1,
+        "markers_lost": 2,
+        "plate_lost": 1,
+        "doubts": {"incipient": None, "gross": "hidden"},
+    }
     assert [text for _, text in reasons_for_doubt(TrialLabel.model_validate(data))] == [
-        "gross: hidden", "no slip was found", "2 times a marker was not seen",
+        "gross: hidden",
+        "no slip was found",
+        "2 times a marker was not seen",
         "the plate's marker was not seen in 1 frame",
-    ]  # fmt: skip
+    ]
 
 
 def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:

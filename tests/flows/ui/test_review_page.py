@@ -44,9 +44,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     made = Reviewable(tmp_path_factory.mktemp("review") / "store")
     process = subprocess.Popen(
         [sys.executable, "-m", "sliplab", "review", str(made.store.folder), "--json", "--who=anna"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
         env={**os.environ, "PYTHONWARNINGS": "default"},
-    )  # fmt: skip
+    )
     try:
         assert process.stdout is not None
         reported = json.loads(process.stdout.readline())
@@ -255,9 +258,17 @@ def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: 
     known = label()
     onsets = review.Onsets(known["incipient_ns"], known["gross_ns"])
     review.decide(
-        served.made.store, NAME, trial, "reject", label=served.made.keys[trial], old=onsets,
-        new=review.Onsets(), seen=0, who="bert", why="blurred",
-    )  # fmt: skip
+        served.made.store,
+        NAME,
+        trial,
+        "reject",
+        label=served.made.keys[trial],
+        old=onsets,
+        new=review.Onsets(),
+        seen=0,
+        who="bert",
+        why="blurred",
+    )
     tab.press("a")
     # either the page knew already, and this is a second decision, or it says so
     expect(tab.page.locator("table.past")).to_contain_text("bert")

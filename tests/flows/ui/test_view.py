@@ -46,9 +46,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Reviewable:
     old = Onsets(known["incipient_ns"], known["gross_ns"])
     new = Onsets(310_000_001, 450_000_002)
     review.decide(
-        found.store, NAME, trial, "adjust", label=found.keys[trial], old=old, new=new, seen=0,
+        found.store,
+        NAME,
+        trial,
+        "adjust",
+        label=found.keys[trial],
+        old=old,
+        new=new,
+        seen=0,
         who="anna",
-    )  # fmt: skip
+    )
     counts = {"counts": np.arange(12).reshape(4, 3), "end_ns": np.array([5, 7, 9, 1 << 60])}
     Derived.of(found.store, "counts", NAME).write(trial, "k", {}, counts)
     return found

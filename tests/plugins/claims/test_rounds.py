@@ -25,9 +25,10 @@ from tests.flows.live import quick
 SURE = {"figure": "first_slip", "at_most": "10 s"}
 NEVER = {"figure": "first_slip", "statistic": "p05", "within": "0.001 ms"}  # needs 60 blocks
 RIG = {
-    "extends": str(ROOT / "rigs" / "mock.yaml"), "name": "mock",
+    "extends": str(ROOT / "rigs" / "mock.yaml"),
+    "name": "mock",
     "mock": {"frame_camera": {"level": "tracks"}},
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -259,9 +260,10 @@ def test_a_claim_about_a_network_needs_one(tmp_path: Path) -> None:
 def test_through_real_drivers_a_campaign_ends_by_its_claims(tmp_path: Path) -> None:
     data = quick(trials=2, repetitions=9)
     data["collection"] |= {
-        "order": "adaptive", "choice": {"batch": 2, "start": 2},
+        "order": "adaptive",
+        "choice": {"batch": 2, "start": 2},
         "stopping": {"error": 0.4, "claims": [SURE]},
-    }  # fmt: skip
+    }
     protocol, store = write(tmp_path / "quick.yaml", data), tmp_path / "store"
     words = ("collect", protocol, "--rig", "loopback", "--store", store)
     taken = answer(*words)["taken"]

@@ -19,9 +19,16 @@ from sliplab.storage.trials.store import Store
 def state(low: float | None, **more: Any) -> ClaimState:
     """A claim of at most 90 ms."""
     return ClaimState(
-        claim="median latency at most 90 ms", kind="at_most", value=90.0, unit="ms", trials=7,
-        estimate=70.5, low=low, high=None, **{"holds": False, "refuted": False, **more},
-    )  # fmt: skip
+        claim="median latency at most 90 ms",
+        kind="at_most",
+        value=90.0,
+        unit="ms",
+        trials=7,
+        estimate=70.5,
+        low=low,
+        high=None,
+        **{"holds": False, "refuted": False, **more},
+    )
 
 
 def campaign(
@@ -55,9 +62,19 @@ def test_a_claim_stands_with_the_look_that_called_it(tmp_path: Path, small: dict
     assert (shown.taken, shown.planned, shown.error, shown.chosen) == (27, 36, 10.0, False)
     (row,) = shown.table.rows
     assert row == [
-        "median latency at most 90 ms", "holds", "18", "70.5", "61", "–", "ms", "7",
-        "0", "0", "0", "–",
-    ]  # fmt: skip
+        "median latency at most 90 ms",
+        "holds",
+        "18",
+        "70.5",
+        "61",
+        "–",
+        "ms",
+        "7",
+        "0",
+        "0",
+        "0",
+        "–",
+    ]
     data = shown.figure.data
     assert data["trials"] == [9, 18, 27]
     assert data["1: median latency at most 90 ms, low (ms)"] == [None, 60.0, 61.0]

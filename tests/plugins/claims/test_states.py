@@ -51,9 +51,7 @@ def shuffled(plan: Plan, y: np.ndarray) -> Iterator[tuple[ClaimState, ...]]:
     assert stopping is not None
     ends = np.arange(36, len(y) + 1, 36)
     found: tuple[ClaimState, ...] = ()
-    whole = Evidence(
-        grid, np.arange(len(y)), ends, {"slip_duration": y}, block=stopping.block
-    )  # fmt: skip
+    whole = Evidence(grid, np.arange(len(y)), ends, {"slip_duration": y}, block=stopping.block)
     for k in range(len(ends)):
         found = states(whole.until(k), stopping, earlier=found)
         yield found
@@ -67,18 +65,24 @@ def adaptive(plan: Plan, y: np.ndarray) -> Iterator[tuple[Evidence, tuple[ClaimS
     assert choice is not None
     batches: list[Batch] = []
     evidence = Evidence(
-        grid, np.array([], np.int64), np.array([], np.int64),
-        {"slip_duration": np.array([])}, np.array([]),
-    )  # fmt: skip
+        grid,
+        np.array([], np.int64),
+        np.array([], np.int64),
+        {"slip_duration": np.array([])},
+        np.array([]),
+    )
     while (batch := next_batch(evidence, batches, stopping, choice, 5)) is not None:
         batches.append(batch)
         items = [(item, each) for each in batches for item in each.trials]
         taken = np.array([grid.number[item.trial] for item, _ in items])
         chance = [np.nan if item.chance is None else item.chance for item, _ in items]
         evidence = Evidence(
-            grid, taken, np.cumsum([len(each.trials) for each in batches]),
-            {"slip_duration": y[taken]}, np.array(chance),
-        )  # fmt: skip
+            grid,
+            taken,
+            np.cumsum([len(each.trials) for each in batches]),
+            {"slip_duration": y[taken]},
+            np.array(chance),
+        )
         yield evidence, states(evidence, stopping)
 
 
@@ -98,8 +102,13 @@ def test_a_claim_of_each_kind_is_settled_as_it_is() -> None:
     y = 3000.0 + 600.0 * (depth == 2.4) + np.random.default_rng(1).normal(0, 50, len(depth))
     *_, last = shuffled(plan, y)
     assert [(s.holds, s.refuted) for s in last] == [
-        (True, False), (True, False), (False, True), (True, False), (True, False), (True, False),
-    ]  # fmt: skip
+        (True, False),
+        (True, False),
+        (False, True),
+        (True, False),
+        (True, False),
+        (True, False),
+    ]
     assert settled(last)
     assert last[0].estimate == pytest.approx(np.median(y), abs=20)
     assert last[4].estimate == pytest.approx(-600, abs=40)

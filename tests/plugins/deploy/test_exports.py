@@ -129,23 +129,33 @@ def test_what_does_not_fit_is_said(network: Network, windows: Windows, said: str
 
 @settings(max_examples=60)
 @given(
-    st.integers(1, 64), st.integers(1, 64), st.integers(1, 128),
-    st.sampled_from([1, 3, 5, 7]), st.sampled_from([1, 3, 5, 7]), st.sampled_from([6, 10, 20, 28]),
-)  # fmt: skip
+    st.integers(1, 64),
+    st.integers(1, 64),
+    st.integers(1, 128),
+    st.sampled_from([1, 3, 5, 7]),
+    st.sampled_from([1, 3, 5, 7]),
+    st.sampled_from([6, 10, 20, 28]),
+)
 def test_memories_are_those_that_sinabs_reckons(
     conv1: int, conv2: int, hidden: int, kernel1: Any, kernel2: Any, cells: int
 ) -> None:
     """Sinabs' own check, on sides where the half pixel that it leaves in does not matter."""
     network = Network(
-        conv1_channels=conv1, conv2_channels=conv2, hidden=hidden, conv1_kernel=kernel1,
+        conv1_channels=conv1,
+        conv2_channels=conv2,
+        hidden=hidden,
+        conv1_kernel=kernel1,
         conv2_kernel=kernel2,
-    )  # fmt: skip
+    )
     for layer in speck_fit(network, Windows(crop_px=10 * cells, pool_px=10)).layers:
         arguments = (
-            layer.in_channels, layer.out_channels, (layer.kernel, layer.kernel),
-            (layer.stride, layer.stride), (layer.padding, layer.padding),
+            layer.in_channels,
+            layer.out_channels,
+            (layer.kernel, layer.kernel),
+            (layer.stride, layer.stride),
+            (layer.padding, layer.padding),
             (layer.in_side, layer.in_side),
-        )  # fmt: skip
+        )
         if layer.problems:
             with pytest.raises(Exception, match=r"[Kk]ernel|memory"):  # it raises nothing finer
                 validate_memory_mapping_speck(*arguments)
@@ -240,9 +250,13 @@ def test_changes_are_counted() -> None:
     real = np.array([[5, 0, 0], [5, 0, 0], [1, 1, 0], [0, 4, 3]])
     whole = np.array([[5, 0, 0], [4, 3, 0], [1, 1, 0], [0, 3, 4]])
     assert compare(real, whole, 2.0).to_json() == {
-        "windows": 4, "equal_counts": 0.5, "equal_class": 0.75, "equal_class_by_margin": 0.75,
-        "mean_change": 6 / 12, "largest_change": 3,
-    }  # fmt: skip
+        "windows": 4,
+        "equal_counts": 0.5,
+        "equal_class": 0.75,
+        "equal_class_by_margin": 0.75,
+        "mean_change": 6 / 12,
+        "largest_change": 3,
+    }
     with pytest.raises(ValueError, match="expected as many"):
         compare(real, whole[:2], 2.0)
 
@@ -299,16 +313,28 @@ def test_a_card_says_where_the_data_are_from(simulated: bool) -> None:
     counts = np.array([[5, 0, 0], [0, 5, 0], [0, 0, 5], [1, 1, 0]])
     part = SplitResult(counts, np.array([0, 1, 2, 2]), 4)
     campaign = CardCampaign(
-        name="c", experiment="kinematic", protocol="p", collection_hash="a" * 64,
-        analysis_hash="b" * 64, rig="r", simulated=simulated, trials={"train": 2, "test": 4},
-    )  # fmt: skip
+        name="c",
+        experiment="kinematic",
+        protocol="p",
+        collection_hash="a" * 64,
+        analysis_hash="b" * 64,
+        rig="r",
+        simulated=simulated,
+        trials={"train": 2, "test": 4},
+    )
     data = CardData(
         store="s", simulated=simulated, made_from_these_data=False, campaigns=(campaign,)
     )
     card = model_card(
-        one, ModelFile(file="m.pt", sha256="c" * 64), data, {"test": part},
-        activity(build(SMALL, TINY, 0), sparse(2, TINY, 0, 0.2)), {}, {"torch": "1"}, 2.0,
-    )  # fmt: skip
+        one,
+        ModelFile(file="m.pt", sha256="c" * 64),
+        data,
+        {"test": part},
+        activity(build(SMALL, TINY, 0), sparse(2, TINY, 0, 0.2)),
+        {},
+        {"torch": "1"},
+        2.0,
+    )
     reported = card.to_json()
     assert json.loads(json.dumps(reported, allow_nan=False)) == reported
     assert reported["model"]["network"] == SMALL.model_dump(mode="json")  # the defaults too

@@ -35,9 +35,13 @@ def ur_settings() -> UrSettings:
 
 def abb_settings() -> AbbSettings:
     return AbbSettings(
-        host=own_address(), rws_port=8080, egm_bind="127.0.0.1", egm_port=free_udp_port(),
-        limits=LIMITS, tool={"tcp_mm": (0, 0, 120), "mass_kg": 0.4},
-    )  # fmt: skip
+        host=own_address(),
+        rws_port=8080,
+        egm_bind="127.0.0.1",
+        egm_port=free_udp_port(),
+        limits=LIMITS,
+        tool={"tcp_mm": (0, 0, 120), "mass_kg": 0.4},
+    )
 
 
 def abb_cases() -> list[Case]:

@@ -24,10 +24,13 @@ USUAL = {"arm", "gripper"}
 def run(*words: object, cwd: Path, site: Path) -> str:
     """Run a program that finds packages in `site`; what it prints."""
     done = subprocess.run(
-        [sys.executable, "-m", *map(str, words)], cwd=cwd, capture_output=True, text=True,
+        [sys.executable, "-m", *map(str, words)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
         env={**os.environ, "PYTHONPATH": str(site), "SLIPLAB_RUNTIME": str(site / "runtime")},
         timeout=LIMIT_S,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, f"{words}\n{done.stdout}{done.stderr}"
     return done.stdout
 
@@ -62,14 +65,17 @@ def test_nothing_of_the_example_is_left_and_every_module_compiles(kind: str) -> 
         assert max(map(len, text.splitlines())) <= 100, path
 
 
-@pytest.mark.parametrize(("name", "why"), [
-    ("Lab-Arm", "must be lower-case letters, digits and underscores"),
-    ("", "must be lower-case letters"),
-    ("3arm", "a letter first"),
-    ("json", "is a name that Python or SlipLab uses"),
-    ("class", "is a name that Python or SlipLab uses"),
-    ("ur", "is already the name of a driver of sliplab"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("Lab-Arm", "must be lower-case letters, digits and underscores"),
+        ("", "must be lower-case letters"),
+        ("3arm", "a letter first"),
+        ("json", "is a name that Python or SlipLab uses"),
+        ("class", "is a name that Python or SlipLab uses"),
+        ("ur", "is already the name of a driver of sliplab"),
+    ],
+)
 def test_a_name_that_cannot_be_is_refused_in_a_line(name: str, why: str, tmp_path: Path) -> None:
     assert why in name_fault(name)
     done = here("new", "driver", name, "--into", tmp_path)
@@ -137,9 +143,10 @@ def test_a_rig_of_new_drivers_alone_collects_on_a_loopback_rig(
     (work / "rig.yaml").write_text(yaml.safe_dump(rig))
     collection = small["collection"]
     collection["factors"] = {
-        "depth": {"unit": "mm", "values": [2.4]}, "speed": {"unit": "mm/s", "values": [6]},
+        "depth": {"unit": "mm", "values": [2.4]},
+        "speed": {"unit": "mm/s", "values": [6]},
         "direction": {"unit": "deg", "values": [0]},
-    }  # fmt: skip
+    }
     collection["repetitions"] = 1
     collection.pop("maintenance")
     collection["gates"] |= {"retakes": 5}

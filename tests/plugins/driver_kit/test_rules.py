@@ -24,10 +24,17 @@ from tests.plugins.driver_kit.trying import LIMITS
 from tests.rigs.waiting import own_address
 
 KINDS = (
-    arm_rules.RULES, motion_rules.RULES, stream_rules.RULES, stream_rules.CLOCK_RULES,
-    stream_rules.HOST_RULES, stream_rules.EVENT_RULES, stream_rules.FRAME_RULES,
-    stream_rules.FORCE_RULES, sync_rules.RULES, gripper_rules.RULES,
-)  # fmt: skip
+    arm_rules.RULES,
+    motion_rules.RULES,
+    stream_rules.RULES,
+    stream_rules.CLOCK_RULES,
+    stream_rules.HOST_RULES,
+    stream_rules.EVENT_RULES,
+    stream_rules.FRAME_RULES,
+    stream_rules.FORCE_RULES,
+    sync_rules.RULES,
+    gripper_rules.RULES,
+)
 
 
 def arm_settings() -> arm.ExampleArmSettings:

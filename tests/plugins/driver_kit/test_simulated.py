@@ -39,10 +39,20 @@ SETTINGS = MockSettings(
     force=ForceSettings(),
 )
 ARM_RULES = {
-    "path", "times in order", "one path at a time", "stop at rest", "stop while moving",
-    "protective stop", "speed and length", "turn", "orientation", "poses", "calls while moving",
-    "clock", "host times",
-}  # fmt: skip
+    "path",
+    "times in order",
+    "one path at a time",
+    "stop at rest",
+    "stop while moving",
+    "protective stop",
+    "speed and length",
+    "turn",
+    "orientation",
+    "poses",
+    "calls while moving",
+    "clock",
+    "host times",
+}
 STREAM_RULES = {"data", "stop", "arrays", "read at once"}
 ALL_ARM_RULES = [*arm_rules.RULES.all, *motion_rules.RULES.all]
 TIMED = {"frames", "force"}
@@ -169,9 +179,12 @@ def test_the_simulated_arm_keeps_a_rule(rule: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "capability"),
     [
-        ("events", EventCamera), ("frames", FrameCamera), ("force", ForceSensor), ("sync", SyncBox),
+        ("events", EventCamera),
+        ("frames", FrameCamera),
+        ("force", ForceSensor),
+        ("sync", SyncBox),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize(
     "rule",
     [rule for rule in stream_rules.RULES.all if rule.name in STREAM_RULES],

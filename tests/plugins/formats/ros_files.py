@@ -196,10 +196,13 @@ def arrays(store: Any, chunk: EventChunk) -> list[Message]:
 def frames(store: Any, count: int = 3) -> list[Message]:
     """Grey frames."""
     return [
-        ("/camera/image_raw", IMAGE,
-         image(store, BASE_NS + n, "mono8", np.full((4, 6), 10 * n, np.uint8)))
+        (
+            "/camera/image_raw",
+            IMAGE,
+            image(store, BASE_NS + n, "mono8", np.full((4, 6), 10 * n, np.uint8)),
+        )
         for n in range(count)
-    ]  # fmt: skip
+    ]
 
 
 def serialised(store: Any, message: Any, kind: str) -> bytes:

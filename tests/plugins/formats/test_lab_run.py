@@ -42,8 +42,12 @@ def _pickle(path: Path, places: Any) -> None:
 
 
 def _stream(path: Path) -> None:
-    rows = [(t, x, y, p) for p, places in ((1, ON), (0, OFF)) for (y, x), times in places.items()
-            for t in times]  # fmt: skip
+    rows = [
+        (t, x, y, p)
+        for p, places in ((1, ON), (0, OFF))
+        for (y, x), times in places.items()
+        for t in times
+    ]
     t, x, y, p = np.array(rows).T
     with h5py.File(path, "w") as file:
         file["events/ts"] = UNIX + t / 1000
@@ -78,8 +82,9 @@ def test_pickles_and_stream_of_one_recording_are_one_trial(
     assert found.record.condition == {"depth": "2", "speed": "1.0", "direction": "up"}
     assert found.record.repetition == 3
     assert (found.events().p.tolist(), found.events().t_us[0]) == (
-        [1, 1, 1, 0, 0, 0, 0], UNIX * 10**6 + 10_000
-    )  # fmt: skip
+        [1, 1, 1, 0, 0, 0, 0],
+        UNIX * 10**6 + 10_000,
+    )
     assert _warnings(found) == ()
     assert found.record.imported.meta["tip"] == "IncUndExt_v1"  # type: ignore[union-attr]
     assert skipped_in(run / place, kind_of(run / place)) == []
@@ -206,8 +211,11 @@ def test_force_file_becomes_a_stream(tmp_path: Path, form: str) -> None:
     rows = np.array([[0.0, 1, 2, 3], [0.001, 4, 5, 6], [0.002, 7, 8, np.nan]])
     path = run / f"{STEM}_force.{form}"
     if form == "csv":
-        path.write_text("Time (s),Fx (N),Fy (N),Fz (N)\n" + "\n".join(
-            ",".join(map(str, row)) for row in rows.tolist()) + "\n")  # fmt: skip
+        path.write_text(
+            "Time (s),Fx (N),Fy (N),Fz (N)\n"
+            + "\n".join(",".join(map(str, row)) for row in rows.tolist())
+            + "\n"
+        )
     elif form == "npy":
         np.save(path, rows)
     else:

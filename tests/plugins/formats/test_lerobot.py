@@ -78,46 +78,60 @@ def foreign(folder: Path) -> dict[str, Any]:
         "observation.images.wrist": {"dtype": "image", "shape": [16, 24, 3], "names": None},
         "observation.images.top": {"dtype": "video", "shape": [3, 16, 24], "names": None},
         "observation.state": {
-            "dtype": "float32", "shape": [len(STATE)], "names": {"motors": list(STATE)}
+            "dtype": "float32",
+            "shape": [len(STATE)],
+            "names": {"motors": list(STATE)},
         },
         "observation.wrist_force": {"dtype": "float32", "shape": [6], "names": list(FORCE)},
         "action": {"dtype": "float32", "shape": [2], "names": None},
         "next.done": {"dtype": "bool", "shape": [1], "names": None},
         "instruction": {"dtype": "string", "shape": [1], "names": None},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    }  # fmt: skip
+    }
     info = {
-        "codebase_version": "v3.0", "robot_type": "so101", "fps": FPS, "features": features,
+        "codebase_version": "v3.0",
+        "robot_type": "so101",
+        "fps": FPS,
+        "features": features,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-    }  # fmt: skip
+    }
     for part in ("meta/episodes/chunk-000", "data/chunk-000"):
         (folder / part).mkdir(parents=True)
     (folder / "meta/info.json").write_text(json.dumps(info))
-    rows = pa.table({
-        "observation.images.wrist": [_png(image) for image in images],
-        "observation.state": state.tolist(),
-        "observation.wrist_force": force.tolist(),
-        "action": pa.array(state[:, :2].tolist(), pa.list_(pa.float32(), 2)),
-        "next.done": [False, *[True] * (count - 1)],
-        "instruction": ["push"] * count,
-        "timestamp": pa.array(seconds),
-        "episode_index": episode,
-    })  # fmt: skip
+    rows = pa.table(
+        {
+            "observation.images.wrist": [_png(image) for image in images],
+            "observation.state": state.tolist(),
+            "observation.wrist_force": force.tolist(),
+            "action": pa.array(state[:, :2].tolist(), pa.list_(pa.float32(), 2)),
+            "next.done": [False, *[True] * (count - 1)],
+            "instruction": ["push"] * count,
+            "timestamp": pa.array(seconds),
+            "episode_index": episode,
+        }
+    )
     pq.write_table(rows, folder / "data/chunk-000/file-000.parquet", row_group_size=3)
     top = "videos/observation.images.top"
     _video(folder / f"{top}/chunk-000/file-000.mp4", images)
     pq.write_table(
-        pa.Table.from_pylist([
-            {
-                "episode_index": number, "tasks": ["push the block"], "length": length,
-                "data/chunk_index": 0, "data/file_index": 0, f"{top}/chunk_index": 0,
-                f"{top}/file_index": 0, f"{top}/from_timestamp": starts[number] / FPS,
-            }
-            for number, length in enumerate(LENGTHS)
-        ]),
+        pa.Table.from_pylist(
+            [
+                {
+                    "episode_index": number,
+                    "tasks": ["push the block"],
+                    "length": length,
+                    "data/chunk_index": 0,
+                    "data/file_index": 0,
+                    f"{top}/chunk_index": 0,
+                    f"{top}/file_index": 0,
+                    f"{top}/from_timestamp": starts[number] / FPS,
+                }
+                for number, length in enumerate(LENGTHS)
+            ]
+        ),
         folder / "meta/episodes/chunk-000/file-000.parquet",
-    )  # fmt: skip
+    )
     return {"state": state, "force": force, "images": images, "seconds": seconds}
 
 
@@ -170,8 +184,13 @@ def test_frames_poses_forces_and_scalars_of_every_episode(tmp_path: Path) -> Non
             trial.wrenches("wrist_force").torque_nm, there["force"][rows, 3:]
         )
         assert set(record.streams) == {
-            "top", "wrist_force", "state_gripper_pos", "action_0", "action_1", "next_done"
-        }  # fmt: skip
+            "top",
+            "wrist_force",
+            "state_gripper_pos",
+            "action_0",
+            "action_1",
+            "next_done",
+        }
         kept = record.imported.to_json()
         assert kept["streams"]["state_gripper_pos"] == "observation.state[gripper.pos]"
         assert kept["streams"]["top"] == "observation.images.top"
@@ -277,13 +296,14 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "rows of other widths": (_rows("action", [[1.0]] * COUNT), "not 2 numbers each"),
     "words for numbers": (_rows("next.done", ["no"] * COUNT), "not 1 numbers each"),
     "an image that is none": (
-        _rows("observation.images.wrist", [{"bytes": b"x", "path": None}] * COUNT), "cannot be read"
+        _rows("observation.images.wrist", [{"bytes": b"x", "path": None}] * COUNT),
+        "cannot be read",
     ),
     "an image elsewhere": (
         _rows("observation.images.wrist", [{"bytes": None, "path": "/etc/passwd"}] * COUNT),
         "outside of its rows",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

@@ -221,11 +221,13 @@ def test_onsets_are_messages_with_rule_and_doubt(labelled: Store, tmp_path: Path
         (item.t_ns, item.rule, item.kind) for _, item, _ in decoded(tmp_path / "t.mcap")["/onsets"]
     ]
     assert set(onsets) == {
-        (label.incipient_ns, "own", "incipient"), (label.gross_ns, "own", "gross"),
-        (label.paper.incipient_ns, "paper", "incipient"), (label.paper.gross_ns, "paper", "gross"),
+        (label.incipient_ns, "own", "incipient"),
+        (label.gross_ns, "own", "gross"),
+        (label.paper.incipient_ns, "paper", "incipient"),
+        (label.paper.gross_ns, "paper", "gross"),
         (label.change_point.incipient_ns, "change_point", "incipient"),
         (label.change_point.gross_ns, "change_point", "gross"),
-    }  # fmt: skip
+    }
     assert [t_ns for t_ns, _, _ in onsets] == sorted(t_ns for t_ns, _, _ in onsets)
 
 
@@ -367,20 +369,29 @@ def _ros_bag(
             words = [
                 (int(t) * 1000 + 300 - base) | int(x) << 32 | int(y) << 48 | int(p) << 63
                 for x, y, p, t in zip(*(part[rows] for part in vars(sent).values()), strict=True)
-            ]  # fmt: skip
+            ]
             packet = {
-                "header": header, "width": 640, "height": 480, "seq": low, "time_base": base,
-                "encoding": encoding, "is_bigendian": False,
+                "header": header,
+                "width": 640,
+                "height": 480,
+                "seq": low,
+                "time_base": base,
+                "encoding": encoding,
+                "is_bigendian": False,
                 "events": struct.pack(f"<{len(words)}Q", *words),
-            }  # fmt: skip
+            }
             writer.write_message("/cam/events", types[ros2.EVENTS], packet, base, base)
         for number in range(3):
             levels = np.full((4, 8), number, np.uint8)
             one = {
                 "header": {"stamp": {"sec": 1_700_000_000, "nanosec": number}, "frame_id": ""},
-                "height": 4, "width": 6, "encoding": "mono8", "is_bigendian": 0, "step": 8,
+                "height": 4,
+                "width": 6,
+                "encoding": "mono8",
+                "is_bigendian": 0,
+                "step": 8,
                 "data": levels.tobytes(),
-            }  # fmt: skip
+            }
             writer.write_message("/cam/image", types[ros2.IMAGE], one, base, base)
         writer.write_message("/tool", types[ros2.POSE], {"header": header}, base, base)
         writer.finish()

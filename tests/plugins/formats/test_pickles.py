@@ -22,17 +22,22 @@ from sliplab.protocols.errors import InputError
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 PLAIN = (
-    st.none() | st.booleans() | st.integers(-(2**200), 2**200) | st.floats(allow_nan=False)
-    | st.text() | st.binary()
-)  # fmt: skip
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**200), 2**200)
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary()
+)
 VALUES = st.recursive(
     PLAIN,
     lambda inner: (
-        st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner)
+        st.lists(inner)
+        | st.dictionaries(st.text() | st.integers(), inner)
         | st.lists(inner).map(tuple)
     ),
     max_leaves=20,
-)  # fmt: skip
+)
 
 
 @given(VALUES, st.sampled_from(PROTOCOLS))
@@ -189,7 +194,7 @@ ATTACKS = {
     "unknown instruction": b"\xff.",
     "not UTF-8": b"\x8c\x01\xff.",
     "half a float": b"G\x00\x00.",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", ATTACKS)

@@ -111,36 +111,85 @@ def by_faery(path: Path, form: str) -> list[Row]:
 # -- words ---------------------------------------------------------------------------------
 
 STREAM3 = evt3(
-    (ADDR_Y, 9), (BASE_X, ON | 70), (ADDR_X, 1), (VECT_8, 0xFF),  # no time yet: dropped
-    (HIGH, 2), (ADDR_X, 5),  # the row counts, the lower part of the time is 0
-    (ADDR_Y, 1 << 11 | 100), (LOW, 7), (ADDR_X, ON | 6),  # of a camera that follows another
+    (ADDR_Y, 9),
+    (BASE_X, ON | 70),
+    (ADDR_X, 1),
+    (VECT_8, 0xFF),  # no time yet: dropped
+    (HIGH, 2),
+    (ADDR_X, 5),  # the row counts, the lower part of the time is 0
+    (ADDR_Y, 1 << 11 | 100),
+    (LOW, 7),
+    (ADDR_X, ON | 6),  # of a camera that follows another
     (VECT_12, 0b10),  # the base was moved by 8
-    (BASE_X, ON | 20), (VECT_12, 0b1000_0000_0001), (VECT_12, 0b10), (VECT_8, 0xF80),
-    (ADDR_X, 3), (VECT_8, 0b1),  # a single event leaves the base where it was
-    (OTHERS, 0x14), (CONTINUED_12, 1), (CONTINUED_12, 2), (CONTINUED_4, 3), (TRIGGER, 1),
-    (0x1, 5), (0x9, 5), (0xB, 5), (0xC, 5), (0xD, 5),  # reserved
-    (HIGH, 2), (LOW, 4), (ADDR_X, 8),  # of another source: not earlier than the one before
-    (HIGH, 3), (ADDR_Y, 101), (VECT_8, 0b1),
-)  # fmt: skip
+    (BASE_X, ON | 20),
+    (VECT_12, 0b1000_0000_0001),
+    (VECT_12, 0b10),
+    (VECT_8, 0xF80),
+    (ADDR_X, 3),
+    (VECT_8, 0b1),  # a single event leaves the base where it was
+    (OTHERS, 0x14),
+    (CONTINUED_12, 1),
+    (CONTINUED_12, 2),
+    (CONTINUED_4, 3),
+    (TRIGGER, 1),
+    (0x1, 5),
+    (0x9, 5),
+    (0xB, 5),
+    (0xC, 5),
+    (0xD, 5),  # reserved
+    (HIGH, 2),
+    (LOW, 4),
+    (ADDR_X, 8),  # of another source: not earlier than the one before
+    (HIGH, 3),
+    (ADDR_Y, 101),
+    (VECT_8, 0b1),
+)
 EVENTS3 = [
-    (8192, 5, 9, 0), (8199, 6, 100, 1), (8199, 79, 100, 1),
-    (8199, 20, 100, 1), (8199, 31, 100, 1), (8199, 33, 100, 1), (8199, 51, 100, 1),
-    (8199, 3, 100, 0), (8199, 52, 100, 1), (8199, 8, 100, 0),
+    (8192, 5, 9, 0),
+    (8199, 6, 100, 1),
+    (8199, 79, 100, 1),
+    (8199, 20, 100, 1),
+    (8199, 31, 100, 1),
+    (8199, 33, 100, 1),
+    (8199, 51, 100, 1),
+    (8199, 3, 100, 0),
+    (8199, 52, 100, 1),
+    (8199, 8, 100, 0),
     (12288, 60, 101, 1),
-]  # fmt: skip
+]
 STREAM2 = evt2(
-    cd(1, 3, 1, 1), high(10), cd(1, 3, 40, 50), cd(0, 2, 639, 479), OTHERS << 28, 0xF << 28 | 5,
-    0x5 << 28, TRIGGER << 28 | 9 << 22 | 1, cd(0, 8, 0, 0), high(10), high(12), cd(1, 0, 7, 8),
-)  # fmt: skip
+    cd(1, 3, 1, 1),
+    high(10),
+    cd(1, 3, 40, 50),
+    cd(0, 2, 639, 479),
+    OTHERS << 28,
+    0xF << 28 | 5,
+    0x5 << 28,
+    TRIGGER << 28 | 9 << 22 | 1,
+    cd(0, 8, 0, 0),
+    high(10),
+    high(12),
+    cd(1, 0, 7, 8),
+)
 EVENTS2 = [(643, 40, 50, 1), (643, 639, 479, 0), (648, 0, 0, 0), (768, 7, 8, 1)]
 STREAM21 = evt21(
-    (cd(1, 3, 1, 1), 1), (high(10), 0), (cd(1, 3, 40, 50), 0x8000_0005), (cd(0, 2, 639, 479), 1),
-    (OTHERS << 28, 0x14), (TRIGGER << 28 | 9 << 22 | 1, 0), (cd(0, 20, 3, 4), 0), (high(12), 0),
+    (cd(1, 3, 1, 1), 1),
+    (high(10), 0),
+    (cd(1, 3, 40, 50), 0x8000_0005),
+    (cd(0, 2, 639, 479), 1),
+    (OTHERS << 28, 0x14),
+    (TRIGGER << 28 | 9 << 22 | 1, 0),
+    (cd(0, 20, 3, 4), 0),
+    (high(12), 0),
     (cd(1, 0, 608, 8), 0x8000_0000),
-)  # fmt: skip
+)
 EVENTS21 = [
-    (643, 40, 50, 1), (643, 42, 50, 1), (643, 71, 50, 1), (643, 639, 479, 0), (768, 639, 8, 1),
-]  # fmt: skip
+    (643, 40, 50, 1),
+    (643, 42, 50, 1),
+    (643, 71, 50, 1),
+    (643, 639, 479, 0),
+    (768, 639, 8, 1),
+]
 ROWS = [(5, 1, 2, 1), (5, 639, 479, 0), (3, 3, 4, 1), ((1 << 32) - 1, 5, 6, 0), (1 << 32, 7, 8, 1)]
 EVENTS_DAT = [(5, 1, 2, 1), (5, 639, 479, 0), (5, 3, 4, 1), *ROWS[3:]]
 STREAMS = {
@@ -202,15 +251,21 @@ def test_blocks_chunks_and_edges_may_end_anywhere(
         ("evt3", evt3((HIGH, 4095), (HIGH, 0), (HIGH, 4095), (HIGH, 0)), []),
         ("evt2", evt2(high((1 << 28) - 1), high(0), cd(0, 1, 2, 3)), [(1 << 34) + 1]),
         ("evt2", evt2(high((1 << 28) - 9), high(5), cd(0, 1, 2, 3)), [(1 << 34) + 321]),
-        ("evt21", evt21((high((1 << 28) - 1), 0), (high(0), 0), (cd(0, 1, 2, 3), 1)),
-         [(1 << 34) + 1]),
-        ("dat", dat(((1 << 32) - 5, 1, 1, 1), (3, 1, 1, 1), ((1 << 32) - 5, 1, 1, 1)),
-         [(1 << 32) - 5, (1 << 32) + 3, (2 << 32) - 5]),
+        (
+            "evt21",
+            evt21((high((1 << 28) - 1), 0), (high(0), 0), (cd(0, 1, 2, 3), 1)),
+            [(1 << 34) + 1],
+        ),
+        (
+            "dat",
+            dat(((1 << 32) - 5, 1, 1, 1), (3, 1, 1, 1), ((1 << 32) - 5, 1, 1, 1)),
+            [(1 << 32) - 5, (1 << 32) + 3, (2 << 32) - 5],
+        ),
         ("dat", dat((40_960, 1, 1, 1), (0, 1, 1, 1)), [40_960, 40_960]),
         ("dat", dat((40_961, 1, 1, 1), (0, 1, 1, 1)), [40_961, 0]),  # the import leaves one out
         ("dat", dat((1 << 31, 1, 1, 1), (0, 1, 1, 1)), [1 << 31, 0]),  # not by more than half
     ],
-)  # fmt: skip
+)
 def test_the_time_goes_on_where_its_bits_begin_anew(
     tmp_path: Path, form: str, data: bytes, times: list[int]
 ) -> None:
@@ -221,8 +276,20 @@ def test_the_time_goes_on_where_its_bits_begin_anew(
 UNUSED: dict[str, tuple[str, bytes, list[int]]] = {
     "a low part": (
         "evt3",
-        evt3((HIGH, 1), (LOW, 799), (ADDR_X, 1), (LOW, 811), (LOW, 800), (ADDR_X, 2), (LOW, 801),
-             (ADDR_X, 3), (VECT_12, 0), (LOW, 700), (LOW, 802), (ADDR_X, 4)),
+        evt3(
+            (HIGH, 1),
+            (LOW, 799),
+            (ADDR_X, 1),
+            (LOW, 811),
+            (LOW, 800),
+            (ADDR_X, 2),
+            (LOW, 801),
+            (ADDR_X, 3),
+            (VECT_12, 0),
+            (LOW, 700),
+            (LOW, 802),
+            (ADDR_X, 4),
+        ),
         [4895, 4896, 4897, 4898],
     ),
     "an empty vector": (
@@ -230,27 +297,33 @@ UNUSED: dict[str, tuple[str, bytes, list[int]]] = {
         evt3((HIGH, 1), (LOW, 9), (VECT_12, 0), (LOW, 5), (ADDR_X, 1), (VECT_8, 1)),
         [4101, 4101],
     ),
-    "an edge": (
-        "evt3", evt3((HIGH, 0), (LOW, 9), (TRIGGER, 1), (LOW, 5), (ADDR_X, 1)), [5]
-    ),
+    "an edge": ("evt3", evt3((HIGH, 0), (LOW, 9), (TRIGGER, 1), (LOW, 5), (ADDR_X, 1)), [5]),
     "a high part": (
-        "evt3", evt3((HIGH, 6), (HIGH, 5), (LOW, 4), (ADDR_X, 1), (HIGH, 6), (ADDR_X, 2)),
+        "evt3",
+        evt3((HIGH, 6), (HIGH, 5), (LOW, 4), (ADDR_X, 1), (HIGH, 6), (ADDR_X, 2)),
         [20484, 24576],
     ),
     "an edge of EVT 2.0": (
-        "evt2", evt2(high(1), TRIGGER << 28 | 9 << 22 | 1, cd(0, 5, 1, 1), cd(0, 6, 1, 1)),
+        "evt2",
+        evt2(high(1), TRIGGER << 28 | 9 << 22 | 1, cd(0, 5, 1, 1), cd(0, 6, 1, 1)),
         [69, 70],
     ),
     "a high part of EVT 2.0": (
-        "evt2", evt2(high(8), high(7), cd(0, 5, 1, 1), high(8), cd(0, 6, 1, 1)), [453, 518]
+        "evt2",
+        evt2(high(8), high(7), cd(0, 5, 1, 1), high(8), cd(0, 6, 1, 1)),
+        [453, 518],
     ),
     "an edge of EVT 2.1": (
-        "evt21", evt21((high(1), 0), (TRIGGER << 28 | 9 << 22 | 1, 0), (cd(0, 5, 1, 1), 1)), [69]
+        "evt21",
+        evt21((high(1), 0), (TRIGGER << 28 | 9 << 22 | 1, 0), (cd(0, 5, 1, 1), 1)),
+        [69],
     ),
     "an empty word of EVT 2.1": (
-        "evt21", evt21((high(1), 0), (cd(0, 9, 1, 1), 0), (cd(0, 5, 1, 1), 1)), [69]
+        "evt21",
+        evt21((high(1), 0), (cd(0, 9, 1, 1), 0), (cd(0, 5, 1, 1), 1)),
+        [69],
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", UNUSED)
@@ -265,34 +338,74 @@ STEPS_BACK: dict[str, tuple[str, bytes, list[int], str]] = {
     # form, words, times, what is said
     "by one": (
         "evt3",
-        evt3((HIGH, 5), (LOW, 3), (ADDR_X, 1), (HIGH, 4), (LOW, 4000), (ADDR_X, 2), (HIGH, 5),
-             (LOW, 9), (ADDR_X, 3)),
-        [20483, 20483, 20489], "1 times of events step back, by up to 99 us: ",
+        evt3(
+            (HIGH, 5),
+            (LOW, 3),
+            (ADDR_X, 1),
+            (HIGH, 4),
+            (LOW, 4000),
+            (ADDR_X, 2),
+            (HIGH, 5),
+            (LOW, 9),
+            (ADDR_X, 3),
+        ),
+        [20483, 20483, 20489],
+        "1 times of events step back, by up to 99 us: ",
     ),
     "over the end": (
         "evt3",
-        evt3((HIGH, 4095), (HIGH, 0), (LOW, 3), (ADDR_X, 1), (HIGH, 4095), (LOW, 4090), (ADDR_X, 2),
-             (HIGH, 0), (LOW, 9), (ADDR_X, 3), (HIGH, 1), (ADDR_X, 4)),
-        [16777219, 16777219, 16777225, 16781312], "1 times of events step back, by up to 9 us: ",
+        evt3(
+            (HIGH, 4095),
+            (HIGH, 0),
+            (LOW, 3),
+            (ADDR_X, 1),
+            (HIGH, 4095),
+            (LOW, 4090),
+            (ADDR_X, 2),
+            (HIGH, 0),
+            (LOW, 9),
+            (ADDR_X, 3),
+            (HIGH, 1),
+            (ADDR_X, 4),
+        ),
+        [16777219, 16777219, 16777225, 16781312],
+        "1 times of events step back, by up to 9 us: ",
     ),
     "before the first time": (
-        "evt3", evt3((HIGH, 0), (ADDR_X, 1), (HIGH, 4095), (LOW, 4095), (ADDR_X, 2)),
-        [0, 0], "1 times of events step back, by up to 1 us: ",
+        "evt3",
+        evt3((HIGH, 0), (ADDR_X, 1), (HIGH, 4095), (LOW, 4095), (ADDR_X, 2)),
+        [0, 0],
+        "1 times of events step back, by up to 1 us: ",
     ),
     "of EVT 2.0": (
-        "evt2", evt2(high(9), cd(0, 1, 2, 3), high(8), cd(0, 60, 2, 3), cd(0, 61, 2, 3), high(9),
-                     cd(0, 1, 2, 3), high(10), cd(0, 0, 2, 3)),
-        [577, 577, 577, 577, 640], "2 times of events step back, by up to 5 us: ",
+        "evt2",
+        evt2(
+            high(9),
+            cd(0, 1, 2, 3),
+            high(8),
+            cd(0, 60, 2, 3),
+            cd(0, 61, 2, 3),
+            high(9),
+            cd(0, 1, 2, 3),
+            high(10),
+            cd(0, 0, 2, 3),
+        ),
+        [577, 577, 577, 577, 640],
+        "2 times of events step back, by up to 5 us: ",
     ),
     "of EVT 2.1": (
-        "evt21", evt21((high(9), 0), (cd(0, 1, 2, 3), 1), (high(8), 0), (cd(0, 60, 2, 3), 3)),
-        [577, 577, 577], "1 times of events step back, by up to 5 us: ",
+        "evt21",
+        evt21((high(9), 0), (cd(0, 1, 2, 3), 1), (high(8), 0), (cd(0, 60, 2, 3), 3)),
+        [577, 577, 577],
+        "1 times of events step back, by up to 5 us: ",
     ),
     "of DAT": (
-        "dat", dat((9, 1, 1, 1), (5, 1, 1, 1), (7, 1, 1, 1), (11, 1, 1, 1)), [9, 9, 9, 11],
+        "dat",
+        dat((9, 1, 1, 1), (5, 1, 1, 1), (7, 1, 1, 1), (11, 1, 1, 1)),
+        [9, 9, 9, 11],
         "2 times of events step back, by up to 4 us: ",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", STEPS_BACK)
@@ -381,50 +494,72 @@ def test_a_vector_that_is_left_out_moves_the_base_on(tmp_path: Path) -> None:
 FAULTS: dict[str, tuple[str, bytes, int, str]] = {
     # form, words, index of the wrong one, reason
     "the clock falls": (
-        "evt3", evt3((HIGH, 19), (ADDR_X, 1), (HIGH, 8), (ADDR_X, 2)), 2,
+        "evt3",
+        evt3((HIGH, 19), (ADDR_X, 1), (HIGH, 8), (ADDR_X, 2)),
+        2,
         "the high part of the time falls from 19 to 8",
     ),
     "the clock falls by less than half": (
-        "evt3", evt3((HIGH, 2047), (ADDR_X, 1), (HIGH, 0)), 2,
+        "evt3",
+        evt3((HIGH, 2047), (ADDR_X, 1), (HIGH, 0)),
+        2,
         "the high part of the time falls from 2047 to 0",
     ),
     "the clock of EVT 2.0 falls": (
-        "evt2", evt2(high(19), cd(0, 1, 2, 3), high(8)), 2,
+        "evt2",
+        evt2(high(19), cd(0, 1, 2, 3), high(8)),
+        2,
         "the high part of the time falls from 19 to 8",
     ),
     "the clock of EVT 2.1 falls": (
-        "evt21", evt21((high(19), 0), (cd(0, 1, 2, 3), 1), (high(8), 0)), 2,
+        "evt21",
+        evt21((high(19), 0), (cd(0, 1, 2, 3), 1), (high(8), 0)),
+        2,
         "the high part of the time falls from 19 to 8",
     ),
     "a column": (
-        "evt3", evt3((HIGH, 0), (ADDR_Y, 479), (ADDR_X, 639), (ADDR_X, 640)), 3,
+        "evt3",
+        evt3((HIGH, 0), (ADDR_Y, 479), (ADDR_X, 639), (ADDR_X, 640)),
+        3,
         "an event at column 640, row 479, outside of the 640 x 480 pixels in its header",
     ),
     "a row": (
-        "evt3", evt3((HIGH, 0), (ADDR_X, 1), (ADDR_Y, 480), (ADDR_X, 4)), 3,
+        "evt3",
+        evt3((HIGH, 0), (ADDR_X, 1), (ADDR_Y, 480), (ADDR_X, 4)),
+        3,
         "an event at column 4, row 480, outside",
     ),
     "a vector beyond the camera": (
-        "evt3", evt3((HIGH, 0), (BASE_X, 630), (VECT_12, 0x3FF), (BASE_X, 630), (VECT_12, 0xC00)),
-        4, "an event at column 641, row 0, outside",
+        "evt3",
+        evt3((HIGH, 0), (BASE_X, 630), (VECT_12, 0x3FF), (BASE_X, 630), (VECT_12, 0xC00)),
+        4,
+        "an event at column 641, row 0, outside",
     ),
     "a vector in a row that is not there": (
-        "evt3", evt3((HIGH, 0), (ADDR_Y, 480), (VECT_12, 0), (VECT_8, 1)), 3,
+        "evt3",
+        evt3((HIGH, 0), (ADDR_Y, 480), (VECT_12, 0), (VECT_8, 1)),
+        3,
         "an event at column 12, row 480, outside",
     ),
     "a pixel of EVT 2.0": (
-        "evt2", evt2(high(9), cd(0, 1, 639, 479), cd(0, 1, 640, 3)), 2,
+        "evt2",
+        evt2(high(9), cd(0, 1, 639, 479), cd(0, 1, 640, 3)),
+        2,
         "an event at column 640, row 3, outside",
     ),
     "a pixel of EVT 2.1": (
-        "evt21", evt21((high(9), 0), (cd(0, 1, 608, 3), 0xFFFF_FFFF), (cd(0, 1, 609, 3), 1 << 31)),
-        2, "an event at column 640, row 3, outside",
+        "evt21",
+        evt21((high(9), 0), (cd(0, 1, 608, 3), 0xFFFF_FFFF), (cd(0, 1, 609, 3), 1 << 31)),
+        2,
+        "an event at column 640, row 3, outside",
     ),
     "a pixel of DAT": (
-        "dat", dat((5, 1, 2, 1), (6, 639, 479, 0), (7, 3, 480, 1), (8, 3, 4, 1)), 2,
+        "dat",
+        dat((5, 1, 2, 1), (6, 639, 479, 0), (7, 3, 480, 1), (8, 3, 4, 1)),
+        2,
         "an event at column 3, row 480, outside",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -458,7 +593,7 @@ def test_what_is_outside_without_an_event_is_no_damage(tmp_path: Path) -> None:
         ("evt2", evt2(high(0), cd(0, 0, 2047, 2047)), 2048),
         ("dat", dat((0, 16383, 16383, 1)), 16384),
     ],
-)  # fmt: skip
+)
 def test_without_a_size_a_pixel_may_be_anywhere_in_its_bits(
     tmp_path: Path, form: str, data: bytes, most: int
 ) -> None:
@@ -543,7 +678,7 @@ def test_words_that_begin_as_a_line_are_no_header(tmp_path: Path, end: bytes, wo
         ("dat", b"% Version 2\n\x0c\x04", "holds DAT events of type 12 with 4 bytes"),
         ("dat", b"% Version 2\n% " + b"x" * (1 << 20) + b"\n", "has a line of more than"),
     ],
-)  # fmt: skip
+)
 def test_other_headers_are_refused(tmp_path: Path, form: str, head: bytes, says: str) -> None:
     with pytest.raises(FormatError, match=says) as caught:
         read_prophesee(write(tmp_path, form, bytes(8), head), "a")
@@ -593,18 +728,34 @@ def test_a_cut_at_any_byte_leaves_a_prefix(tmp_path: Path, form: str) -> None:
 
 EDGES = {
     "evt2": evt2(
-        TRIGGER << 28 | 1, high(1), TRIGGER << 28 | 2 << 22 | 1, cd(0, 3, 1, 1),
-        TRIGGER << 28 | 4 << 22 | 6 << 8 | 1, TRIGGER << 28 | 5 << 22,
+        TRIGGER << 28 | 1,
+        high(1),
+        TRIGGER << 28 | 2 << 22 | 1,
+        cd(0, 3, 1, 1),
+        TRIGGER << 28 | 4 << 22 | 6 << 8 | 1,
+        TRIGGER << 28 | 5 << 22,
     ),
     "evt21": evt21(
-        (TRIGGER << 28 | 1, 0), (high(1), 0), (TRIGGER << 28 | 2 << 22 | 1, 0), (cd(0, 3, 1, 1), 1),
-        (TRIGGER << 28 | 4 << 22 | 6 << 8 | 1, 0), (TRIGGER << 28 | 5 << 22, 0),
+        (TRIGGER << 28 | 1, 0),
+        (high(1), 0),
+        (TRIGGER << 28 | 2 << 22 | 1, 0),
+        (cd(0, 3, 1, 1), 1),
+        (TRIGGER << 28 | 4 << 22 | 6 << 8 | 1, 0),
+        (TRIGGER << 28 | 5 << 22, 0),
     ),
     "evt3": evt3(
-        (TRIGGER, 1), (HIGH, 0), (LOW, 66), (TRIGGER, 1), (LOW, 67), (ADDR_X, 1), (LOW, 68),
-        (TRIGGER, 6 << 8 | 1), (LOW, 69), (TRIGGER, 0),
+        (TRIGGER, 1),
+        (HIGH, 0),
+        (LOW, 66),
+        (TRIGGER, 1),
+        (LOW, 67),
+        (ADDR_X, 1),
+        (LOW, 68),
+        (TRIGGER, 6 << 8 | 1),
+        (LOW, 69),
+        (TRIGGER, 0),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("form", EDGES)
@@ -773,7 +924,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("form", "head"),
     [("evt3", b"% evt 3.0\n"), ("evt2", b"% evt 2.0\n"), ("dat", b"% Version 2\n\x0c\x08")],
-)  # fmt: skip
+)
 def test_the_same_events_as_faery_reads(tmp_path: Path, form: str, head: bytes) -> None:
     words = {"evt3": words3(), "evt2": words2(), "dat": words_dat()}[form]
 

@@ -36,18 +36,32 @@ WRITERS: dict[str, tuple[str, Any, Write]] = {
     "mcap of ros 1": ("a.mcap", ROS1, lambda path, made: ros.write_mcap(path, made, store=ROS1)),
     "bag": ("a.bag", ROS1, ros.write_bag),
     "bag lz4": (
-        "a.bag", ROS1, lambda path, made: ros.write_bag(path, made, Writer1.CompressionFormat.LZ4),
+        "a.bag",
+        ROS1,
+        lambda path, made: ros.write_bag(path, made, Writer1.CompressionFormat.LZ4),
     ),
     "bag bz2": (
-        "a.bag", ROS1, lambda path, made: ros.write_bag(path, made, Writer1.CompressionFormat.BZ2),
+        "a.bag",
+        ROS1,
+        lambda path, made: ros.write_bag(path, made, Writer1.CompressionFormat.BZ2),
     ),
     "folder": ("a", ROS2, ros.write_folder),
     "folder of mcap": ("a", ROS2, lambda path, made: ros.write_folder(path, made, "mcap")),
-    "folder of packed messages": ("a", ROS2, lambda path, made: ros.write_folder(
-        path, made, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))),
-    "folder of packed files": ("a", ROS2, lambda path, made: ros.write_folder(
-        path, made, compression=(CompressionMode.FILE, CompressionFormat.ZSTD))),
-}  # fmt: skip
+    "folder of packed messages": (
+        "a",
+        ROS2,
+        lambda path, made: ros.write_folder(
+            path, made, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+        ),
+    ),
+    "folder of packed files": (
+        "a",
+        ROS2,
+        lambda path, made: ros.write_folder(
+            path, made, compression=(CompressionMode.FILE, CompressionFormat.ZSTD)
+        ),
+    ),
+}
 
 
 def take(folder: Path, path: Path, *, salvage: bool = False) -> tuple[Json, list[Recording]]:
@@ -174,10 +188,13 @@ def test_what_is_not_read_is_named(tmp_path: Path, writer: str) -> None:
     deep = ros.image(store, BASE_NS, "32FC1", np.ones((4, 6), np.float32), width=6)
     other = ros.image(store, BASE_NS, "mono8", np.ones((4, 6), np.uint8))
     made = [
-        _imu(store), ("/depth", ros.IMAGE, deep), *ros.packets(store, "mono", ros.sent()),
+        _imu(store),
+        ("/depth", ros.IMAGE, deep),
+        *ros.packets(store, "mono", ros.sent()),
         *[("/right/events", kind, one) for _, kind, one in ros.arrays(store, ros.sent(250))],
-        *ros.frames(store), ("/other", ros.IMAGE, other),
-    ]  # fmt: skip
+        *ros.frames(store),
+        ("/other", ros.IMAGE, other),
+    ]
     write(tmp_path / name, made)
     result, (found,) = take(tmp_path / "store", tmp_path / name)
     assert (result["events"], result["frames"]) == (2000, 3)
@@ -392,19 +409,35 @@ def words(*found: int) -> bytes:
 
 def test_tokens_of_libcaer_cmp_mean_what_the_driver_writes() -> None:
     data = words(
-        2 << 12 | 100, 3 << 12 | 1 << 11 | 7,  # an ON event at (100, 7), at the base
-        1 << 12 | 5, 4 << 12 | 16, 5 << 12 | 0b1000_0001, 5 << 12 | 0b10,  # OFF; 8 rows further
-        0 << 12 | 3, 3 << 12 | 8,  # the high part alone
-        1 << 12 | 4000, 3 << 12 | 9, 1 << 12 | 2, 3 << 12 | 10,  # a high part that is not written
-        0 << 12 | 15, 3 << 12 | 11, 0 << 12 | 1, 3 << 12 | 12,  # of which 4 bits are written
-    )  # fmt: skip
+        2 << 12 | 100,
+        3 << 12 | 1 << 11 | 7,  # an ON event at (100, 7), at the base
+        1 << 12 | 5,
+        4 << 12 | 16,
+        5 << 12 | 0b1000_0001,
+        5 << 12 | 0b10,  # OFF; 8 rows further
+        0 << 12 | 3,
+        3 << 12 | 8,  # the high part alone
+        1 << 12 | 4000,
+        3 << 12 | 9,
+        1 << 12 | 2,
+        3 << 12 | 10,  # a high part that is not written
+        0 << 12 | 15,
+        3 << 12 | 11,
+        0 << 12 | 1,
+        3 << 12 | 12,  # of which 4 bits are written
+    )
     found, decoder = decoded("libcaer_cmp", data, base_ns=7_000_400)
     assert found == [
-        (7000, 100, 7, 1), (7005, 100, 16, 0), (7005, 100, 23, 0), (7005, 100, 25, 0),
+        (7000, 100, 7, 1),
+        (7005, 100, 16, 0),
+        (7005, 100, 23, 0),
+        (7005, 100, 25, 0),
         (7000 + 3 * 4096 + 5, 100, 8, 0),
-        (7000 + 3 * 4096 + 4000, 100, 9, 0), (7000 + 4 * 4096 + 2, 100, 10, 0),
-        (7000 + 15 * 4096 + 2, 100, 11, 0), (7000 + 17 * 4096 + 2, 100, 12, 0),
-    ]  # fmt: skip
+        (7000 + 3 * 4096 + 4000, 100, 9, 0),
+        (7000 + 4 * 4096 + 2, 100, 10, 0),
+        (7000 + 15 * 4096 + 2, 100, 11, 0),
+        (7000 + 17 * 4096 + 2, 100, 12, 0),
+    ]
     assert decoder.warnings() == []
 
 
@@ -608,10 +641,13 @@ def test_a_plain_colour_behind_a_bayer_filter_keeps_its_brightness(order: str, b
 def test_compressed_frames_are_read(tmp_path: Path, ending: str) -> None:
     data = cv2.imencode(f".{ending}", BGR)[1].tobytes()
     made = [
-        ("/image/compressed", ros.COMPRESSED,
-         ros.compressed(ROS2, BASE_NS + n, f"bgr8; {ending} compressed bgr8", data))
+        (
+            "/image/compressed",
+            ros.COMPRESSED,
+            ros.compressed(ROS2, BASE_NS + n, f"bgr8; {ending} compressed bgr8", data),
+        )
         for n in range(3)
-    ]  # fmt: skip
+    ]
     ros.write_mcap(tmp_path / "a.mcap", [*ros.packets(ROS2, "evt3", ros.sent()), *made])
     result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
     assert (result["events"], result["frames"]) == (2000, 3)

@@ -111,8 +111,12 @@ def test_files_are_those_of_the_store_and_the_folder_reads_as_one(
 ) -> None:
     done = subprocess.run(
         ["sha256sum", "--check", "--quiet", "checksums.sha256"],
-        cwd=published, capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+        cwd=published,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert (done.returncode, done.stdout) == (0, "")
     theirs = Store.open(published)
     assert catalogue(theirs).equals(catalogue(labelled))
@@ -135,11 +139,17 @@ def test_the_card_says_what_the_data_are(published: Path) -> None:
     assert card.splitlines()[0] == "Simulated data."
     info = Store.open(published).campaigns()[0].info
     for text in (
-        "CC-BY-4.0", "A. Author, B. Author (2026): Four slides (simulated data)",
-        info["collection_hash"], info["rig_hash"], "sliplab 0.1.0", "| small | 4 | 0 | 0 |",
-        "| small | events | trigger input (95 %) | 4 | 1.35 | 1.42 |", "mm in the arm's base frame",
-        "level of the factor speed, mm/s", "first slip of any marker, ns on the trial's time line",
-    ):  # fmt: skip
+        "CC-BY-4.0",
+        "A. Author, B. Author (2026): Four slides (simulated data)",
+        info["collection_hash"],
+        info["rig_hash"],
+        "sliplab 0.1.0",
+        "| small | 4 | 0 | 0 |",
+        "| small | events | trigger input (95 %) | 4 | 1.35 | 1.42 |",
+        "mm in the arm's base frame",
+        "level of the factor speed, mm/s",
+        "first slip of any marker, ns on the trial's time line",
+    ):
         assert text in card
 
 

@@ -44,16 +44,22 @@ def _trial(where: Any, name: str, shift: int = 0) -> None:
     writer.add_frames(type(shown)(**{**vars(shown), "t_ns": START_NS + shown.t_ns}))
     clock = {"map": IDENTITY, "uncertainty_ns": 1.0}
     clocks = {
-        "events": clock, "arm": clock, "frames": clock, "streams": {"force": clock},
-    }  # fmt: skip
+        "events": clock,
+        "arm": clock,
+        "frames": clock,
+        "streams": {"force": clock},
+    }
     writer.commit(
         record(
-            name, geometry=GEOMETRY, clocks=clocks, repetition=shift,
+            name,
+            geometry=GEOMETRY,
+            clocks=clocks,
+            repetition=shift,
             counts={"events": 1000, "frames": 12, "poses": 50, "pulses": 0},
             streams={"force": {"kind": "wrench", "rows": 50}},
         ),
         Provenance(),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")

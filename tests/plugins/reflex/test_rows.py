@@ -18,13 +18,21 @@ def trial(number: int, reflex: str | None = "stop", **said: Any) -> ReflexTrial:
     """A trial in which a reflex held the plate 100 ms after the first tip's slip."""
     parts = ReactionParts(window=100.0, sensor=20.0, network=1.0, command=0.5, actuator=30.0)
     data: dict[str, Any] = {
-        "trial": f"r={number}", "mass_kg": 0.2, "speed_mm_s": 1.0,
-        "detector": None if reflex is None else "network", "reflex": reflex,
-        "slip_ms": 300.0, "detected_ms": None if reflex is None else 400.0, "gross_ms": None,
-        "dropped": reflex is None, "fallen_mm": 25.0 if reflex is None else 0.2,
-        "extra_n": None if reflex is None else 1.0, "parts": None if reflex is None else parts,
-        "heights_mm": (0.0, -0.1), "step_ms": 20,
-    }  # fmt: skip
+        "trial": f"r={number}",
+        "mass_kg": 0.2,
+        "speed_mm_s": 1.0,
+        "detector": None if reflex is None else "network",
+        "reflex": reflex,
+        "slip_ms": 300.0,
+        "detected_ms": None if reflex is None else 400.0,
+        "gross_ms": None,
+        "dropped": reflex is None,
+        "fallen_mm": 25.0 if reflex is None else 0.2,
+        "extra_n": None if reflex is None else 1.0,
+        "parts": None if reflex is None else parts,
+        "heights_mm": (0.0, -0.1),
+        "step_ms": 20,
+    }
     return ReflexTrial.model_validate({**data, **said})
 
 
@@ -78,8 +86,11 @@ def test_a_plate_that_still_slides_has_dropped() -> None:
     at_stop = [max(-25.0, -0.1 * t) for t in T_MS]
     caught = [max(-10.0, -0.1 * t) for t in T_MS]
     assert [dropped(T_MS, it, 25.0) for it in (creeping, sliding, at_stop, caught)] == [
-        False, True, True, False,
-    ]  # fmt: skip
+        False,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_extra_force_is_that_after_the_trigger() -> None:
@@ -96,9 +107,14 @@ def test_extra_force_is_that_after_the_trigger() -> None:
 def test_the_page_says_that_it_is_simulated_and_holds_every_row() -> None:
     trials = {f"{k} {r}": trial(k, r) for k in range(3) for r in (None, "stop", "grip:0.4")}
     study = ReflexStudy(
-        simulated=True, rig="mock-gripper", protocol="reflex", virtual_time=True,
-        detectors={"network": "0" * 64}, rows=reflex_rows(trials.values()), trials=trials,
-    )  # fmt: skip
+        simulated=True,
+        rig="mock-gripper",
+        protocol="reflex",
+        virtual_time=True,
+        detectors={"network": "0" * 64},
+        rows=reflex_rows(trials.values()),
+        trials=trials,
+    )
     text = render(study)
     for part in ("simulated", "grip:0.4 (network)", "3 of 3 (29 to 100 %)", "no reflex", "p99"):
         assert part in text
@@ -109,7 +125,12 @@ def test_the_page_says_that_it_is_simulated_and_holds_every_row() -> None:
 def test_a_study_without_a_reflex_has_a_page() -> None:
     trials = {"0": trial(0, None, dropped=False)}
     study = ReflexStudy(
-        simulated=True, rig="r", protocol="p", virtual_time=False, detectors={},
-        rows=reflex_rows(trials.values()), trials=trials,
-    )  # fmt: skip
+        simulated=True,
+        rig="r",
+        protocol="p",
+        virtual_time=False,
+        detectors={},
+        rows=reflex_rows(trials.values()),
+        trials=trials,
+    )
     assert "Reaction time" not in render(study)

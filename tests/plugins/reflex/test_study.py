@@ -158,5 +158,7 @@ def test_wrong_input_is_said(model: Path, fast: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=right):
             study.request(place, rig, tmp_path / "out", protocol, reflexes)
     assert [case.reflex for case in study.request(model, Path("mock"), tmp_path, fast).cases] == [
-        None, "stop", "press:0.4",
-    ]  # fmt: skip
+        None,
+        "stop",
+        "press:0.4",
+    ]

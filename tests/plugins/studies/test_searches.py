@@ -35,8 +35,10 @@ def test_what_a_study_can_have(ran: tuple[list[RunRequest], Outcome]) -> None:
     assert not real.simulated
     slides, falls = (replace(run_request, rig=real) for run_request in (slides, falls))
     assert [each.name for each in searches([slides, falls])] == [
-        "baselines", "generalisation", "detector search",
-    ]  # fmt: skip
+        "baselines",
+        "generalisation",
+        "detector search",
+    ]
     with pytest.raises(InputError, match=r"--searches.*needs a kinematic protocol"):
         searches([falls])
 
@@ -70,10 +72,17 @@ def test_each_is_done_once_and_reported(
     outcome = study(run_requests, more=searches(run_requests))
     done = {step["step"]: step["done"] for step in outcome.steps}
     assert done == {
-        "sync": 0, "label": 0, "train": 0, "evaluate": 0, "baselines": 1,
-        "generalisation": 2, "guesses": 3, "scene search": 1, "detector search": 2,
+        "sync": 0,
+        "label": 0,
+        "train": 0,
+        "evaluate": 0,
+        "baselines": 1,
+        "generalisation": 2,
+        "guesses": 3,
+        "scene search": 1,
+        "detector search": 2,
         "report": 1,
-    }  # fmt: skip
+    }
     store = Store.open(run_requests[0].store)
     for result in (GENERALISATION, GUESSES, RESULTS["scene"], RESULTS["detector"]):
         assert result.read(store) is not None

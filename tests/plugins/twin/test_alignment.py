@@ -296,9 +296,11 @@ def test_frames_that_are_late_against_events_have_their_delay(seconds: float) ->
         t, x, y = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.argsort(t)
         events = EventChunk(
-            x[order].astype(np.uint16), y[order].astype(np.uint16), np.ones(len(t), np.int8),
+            x[order].astype(np.uint16),
+            y[order].astype(np.uint16),
+            np.ones(len(t), np.int8),
             np.round(1e6 * t[order]).astype(np.int64),
-        )  # fmt: skip
+        )
         made.append(replace(trial, camera=Camera(events, (400, 400))))
     found = event_delay_ms(late(made, seconds), rests)
     assert found == pytest.approx(-1e3 * seconds, abs=2.0)

@@ -165,8 +165,10 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     drawn = [one[friction.key] for one in samples]
     assert np.quantile(drawn, [0.025, 0.975]) == pytest.approx([friction.low, friction.high], 0.01)
     assert rig.scene.scene.friction.kinetic == pytest.approx(friction.value, rel=1e-4)
-    said = {it.name: it.finding for it in check(Path("kinematic"), tmp_path / "twin.yaml",
-                                                tmp_path / "other", ())}  # fmt: skip
+    said = {
+        it.name: it.finding
+        for it in check(Path("kinematic"), tmp_path / "twin.yaml", tmp_path / "other", ())
+    }
     assert "the twin was fitted on" in said["twin"] or "within what" in said["twin"]
 
 
@@ -188,8 +190,12 @@ def test_no_interval_where_a_misfit_touches_its_parameter(
     title = "noise of the event camera drifts during the pilot"
     assert [check.title for check in fit.checks if check.found] == [title]
     withheld = {it.key for it in fit.parameters if it.withheld}
-    assert withheld == {"event_camera.noise_hz", "event_camera.leak_share",
-                        "event_camera.hot_pixels", "event_camera.hot_hz"}  # fmt: skip
+    assert withheld == {
+        "event_camera.noise_hz",
+        "event_camera.leak_share",
+        "event_camera.hot_pixels",
+        "event_camera.hot_hz",
+    }
     for it in fit.parameters:
         assert ((it.low, it.high) == (None, None)) == bool(it.withheld)
         assert it.withheld in ((), (title,))
@@ -238,13 +244,28 @@ def test_a_misfit_ends_with_exit_code_1(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = MisfitCheck(
-        title="light that flickers", stream="events", unit="times noise", pilot=40.0, limit=2.0,
-        share=1e-6, found=True,
-    )  # fmt: skip
+        title="light that flickers",
+        stream="events",
+        unit="times noise",
+        pilot=40.0,
+        limit=2.0,
+        share=1e-6,
+        found=True,
+    )
     fit = TwinFit(
-        simulated=True, campaign="pilot", rig="rehearsal", checksum="00", trials=9, judged=3,
-        worlds=100, predicted=2, seconds=1.0, parameters=(), statistics={}, checks=(line,),
-    )  # fmt: skip
+        simulated=True,
+        campaign="pilot",
+        rig="rehearsal",
+        checksum="00",
+        trials=9,
+        judged=3,
+        worlds=100,
+        predicted=2,
+        seconds=1.0,
+        parameters=(),
+        statistics={},
+        checks=(line,),
+    )
     monkeypatch.setattr(calibrate, "calibrate_scene", lambda *_: fit)
     asked = ["calibrate", "scene", str(store.folder), "--rig", "rehearsal"]
     asked += ["--out", str(tmp_path / "twin.yaml")]
@@ -273,9 +294,17 @@ def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
         folder = tmp_path / level
         sliplab.collect("pilot", rig=rig, store=folder, trials=1)
         said = CliRunner().invoke(
-            app, ["calibrate", "scene", str(folder), "--rig", "rehearsal",
-                  "--out", str(tmp_path / "twin.yaml")],
-        )  # fmt: skip
+            app,
+            [
+                "calibrate",
+                "scene",
+                str(folder),
+                "--rig",
+                "rehearsal",
+                "--out",
+                str(tmp_path / "twin.yaml"),
+            ],
+        )
         assert said.exit_code == 1
         assert reason in str(said.exception)
     assert not (tmp_path / "twin.yaml").exists()
@@ -286,9 +315,11 @@ def test_a_hidden_rig_is_found(tmp_path: Path) -> None:
     """Worlds are simulated: friction, relaxation and noise lie within their intervals."""
     hidden = tmp_path / "hidden.yaml"
     values = {
-        "scene.friction.path_variation": 0.06, "scene.skin.relaxation_share": 0.24,
-        "event_camera.noise_hz": 0.013, "event_camera.readout_hz": 4500.0,
-    }  # fmt: skip
+        "scene.friction.path_variation": 0.06,
+        "scene.skin.relaxation_share": 0.24,
+        "event_camera.noise_hz": 0.013,
+        "event_camera.readout_hz": 4500.0,
+    }
     hidden.write_text(
         "extends: rehearsal\nname: hidden\nmock:\n  seed: 77\n"
         "  scene: {level: L3, friction: {path_variation: 0.06}, skin: {relaxation_share: 0.24}}\n"

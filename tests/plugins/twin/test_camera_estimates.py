@@ -38,9 +38,11 @@ def chunk(t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> Even
     """Events in order of time."""
     order = np.argsort(t_us, kind="stable")
     return EventChunk(
-        x[order].astype(np.uint16), y[order].astype(np.uint16), p[order].astype(np.uint8),
+        x[order].astype(np.uint16),
+        y[order].astype(np.uint16),
+        p[order].astype(np.uint8),
         t_us[order].astype(np.int64),
-    )  # fmt: skip
+    )
 
 
 def nothing() -> EventChunk:
@@ -54,11 +56,15 @@ def trial(
     frame_s = np.arange(HOLD_S, SLIDE_S, 0.01)
     way = np.array([np.cos(angle), np.sin(angle)])
     return PilotTrial(
-        "t", Slide(depth, 1.0, way), HOLD_S, SLIDE_S, frame_s,
+        "t",
+        Slide(depth, 1.0, way),
+        HOLD_S,
+        SLIDE_S,
+        frame_s,
         np.broadcast_to(LAYOUT, (len(frame_s), *LAYOUT.shape)),
         np.outer(np.clip(frame_s, 0.0, None), way),
         None if events is None else Camera(events, size),
-    )  # fmt: skip
+    )
 
 
 def noise(
@@ -162,7 +168,7 @@ def test_pixels_that_are_busy_in_the_slide_alone_are_not_hot() -> None:
         t_us = np.linspace(5e5 * made.slide_s, 9e5 * made.slide_s, 400).astype(np.int64)
         passed = EventChunk(
             x.astype(np.uint16), (y + 1).astype(np.uint16), np.ones(400, np.int8), t_us
-        )  # fmt: skip
+        )
         both = EventChunk.joined([made.camera.events, *[passed] * 6])
         order = np.argsort(both.t_us, kind="stable")
         events = EventChunk(both.x[order], both.y[order], both.p[order], both.t_us[order])
@@ -208,9 +214,15 @@ def scanned(
 
 @pytest.mark.parametrize(
     ("hz", "scan_us", "width"),
-    [(5000.0, 192.0, 640), (3846.2, 150.0, 640), (6499.0, 153.0, 640), (1000.0, 900.0, 346),
-     (9900.0, 60.0, 1280), (5000.0, 0.0, 640)],
-)  # fmt: skip
+    [
+        (5000.0, 192.0, 640),
+        (3846.2, 150.0, 640),
+        (6499.0, 153.0, 640),
+        (1000.0, 900.0, 346),
+        (9900.0, 60.0, 1280),
+        (5000.0, 0.0, 640),
+    ],
+)
 def test_scans_of_a_read_out(hz: float, scan_us: float, width: int) -> None:
     found = find_scans(scanned(np.random.default_rng(3), 1e6 / hz, scan_us, width), width)
     assert found is not None
@@ -319,8 +331,10 @@ def test_noise_alone_is_measured_in_the_hold() -> None:
     rng, size = np.random.default_rng(6), (346, 260)
     frames = replace(
         trial(noise(rng, hot=3, size=size), size),
-        frame_s=np.empty(0), tips_mm=np.empty((0, 7, 2)), base_mm=np.empty((0, 2)),
-    )  # fmt: skip
+        frame_s=np.empty(0),
+        tips_mm=np.empty((0, 7, 2)),
+        base_mm=np.empty((0, 2)),
+    )
     found = camera_estimates([frames])
     assert found["noise_hz"] == pytest.approx(NOISE_HZ, rel=0.03)
     assert found["leak_share"] == pytest.approx(LEAK, rel=0.05)

@@ -57,9 +57,14 @@ def each_papilla(trials: Sequence[PilotTrial]) -> Papillae | None:
 
 
 def slide(
-    tracks: Tracks, speed: float = 1.0, way: Sequence[float] = (1.0, 0.0), depth: float = 2.8,
-    noise: float = 2e-4, seed: int = 0, forces: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> PilotTrial:  # fmt: skip
+    tracks: Tracks,
+    speed: float = 1.0,
+    way: Sequence[float] = (1.0, 0.0),
+    depth: float = 2.8,
+    noise: float = 2e-4,
+    seed: int = 0,
+    forces: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> PilotTrial:
     """A slide of 9 mm whose tips go as `tracks` says, begun 4.5 mm before the plate's middle."""
     rng = np.random.default_rng(seed)
     t = np.arange(-2.0, 9.0 / speed, 0.01) + 0.003
@@ -99,10 +104,12 @@ def pilot(tracks: Callable[[float], Tracks], **others: object) -> list[PilotTria
     return [
         slide(tracks(depth), speed, way, depth, seed=number, **others)  # type: ignore[arg-type]
         for number, (depth, speed, way) in enumerate(
-            (depth, speed, way) for depth in (2.4, 2.8, 3.4) for speed in (0.6, 1.0, 1.6)
+            (depth, speed, way)
+            for depth in (2.4, 2.8, 3.4)
+            for speed in (0.6, 1.0, 1.6)
             for way in ways
         )
-    ]  # fmt: skip
+    ]
 
 
 def test_a_tip_lets_go_where_its_spring_reaches_friction() -> None:
@@ -209,9 +216,9 @@ def test_friction_along_the_path_gives_its_deviation_and_length() -> None:
         def tracks(t: np.ndarray, speed: float) -> np.ndarray:
             base = speed * t[:, None]
             way = np.maximum(base - STRETCH, 0.0)
-            wander = np.array([
-                np.interp(way[:, j], np.arange(800) * 0.02, field[j]) for j in range(19)
-            ]).T  # fmt: skip
+            wander = np.array(
+                [np.interp(way[:, j], np.arange(800) * 0.02, field[j]) for j in range(19)]
+            ).T
             return np.where(way > 0.0, np.maximum(base - STRETCH * (1 + 0.05 * wander), 0.0), 0.0)
 
         return tracks
@@ -245,9 +252,12 @@ def test_the_tremor_along_the_plate_is_told_from_that_of_the_depth() -> None:
 
 @settings(deadline=None)
 @given(
-    mu=st.floats(0.4, 1.3), deep=st.floats(0.01, 3.0), height=st.floats(7.0, 11.0),
-    normal=st.floats(2.0, 8.0), tangential=st.floats(1.0, 6.0),
-)  # fmt: skip
+    mu=st.floats(0.4, 1.3),
+    deep=st.floats(0.01, 3.0),
+    height=st.floats(7.0, 11.0),
+    normal=st.floats(2.0, 8.0),
+    tangential=st.floats(1.0, 6.0),
+)
 def test_a_steady_lag_solves_the_equations_of_the_column(
     mu: float, deep: float, height: float, normal: float, tangential: float
 ) -> None:
@@ -299,11 +309,16 @@ def exact_lags(
     dragged = TRUE["young"] * mu * pressed
     in_ring = RING[:, None] == np.arange(3)
     lags = Lags(
-        depth, RING, lag, np.hypot(0.003 * lag, 1e-3), resting if forces else nothing,
+        depth,
+        RING,
+        lag,
+        np.hypot(0.003 * lag, 1e-3),
+        resting if forces else nothing,
         float(dragged.sum() / pressed.sum() / TRUE["young"]) if forces else np.nan,
-        TRUE["young"] * pressed.sum(axis=1) / resting if forces else nothing, nothing,
+        TRUE["young"] * pressed.sum(axis=1) / resting if forces else nothing,
+        nothing,
         (dragged @ in_ring) / np.maximum(lag @ in_ring, 1e-9) * (1.0 if forces else np.nan),
-    )  # fmt: skip
+    )
     return lags, friction, raised
 
 
@@ -429,8 +444,9 @@ def test_papillae_have_the_gaps_and_friction_that_were_drawn() -> None:
     outer = RING == 2
     np.testing.assert_allclose(
         found.gap_mm[outer] - found.gap_mm[outer].mean(),
-        raised[outer].mean() - raised[outer], atol=0.01,
-    )  # fmt: skip
+        raised[outer].mean() - raised[outer],
+        atol=0.01,
+    )
     np.testing.assert_allclose(found.place_mm, LATTICE, atol=1e-3)
 
 

@@ -68,9 +68,13 @@ def base_way(t: F64, speed: float, ramp_mm_s2: float) -> tuple[F64, float]:
 
 
 def pilot(
-    friction: F64 | None = None, raised_mm: F64 | None = None, ramp_mm_s2: float = np.inf,
-    spot: tuple[float, float] | None = None, seed: int = 0, worn: float = 0.0,
-) -> list[PilotTrial]:  # fmt: skip
+    friction: F64 | None = None,
+    raised_mm: F64 | None = None,
+    ramp_mm_s2: float = np.inf,
+    spot: tuple[float, float] | None = None,
+    seed: int = 0,
+    worn: float = 0.0,
+) -> list[PilotTrial]:
     """Slides at three depths and two speeds in four directions, of papillae that are springs.
 
     Args:
@@ -97,9 +101,14 @@ def pilot(
 
 
 def _slide(
-    lag: F64, depth: float, speed: float, way: F64, ramp_mm_s2: float,
-    spot: tuple[float, float] | None, rng: np.random.Generator,
-) -> PilotTrial:  # fmt: skip
+    lag: F64,
+    depth: float,
+    speed: float,
+    way: F64,
+    ramp_mm_s2: float,
+    spot: tuple[float, float] | None,
+    rng: np.random.Generator,
+) -> PilotTrial:
     t = np.arange(-2.0, LENGTH_MM / speed + speed / ramp_mm_s2, 0.01) + 0.003
     base, end_s = base_way(t, speed, ramp_mm_s2)
     rest = LATTICE + rng.normal(0.0, 0.02, LATTICE.shape) - 4.5 * way
@@ -202,8 +211,9 @@ def lit(share: float, hz: float = 100.0, scans_hz: float = 0.0, seed: int = 0) -
         events = EventChunk(
             rng.integers(0, 400, kept.sum()).astype(np.int16),
             rng.integers(0, 400, kept.sum()).astype(np.int16),
-            p[kept], np.round(t[kept] * 1e6).astype(np.int64),
-        )  # fmt: skip
+            p[kept],
+            np.round(t[kept] * 1e6).astype(np.int64),
+        )
         found.append(replace(trial, camera=Camera(events, (400, 400))))
     return found
 
@@ -272,8 +282,17 @@ def test_a_number_that_is_always_zero_has_a_limit() -> None:
     assert 0.05 < tail.limit(0.005) < 0.5
 
 
-STATISTICS = ("kinetic", "correlation_mm", "friction_scatter", "tremor_mm", "height_reach_mm",
-              "normal_n", "ratio", "pull_ring1_n_per_mm", *NAMES[:8])  # fmt: skip
+STATISTICS = (
+    "kinetic",
+    "correlation_mm",
+    "friction_scatter",
+    "tremor_mm",
+    "height_reach_mm",
+    "normal_n",
+    "ratio",
+    "pull_ring1_n_per_mm",
+    *NAMES[:8],
+)
 
 
 def worlds(k: int, rng: np.random.Generator) -> tuple[list[dict[str, float]], F64]:
@@ -281,13 +300,21 @@ def worlds(k: int, rng: np.random.Generator) -> tuple[list[dict[str, float]], F6
     q = len(STATISTICS)
     mix = np.random.default_rng(5).normal(size=(4, q))
     s = rng.uniform(-1.0, 1.0, (k, 4)) @ mix + 0.05 * rng.standard_t(5, (k, q))
-    rows = np.column_stack([
-        0.002 * rng.rayleigh(size=k), 2.5 * rng.lognormal(0.0, 0.2, k), np.zeros(k),
-        1.2 * rng.lognormal(0.0, 0.08, k), 1e-3 * rng.gamma(4.0, 0.3, k), 3.0 + rng.gumbel(size=k),
-        # those that tell of places, times and trends
-        *(np.abs(rng.normal(size=k)) if not it.signed else rng.normal(1.0, it.floor, k)
-          for it in CHECKS[6:]),
-    ])  # fmt: skip
+    rows = np.column_stack(
+        [
+            0.002 * rng.rayleigh(size=k),
+            2.5 * rng.lognormal(0.0, 0.2, k),
+            np.zeros(k),
+            1.2 * rng.lognormal(0.0, 0.08, k),
+            1e-3 * rng.gamma(4.0, 0.3, k),
+            3.0 + rng.gumbel(size=k),
+            # those that tell of places, times and trends
+            *(
+                np.abs(rng.normal(size=k)) if not it.signed else rng.normal(1.0, it.floor, k)
+                for it in CHECKS[6:]
+            ),
+        ]
+    )
     keys = [check.key for check in CHECKS]
     return [dict(zip(keys, row, strict=True)) for row in rows.tolist()], s
 
@@ -309,11 +336,20 @@ def test_false_alarms_keep_to_the_level(k: int) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value", "stream"),
-    [(TILT, 0.0175, "frames"), (STICKY, 8.0, "frames"), (BROKEN, 1.0, "frames"),
-     (LIGHT, 1e4, "events"), (RAMP, 0.1, "poses"), (SPOT, 20.0, "frames"),
-     (TURN, 6.0, "frames"), (LAG, 9.0, "frames"), (PULL, 9.0, "force"),
-     (NOISE_TREND, 9.0, "events"), (FORCE_DELAY, -15.0, "force")],
-)  # fmt: skip
+    [
+        (TILT, 0.0175, "frames"),
+        (STICKY, 8.0, "frames"),
+        (BROKEN, 1.0, "frames"),
+        (LIGHT, 1e4, "events"),
+        (RAMP, 0.1, "poses"),
+        (SPOT, 20.0, "frames"),
+        (TURN, 6.0, "frames"),
+        (LAG, 9.0, "frames"),
+        (PULL, 9.0, "force"),
+        (NOISE_TREND, 9.0, "events"),
+        (FORCE_DELAY, -15.0, "force"),
+    ],
+)
 def test_an_effect_is_called_by_its_stream(key: str, value: float, stream: str) -> None:
     rng = np.random.default_rng(3)
     bank, s = worlds(100, rng)

@@ -39,8 +39,11 @@ def bank_of(unit: F64, s: F64) -> Bank:
     return Bank(
         tuple(f"theta{j}" for j in range(p)),
         tuple(f"s{j}" for j in range(s.shape[1])),
-        unit * HALF, s, np.full(p, -HALF), np.full(p, HALF),
-    )  # fmt: skip
+        unit * HALF,
+        s,
+        np.full(p, -HALF),
+        np.full(p, HALF),
+    )
 
 
 def useless(s: F64, many: int, rng: np.random.Generator) -> F64:
@@ -240,10 +243,19 @@ def test_an_unknown_gain_widens_what_goes_with_it_and_no_more() -> None:
     rng = np.random.default_rng(8)
     samples = rng.normal([1.0, -1.0, 0.0], [0.01, 0.01, 0.01], (400, 3))
     estimates = tuple(
-        Estimate(name, float(it.mean()), 0.01, *np.quantile(it, [0.025, 0.975]).tolist(),
-                 -2.0, 2.0, 0.01, True, ())
+        Estimate(
+            name,
+            float(it.mean()),
+            0.01,
+            *np.quantile(it, [0.025, 0.975]).tolist(),
+            -2.0,
+            2.0,
+            0.01,
+            True,
+            (),
+        )
         for name, it in zip("abc", samples.T, strict=True)
-    )  # fmt: skip
+    )
     found = Posterior(estimates, samples)
     error = np.log(1.15)
     up, down, other = widened(found, np.array([1.0, -1.0, 0.0]), error)

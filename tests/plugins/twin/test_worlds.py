@@ -56,9 +56,13 @@ def test_depth_zero_is_right_with_the_rigs_own_touch_depth() -> None:
 def test_touches_that_differ_leave_no_common_error_of_depth() -> None:
     rig, _ = load_rig_file(shipped_rigs()["rehearsal"])
     few_pixels = {
-        "px_per_mm": 12.3, "radius_mm": 1.07, "growth_mm_per_n": 0.37, "noise_hz": 0.012,
-        "hot_pixels": 12, "hot_hz": 13.0,
-    }  # fmt: skip
+        "px_per_mm": 12.3,
+        "radius_mm": 1.07,
+        "growth_mm_per_n": 0.37,
+        "noise_hz": 0.012,
+        "hot_pixels": 12,
+        "hot_hz": 13.0,
+    }
     other = changed(rig, {"event_camera": few_pixels})
     calibration = other.calibration.model_copy(update={"touch_depth": touch_depth_mm(other)})
     own = other.model_copy(update={"calibration": calibration})

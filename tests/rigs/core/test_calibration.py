@@ -27,23 +27,39 @@ PLANE: dict[str, Any] = {
 WHOLE: dict[str, Any] = {
     "contact_plane": {**PLANE, "residual": "0.02 mm", "method": "touches"},
     "depth_zero": {
-        "zero": "0.01 mm", "taught": "2026-11-30", "residual": "0.02 mm", "method": "touches",
+        "zero": "0.01 mm",
+        "taught": "2026-11-30",
+        "residual": "0.02 mm",
+        "method": "touches",
     },
     "tool_centre_point": {
-        "offset": ["0 mm", "0 mm", "90 mm"], "pivot": ["300 mm", "0 mm", "200 mm"], "poses": 8,
-        "taught": "2026-11-01", "residual": "0.1 mm", "method": "pivoting",
+        "offset": ["0 mm", "0 mm", "90 mm"],
+        "pivot": ["300 mm", "0 mm", "200 mm"],
+        "poses": 8,
+        "taught": "2026-11-01",
+        "residual": "0.1 mm",
+        "method": "pivoting",
     },
     "lens": {
-        "scale_px_per_mm": 20.01, "focal": ["6000 px", "6000 px"],
-        "centre": ["960 px", "600 px"], "distortion": [0, 0, 0, 0, 0], "tilt": "0 deg",
-        "size": ["1920 px", "1200 px"], "views": 8, "measured": "2026-11-01",
-        "residual": "0.1 px", "method": "ChArUco",
+        "scale_px_per_mm": 20.01,
+        "focal": ["6000 px", "6000 px"],
+        "centre": ["960 px", "600 px"],
+        "distortion": [0, 0, 0, 0, 0],
+        "tilt": "0 deg",
+        "size": ["1920 px", "1200 px"],
+        "views": 8,
+        "measured": "2026-11-01",
+        "residual": "0.1 px",
+        "method": "ChArUco",
     },
     "event_crop": {
-        "centre": ["318 px", "241 px"], "size": "360 px", "measured": "2026-11-01",
-        "residual": "1 px", "method": "circle",
+        "centre": ["318 px", "241 px"],
+        "size": "360 px",
+        "measured": "2026-11-01",
+        "residual": "1 px",
+        "method": "circle",
     },
-}  # fmt: skip
+}
 
 
 def calibration(**changes: Any) -> Calibration:
@@ -85,11 +101,13 @@ def test_an_entry_that_is_missing_or_old_names_its_command(name: str) -> None:
 
 
 def test_the_last_day_still_counts() -> None:
-    at_limit = calibration(contact_plane={"taught": "2026-11-01"}, depth_zero=None,
-                           max_age={"depth_zero": None})  # fmt: skip
+    at_limit = calibration(
+        contact_plane={"taught": "2026-11-01"}, depth_zero=None, max_age={"depth_zero": None}
+    )
     assert faults(at_limit) == []
-    beyond = calibration(contact_plane={"taught": "2026-10-31"}, depth_zero=None,
-                         max_age={"depth_zero": None})  # fmt: skip
+    beyond = calibration(
+        contact_plane={"taught": "2026-10-31"}, depth_zero=None, max_age={"depth_zero": None}
+    )
     assert len(faults(beyond)) == 1
 
 
@@ -101,14 +119,19 @@ def test_a_day_to_come_is_refused() -> None:
 
 def test_a_simulated_rig_has_no_age_unless_its_file_says_so() -> None:
     bare = calibration(
-        contact_plane={"taught": "2020-01-01"}, depth_zero=None, tool_centre_point=None,
-        lens=None, event_crop=None,
-    )  # fmt: skip
+        contact_plane={"taught": "2020-01-01"},
+        depth_zero=None,
+        tool_centre_point=None,
+        lens=None,
+        event_crop=None,
+    )
     assert faults(bare, simulated=True) == []
     reported = calibration(
-        contact_plane={"taught": "2020-01-01"}, depth_zero=None, lens=None,
+        contact_plane={"taught": "2020-01-01"},
+        depth_zero=None,
+        lens=None,
         max_age={"contact_plane": "30 d", "lens": "90 d"},
-    )  # fmt: skip
+    )
     said = faults(reported, simulated=True)
     assert len(said) == 2
     assert "2020-01-01" in said[0]
@@ -134,10 +157,12 @@ def test_scale_and_lens_have_to_agree() -> None:
 @pytest.mark.parametrize(
     ("age", "says"),
     [
-        ("30 days", "whole number of days"), (30, "whole number of days"),
-        ("-1 d", "whole number"), ("0.5 d", "whole number"),
+        ("30 days", "whole number of days"),
+        (30, "whole number of days"),
+        ("-1 d", "whole number"),
+        ("0.5 d", "whole number"),
     ],
-)  # fmt: skip
+)
 def test_an_age_is_a_number_of_days(age: object, says: str) -> None:
     data = parse_yaml(MOCK, "mock")
     data["calibration"]["max_age"] = {"lens": age}

@@ -366,9 +366,13 @@ def test_a_simulated_rig_is_freed_once_nobody_has_it(name: str) -> None:
         rig = build_rig(file)
         rig.connect()
         rig.run_trial(
-            plan.program(plan.trials[0]), NullSink(), 7, file.frame_px(plan), 100,
+            plan.program(plan.trials[0]),
+            NullSink(),
+            7,
+            file.frame_px(plan),
+            100,
             file.with_events(plan),
-        )  # fmt: skip
+        )
         rig.close()
         parts = [weakref.ref(part) for part in (rig, *rig._devices())]
         del rig

@@ -176,8 +176,9 @@ def test_noise_that_lags_more_and_more_is_no_noise(rate: float, seconds: float) 
 
     def noise(until_s: float) -> EventChunk:
         t_us = np.arange(int(1e6 * (until_s - 0.5)), int(1e6 * until_s), 2000)
-        return EventChunk(*(np.zeros(len(t_us), kind) for kind in (np.uint16, np.uint16, np.uint8)),
-                          t_us)  # fmt: skip
+        return EventChunk(
+            *(np.zeros(len(t_us), kind) for kind in (np.uint16, np.uint16, np.uint8)), t_us
+        )
 
     watch = NoiseWatch(noise(0.0), lambda: now_ns[0], may_be_silent=False)
     polls = np.arange(0.01, seconds, 0.01)

@@ -38,12 +38,15 @@ from tests.conftest import ROOT
 LIMIT_N = 0.6
 HOME = Position(0.0, 0.0, -2.0)
 DEEP = Position(0.0, 0.0, 2.4)
-PROGRAM = Program(HOME, (
-    Move("press", DEEP, 2.0),
-    Dwell("hold", 0.1, recorded=True),
-    Move("slide", Position(3.0, 0.0, 2.4), 3.0, recorded=True),
-    Move("release", HOME, 10.0),
-))  # fmt: skip
+PROGRAM = Program(
+    HOME,
+    (
+        Move("press", DEEP, 2.0),
+        Dwell("hold", 0.1, recorded=True),
+        Move("slide", Position(3.0, 0.0, 2.4), 3.0, recorded=True),
+        Move("release", HOME, 10.0),
+    ),
+)
 
 
 def make_rig(name: str = "mock-force", limit_n: float | None = LIMIT_N, **scene: Any) -> Rig:
@@ -269,10 +272,17 @@ def test_listening_sees_a_sensor_that_is_dead() -> None:
 # -- force sensors that say nothing usable -----------------------------------------------------
 
 FAULTS = {
-    "nan": "no number", "one axis": "no number", "inf": "no number", "none": "not a WrenchChunk",
-    "empty": "no (newer )?sample", "frozen": "no newer sample", "replayed": "no newer sample",
-    "shape": r"of the shape \(\d+, 2\)", "zeros": "exactly the same", "stuck": "exactly the same",
-}  # fmt: skip
+    "nan": "no number",
+    "one axis": "no number",
+    "inf": "no number",
+    "none": "not a WrenchChunk",
+    "empty": "no (newer )?sample",
+    "frozen": "no newer sample",
+    "replayed": "no newer sample",
+    "shape": r"of the shape \(\d+, 2\)",
+    "zeros": "exactly the same",
+    "stuck": "exactly the same",
+}
 
 
 def breaks(rig: Rig, how: str, broken: Callable[[], bool] = lambda: True) -> list[int]:
@@ -415,15 +425,23 @@ def test_sensor_without_a_limit_is_held_where_a_press_ends_by_it(how: str) -> No
 
 def test_ideal_sensor_without_noise_is_no_dead_one() -> None:
     ideal = {
-        "noise_n": 0, "noise_nm": 0, "drift_n_per_min": 0, "drift_nm_per_min": 0,
+        "noise_n": 0,
+        "noise_nm": 0,
+        "drift_n_per_min": 0,
+        "drift_nm_per_min": 0,
         "cross_talk_share": 0,
-    }  # fmt: skip
+    }
     rig = make_rig(limit_n=30.0, force=ideal, arm={"vibration_um": 0, "pose_noise_um": 0})
     trial(rig)
-    twisted = Program(HOME, (
-        PROGRAM.steps[0], Dwell("hold", 0.1, recorded=True),
-        Twist("twist", replace(DEEP, twist_deg=15.0), 5.0, recorded=True), PROGRAM.steps[-1],
-    ))  # fmt: skip
+    twisted = Program(
+        HOME,
+        (
+            PROGRAM.steps[0],
+            Dwell("hold", 0.1, recorded=True),
+            Twist("twist", replace(DEEP, twist_deg=15.0), 5.0, recorded=True),
+            PROGRAM.steps[-1],
+        ),
+    )
     rig.run_trial(twisted, NullSink(), 1, None, 100)
 
 
@@ -918,8 +936,10 @@ def test_frames_that_never_change_stop_a_touch_by_markers(how: str) -> None:
         assert chunk.markers_px is not None
         kept.append(chunk.markers_px[-1])
         if how == "empty":
-            return replace(chunk, **{name: column[:0] for name, column in vars(chunk).items()
-                                     if column is not None})  # fmt: skip
+            return replace(
+                chunk,
+                **{name: column[:0] for name, column in vars(chunk).items() if column is not None},
+            )
         return replace(chunk, markers_px=np.repeat(kept[0][None], len(chunk), 0))
 
     rig.frames.read = bad  # type: ignore[method-assign]

@@ -48,8 +48,11 @@ def test_a_way_follows_its_ramps() -> None:
     expected = [0.0, 0.0, 0.2, 0.8, 3.2, 7.2, 7.8, 8.0, 8.0]
     assert gone_mm(path, *times) == pytest.approx(expected, abs=1e-6)
     assert [path.moving(round(t * 1e9)) for t in (0.9, 1.1, 3.3, 3.5)] == [
-        False, True, True, False,
-    ]  # fmt: skip
+        False,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_a_short_way_never_comes_to_its_speed() -> None:
@@ -116,11 +119,16 @@ def test_the_arm_trembles_while_it_moves() -> None:
 
 MOVES = st.lists(
     st.tuples(
-        st.floats(-8, 8), st.floats(-6, 3), st.floats(1, 50), st.floats(50, 5000),
-        st.floats(0.05, 3), st.booleans(),
+        st.floats(-8, 8),
+        st.floats(-6, 3),
+        st.floats(1, 50),
+        st.floats(50, 5000),
+        st.floats(0.05, 3),
+        st.booleans(),
     ),
-    min_size=1, max_size=6,
-)  # fmt: skip
+    min_size=1,
+    max_size=6,
+)
 
 
 @given(MOVES, st.integers(-200_000, 200_000))

@@ -39,9 +39,14 @@ def joined(chunks: list[Any]) -> dict[str, np.ndarray]:
 
 
 def go(
-    devices: MockDevices, x: float, y: float, depth: float, speed: float, step_s: float,
+    devices: MockDevices,
+    x: float,
+    y: float,
+    depth: float,
+    speed: float,
+    step_s: float,
     each: Callable[[], None],
-) -> None:  # fmt: skip
+) -> None:
     """Move in a straight line to a place on the plate; `each` is called after every step."""
     devices.arm.start([Segment(devices.world.plane.pose(x, y, depth), speed)])
     while not devices.arm.progress().done:
@@ -50,10 +55,16 @@ def go(
 
 
 def slide(
-    devices: MockDevices, seed: int, *, chunk_s: float = 0.5, distance: float = 4.0,
-    speed: float = 2.0, depth: float = 2.6, rest_s: float = 0.4,
+    devices: MockDevices,
+    seed: int,
+    *,
+    chunk_s: float = 0.5,
+    distance: float = 4.0,
+    speed: float = 2.0,
+    depth: float = 2.6,
+    rest_s: float = 0.4,
     nuisances: TrialNuisances | None = None,
-) -> Trial:  # fmt: skip
+) -> Trial:
     """Press, hold, slide; streams are read every `chunk_s` seconds, whatever the motion does."""
     clock, arm, world = devices.clock, devices.arm, devices.world
     arm.connect()
@@ -95,10 +106,15 @@ def slide(
     clock.wait(0.05)
     read()
     return Trial(
-        joined(parts["e"]), joined(parts["f"]), joined(parts["p"]),
-        joined(parts["ep"])["t_ns"], joined(parts["ap"])["t_ns"], joined(parts["sp"])["t_ns"],
-        devices.truth(start), start,
-    )  # fmt: skip
+        joined(parts["e"]),
+        joined(parts["f"]),
+        joined(parts["p"]),
+        joined(parts["ep"])["t_ns"],
+        joined(parts["ap"])["t_ns"],
+        joined(parts["sp"])["t_ns"],
+        devices.truth(start),
+        start,
+    )
 
 
 def same(a: Trial, b: Trial) -> None:

@@ -16,9 +16,13 @@ CODE = 4321
 
 
 def rig(
-    timing: dict[str, Any], *faults: dict[str, Any], clocks: dict[str, Any] | None = None,
-    camera: dict[str, Any] | None = None, arm: dict[str, Any] | None = None, seed: int = 7,
-) -> MockDevices:  # fmt: skip
+    timing: dict[str, Any],
+    *faults: dict[str, Any],
+    clocks: dict[str, Any] | None = None,
+    camera: dict[str, Any] | None = None,
+    arm: dict[str, Any] | None = None,
+    seed: int = 7,
+) -> MockDevices:
     """A rig that has no pictures, ready for a trial."""
     data = {
         "frame_camera": FrameCamera(level="tracks", **(camera or {})).model_dump(),

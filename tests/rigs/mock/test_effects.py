@@ -264,20 +264,24 @@ def test_a_short_move_never_gets_to_its_speed() -> None:
         (({"kind": "papilla_sticky", "papilla": 1, "at_s": 1},), {}, "[0].at_s", "unknown key"),
         (({"kind": "plate_spot", "radius_mm": 1},), {}, "[0].centre_mm", "is missing"),
         (
-            ({"kind": "plate_spot", "centre_mm": [0, 0], "radius_mm": 0},), {}, "[0].radius_mm",
+            ({"kind": "plate_spot", "centre_mm": [0, 0], "radius_mm": 0},),
+            {},
+            "[0].radius_mm",
             "than 0",
         ),
         (({"kind": "mains_light", "share": 0.6},), {}, "[0].share", "0.5"),
         (({"kind": "mains_light", "hz": 0},), {}, "[0].hz", "10"),
         (
-            ({"kind": "mains_light"}, {"kind": "mains_light", "trial": 3}), {}, "[1].kind",
+            ({"kind": "mains_light"}, {"kind": "mains_light", "trial": 3}),
+            {},
+            "[1].kind",
             "once only for a trial",
         ),
         (({"kind": "mains_light"},), {"cutoff_hz": 200}, "[0].kind", "cutoff_hz = 0"),
         (({"kind": "arm_ramp", "mm_s2": 0},), {}, "[0].mm_s2", "0.01"),
         (({"kind": "arm_ramp"}, {"kind": "arm_ramp"}), {}, "[1].kind", "once only for a trial"),
     ],
-)  # fmt: skip
+)
 def test_an_impossible_effect_is_said_as_any_wrong_input(
     faults: tuple[dict[str, Any], ...], camera: dict[str, Any], key: str, said: str
 ) -> None:

@@ -134,24 +134,41 @@ def test_a_stuck_plate_does_not_fall() -> None:
 def calls(devices: MockDevices, device: str) -> list[Any]:
     return {
         "arm": [
-            devices.arm.state, devices.arm.pose, devices.arm.now_ns, devices.arm.progress,
-            devices.arm.read_poses, devices.arm.read_pulses, devices.arm.stop, devices.arm.close,
-            devices.arm.connect, lambda: devices.arm.start([]),
+            devices.arm.state,
+            devices.arm.pose,
+            devices.arm.now_ns,
+            devices.arm.progress,
+            devices.arm.read_poses,
+            devices.arm.read_pulses,
+            devices.arm.stop,
+            devices.arm.close,
+            devices.arm.connect,
+            lambda: devices.arm.start([]),
         ],
         "event_camera": [
-            devices.events.start, devices.events.read, devices.events.read_pulses,
-            devices.events.stop, devices.events.close,
+            devices.events.start,
+            devices.events.read,
+            devices.events.read_pulses,
+            devices.events.stop,
+            devices.events.close,
         ],
         "frame_camera": [
-            devices.frames.start, devices.frames.read, devices.frames.stop, devices.frames.close,
-            lambda: devices.frames.set_region(64, 64), devices.frames.read_clock,
+            devices.frames.start,
+            devices.frames.read,
+            devices.frames.stop,
+            devices.frames.close,
+            lambda: devices.frames.set_region(64, 64),
+            devices.frames.read_clock,
         ],
         "sync_box": [
-            devices.sync.read_pulses, devices.sync.read_exposures, devices.sync.read_clock,
-            devices.sync.stop, devices.sync.close,
+            devices.sync.read_pulses,
+            devices.sync.read_exposures,
+            devices.sync.read_clock,
+            devices.sync.stop,
+            devices.sync.close,
             lambda: devices.sync.start(100.0, 1),
         ],
-    }[device]  # fmt: skip
+    }[device]
 
 
 @pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera", "sync_box"])
@@ -249,12 +266,13 @@ def test_faults_belong_to_their_trial() -> None:
         ({"kind": "papilla_torn", "papilla": 19}, "mock.faults[1].papilla", "from 0 (the centre)"),
         ({"kind": "marker_occluded"}, "mock.faults[1]", "needs either a papilla"),
         (
-            {"kind": "arm_protective_stop", "at_s": 1, "at_mm": 2}, "mock.faults[1]",
+            {"kind": "arm_protective_stop", "at_s": 1, "at_mm": 2},
+            "mock.faults[1]",
             "needs a time (at_s) or a point (at_mm)",
         ),
         ({"kind": "plate_stuck", "at_s": 1}, "mock.faults[1].at_s", "unknown key"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_fault_is_said_as_any_wrong_input(fault: Any, key: str, said: str) -> None:
     data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
     data["mock"]["faults"] = [{"kind": "event_gap"}, fault]

@@ -27,9 +27,13 @@ from sliplab.storage.trials.writer import TrialWriter
 from tests.rigs.core.test_rig import FRAME_PX, RIG, Memory, run, short_plan
 
 QUIET = {
-    "noise_n": 0.0, "noise_nm": 0.0, "drift_n_per_min": 0.0, "drift_nm_per_min": 0.0,
-    "cross_talk_share": 0.0, "bias": "never",
-}  # fmt: skip
+    "noise_n": 0.0,
+    "noise_nm": 0.0,
+    "drift_n_per_min": 0.0,
+    "drift_nm_per_min": 0.0,
+    "cross_talk_share": 0.0,
+    "bias": "never",
+}
 PERIOD_NS = 1_000_000
 
 

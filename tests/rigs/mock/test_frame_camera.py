@@ -149,8 +149,10 @@ def test_a_fast_fall_is_smeared_in_the_video_and_its_mean_in_the_tracks() -> Non
     # the mean grey moves as the mean place does, from the frame before
     before = video.images[0][:, SIZE // 2 + 246 :]
     rows = np.arange(SIZE)
-    moved = [float((rows @ (part.astype(float) - 25)).sum() / (part - 25.0).sum())
-             for part in (before, image)]  # fmt: skip
+    moved = [
+        float((rows @ (part.astype(float) - 25)).sum() / (part - 25.0).sum())
+        for part in (before, image)
+    ]
     expected = tracks.plate_px[fast, 1] - tracks.plate_px[0, 1]
     assert moved[1] - moved[0] == pytest.approx(expected, abs=0.1)
 

@@ -15,9 +15,13 @@ def filled(times: list[int]) -> History:
 def test_rows_between_reach_over_both_ends() -> None:
     history = filled([0, 4, 8, 9, 10, 16])
     for (first, last), expected in {
-        (0, 0): [0], (1, 3): [0, 4], (4, 8): [4, 8], (5, 9): [4, 8, 9], (9, 99): [9, 10, 16],
+        (0, 0): [0],
+        (1, 3): [0, 4],
+        (4, 8): [4, 8],
+        (5, 9): [4, 8, 9],
+        (9, 99): [9, 10, 16],
         (16, 20): [16],
-    }.items():  # fmt: skip
+    }.items():
         times, rows = history.between(first, last)
         assert times.tolist() == expected
         assert rows[:, 0].tolist() == expected

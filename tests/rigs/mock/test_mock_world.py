@@ -30,10 +30,14 @@ def trial(devices: MockDevices) -> Trial:
 
 def test_devices_can_do_what_a_rig_needs(devices: MockDevices) -> None:
     for device, capability in (
-        (devices.clock, Clock), (devices.arm, Arm), (devices.events, EventCamera),
-        (devices.frames, FrameCamera), (devices.sync, SyncBox), (devices.plate, Plate),
+        (devices.clock, Clock),
+        (devices.arm, Arm),
+        (devices.events, EventCamera),
+        (devices.frames, FrameCamera),
+        (devices.sync, SyncBox),
+        (devices.plate, Plate),
         (devices.operator, Operator),
-    ):  # fmt: skip
+    ):
         assert isinstance(device, capability)
 
 
@@ -65,8 +69,11 @@ def test_streams_have_the_shapes_and_types_of_the_contract(trial: Trial) -> None
     n = len(trial.events["t_us"])
     assert n > 10_000
     assert [trial.events[k].dtype for k in ("x", "y", "p", "t_us")] == [
-        np.uint16, np.uint16, np.uint8, np.int64,
-    ]  # fmt: skip
+        np.uint16,
+        np.uint16,
+        np.uint8,
+        np.int64,
+    ]
     assert np.all(np.diff(trial.events["t_us"]) >= 0)
     assert trial.events["x"].max() < 640
     assert trial.events["y"].max() < 480
@@ -105,8 +112,10 @@ def test_every_device_sees_the_same_pulses_on_its_own_clock(
 
 def test_clocks_count_from_other_days(trial: Trial) -> None:
     starts = [
-        trial.events["t_us"][0] * 1000, trial.frames["t_ns"][0], trial.poses["t_ns"][0],
-    ]  # fmt: skip
+        trial.events["t_us"][0] * 1000,
+        trial.frames["t_ns"][0],
+        trial.poses["t_ns"][0],
+    ]
     assert min(starts) > 1_000_000_000
     assert min(abs(a - b) for a in starts for b in starts if a is not b) > 1_000_000_000
 

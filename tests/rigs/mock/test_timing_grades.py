@@ -73,8 +73,13 @@ def test_its_rate_is_its_own() -> None:
 
 def test_a_clock_that_drifts_at_once_does_not_expose_before_the_start() -> None:
     for ppm in (10_000, -10_000):
-        fault = {"kind": "clock_drift", "device": "frame_camera", "ppm": ppm, "since": "trial",
-                 "at_s": 0.0}  # fmt: skip
+        fault = {
+            "kind": "clock_drift",
+            "device": "frame_camera",
+            "ppm": ppm,
+            "since": "trial",
+            "at_s": 0.0,
+        }
         devices = rig({"frames": "exposure line"}, fault)
         devices.clock.wait(20.0)
         found = record(devices, 1.0)

@@ -41,10 +41,8 @@ def straight_legs(corners: Sequence[tuple[float, float]], speed_mm_s: float) -> 
         end = begin + float(np.hypot(*way)) / speed_mm_s
         v = way / (end - begin)
         legs.append(
-            Leg(
-                begin, end, lambda t, p=start, v=v, t0=begin: p + v * (t - t0), lambda t, v=v: v
-            )
-        )  # fmt: skip
+            Leg(begin, end, lambda t, p=start, v=v, t0=begin: p + v * (t - t0), lambda t, v=v: v)
+        )
         begin = end
     return legs
 
@@ -71,9 +69,10 @@ class Papilla:
             return
         slopes = (np.roll(knots, -1) - np.roll(knots, 1)) / (2 * KNOT_MM)
         cubic = CubicHermiteSpline(
-            np.arange(len(knots) + 1) * KNOT_MM, np.append(knots, knots[0]),
+            np.arange(len(knots) + 1) * KNOT_MM,
+            np.append(knots, knots[0]),
             np.append(slopes, slopes[0]),
-        )  # fmt: skip
+        )
         slope, period = cubic.derivative(), len(knots) * KNOT_MM
         self.grip = lambda path: (float(cubic(path % period)), float(slope(path % period)))
 
@@ -170,9 +169,16 @@ class _Law:
 
         ends.terminal, ends.direction = True, 1  # type: ignore[attr-defined]
         return solve_ivp(
-            flow, (t, leg.end_s), y, method="DOP853", rtol=RTOL, atol=ATOL, events=ends,
-            dense_output=True, max_step=0.05,
-        )  # fmt: skip
+            flow,
+            (t, leg.end_s),
+            y,
+            method="DOP853",
+            rtol=RTOL,
+            atol=ATOL,
+            events=ends,
+            dense_output=True,
+            max_step=0.05,
+        )
 
     def drop(self, t: float, y: np.ndarray) -> np.ndarray:
         """Slip in no time from the static cone onto the kinetic one."""

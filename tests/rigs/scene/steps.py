@@ -37,9 +37,17 @@ def run(
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     rows = times(steps, h) if t_ns is None else t_ns
     advance(
-        springs.table, springs.friction, springs.law, tips.state, rows, full,
-        np.zeros(steps + 1), track, load, springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        rows,
+        full,
+        np.zeros(steps + 1),
+        track,
+        load,
+        springs.spots,
+    )
     return track, load.reshape(steps, n, 3)
 
 
@@ -67,9 +75,21 @@ def fall(
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     rows = times(steps, h) if t_ns is None else t_ns
     done, _ = advance_free(
-        springs.table, springs.friction, springs.law, tips.state, rows, full, motion,
-        mass, pull, stiction, -25.0, track, load, springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        rows,
+        full,
+        motion,
+        mass,
+        pull,
+        stiction,
+        -25.0,
+        track,
+        load,
+        springs.spots,
+    )
     return track[:done], done
 
 

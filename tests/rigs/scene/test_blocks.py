@@ -50,9 +50,7 @@ def states(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-unt
     decay, gain = relaxing(h, law.relaxation_s)
     found = np.empty((sensor.shape[0], *state.shape))
     for k in range(sensor.shape[0]):
-        move_tips(
-            blocks, n, field, law, sensor[k], plate_y[k], k * h, Step(h, decay, gain, 0.0)
-        )  # fmt: skip
+        move_tips(blocks, n, field, law, sensor[k], plate_y[k], k * h, Step(h, decay, gain, 0.0))
         store_state(blocks, state)
         found[k] = state
     return found
@@ -90,23 +88,34 @@ def both(
     # touching, letting go, turns back and sideways, lifting off, tilts, and the plate as well
     waypoints=st.lists(
         st.tuples(
-            st.floats(-8, 8), st.floats(-8, 8), st.floats(-0.3, 3.6),
-            st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-3, 3),
+            st.floats(-8, 8),
+            st.floats(-8, 8),
+            st.floats(-0.3, 3.6),
+            st.floats(-0.05, 0.05),
+            st.floats(-0.05, 0.05),
+            st.floats(-3, 3),
         ),
-        min_size=2, max_size=6,
+        min_size=2,
+        max_size=6,
     ),
     steps=st.sampled_from([1, 7, 60, 400]),
     h=st.sampled_from([1e-4, 2e-3, 0.1]),
-)  # fmt: skip
+)
 @example(
     # a tip is pushed straight back while its normal force vanishes
-    seed=0, level=2, off=None, exact_turns=True, variation=0.0,
+    seed=0,
+    level=2,
+    off=None,
+    exact_turns=True,
+    variation=0.0,
     waypoints=[
-        (0.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.25, 0.03125, 0.0, 0.0),
+        (0.0, 1.0, 1.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 2.25, 0.03125, 0.0, 0.0),
         (0.0, 4.0, 2.0, 0.03125, 0.0, 0.0),
     ],
-    steps=1, h=0.1,
-)  # fmt: skip
+    steps=1,
+    h=0.1,
+)
 def test_tips_that_share_a_block_are_as_alone(
     seed: int,
     level: int,
@@ -120,9 +129,12 @@ def test_tips_that_share_a_block_are_as_alone(
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08, friction_scatter=0.05), seed)
     options = {name: value for name, value in SWITCHES.items() if name != off}
     springs = make_springs(
-        skin, friction_knots(skin, MU, variation, 0.5, seed), level, exact_turns=exact_turns,
+        skin,
+        friction_knots(skin, MU, variation, 0.5, seed),
+        level,
+        exact_turns=exact_turns,
         **options,
-    )  # fmt: skip
+    )
     corners = [(0.0,) * 6, *waypoints]
     way = np.concatenate([line(a, b, steps) for a, b in zip(corners, waypoints, strict=False)])
     alone, together = both(springs, way[:, :5], way[:, 5], h)
@@ -133,18 +145,21 @@ def test_tips_that_share_a_block_are_as_alone(
 @pytest.mark.long
 def test_the_scenes_of_that_test_have_every_kind_of_step() -> None:
     corners = [(0, 0, -0.3), (0, 0, 3.2), (6, 0, 3.2), (6, 5, 2.0), (4, 1, 3.4), (4, 1, 0.2)]
-    springs = make_springs(
-        ideal_skin(), friction_knots(ideal_skin(), MU, 0.3, 0.5, 1), **SWITCHES
-    )  # fmt: skip
+    springs = make_springs(ideal_skin(), friction_knots(ideal_skin(), MU, 0.3, 0.5, 1), **SWITCHES)
     way = np.concatenate([line(a, b, 400) for a, b in itertools.pairwise(corners)])
     alone, together = both(springs, way, np.zeros(len(way)), 2e-3)
     assert np.array_equal(alone, together, equal_nan=True)
     modes = together[:, :, 14]
     kinds = {(a, b) for a, b in zip(modes[:-1].ravel(), modes[1:].ravel(), strict=True)}
     assert kinds >= {
-        (FREE, FREE), (FREE, STUCK), (STUCK, STUCK), (STUCK, SLIDING), (SLIDING, SLIDING),
-        (SLIDING, STUCK), (SLIDING, FREE),
-    }  # fmt: skip
+        (FREE, FREE),
+        (FREE, STUCK),
+        (STUCK, STUCK),
+        (STUCK, SLIDING),
+        (SLIDING, SLIDING),
+        (SLIDING, STUCK),
+        (SLIDING, FREE),
+    }
 
 
 @pytest.mark.parametrize("counts", [(1,), (1, 6), (1, 6, 12, 18), (4, 6, 12, 18)])

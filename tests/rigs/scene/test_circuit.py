@@ -16,9 +16,14 @@ from sliplab.rigs.scene.edges import CUT
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
 
 QUIET = {
-    "noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0, "refractory_us": 0.0,
-    "readout_hz": 0.0, "width": 96, "height": 96,
-}  # fmt: skip
+    "noise_hz": 0.0,
+    "hot_pixels": 0,
+    "threshold_sigma": 0.0,
+    "refractory_us": 0.0,
+    "readout_hz": 0.0,
+    "width": 96,
+    "height": 96,
+}
 ONE = np.zeros((1, 2))
 MIDDLE = 47.5
 RADIUS_PX = 14.0 * 1.2
@@ -252,9 +257,14 @@ def test_a_slow_pixel_fires_later_and_a_dark_one_is_slower() -> None:
 @pytest.mark.parametrize("cuts", [[32], [64, 128, 160, 320, 512], list(range(32, 640, 32))])
 def test_chunks_do_not_matter_to_cells(cuts: list[int]) -> None:
     changes = {
-        "leak": "reference", "noise_hz": 1.0, "cutoff_hz": 30.0, "threshold_off_sigma": 0.05,
-        "threshold_sigma": 0.03, "readout_hz": 5000.0, "refractory_us": 300.0,
-    }  # fmt: skip
+        "leak": "reference",
+        "noise_hz": 1.0,
+        "cutoff_hz": 30.0,
+        "threshold_off_sigma": 0.05,
+        "threshold_sigma": 0.03,
+        "readout_hz": 5000.0,
+        "refractory_us": 300.0,
+    }
     sensor, whole = sensed(there_and_back, 640, **changes)
     t_ns = np.arange(0, 641, 2, dtype=np.int64) * 1_000_000
     loads = loads_on(there_and_back, t_ns * 1e-9)

@@ -65,16 +65,21 @@ def test_slip_runs_from_the_outer_layer_to_the_centre(
     geometry = SkinGeometry(height_scatter_mm=0.08, position_scatter_mm=0.05, friction_scatter=0.05)
     skin = make_skin(geometry, seed=3)
     springs = make_springs(
-        skin, friction_knots(skin, MU, 0.05, 0.5, seed=9), level, static_excess=0.03,
-        relaxation_share=0.2, strengthening=0.01,
-    )  # fmt: skip
+        skin,
+        friction_knots(skin, MU, 0.05, 0.5, seed=9),
+        level,
+        static_excess=0.03,
+        relaxation_share=0.2,
+        strengthening=0.01,
+    )
     tips = pressed(springs, depth)
     angle = math.radians(direction)
     track, _ = run(
-        springs, tips,
+        springs,
+        tips,
         line((0, 0, depth), (15 * math.cos(angle), 15 * math.sin(angle), depth), 500),
         h=0.03,
-    )  # fmt: skip
+    )
     first = np.argmax(slid(track) > 1e-9, axis=0)
     outer, middle, centre = (first[skin.ring == ring] for ring in (2, 1, 0))
     assert np.all(slid(track)[-1] > 0)
@@ -134,12 +139,13 @@ def test_huge_stiffness_and_long_steps_stay_finite_and_inside_the_cone(level: in
     skin = ideal_skin()
     stiff = springs_of(
         replace(
-            skin, normal_n_per_mm=1e9 * skin.normal_n_per_mm,
+            skin,
+            normal_n_per_mm=1e9 * skin.normal_n_per_mm,
             bending_n_per_mm=1e9 * skin.bending_n_per_mm,
             compliance_mm_per_n=1e-9 * skin.compliance_mm_per_n,
         ),
         level,
-    )  # fmt: skip
+    )
     tips = new_tips(19)
     run(stiff, tips, at(0, 0, 2.8, 3), h=0.01)
     track, load = run(stiff, tips, line((0, 0, 2.8), (15, 4, 2.8), 1500), h=0.01)
@@ -215,12 +221,18 @@ def test_leaving_and_touching_again_resets_the_slider(level: int) -> None:
 def test_chunks_do_not_matter() -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08), seed=2)
     springs = make_springs(
-        skin, friction_knots(skin, MU, 0.05, 0.5, 4), static_excess=0.03, relaxation_share=0.2,
+        skin,
+        friction_knots(skin, MU, 0.05, 0.5, 4),
+        static_excess=0.03,
+        relaxation_share=0.2,
         strengthening=0.01,
-    )  # fmt: skip
-    path = np.vstack([
-        line((0, 0, 0), (0, 0, 2.6), 300), line((0, 0, 2.6), (4, 2, 2.6), 700),
-    ])  # fmt: skip
+    )
+    path = np.vstack(
+        [
+            line((0, 0, 0), (0, 0, 2.6), 300),
+            line((0, 0, 2.6), (4, 2, 2.6), 700),
+        ]
+    )
     whole, parts = new_tips(19), new_tips(19)
     track, _ = run(springs, whole, path)
     rows = times(1000, 1e-3)
@@ -231,9 +243,14 @@ def test_chunks_do_not_matter() -> None:
 
 @settings(max_examples=40, deadline=None)
 @example(
-    seed=0, waypoints=[(0.0, 1.0, 1.0), (1.0, 0.0, 0.0)], share=0.2, level=3, variation=0.1,
-    excess=0.0, h=1e-3,
-)  # fmt: skip
+    seed=0,
+    waypoints=[(0.0, 1.0, 1.0), (1.0, 0.0, 0.0)],
+    share=0.2,
+    level=3,
+    variation=0.1,
+    excess=0.0,
+    h=1e-3,
+)
 @given(
     seed=st.integers(0, 1000),
     waypoints=st.lists(
@@ -265,7 +282,7 @@ def test_every_force_stays_inside_its_cone(
         assert np.all(np.isfinite(load))
         size = np.hypot(load[..., 0], load[..., 1])
         way = slid(track)
-        grip = np.array([
-            [grip_at(springs.friction, i, way[k, i])[0] for i in range(19)] for k in range(60)
-        ])  # fmt: skip
+        grip = np.array(
+            [[grip_at(springs.friction, i, way[k, i])[0] for i in range(19)] for k in range(60)]
+        )
         assert np.all(size <= grip * load[..., 2] * (1 + excess) * (1 + 1e-12))

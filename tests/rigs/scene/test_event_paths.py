@@ -13,9 +13,12 @@ from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
 from sliplab.rigs.scene.marker_path import excursion, fit_blocks, inner_weights, slope_weights
 
 QUIET = {
-    "noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0, "refractory_us": 0.0,
+    "noise_hz": 0.0,
+    "hot_pixels": 0,
+    "threshold_sigma": 0.0,
+    "refractory_us": 0.0,
     "readout_hz": 0.0,
-}  # fmt: skip
+}
 OPTICS = EventOptics(**QUIET)
 ONE = np.zeros((1, 2))
 RADIUS_PX = OPTICS.px_per_mm * OPTICS.radius_mm

@@ -15,9 +15,12 @@ from sliplab.rigs.scene.rim_pixels import no_lists
 STEP_NS = 1_000_000
 ONE = np.zeros((1, 2))
 QUIET = {
-    "noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0, "refractory_us": 0.0,
+    "noise_hz": 0.0,
+    "hot_pixels": 0,
+    "threshold_sigma": 0.0,
+    "refractory_us": 0.0,
     "readout_hz": 0.0,
-}  # fmt: skip
+}
 
 
 def loads_for(centre_px: np.ndarray, optics: EventOptics, growth_px: np.ndarray | None = None):
@@ -115,10 +118,12 @@ def test_a_growing_disc_fires_where_its_rim_is() -> None:
     assert np.all(p == 1)
     away = np.hypot(x - 319.5, y - 239.5) - 16.8 - t_ns * 1e-9 * 10.0
     level = np.array([level_at(d, optics.contrast, optics.edge_px) for d in away])
-    start = np.array([
-        level_at(d, optics.contrast, optics.edge_px)
-        for d in np.hypot(x - 319.5, y - 239.5) - 16.8
-    ])  # fmt: skip
+    start = np.array(
+        [
+            level_at(d, optics.contrast, optics.edge_px)
+            for d in np.hypot(x - 319.5, y - 239.5) - 16.8
+        ]
+    )
     share = (level - start) / optics.threshold
     assert np.abs(share - np.rint(share)).max() < 1e-4
 
@@ -140,9 +145,12 @@ def test_a_pixel_tangent_to_the_rim_has_both_crossings_or_none() -> None:
     rim = rim_of(optics.threshold, optics.contrast, optics.edge_px)
     for offset in (-1e-9, 0.0, 1e-9, 1e-4):
         above = 0.5 * (optics.height - 1) - 100 - (16.8 + rim) + offset
-        path = np.column_stack([
-            np.linspace(-60, 60, 241), np.full(241, above - 0.5 * (optics.height - 1)),
-        ])  # fmt: skip
+        path = np.column_stack(
+            [
+                np.linspace(-60, 60, 241),
+                np.full(241, above - 0.5 * (optics.height - 1)),
+            ]
+        )
         t_ns, x, y, p = sense(MarkerSensor(optics, ONE, 1), loads_for(path, optics))
         here = (y == round(above + 16.8 + rim)) & (x == 320)
         assert sorted(p[here].tolist()) in ([], [0, 1])
@@ -190,10 +198,13 @@ def uneven_times(rng: np.random.Generator, first_ms: int, end_ms: int) -> np.nda
 
 @settings(max_examples=12, deadline=None)
 @given(
-    seed=st.integers(0, 100), first=st.integers(0, 70),
-    readout=st.sampled_from([0, 1000, 3300, 5000]), uneven=st.booleans(),
-    path=st.sampled_from(["cubic", "chord"]), data=st.data(),
-)  # fmt: skip
+    seed=st.integers(0, 100),
+    first=st.integers(0, 70),
+    readout=st.sampled_from([0, 1000, 3300, 5000]),
+    uneven=st.booleans(),
+    path=st.sampled_from(["cubic", "chord"]),
+    data=st.data(),
+)
 def test_chunks_do_not_matter(
     seed: int, first: int, readout: float, uneven: bool, path: str, data: st.DataObject
 ) -> None:

@@ -133,9 +133,13 @@ def test_a_light_keeps_the_refractory_period_and_the_scans() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    first=st.integers(0, 100), since=st.integers(0, 400), readout=st.sampled_from([0.0, 5000.0]),
-    hz=st.sampled_from([10.0, 100.0, 333.3]), off=st.sampled_from([None, 0.18]), data=st.data(),
-)  # fmt: skip
+    first=st.integers(0, 100),
+    since=st.integers(0, 400),
+    readout=st.sampled_from([0.0, 5000.0]),
+    hz=st.sampled_from([10.0, 100.0, 333.3]),
+    off=st.sampled_from([None, 0.18]),
+    data=st.data(),
+)
 def test_chunks_do_not_matter(
     first: int, since: int, readout: float, hz: float, off: float | None, data: st.DataObject
 ) -> None:

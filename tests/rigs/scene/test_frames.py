@@ -23,9 +23,14 @@ HALF = 0.5 * (SIZE - 1)
 
 
 def draw(
-    optics: FrameOptics, tips: np.ndarray, plate: float | None = None, number: int = 0,
-    size: tuple[int, int] = (SIZE, SIZE), seed: int = 1, way: ExposurePath | None = None,
-) -> np.ndarray:  # fmt: skip
+    optics: FrameOptics,
+    tips: np.ndarray,
+    plate: float | None = None,
+    number: int = 0,
+    size: tuple[int, int] = (SIZE, SIZE),
+    seed: int = 1,
+    way: ExposurePath | None = None,
+) -> np.ndarray:
     image = np.full((1, size[1], size[0]), 77, np.uint8)
     height = None if plate is None else np.array([plate])
     ways = None if way is None else {0: way}

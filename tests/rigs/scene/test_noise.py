@@ -56,9 +56,14 @@ def test_dark_pixels_have_their_rate_and_their_share_of_leakage() -> None:
 def test_pixels_on_a_marker_have_a_quarter_of_the_shot_noise(leak_share: float) -> None:
     """Hu, Liu and Delbruck 2021: leakage does not depend on intensity, shot noise falls with it."""
     optics = EventOptics(
-        width=256, height=256, noise_hz=2.0, leak_share=leak_share, hot_pixels=0, radius_mm=6.0,
+        width=256,
+        height=256,
+        noise_hz=2.0,
+        leak_share=leak_share,
+        hot_pixels=0,
+        radius_mm=6.0,
         **STILL,
-    )  # fmt: skip
+    )
     _, x, y, p = still(optics, 8)
     gap = np.hypot(x - 127.5, y - 127.5) - 14.0 * 6.0
     rows, columns = np.mgrid[:256, :256]
@@ -85,9 +90,16 @@ def test_brightness_is_linear_in_intensity() -> None:
 def test_noise_follows_a_marker_that_moves() -> None:
     """A pixel that a marker leaves is dark again: the marker's place decides, block by block."""
     optics = EventOptics(
-        width=128, height=128, noise_hz=50.0, leak_share=0.0, hot_pixels=0, radius_mm=2.0,
-        threshold=9.0, threshold_sigma=0.0, **STILL,
-    )  # fmt: skip
+        width=128,
+        height=128,
+        noise_hz=50.0,
+        leak_share=0.0,
+        hot_pixels=0,
+        radius_mm=2.0,
+        threshold=9.0,
+        threshold_sigma=0.0,
+        **STILL,
+    )
     sensor = MarkerSensor(optics, np.zeros((1, 2)), 1)
     t_ns = np.arange(0, 4001, 32, dtype=np.int64) * 1_000_000
     loads = np.zeros((len(t_ns), 3))

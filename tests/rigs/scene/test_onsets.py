@@ -20,9 +20,13 @@ SKIN = make_skin(
 @pytest.mark.parametrize(("depth", "speed"), [(2.4, 1.6), (2.8, 1.0), (3.4, 0.6)])
 def test_slides_let_go_when_expected(level: int, depth: float, speed: float) -> None:
     springs = make_springs(
-        SKIN, friction_knots(SKIN, MU, 0.0, 0.5, 1), level, static_excess=0.03,
-        relaxation_share=0.2, relaxation_s=1.0,
-    )  # fmt: skip
+        SKIN,
+        friction_knots(SKIN, MU, 0.0, 0.5, 1),
+        level,
+        static_excess=0.03,
+        relaxation_share=0.2,
+        relaxation_s=1.0,
+    )
     found = run_slide(springs, depth, speed, 30.0, settled_s=2.0, step_mm=0.01).slipped_s
     expected = slide_onsets(SKIN, MATERIAL, level, depth, speed, 2.0, 2.0)
     assert found == pytest.approx(expected, abs=1e-9)

@@ -90,11 +90,16 @@ def floor_of_turns(switch: str) -> float:
 @pytest.mark.parametrize(
     ("level", "switch", "angle_deg", "speed"),
     [
-        (2, "none", 60, 1.0), (3, "relaxation", 90, 1.0), (3, "no static", 90, 1.0),
-        (3, "no static", 30, 1.0), (3, "all", 150, 4.0), (3, "static", 110, 1.0),
-        (3, "strengthening", 180, 3.0), (3, "much static", 90, 1.0),
+        (2, "none", 60, 1.0),
+        (3, "relaxation", 90, 1.0),
+        (3, "no static", 90, 1.0),
+        (3, "no static", 30, 1.0),
+        (3, "all", 150, 4.0),
+        (3, "static", 110, 1.0),
+        (3, "strengthening", 180, 3.0),
+        (3, "much static", 90, 1.0),
     ],
-)  # fmt: skip
+)
 def test_a_turn_is_of_second_order_in_the_step(
     level: int, switch: str, angle_deg: float, speed: float
 ) -> None:

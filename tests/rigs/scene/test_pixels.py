@@ -87,9 +87,18 @@ def look(seed: int, px: float, smooth: float) -> Look:
     amount = 0
     for block in range(3):
         amount = cut_block(
-            first[block], first[block + 1], block, t[first[block]], CUT * EDGE, since, since + NS,
-            curve, spread, segments, amount,
-        )  # fmt: skip
+            first[block],
+            first[block + 1],
+            block,
+            t[first[block]],
+            CUT * EDGE,
+            since,
+            since + NS,
+            curve,
+            spread,
+            segments,
+            amount,
+        )
     threshold = 0.2 + 0.03 * rng.uniform(-3, 3, (HEIGHT, WIDTH))
     state = dark_pixels(threshold, CONTRAST, EDGE)
     disc = path[:, :, 0]
@@ -105,9 +114,27 @@ def side_by_side(a: Look, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gaps, out = np.empty(len(pixels)), np.empty(400_000, np.int64)
     scratch = [np.empty(STRIDE * count) for count in (PIXEL_FIELDS, FIRE_FIELDS, WAIT_FIELDS)]
     n = events_of_pixels(
-        pixels, len(pixels), a.segments, a.first, a.since, a.until, a.inverse, a.curve, steps, tree,
-        a.threshold, CONTRAST, EDGE, 0, np.empty((160, 3)), *scratch, state, gaps, out, 0,
-    )  # fmt: skip
+        pixels,
+        len(pixels),
+        a.segments,
+        a.first,
+        a.since,
+        a.until,
+        a.inverse,
+        a.curve,
+        steps,
+        tree,
+        a.threshold,
+        CONTRAST,
+        EDGE,
+        0,
+        np.empty((160, 3)),
+        *scratch,
+        state,
+        gaps,
+        out,
+        0,
+    )
     return np.sort(out[:n]), gaps
 
 
@@ -117,9 +144,18 @@ def one_by_one(a: Look, state: np.ndarray) -> np.ndarray:
     for block in range(3):
         bound_rates(a.curve, a.first[block], a.first[block + 1], 4 * a.first[block], tree)
     n = search_all(
-        a.segments, a.first, a.since, a.until, a.inverse, a.curve, tree, a.threshold, state, stack,
+        a.segments,
+        a.first,
+        a.since,
+        a.until,
+        a.inverse,
+        a.curve,
+        tree,
+        a.threshold,
+        state,
+        stack,
         out,
-    )  # fmt: skip
+    )
     return np.sort(out[:n])
 
 
@@ -137,10 +173,30 @@ def search_all(  # type: ignore[no-untyped-def]
                 gap = np.hypot(x - segment.x0, y - segment.y0) - segment.r0
                 head = int(segment.zero) << 25 | x << 13 | y << 1
                 on, off, last_one, level, n = events_of_segment(
-                    float(x), float(y), on, off, last_one, level, threshold[y, x], gap, segment,
-                    4 * begin, begin, begin + STEPS, since, until, inverse, curve, tree, CONTRAST,
-                    EDGE, head, stack, out, n,
-                )  # fmt: skip
+                    float(x),
+                    float(y),
+                    on,
+                    off,
+                    last_one,
+                    level,
+                    threshold[y, x],
+                    gap,
+                    segment,
+                    4 * begin,
+                    begin,
+                    begin + STEPS,
+                    since,
+                    until,
+                    inverse,
+                    curve,
+                    tree,
+                    CONTRAST,
+                    EDGE,
+                    head,
+                    stack,
+                    out,
+                    n,
+                )
             kept = state[y, x]
             kept[0], kept[1], kept[2], kept[3] = on, off, last_one, level
     return n
@@ -160,9 +216,10 @@ def near(found: np.ndarray, expected: np.ndarray, *, rel: float, abs: float) -> 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    seed=st.integers(0, 10_000), px=st.sampled_from([0.1, 1.0, 4.0, 20.0]),
+    seed=st.integers(0, 10_000),
+    px=st.sampled_from([0.1, 1.0, 4.0, 20.0]),
     smooth=st.sampled_from([0.0, 0.5, 0.95, 1.0]),
-)  # fmt: skip
+)
 def test_side_by_side_is_as_one_by_one(seed: int, px: float, smooth: float) -> None:
     a = look(seed, px, smooth)
     states = a.state.copy(), a.state.copy()
@@ -219,6 +276,7 @@ def roots_of(a: Look, x: int, y: int) -> list[tuple[float, int]]:
                 found.append((k * NS + now, int(comes)))
                 level += step if comes else -step
                 on, off = (
-                    rim_of(level + step, CONTRAST, EDGE), rim_of(level - step, CONTRAST, EDGE)
-                )  # fmt: skip
+                    rim_of(level + step, CONTRAST, EDGE),
+                    rim_of(level - step, CONTRAST, EDGE),
+                )
     return found

@@ -249,9 +249,7 @@ def test_rings_let_go_and_the_plate_lands_when_an_integration_says_at_second_ord
         depth = true.depth - true.retract * np.maximum(t - true.ramp_s - true.still_s, 0.0)
         weight = np.minimum(t / true.ramp_s, 1.0) * true.mass * G
         tips.state[:, SLIPPED] = np.nan
-        track, done = fall(
-            springs, tips, motion, depth, true.mass, weight=weight, h=h, t_ns=rows
-        )  # fmt: skip
+        track, done = fall(springs, tips, motion, depth, true.mass, weight=weight, h=h, t_ns=rows)
         assert motion.tolist() == [-25.0, 0.0]
         first = [
             track[np.argmax(slid(track)[:, i] > 0.0), 57 + i]

@@ -66,10 +66,14 @@ class RichHanging(Hanging):
 
         def flow(t: float, y: np.ndarray) -> np.ndarray:
             force, normal, there = self.still(t, y)
-            w = np.array([
-                self.speed(ring, force[ring], normal[ring]) if slips[ring] and there[ring] else 0.0
-                for ring in range(3)
-            ])  # fmt: skip
+            w = np.array(
+                [
+                    self.speed(ring, force[ring], normal[ring])
+                    if slips[ring] and there[ring]
+                    else 0.0
+                    for ring in range(3)
+                ]
+            )
             pull = np.where(there, force - self.k * self.damping_s * w, 0.0)
             weight = self.mass * G * min(t / self.ramp_s, 1.0)
             rate = -y[1] - w
@@ -105,9 +109,7 @@ def test_onsets_with_all_of_l3_are_of_second_order_in_the_step() -> None:
         depth = true.depth - true.retract * np.maximum(t - true.ramp_s - true.still_s, 0.0)
         weight = np.minimum(t / true.ramp_s, 1.0) * true.mass * G
         tips.state[:, SLIPPED] = np.nan
-        track, done = fall(
-            springs, tips, motion, depth, true.mass, weight=weight, h=h, t_ns=rows
-        )  # fmt: skip
+        track, done = fall(springs, tips, motion, depth, true.mass, weight=weight, h=h, t_ns=rows)
         first = [track[np.argmax(slid(track)[:, i] > 0.0), 57 + i] for i in true.which]
         misses.append(np.abs(np.array(first) - onsets))
         landings.append(abs(rows[done] * 1e-9 - lands))

@@ -98,9 +98,12 @@ def test_columns_of_the_default_read_out_have_stamps_of_their_own(rate_hz: float
     place = set(zip(stamp.tolist(), x.tolist(), y.tolist(), strict=True))
     scan = sensor.scans.begin(true[0])
     read = sensor.scans.stamp(scan, true[1])
-    kept = np.array([
-        key in place for key in zip(read.tolist(), true[1].tolist(), true[2].tolist(), strict=True)
-    ])  # fmt: skip
+    kept = np.array(
+        [
+            key in place
+            for key in zip(read.tolist(), true[1].tolist(), true[2].tolist(), strict=True)
+        ]
+    )
     assert kept.mean() > 0.99
     wait = np.sort((scan - true[0])[kept]) / 200_000
     ranks = (np.arange(len(wait)) + 0.5) / len(wait)
@@ -166,9 +169,12 @@ def test_times_off_the_scans_are_their_own() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    seed=st.integers(0, 1000), n=st.sampled_from([0, 1, 2, 24, 25, 300, 4000]),
-    low=st.integers(0, 30), width=st.integers(0, 30), span=st.integers(0, 20),
-)  # fmt: skip
+    seed=st.integers(0, 1000),
+    n=st.sampled_from([0, 1, 2, 24, 25, 300, 4000]),
+    low=st.integers(0, 30),
+    width=st.integers(0, 30),
+    span=st.integers(0, 20),
+)
 def test_the_sort_sorts(seed: int, n: int, low: int, width: int, span: int) -> None:
     """Whatever bits are counted: also none, also where many keys are equal in them."""
     rng = np.random.default_rng(seed)

@@ -77,9 +77,12 @@ def test_a_tip_that_crosses_a_spot_lags_less_on_it_by_the_factor() -> None:
 def test_shorter_steps_change_a_crossing_by_a_step_at_most(factor: float) -> None:
     skin = ideal_skin()
     springs = make_springs(
-        skin, friction_knots(skin, MU, 0.05, 0.5, 1), static_excess=0.03, strengthening=0.01,
+        skin,
+        friction_knots(skin, MU, 0.05, 0.5, 1),
+        static_excess=0.03,
+        strengthening=0.01,
         relaxation_share=0.2,
-    )  # fmt: skip
+    )
     springs = spotted(springs, (7.0, 1.0, 3.0, factor), (-9.0, -2.0, 2.0, factor))
     fine, _ = slide(springs, 6.0, 5e-4)
     coarse, _ = slide(springs, 6.0, 4e-3)

@@ -110,9 +110,12 @@ def test_a_hair_of_a_difference_stays_one_where_the_direction_turned() -> None:
     # a search for the slip that stops too early feeds back through the speed of the next step
     skin = ideal_skin()
     springs = make_springs(
-        skin, friction_knots(skin, MU, 0.05, 0.5, 1), static_excess=0.03, strengthening=0.01,
+        skin,
+        friction_knots(skin, MU, 0.05, 0.5, 1),
+        static_excess=0.03,
+        strengthening=0.01,
         relaxation_share=0.2,
-    )  # fmt: skip
+    )
     forces, paths = [], []
     for hair in (0.0, 1e-12):
         tips = pressed(springs)

@@ -15,9 +15,17 @@ def turn(springs: Springs, tips: Tips, sensor: np.ndarray) -> tuple[np.ndarray, 
     n, steps = len(springs.gap), len(sensor)
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     advance(
-        springs.table, springs.friction, springs.law, tips.state, times(steps, 1e-3), sensor,
-        np.zeros(steps + 1), track, load, springs.spots,
-    )  # fmt: skip
+        springs.table,
+        springs.friction,
+        springs.law,
+        tips.state,
+        times(steps, 1e-3),
+        sensor,
+        np.zeros(steps + 1),
+        track,
+        load,
+        springs.spots,
+    )
     return track, load.reshape(steps, n, 3)
 
 

@@ -17,8 +17,11 @@ from sliplab.storage.trials.recording import Recording
 from tests.storage.formats.adapters import bring
 
 EVENTS: dict[str, Any] = {
-    "format": "csv", "columns": {"t": 0, "x": 1, "y": 2, "p": 3}, "unit": "us", "size_px": [8, 6],
-}  # fmt: skip
+    "format": "csv",
+    "columns": {"t": 0, "x": 1, "y": 2, "p": 3},
+    "unit": "us",
+    "size_px": [8, 6],
+}
 BASE: dict[str, Any] = {
     "adapter": 1,
     "name": "streams",

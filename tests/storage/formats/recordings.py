@@ -61,8 +61,9 @@ def write_dsec(path: Path, *, newest: bool = False, **storage: Any) -> None:
     storage = storage or dict(hdf5plugin.Blosc(cname="zstd"))
     with h5py.File(path, "w", libver="latest" if newest else "earliest") as file:
         for name, values in columns.items():
-            file.create_dataset(f"events/{name}", (0,), values.dtype, maxshape=(None,),
-                                chunks=(PACKET,), **storage)  # fmt: skip
+            file.create_dataset(
+                f"events/{name}", (0,), values.dtype, maxshape=(None,), chunks=(PACKET,), **storage
+            )
         for low in range(0, COUNT, PACKET):
             for name, values in columns.items():
                 file[f"events/{name}"].resize((low + PACKET,))
@@ -188,7 +189,16 @@ FILES: dict[str, tuple[str, Callable[[Path], None]]] = {
 CHECKED = {"dsec checked", "mcap"}
 """Formats whose packets have checksums, so that no damage goes by unseen."""
 HEADERS = {
-    "aedat4": 1354, "dsec": 4096, "dsec newest": 2048, "dsec checked": 4096, "contiguous": 2048,
-    "lab": 2048, "mcap": 300, "es": 20, "evt2": 44, "evt3": 50, "dat": 40,
-}  # fmt: skip
+    "aedat4": 1354,
+    "dsec": 4096,
+    "dsec newest": 2048,
+    "dsec checked": 4096,
+    "contiguous": 2048,
+    "lab": 2048,
+    "mcap": 300,
+    "es": 20,
+    "evt2": 44,
+    "evt3": 50,
+    "dat": 40,
+}
 """Bytes at the beginning of each that describe it."""

@@ -76,8 +76,11 @@ def test_a_set_of_slides_comes_with_all_of_its_streams(tmp_path: Path) -> None:
     record = recording.record
     assert record.condition == {"speed": "0.6 mm/s", "side": "left"}
     assert record.imported.fields == {
-        "person": "ann", "speed": "0.6", "number": "0", "side": "left"
-    }  # fmt: skip
+        "person": "ann",
+        "speed": "0.6",
+        "number": "0",
+        "side": "left",
+    }
     events = recording.events()
     np.testing.assert_array_equal(events.t_us, np.arange(101) * 10_000)
     np.testing.assert_array_equal(events.p, np.arange(101) % 2 == 0)
@@ -110,9 +113,14 @@ def spans_of(folder: Path) -> dict[str, Any]:
         (folder / "rec" / name / "marks.jsonl").write_text(text)
     names = {"stick": "no_slip", "slip": "incipient"}
     spans = {
-        "file": "rec/{folder}/marks.jsonl", "start": "a", "end": "b", "class": "what",
-        "unit": "s", "clock": "start", "names": names,
-    }  # fmt: skip
+        "file": "rec/{folder}/marks.jsonl",
+        "start": "a",
+        "end": "b",
+        "class": "what",
+        "unit": "s",
+        "clock": "start",
+        "names": names,
+    }
     return {**SLIDES, "labels": {"spans": spans}}
 
 
@@ -127,8 +135,9 @@ def test_intervals_become_onsets_of_slip_or_classes(tmp_path: Path) -> None:
     campaign = bring(adapter, tmp_path / "set", tmp_path / "store")
     given = campaign.recording("bob_0.6_1").record.imported.given
     assert [(s.start_ns, s.end_ns, s.name) for s in given.spans] == [
-        (0, 250_000_000, "stick"), (250_000_000, 500_000_001, "slip")
-    ]  # fmt: skip
+        (0, 250_000_000, "stick"),
+        (250_000_000, 500_000_001, "slip"),
+    ]
     assert Collected(campaign).planned.classes == ("slip", "stick")
 
 
@@ -144,13 +153,13 @@ def test_a_table_may_say_what_the_trials_are_and_a_zip_is_read_in_place(tmp_path
         packed.writestr("top/.hidden", "")
         packed.writestr("../out.npy", "")
     adapter = {
-        "adapter": 1, "name": "packed", "experiment": "classes",
+        "adapter": 1,
+        "name": "packed",
+        "experiment": "classes",
         "trials": {"table": "**/trials.json", "files": "top/data/{name}.npy", "id": "t{name}"},
-        "streams": {
-            "events": {"format": "counts", "axes": ["step", "y", "x"], "step_ms": 0.5}
-        },
+        "streams": {"events": {"format": "counts", "axes": ["step", "y", "x"], "step_ms": 0.5}},
         "labels": {"class": "{kind}"},
-    }  # fmt: skip
+    }
     campaign = bring(adapter, tmp_path / "set.zip", tmp_path / "store")
     recording = campaign.recording("t3")
     again = np.zeros_like(counts)
@@ -193,20 +202,23 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         r"events.csv: streams.events: has no column trial",
     ),
     "a label's column": (
-        _with(*ONSETS, "gross", to="fall"), r"labels.onsets.gross = '?fall.*there are first"
+        _with(*ONSETS, "gross", to="fall"),
+        r"labels.onsets.gross = '?fall.*there are first",
     ),
     "a time outside": (
-        _with(*ONSETS, "unit", to="s"), r"onsets.csv: row 2, first = '?300.*lies outside of"
+        _with(*ONSETS, "unit", to="s"),
+        r"onsets.csv: row 2, first = '?300.*lies outside of",
     ),
     "onsets in a wrong order": (
         _with(*ONSETS, to={**SLIDES["labels"]["onsets"], "incipient": "full", "gross": "first"}),
         r"onsets.csv: row 2, first = '?300.*lies before full",
     ),
     "an event outside of the sensor": (
-        _with("streams", "events", "size_px", to=[8, 12]), r"events up to column 15 .* 8 x 12"
+        _with("streams", "events", "size_px", to=[8, 12]),
+        r"events up to column 15 .* 8 x 12",
     ),
     "a motion outside": (_with("motion", "end", to=5), r"motion.start = 0.1: to 5: lies outside"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -215,9 +227,13 @@ def test_what_is_wrong_is_named_and_nothing_is_written(case: str, tmp_path: Path
     slides(tmp_path / "set")
     (tmp_path / "adapter.yaml").write_text(yaml.safe_dump(adapter))
     done = here(
-        "import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "set",
-        "--store", tmp_path / "store",
-    )  # fmt: skip
+        "import",
+        "--adapter",
+        tmp_path / "adapter.yaml",
+        tmp_path / "set",
+        "--store",
+        tmp_path / "store",
+    )
     assert done.returncode == 2, done.stderr
     assert re.search(message, done.stderr), done.stderr
     assert not (tmp_path / "store").exists()
@@ -259,8 +275,9 @@ def test_an_import_lists_first_then_adds_what_is_new(tmp_path: Path) -> None:
         name: name[-1] for name in made
     }
     assert {item["file"]: item["reason"] for item in listed["skipped"]} == {
-        "notes.txt": "matches no pattern of the adapter", "link.npy": "is a link"
-    }  # fmt: skip
+        "notes.txt": "matches no pattern of the adapter",
+        "link.npy": "is a link",
+    }
     done = here(*line)
     assert len(json.loads(done.stdout)["imported"]) == 6, done.stderr
     np.save(tmp_path / "set" / "train" / "sample_7_label_1.npy", np.ones((5, 2, 8)))

@@ -59,9 +59,10 @@ def test_events_of_a_known_format_are_those_of_the_file(name: str, tmp_path: Pat
     folder.mkdir(parents=True)
     write(folder / file)
     made = {
-        **BASE, "trials": {"files": f"s{{number:number}}/{file}", "id": "trial-{number}"},
+        **BASE,
+        "trials": {"files": f"s{{number:number}}/{file}", "id": "trial-{number}"},
         "streams": {"events": {"format": form}},
-    }  # fmt: skip
+    }
     whole = all_events()
     for path in (tmp_path / "set", zipped(tmp_path / "set")):
         campaign = bring(made, path, tmp_path / f"store{path.suffix}")
@@ -73,8 +74,9 @@ def test_events_of_a_known_format_are_those_of_the_file(name: str, tmp_path: Pat
         assert record.geometry.event_px == size
         assert ("sensor size" in record.imported.unknown) == (size is None)
         assert record.imported.span_ns == (
-            int(whole.t_us[0]) * 1000, (int(whole.t_us[-1]) + 1) * 1000
-        )  # fmt: skip
+            int(whole.t_us[0]) * 1000,
+            (int(whole.t_us[-1]) + 1) * 1000,
+        )
         assert record.imported.fields == {"number": "7"}
         with recording.open() as reader:
             pulses = reader.pulses("event_pulses")
@@ -101,16 +103,20 @@ def test_the_labs_pickles_are_one_trial_of_two_files(tmp_path: Path) -> None:
     (tmp_path / "set").mkdir()
     lab_pickles(tmp_path / "set", "d3_s0.5", SMALL[::-1], by_columns=True)
     made = {
-        **BASE, "trials": {"files": "{what}_events_on.pickle", "id": "{what}"},
+        **BASE,
+        "trials": {"files": "{what}_events_on.pickle", "id": "{what}"},
         "streams": {"events": {"format": "lab-pickles", "files": "{what}_events_*.pickle"}},
-    }  # fmt: skip
+    }
     for path in (tmp_path / "set", zipped(tmp_path / "set")):
         events = bring(made, path, tmp_path / f"store{path.suffix}").recording("d3_s0.5").events()
         found = sorted(zip(*(column.tolist() for column in vars(events).values()), strict=True))
         assert found == [
-            (0, 0, 0, 125), (3, 5, 0, 11_250), (3, 5, 1, 10_000), (3, 5, 1, 12_500),
+            (0, 0, 0, 125),
+            (3, 5, 0, 11_250),
+            (3, 5, 1, 10_000),
+            (3, 5, 1, 12_500),
             (7, 5, 1, 11_000),
-        ]  # fmt: skip
+        ]
     (tmp_path / "set" / "d3_s0.5_events_off.pickle").write_bytes(b"\x80\x04.")
     for path in (tmp_path / "set", zipped(tmp_path / "set")):
         with pytest.raises(InputError, match=f"{path}/d3_s0.5_events_off.pickle: "):
@@ -139,34 +145,48 @@ TEXTS: dict[str, tuple[bytes, dict[str, Any]]] = {
     **{
         f"{what} {said}": (_text(separator, heading), columns)
         for what, separator in (
-            ("commas", ","), ("semicolons", ";"), ("tabs", "\t"), ("spaces", " ")
+            ("commas", ","),
+            ("semicolons", ";"),
+            ("tabs", "\t"),
+            ("spaces", " "),
         )
         for said, heading, columns in (
-            ("headed", HEADING, NAMED), ("headed by index", HEADING, BY_INDEX),
+            ("headed", HEADING, NAMED),
+            ("headed by index", HEADING, BY_INDEX),
             ("bare", None, BY_INDEX),
         )
     },
     "Windows' ends and a mark": (_text(",", HEADING, end="\r\n", mark="\ufeff"), NAMED),
     "a mark and no heading": (_text(",", None, mark="\ufeff"), BY_INDEX),
     "a separator in a name": (
-        _text(",", "pol, -1 or 1|time|col|row"), {**NAMED, "p": "pol, -1 or 1"}
+        _text(",", "pol, -1 or 1|time|col|row"),
+        {**NAMED, "p": "pol, -1 or 1"},
     ),
     "another one in a name": (
-        _text(",", "pol; -1 or 1|time|col|row", quoted=True), {**NAMED, "p": "pol; -1 or 1"}
+        _text(",", "pol; -1 or 1|time|col|row", quoted=True),
+        {**NAMED, "p": "pol; -1 or 1"},
     ),
     "spaces in rows": (_text(",", HEADING).replace(b",", b" , "), NAMED),
     "many spaces": (
-        b"".join(b"  %4d %8d   %2d %2d\n" % (p, t, x, y) for t, x, y, p in ROWS), BY_INDEX
+        b"".join(b"  %4d %8d   %2d %2d\n" % (p, t, x, y) for t, x, y, p in ROWS),
+        BY_INDEX,
     ),
     "no end": (_text(",", None).rstrip(), BY_INDEX),
-}  # fmt: skip
+}
 
 
 def check_rows(recording: Recording, rows: list[tuple[int, int, int, int]]) -> None:
     """Check that events are rows of time, column, row and polarity."""
     events = recording.events()
-    found = list(zip(events.t_us.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(),
-                     strict=True))  # fmt: skip
+    found = list(
+        zip(
+            events.t_us.tolist(),
+            events.x.tolist(),
+            events.y.tolist(),
+            events.p.tolist(),
+            strict=True,
+        )
+    )
     assert found == [(t, x, y, int(p > 0)) for t, x, y, p in rows]
 
 
@@ -191,19 +211,16 @@ def _columns() -> dict[str, Any]:
 ARRAYS: dict[str, tuple[Callable[[Path], None], dict[str, Any]]] = {
     "structured": (lambda path: np.save(path, _structured()), NAMED),
     "whole numbers": (
-        lambda path: np.save(path, np.array(ROWS, np.int32)), {"t": 0, "x": 1, "y": 2, "p": 3}
+        lambda path: np.save(path, np.array(ROWS, np.int32)),
+        {"t": 0, "x": 1, "y": 2, "p": 3},
     ),
     "columns first": (
         lambda path: np.save(path, np.asfortranarray(np.array(ROWS, float))),
         {"t": 0, "x": 1, "y": 2, "p": 3},
     ),
-    "an archive": (
-        lambda path: np.savez(path, **_columns()), NAMED
-    ),
-    "a packed archive": (
-        lambda path: np.savez_compressed(path, **_columns()), NAMED
-    ),
-}  # fmt: skip
+    "an archive": (lambda path: np.savez(path, **_columns()), NAMED),
+    "a packed archive": (lambda path: np.savez_compressed(path, **_columns()), NAMED),
+}
 
 
 @pytest.mark.parametrize("name", ARRAYS)

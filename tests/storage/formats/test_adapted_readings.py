@@ -27,13 +27,15 @@ PRESSURES: dict[str, Any] = {
     "streams": {
         "scalars": {
             f"sensor{k}": {
-                **TABLE, "columns": {"t": "Time (s)", "value": f"S{k}"}, "quantity_unit": "kPa"
+                **TABLE,
+                "columns": {"t": "Time (s)", "value": f"S{k}"},
+                "quantity_unit": "kPa",
             }
             for k in (1, 2)
         }
     },
     "labels": {"class": "{kind}"},
-}  # fmt: skip
+}
 
 
 def _data(folder: Path) -> None:
@@ -98,9 +100,14 @@ def test_a_table_without_rows_costs_its_trial_only(tmp_path: Path) -> None:
     (tmp_path / "set" / "slip" / "trial2.csv").write_text("Time (s),S1,S2\n")
     (tmp_path / "a.yaml").write_text(json.dumps(PRESSURES))
     done = here(
-        "import", "--adapter", tmp_path / "a.yaml", tmp_path / "set", "--store", tmp_path / "s",
+        "import",
+        "--adapter",
+        tmp_path / "a.yaml",
+        tmp_path / "set",
+        "--store",
+        tmp_path / "s",
         "--json",
-    )  # fmt: skip
+    )
     assert done.returncode == 1, done.stderr
     result = json.loads(done.stdout)
     assert len(result["imported"]) == 7
@@ -138,9 +145,11 @@ def test_frames_alone_are_exported(tmp_path: Path) -> None:
     levels = np.arange(4, dtype=np.uint8)[:, None, None] * np.ones((1, 6, 8), np.uint8)
     np.save(tmp_path / "set" / "a.npy", levels)
     made: dict[str, Any] = {
-        **PRESSURES, "trials": {"files": "{n}.npy"}, "labels": {},
+        **PRESSURES,
+        "trials": {"files": "{n}.npy"},
+        "labels": {},
         "streams": {"frames": {"files": "{n}.npy", "format": "numpy", "rate_hz": 100}},
-    }  # fmt: skip
+    }
     campaign = bring(made, tmp_path / "set", tmp_path / "store")
     done = export_trials([campaign.recording("a")], tmp_path / "out", "aedat4", "pressures")
     assert (done["events"], done["frames"]) == (0, 4)
@@ -151,9 +160,12 @@ def test_view_shows_imported_trials_of_any_kind(campaign: Campaign, tmp_path: Pa
     from tests.storage.formats.files import lab_hdf5
 
     lab_hdf5(tmp_path / "plain.h5")
-    assert here(
-        "import", tmp_path / "plain.h5", "--store", tmp_path / "plain", "--name", "x"
-    ).returncode == 0  # fmt: skip
+    assert (
+        here(
+            "import", tmp_path / "plain.h5", "--store", tmp_path / "plain", "--name", "x"
+        ).returncode
+        == 0
+    )
     for store, trial, said in (
         (tmp_path / "store", "slip-trial1", '"sensor1_scalar": 30'),
         (tmp_path / "plain", "plain", '"events": 50'),

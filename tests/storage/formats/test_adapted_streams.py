@@ -58,12 +58,17 @@ FURTHER = pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "timing"),
     [
-        ("video", "csv"), ("images", "npy"), ("numpy", "rate"),
-        pytest.param("video", "rate", marks=FURTHER), pytest.param("video", "npy", marks=FURTHER),
-        pytest.param("images", "csv", marks=FURTHER), pytest.param("images", "rate", marks=FURTHER),
-        pytest.param("numpy", "csv", marks=FURTHER), pytest.param("numpy", "npy", marks=FURTHER),
+        ("video", "csv"),
+        ("images", "npy"),
+        ("numpy", "rate"),
+        pytest.param("video", "rate", marks=FURTHER),
+        pytest.param("video", "npy", marks=FURTHER),
+        pytest.param("images", "csv", marks=FURTHER),
+        pytest.param("images", "rate", marks=FURTHER),
+        pytest.param("numpy", "csv", marks=FURTHER),
+        pytest.param("numpy", "npy", marks=FURTHER),
     ],
-)  # fmt: skip
+)
 def test_frames_and_their_times_are_those_of_the_files(
     form: str, timing: str, tmp_path: Path
 ) -> None:
@@ -155,15 +160,22 @@ def test_a_recording_of_frames_only_lies_on_their_clock(tmp_path: Path) -> None:
         np.save(folder / "times.npy", np.array([2.5, 2.75, 3.0, 4.0]))
     (tmp_path / "set" / "marks.csv").write_text("who,first,full\nann,0.25,1.5\nbob,2,\n")
     onsets = {
-        "file": "marks.csv", "match": {"who": "{id}"}, "incipient": "first", "gross": "full",
-        "unit": "s", "clock": "start", "uncertainty_ms": 3,
-    }  # fmt: skip
+        "file": "marks.csv",
+        "match": {"who": "{id}"},
+        "incipient": "first",
+        "gross": "full",
+        "unit": "s",
+        "clock": "start",
+        "uncertainty_ms": 3,
+    }
     timed = {"files": "{who}/times.npy", "unit": "s"}
     streams = {"frames": {**FRAMES["numpy"], "format": "numpy", "times": timed}}
     made = {
-        **BASE, "trials": {"files": "{who}/frames.npy", "id": "{who}"}, "streams": streams,
+        **BASE,
+        "trials": {"files": "{who}/frames.npy", "id": "{who}"},
+        "streams": streams,
         "labels": {"onsets": onsets},
-    }  # fmt: skip
+    }
     with pytest.raises(InputError, match=r"row 3, first = 2: lies outside of .* trial bob"):
         imported(made, tmp_path)
     (tmp_path / "set" / "marks.csv").write_text("who,first,full\nann,0.25,1.5\nbob,1.5,\n")
@@ -213,29 +225,59 @@ def test_each_stream_has_its_clock_to_the_nanosecond_after_an_hour(
         writer.writerow(["rz", "t", "x", "y", "z", "rx", "ry"])
         for t, place, turn in zip(stamps, xyz.tolist(), turned.tolist(), strict=True):
             writer.writerow([turn[2], t, *place, *turn[:2]])
-    rows = np.zeros(4, [("when", "<i8"), ("f", "<f8", 3), ("fx", "<f8"), ("fy", "<f8"),
-                        ("fz", "<f8"), ("tx", "<f8"), ("ty", "<f8"), ("tz", "<f8")])  # fmt: skip
+    rows = np.zeros(
+        4,
+        [
+            ("when", "<i8"),
+            ("f", "<f8", 3),
+            ("fx", "<f8"),
+            ("fy", "<f8"),
+            ("fz", "<f8"),
+            ("tx", "<f8"),
+            ("ty", "<f8"),
+            ("tz", "<f8"),
+        ],
+    )
     rows["when"] = stamps
     for index, axis in enumerate("xyz"):
         rows[f"f{axis}"], rows[f"t{axis}"] = force[:, index], torque[:, index]
     np.save(folder / "force.npy", rows)
     np.save(folder / "heat.npy", np.stack([np.arange(4.0), heat], axis=1))
     clock = {"offset_ms": float(offset_ms), "drift_ppm": float(drift_ppm)}
-    made = adapter({
-        "poses": {
-            "files": "{who}/arm.csv", "format": "csv", "unit": "ns", "length": "m", "angle": "rad",
-            "columns": {key: key for key in ("t", "x", "y", "z", "rx", "ry", "rz")},
-            "clock": {**clock, "uncertainty_ms": 0.25},
-        },
-        "wrenches": {"force": {
-            "files": "{who}/force.npy", "format": "numpy", "unit": "ns", "clock": clock,
-            "columns": {"t": "when", **{k: k for k in ("fx", "fy", "fz", "tx", "ty", "tz")}},
-        }},
-        "scalars": {"heat": {
-            "files": "{who}/heat.npy", "format": "numpy", "unit": "s", "quantity_unit": "degC",
-            "columns": {"t": 0, "value": 1},
-        }},
-    })  # fmt: skip
+    made = adapter(
+        {
+            "poses": {
+                "files": "{who}/arm.csv",
+                "format": "csv",
+                "unit": "ns",
+                "length": "m",
+                "angle": "rad",
+                "columns": {key: key for key in ("t", "x", "y", "z", "rx", "ry", "rz")},
+                "clock": {**clock, "uncertainty_ms": 0.25},
+            },
+            "wrenches": {
+                "force": {
+                    "files": "{who}/force.npy",
+                    "format": "numpy",
+                    "unit": "ns",
+                    "clock": clock,
+                    "columns": {
+                        "t": "when",
+                        **{k: k for k in ("fx", "fy", "fz", "tx", "ty", "tz")},
+                    },
+                }
+            },
+            "scalars": {
+                "heat": {
+                    "files": "{who}/heat.npy",
+                    "format": "numpy",
+                    "unit": "s",
+                    "quantity_unit": "degC",
+                    "columns": {"t": 0, "value": 1},
+                }
+            },
+        }
+    )
     recording = imported(made, tmp_path)
     with recording.open() as reader:
         poses, wrench, scalar = reader.poses(), reader.wrenches("force"), reader.scalars("heat")
@@ -264,11 +306,18 @@ def test_each_stream_has_its_clock_to_the_nanosecond_after_an_hour(
 def test_angles_in_degrees_and_places_in_mm_stay_as_they_are(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     (folder / "arm.csv").write_text("0 1.5 -2 0.1 90 0 -45.25\n0.5 1 2 3 0 0 0\n")
-    made = adapter({"poses": {
-        "files": "{who}/arm.csv", "format": "csv", "unit": "s", "angle": "deg",
-        "columns": dict(zip(("t", "x", "y", "z", "rx", "ry", "rz"), range(7), strict=True)),
-        "clock": {},
-    }})  # fmt: skip
+    made = adapter(
+        {
+            "poses": {
+                "files": "{who}/arm.csv",
+                "format": "csv",
+                "unit": "s",
+                "angle": "deg",
+                "columns": dict(zip(("t", "x", "y", "z", "rx", "ry", "rz"), range(7), strict=True)),
+                "clock": {},
+            }
+        }
+    )
     recording = imported(made, tmp_path)
     with recording.open() as reader:
         poses = reader.poses()
@@ -298,9 +347,14 @@ def test_a_label_on_the_frames_clock_after_an_hour_lies_where_its_drift_puts_it(
     rows = ["who,first,full", "ann,3600000000000,3600000000007", "bob,3600000000000,"]
     (tmp_path / "set" / "marks.csv").write_text("\n".join(rows) + "\n")
     onsets = {
-        "file": "marks.csv", "match": {"who": "{id}"}, "incipient": "first", "gross": "full",
-        "unit": "ns", "clock": "frames", "uncertainty_ms": 2,
-    }  # fmt: skip
+        "file": "marks.csv",
+        "match": {"who": "{id}"},
+        "incipient": "first",
+        "gross": "full",
+        "unit": "ns",
+        "clock": "frames",
+        "uncertainty_ms": 2,
+    }
     campaign = bring(
         adapter({"frames": frames}, labels={"onsets": onsets}), tmp_path / "set", tmp_path / "store"
     )
@@ -314,9 +368,14 @@ def test_a_label_on_the_frames_clock_after_an_hour_lies_where_its_drift_puts_it(
 
 
 SPANS: dict[str, Any] = {
-    "file": "marks.csv", "match": {"trial": "{who}"}, "start": "a", "end": "b", "class": "what",
-    "unit": "ms", "names": {"pause": "", "rub": "slide"},
-}  # fmt: skip
+    "file": "marks.csv",
+    "match": {"trial": "{who}"},
+    "start": "a",
+    "end": "b",
+    "class": "what",
+    "unit": "ms",
+    "names": {"pause": "", "rub": "slide"},
+}
 
 
 def test_a_second_import_takes_the_labels_of_new_trials_from_the_table_of_all(
@@ -326,16 +385,21 @@ def test_a_second_import_takes_the_labels_of_new_trials_from_the_table_of_all(
     for who in ("ann", "bob"):
         folder_of(tmp_path, who)
     rows = [
-        "trial,a,b,what", "ann,0,100,rub", "ann,100,250,pause", "ann,250,500,tap", "cid,1,2,tap",
+        "trial,a,b,what",
+        "ann,0,100,rub",
+        "ann,100,250,pause",
+        "ann,250,500,tap",
+        "cid,1,2,tap",
         "bob,10,20,pause",
-    ]  # fmt: skip
+    ]
     marks = tmp_path / "set" / "marks.csv"
     marks.write_text("\n".join(rows) + "\n")
     first = bring(made, tmp_path / "set", tmp_path / "store")
     given = first.recording("ann").record.imported.given
     assert [(s.start_ns, s.end_ns, s.name) for s in given.spans] == [
-        (0, 100_000_000, "slide"), (250_000_000, 500_000_000, "tap")
-    ]  # fmt: skip
+        (0, 100_000_000, "slide"),
+        (250_000_000, 500_000_000, "tap"),
+    ]
     assert given.source == "marks.csv"
     assert first.recording("bob").record.imported.given is None
     kept = first.recording("ann").raw_checksum
@@ -353,8 +417,9 @@ def test_a_second_import_takes_the_labels_of_new_trials_from_the_table_of_all(
     with pytest.raises(InputError, match="labels: differs from the adapter of campaign 'streams'"):
         bring(
             adapter(experiment="classes", labels={"spans": changed}),
-            tmp_path / "set", tmp_path / "store",
-        )  # fmt: skip
+            tmp_path / "set",
+            tmp_path / "store",
+        )
 
 
 @pytest.mark.parametrize(
@@ -385,18 +450,26 @@ def test_onsets_and_motion_on_another_clock_come_to_the_time_line(
     write_frames(folder, "numpy", some_frames(2))
     (tmp_path / "set" / "t.jsonl").write_text('{"trial": "ann", "a": 0.7000000001, "b": 0.9}\n')
     onsets = {
-        "file": "t.jsonl", "match": {"trial": "{id}"}, "incipient": "a", "gross": "b",
-        "unit": "s", "clock": clock, "uncertainty_ms": 1,
-    }  # fmt: skip
+        "file": "t.jsonl",
+        "match": {"trial": "{id}"},
+        "incipient": "a",
+        "gross": "b",
+        "unit": "s",
+        "clock": clock,
+        "uncertainty_ms": 1,
+    }
     frames = {
-        **FRAMES["numpy"], "format": "numpy", "times": {"files": "{who}/t.npy", "unit": "s"},
+        **FRAMES["numpy"],
+        "format": "numpy",
+        "times": {"files": "{who}/t.npy", "unit": "s"},
         "clock": {"offset_ms": 7.5, "uncertainty_ms": 0.25},
-    }  # fmt: skip
+    }
     np.save(folder / "t.npy", np.array([0.6, 0.7]))
     made = adapter(
-        {"frames": frames}, labels={"onsets": onsets},
+        {"frames": frames},
+        labels={"onsets": onsets},
         motion={"start": 0.6, "end": "0.95", "unit": "s", "clock": clock},
-    )  # fmt: skip
+    )
     recording = imported(made, tmp_path)
     given = recording.record.imported.given
     assert given.incipient_ns == 700_000_000 + moved_ns

@@ -361,9 +361,12 @@ def test_the_labs_pickles(tmp_path: Path, by_columns: bool) -> None:
     columns = (events.t_us, events.x, events.y, events.p)
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
     assert rows == [
-        (125, 0, 0, 0), (10_000, 3, 5, 1), (11_000, 7, 5, 1), (11_250, 3, 5, 0),
+        (125, 0, 0, 0),
+        (10_000, 3, 5, 1),
+        (11_000, 7, 5, 1),
+        (11_250, 3, 5, 0),
         (12_500, 3, 5, 1),
-    ]  # fmt: skip
+    ]
     assert found.record.condition == {"depth": "3", "speed": "0.5", "direction": "back"}
     assert {"sync grade", "poses", "epoch"} <= set(found.record.imported.unknown)
     assert catalogue(made)["trial"].tolist() == [stem]
@@ -502,11 +505,9 @@ BAD: dict[str, Callable[[Path], Path]] = {
     ),
     "pickle of text": _written("a_events_on.pickle", lambda: pickle.dumps("text")),
     "pickle of NaN": _written("a_events_on.pickle", lambda: _cells([float("nan")])),
-    "pickle of one list told often": _written(
-        "a_events_on.pickle", lambda: _cells([1.0] * 1000)
-    ),
+    "pickle of one list told often": _written("a_events_on.pickle", lambda: _cells([1.0] * 1000)),
     "pickle before its clock": _written("a_events_off.pickle", lambda: _cells([-1])),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -580,5 +581,6 @@ def test_pairs_of_pickles(tmp_path: Path) -> None:
     names = ["a_events_on.pickle", "a_events_off.pickle", "b_events_on.pkl", "times.pickle"]
     found = lab.pairs([tmp_path / name for name in names])
     assert [(pair.stem, pair.on is not None, pair.off is not None) for pair in found] == [
-        ("a", True, True), ("b", True, False),
-    ]  # fmt: skip
+        ("a", True, True),
+        ("b", True, False),
+    ]

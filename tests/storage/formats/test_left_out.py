@@ -268,10 +268,18 @@ def test_lab_files_and_tables_leave_events_that_run_back_out(
         events = {"format": "csv", "columns": {key: key for key in "txyp"}, "unit": "s"}
         streams = {"events": {**events, "size_px": [40, 30]}}
         adapter = tmp_path / "theirs.yaml"
-        adapter.write_text(json.dumps({
-            "adapter": 1, "name": "theirs", "experiment": "classes", "trials": {"files": "*.csv"},
-            "streams": streams, "labels": {"class": "slip"},
-        }))  # fmt: skip
+        adapter.write_text(
+            json.dumps(
+                {
+                    "adapter": 1,
+                    "name": "theirs",
+                    "experiment": "classes",
+                    "trials": {"files": "*.csv"},
+                    "streams": streams,
+                    "labels": {"class": "slip"},
+                }
+            )
+        )
         done = here("import", "--adapter", adapter, tmp_path / "theirs", "--store", tmp_path / "s")
         assert done.returncode == 0, done.stderr
         (found,) = Store.open(tmp_path / "s").campaign("theirs").recordings()
@@ -402,9 +410,10 @@ def test_frames_and_triggers_that_run_back_are_left_out(tmp_path: Path) -> None:
     assert (found.frame_times() // 1000).tolist() == [100, 200, 400]
     assert [int(image[0, 0]) for image in found.frames()] == [1, 2, 4]
     assert _dropped(found) == {
-        "frames of another size": 1, "frames whose times run back": 1,
+        "frames of another size": 1,
+        "frames whose times run back": 1,
         "triggers whose times run back": 1,
-    }  # fmt: skip
+    }
 
 
 def _csv(folder: Path, change: Callable[[list[str]], list[str]]) -> Path:
@@ -510,8 +519,9 @@ def test_single_precision_unix_times_fail_their_gates(tmp_path: Path) -> None:
     (found,) = store.campaign("theirs").recordings()
     quality = found.record.quality
     assert (quality.passed, set(quality.gates)) == (
-        False, {"events_time_resolution_us", "events_times"}
-    )  # fmt: skip
+        False,
+        {"events_time_resolution_us", "events_times"},
+    )
     assert catalogue(store)["passed"].tolist() == [False]
     checked = here("verify", tmp_path / "store")
     assert checked.returncode == 0

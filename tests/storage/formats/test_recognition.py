@@ -73,8 +73,10 @@ def test_the_labs_names_with_and_without_ending(
     events = found.events()
     assert events.t_us.tolist() == [10_000, 11_000, 12_000]
     assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [
-        [3, 7, 3], [5, 0, 5], [1, 0, 1],
-    ]  # fmt: skip
+        [3, 7, 3],
+        [5, 0, 5],
+        [1, 0, 1],
+    ]
     assert found.record.geometry.event_px == SIZE
     assert "OFF events" not in found.record.imported.unknown
     if stem.startswith("d2"):
@@ -194,31 +196,35 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "an empty dsec": ("a.h5", _empty_dsec, "contains no events"),
     "empty pickles": (NAME, lambda path: _pickled(path, lab_cells(SIZE, {})), "contains no events"),
     "aedat4 outside of its camera": (
-        "a.aedat4", lambda path: _aedat4(path, _events([3, 64])),
+        "a.aedat4",
+        lambda path: _aedat4(path, _events([3, 64])),
         r"a\.aedat4: holds events up to column 64 and row 32, outside of the 64 x 48 pixels",
     ),
     "a stream outside of its camera": (
-        "a.h5", lambda path: _stream(path, [64, 48], [3, 64], [3, 64]),
+        "a.h5",
+        lambda path: _stream(path, [64, 48], [3, 64], [3, 64]),
         r"a\.h5: holds events up to column 64 and row 64, outside of the 64 x 48 pixels",
     ),
     "an older aedat": (
-        "a.aedat4", lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(50)),
+        "a.aedat4",
+        lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(50)),
         r"a\.aedat4: is an AEDAT 3\.1 file; read is AEDAT 4\.0, to which iniVation's DV converts",
     ),
     "text by the lab's name": (NAME, _text, f"{NAME}: byte 0: is no whole pickle"),
     "an empty file by the lab's name": (NAME, lambda path: path.touch(), "the file is empty"),
     "a pickle cut short": (
-        NAME, lambda path: path.write_bytes(pickle.dumps(lab_cells(SIZE, {}))[:-1]),
+        NAME,
+        lambda path: path.write_bytes(pickle.dumps(lab_cells(SIZE, {}))[:-1]),
         r"byte \d+: is no whole pickle: it ends after \d+ bytes .* as a copy cut short; .*dump",
     ),
     "npy cut short": (
-        "a_on.npy", lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2)))[:-3]),
+        "a_on.npy",
+        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2)))[:-3]),
         r"a_on\.npy: is truncated",
     ),
     "npy of 8 TB": (
         "a_on.npy",
-        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"8, 2), ", b"8, 9**9)"))
-       ,
+        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"8, 2), ", b"8, 9**9)")),
         r"a_on\.npy: has a damaged numpy header",
     ),
     "npy whose header does not end": (
@@ -227,7 +233,8 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         r"a_on\.npy: has a damaged numpy header",
     ),
     "npy of 20 million bytes": (
-        "a_on.npy", lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
+        "a_on.npy",
+        lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
         r"a_on\.npy: holds 20160000 times, as many in every pixel",
     ),
     "npy with another pickle in it": (
@@ -238,14 +245,16 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         r"a_on\.npy: contains data other than the array \(8, 6\)",
     ),
     "npy of counts": (
-        "a_on.npy", lambda path: _saved(path, np.zeros((39, 2, 250))),
+        "a_on.npy",
+        lambda path: _saved(path, np.zeros((39, 2, 250))),
         r"shape \(39, 2, 250\); the lab's",
     ),
     "a pickle of another camera": (
-        NAME, lambda path: _pickled(path, lab_cells((5, 5), {})),
+        NAME,
+        lambda path: _pickled(path, lab_cells((5, 5), {})),
         r"shape \(5, 5\); the lab's files hold",
     ),
-}  # fmt: skip
+}
 
 
 def _npy(cells: Any) -> bytes:
@@ -330,8 +339,11 @@ def test_a_folder_of_several_formats_is_sorted(tmp_path: Path) -> None:
     found = _import(tmp_path / "store", folder)
     origins = [(one.trial_id, one.record.imported) for one in found]
     assert [(name, about.format) for name, about in origins if about is not None] == [
-        ("a", "lab-hdf5"), ("b", "aedat4"), ("c", "lab-pickles"), ("d", "dsec"),
-    ]  # fmt: skip
+        ("a", "lab-hdf5"),
+        ("b", "aedat4"),
+        ("c", "lab-pickles"),
+        ("d", "dsec"),
+    ]
     assert [len(one.events()) for one in found] == [50, 2, 2, 2]
     skipped = {item.file: item.reason for item in skipped_in(folder, kind_of(folder))}
     assert list(skipped) == ["link.h5", "more", "notes.txt", "video_on"]
@@ -392,9 +404,14 @@ def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path)
     _aedat4(folder / "a.aedat4", _events([3, 4]))
     lab_hdf5(folder / "b.h5")
     item = {
-        "trial": "t", "file": "a.aedat4", "condition": {}, "events": 2, "frames": 0, "triggers": 0,
+        "trial": "t",
+        "file": "a.aedat4",
+        "condition": {},
+        "events": 2,
+        "frames": 0,
+        "triggers": 0,
         "repetition": 0,
-    }  # fmt: skip
+    }
     manifest = {"sliplab_export": 1, "simulated": True, "trials": [item]}
     (folder / EXPORT_MANIFEST).write_text(json.dumps(manifest))
     assert kind_of(folder) == MIXED

@@ -160,9 +160,17 @@ def test_a_file_cut_short_gives_a_prefix(
 
 @pytest.mark.parametrize(
     ("name", "share"),
-    [("aedat4", 0.9), ("dsec", 0.5), ("dsec newest", 0.5), ("mcap", 0.8), ("es", 0.9),
-     ("evt2", 0.94), ("evt3", 0.94), ("dat", 0.94)],
-)  # fmt: skip
+    [
+        ("aedat4", 0.9),
+        ("dsec", 0.5),
+        ("dsec newest", 0.5),
+        ("mcap", 0.8),
+        ("es", 0.9),
+        ("evt2", 0.94),
+        ("evt3", 0.94),
+        ("dat", 0.94),
+    ],
+)
 def test_most_of_a_file_that_lost_its_end_is_salvaged(
     tmp_path: Path, name: str, share: float, whole: dict[str, bytes]
 ) -> None:

@@ -38,38 +38,48 @@ def _matlab_73(path: Path) -> None:
 FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "AEDAT 1.0": ("a.aedat", lambda path: path.write_bytes(bytes(60)), "is an AEDAT 1.0 file; "),
     "AEDAT 2.0": (
-        "a.aedat", lambda path: path.write_bytes(b"#!AER-DAT2.0\r\n# x\r\n" + bytes(80)),
+        "a.aedat",
+        lambda path: path.write_bytes(b"#!AER-DAT2.0\r\n# x\r\n" + bytes(80)),
         "is an AEDAT 2.0 file; read is AEDAT 4.0, to which iniVation's DV converts it",
     ),
     "AEDAT 3.1": (
-        "a.aedat", lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n#Format: RAW\r\n" + bytes(80)),
+        "a.aedat",
+        lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n#Format: RAW\r\n" + bytes(80)),
         "is an AEDAT 3.1 file; read is AEDAT 4.0, to which iniVation's DV converts it",
     ),
     "AEDAT 3.1 by another ending": (
-        "a.raw", lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(80)),
+        "a.raw",
+        lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(80)),
         "is an AEDAT 3.1 file",
     ),
     "MATLAB 5": (
-        "a.mat", lambda path: savemat(path, {"x": np.arange(9)}),
+        "a.mat",
+        lambda path: savemat(path, {"x": np.arange(9)}),
         "is a MATLAB file of format 5.0, which does not say what its variables are: load it by "
         "scipy.io.loadmat, and write its events as the columns events/x, y, p and t (us) of an ",
     ),
     "MATLAB 4": (
-        "a.mat", lambda path: savemat(path, {"x": np.arange(9)}, format="4"),
+        "a.mat",
+        lambda path: savemat(path, {"x": np.arange(9)}, format="4"),
         "is a MATLAB file of format 4, which does not say what its variables are: load it by scipy",
     ),
-    "MATLAB 7.3": ("a.mat", _matlab_73, "of format 7.3, which does not say what its variables are"
-                   ": load it by h5py"),
+    "MATLAB 7.3": (
+        "a.mat",
+        _matlab_73,
+        "of format 7.3, which does not say what its variables are: load it by h5py",
+    ),
     "MATLAB by another ending": (
-        "a.h5", lambda path: savemat(path, {"x": np.arange(9)}, appendmat=False),
+        "a.h5",
+        lambda path: savemat(path, {"x": np.arange(9)}, appendmat=False),
         "is a MATLAB file of format 5.0",
     ),
     "N-MNIST": (
-        "00002.bin", _n_mnist,
+        "00002.bin",
+        _n_mnist,
         "has the form of a file of N-MNIST, 5 bytes an event and no header, which is not read: "
         "load it by tonic.io.read_mnist_file, and write its events as ",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FILES)

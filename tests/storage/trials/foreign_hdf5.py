@@ -131,7 +131,8 @@ SHAPES: dict[str, Change] = {
     "no times": lambda file: file["events"].__delitem__("t"),
     "times in a group": linked("events/t", h5py.SoftLink("/poses")),
     "a group as a column": lambda file: (
-        file["events"].__delitem__("t"), file.create_group("events/t/t")
+        file["events"].__delitem__("t"),
+        file.create_group("events/t/t"),
     ),
     "a column as a group": replaced("events", data=np.zeros(3)),
     "a soft link": linked("events/t", h5py.SoftLink("/events/p")),
@@ -171,7 +172,7 @@ SHAPES: dict[str, Change] = {
     "a pixel outside of the camera": pixel,
     "poses of different lengths": replaced("poses/xyz", data=np.zeros((3, 3))),
     "poses in the plane": replaced("poses/xyz", data=np.zeros((10, 2))),
-}  # fmt: skip
+}
 BYTES = 4 << 30
 LOOKS: dict[str, Callable[[Any], Any]] = {
     "event_times": lambda reader: reader.event_times(),

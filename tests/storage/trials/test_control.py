@@ -46,9 +46,12 @@ def test_what_is_no_request_is_passed_over(tmp_path: Path) -> None:
     made = control.ask(store, "pause")
     folder = store.folder / control.FOLDER
     for name, text in (
-        ("000002.json", "{"), ("000003.json", "[]"), ("000004.json", '{"kind": "dance"}'),
-        ("000005.json", json.dumps({"kind": "dance", "who": "x", "when": "y"})), ("note.txt", "x"),
-    ):  # fmt: skip
+        ("000002.json", "{"),
+        ("000003.json", "[]"),
+        ("000004.json", '{"kind": "dance"}'),
+        ("000005.json", json.dumps({"kind": "dance", "who": "x", "when": "y"})),
+        ("note.txt", "x"),
+    ):
         (folder / name).write_text(text)
     assert control.requests(store) == [made]
     assert control.ask(store, "resume").number == 6

@@ -34,54 +34,114 @@ def _flip(path: Path) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Path, Path], object], str, str]] = {
     "description gone": (
-        lambda c, t: (c / "campaign.json").unlink(), "campaign.json: cannot be read", DAMAGED),
+        lambda c, t: (c / "campaign.json").unlink(),
+        "campaign.json: cannot be read",
+        DAMAGED,
+    ),
     "description no JSON": (
-        lambda c, t: (c / "campaign.json").write_text("{"), "is not JSON", DAMAGED),
+        lambda c, t: (c / "campaign.json").write_text("{"),
+        "is not JSON",
+        DAMAGED,
+    ),
     "description too deep": (
-        lambda c, t: (c / "campaign.json").write_text("[" * 100_000), "is not JSON", DAMAGED),
+        lambda c, t: (c / "campaign.json").write_text("[" * 100_000),
+        "is not JSON",
+        DAMAGED,
+    ),
     "description of something else": (
-        lambda c, t: (c / "campaign.json").write_text("{}"), "lacks 'name'", DAMAGED),
+        lambda c, t: (c / "campaign.json").write_text("{}"),
+        "lacks 'name'",
+        DAMAGED,
+    ),
     "protocol changed": (
         lambda c, t: (c / "protocol.yaml").write_text("protocol: 2\n"),
-        "protocol.yaml: does not match its checksum; `sliplab collect`", DAMAGED),
+        "protocol.yaml: does not match its checksum; `sliplab collect`",
+        DAMAGED,
+    ),
     "protocol no YAML": (
-        lambda c, t: (c / "protocol.yaml").write_text("a: &x [*x]"), "cannot be read", DAMAGED),
+        lambda c, t: (c / "protocol.yaml").write_text("a: &x [*x]"),
+        "cannot be read",
+        DAMAGED,
+    ),
     "rig file not UTF-8": (
-        lambda c, t: (c / "rig.yaml").write_bytes(b"\xff"), "cannot be read", DAMAGED),
+        lambda c, t: (c / "rig.yaml").write_bytes(b"\xff"),
+        "cannot be read",
+        DAMAGED,
+    ),
     "rig file gone": (lambda c, t: (c / "rig.yaml").unlink(), "rig.yaml: cannot be", DAMAGED),
     "checksums of a campaign gone": (
-        lambda c, t: (c / "checksums.json").unlink(), "collect` writes it", UNFINISHED),
+        lambda c, t: (c / "checksums.json").unlink(),
+        "collect` writes it",
+        UNFINISHED,
+    ),
     "checksums of a campaign damaged": (
-        lambda c, t: (c / "checksums.json").write_text('{"a": 1}'), "not a list of", DAMAGED),
+        lambda c, t: (c / "checksums.json").write_text('{"a": 1}'),
+        "not a list of",
+        DAMAGED,
+    ),
     "folder gone": (lambda c, t: (c / "bench").rmdir(), "is missing or not a folder", DAMAGED),
     "campaign that never began": (
-        lambda c, t: (c.parent / "d").mkdir(), "d: is a campaign without any trial", UNFINISHED),
+        lambda c, t: (c.parent / "d").mkdir(),
+        "d: is a campaign without any trial",
+        UNFINISHED,
+    ),
     "file among campaigns": (
-        lambda c, t: (c.parent / "x").write_text(""), "x: is not a campaign folder", DAMAGED),
+        lambda c, t: (c.parent / "x").write_text(""),
+        "x: is not a campaign folder",
+        DAMAGED,
+    ),
     "campaign elsewhere": (
-        lambda c, t: _link(c, c.parents[2] / "away"), "is not a campaign folder", DAMAGED),
+        lambda c, t: _link(c, c.parents[2] / "away"),
+        "is not a campaign folder",
+        DAMAGED,
+    ),
     "temporary file": (
         lambda c, t: (c / f".campaign.json.{NOBODY}.tmp").write_text(""),
-        "was left by a killed program", UNFINISHED),
+        "was left by a killed program",
+        UNFINISHED,
+    ),
     "quarantine without cause": (
-        lambda c, t: (c / "quarantine" / "t.1").mkdir(), "gives no cause", DAMAGED),
+        lambda c, t: (c / "quarantine" / "t.1").mkdir(),
+        "gives no cause",
+        DAMAGED,
+    ),
     "empty trial": (lambda c, t: (c / "trials" / "e").mkdir(), "checksums.json: cannot", DAMAGED),
     "file among trials": (
-        lambda c, t: (c / "trials" / "e").write_text(""), "e: is not a trial folder", DAMAGED),
+        lambda c, t: (c / "trials" / "e").write_text(""),
+        "e: is not a trial folder",
+        DAMAGED,
+    ),
     "trial elsewhere": (
-        lambda c, t: _link(t, c.parents[2] / "away"), "is not a trial folder", DAMAGED),
+        lambda c, t: _link(t, c.parents[2] / "away"),
+        "is not a trial folder",
+        DAMAGED,
+    ),
     "data elsewhere": (
-        lambda c, t: _link(t / "data.h5", c.parents[2] / "away"), "is not a regular file", DAMAGED),
+        lambda c, t: _link(t / "data.h5", c.parents[2] / "away"),
+        "is not a regular file",
+        DAMAGED,
+    ),
     "checksums lead elsewhere": (
         lambda c, t: write_json(t / "checksums.json", {"../../x": {"sha256": "", "bytes": 0}}),
-        "is not a list of checksums", DAMAGED),
+        "is not a list of checksums",
+        DAMAGED,
+    ),
     "checksums without data": (
-        lambda c, t: write_json(t / "checksums.json", {}), "no checksum of data.h5", DAMAGED),
+        lambda c, t: write_json(t / "checksums.json", {}),
+        "no checksum of data.h5",
+        DAMAGED,
+    ),
     "provenance gone": (
-        lambda c, t: (t / "provenance.json").unlink(), "provenance.json: cannot be", DAMAGED),
+        lambda c, t: (t / "provenance.json").unlink(),
+        "provenance.json: cannot be",
+        DAMAGED,
+    ),
     "bytes changed in place": (
-        lambda c, t: _flip(t / "data.h5"), "does not match its checksum", DAMAGED),
-}  # fmt: skip
+        lambda c, t: _flip(t / "data.h5"),
+        "does not match its checksum",
+        DAMAGED,
+    ),
+}
 
 
 @pytest.mark.parametrize("name", DAMAGE)
@@ -261,5 +321,7 @@ def test_bench_records_never_take_each_others_place(tmp_path: Path) -> None:
     (where.folder / "bench" / "0001.json").unlink()
     where.add_bench_record({"number": 3})
     assert sorted(path.name for path in (where.folder / "bench").iterdir()) == [
-        "0002.json", "0003.json", "0004.json"
-    ]  # fmt: skip
+        "0002.json",
+        "0003.json",
+        "0004.json",
+    ]

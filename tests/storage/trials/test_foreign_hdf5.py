@@ -44,11 +44,21 @@ Found = dict[str, tuple[list[str], list[str]]]
 def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     """What reading every case gave, in another process: a fault of this kind may end it."""
     done = subprocess.run(
-        [sys.executable, "-X", "faulthandler", "-m", "tests.storage.trials.foreign_hdf5",
-         str(tmp_path_factory.mktemp("foreign"))],
-        capture_output=True, text=True, timeout=300, check=False, cwd=ROOT,
+        [
+            sys.executable,
+            "-X",
+            "faulthandler",
+            "-m",
+            "tests.storage.trials.foreign_hdf5",
+            str(tmp_path_factory.mktemp("foreign")),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        cwd=ROOT,
         stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0, (lines[-1:], done.stderr)
     return {name: (looks, problems) for name, looks, problems in lines}
@@ -67,8 +77,10 @@ def test_trial_with_other_data_is_refused(name: str, found: Found) -> None:
     assert all(text == "clean" or "data.h5" in text for text in looks)
     # an index only bounds the search for a window: nothing else may come of a wrong one
     assert any(text != "clean" for text in looks) or name in {
-        "an index that ends beyond", "an index that runs backwards", "a negative index"
-    }  # fmt: skip
+        "an index that ends beyond",
+        "an index that runs backwards",
+        "a negative index",
+    }
 
 
 def test_wrong_index_returns_no_other_events(tmp_path: Path) -> None:

@@ -77,9 +77,15 @@ def taken(folder: Path, *, spool: bool = False) -> Path:
 def test_everything_comes_back_by_its_name(spool: bool, tmp_path: Path) -> None:
     folder = taken(tmp_path, spool=spool)
     assert sorted(path.name for path in folder.iterdir()) == [
-        "checksums.json", "data.h5", "frames.mkv", "provenance.json", "record.json",
-        "stream-back.h5", "stream-back.mkv", "stream-side.h5",
-    ]  # fmt: skip
+        "checksums.json",
+        "data.h5",
+        "frames.mkv",
+        "provenance.json",
+        "record.json",
+        "stream-back.h5",
+        "stream-back.mkv",
+        "stream-side.h5",
+    ]
     recording = Recording(folder)
     found = recording.events(stream="side")
     for name, sent in vars(SIDE).items():
@@ -107,9 +113,12 @@ def test_the_public_interface_reads_them(tmp_path: Path) -> None:
     taken(tmp_path)
     trial = open_store(tmp_path / "s").trial("t")
     assert trial.streams() == {
-        "events": "events", "side": "events", "frames": "frames", "back": "frames",
+        "events": "events",
+        "side": "events",
+        "frames": "frames",
+        "back": "frames",
         "warm": "scalar",
-    }  # fmt: skip
+    }
     assert len(trial.events(stream="side")) == len(SIDE)
     assert next(trial.frames("back")).shape == (FRAME[1], FRAME[0])
     assert trial.frame(3, "back").shape == (FRAME[1], FRAME[0])

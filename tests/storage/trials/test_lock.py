@@ -161,9 +161,12 @@ with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
 def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Path) -> None:
     path = tmp_path / "lock"
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, path], cwd=ROOT, text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-    )  # fmt: skip
+        [sys.executable, "-c", HOLDER, path],
+        cwd=ROOT,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
     assert holder.stdout is not None
     assert holder.stdin is not None
     try:

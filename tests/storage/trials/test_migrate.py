@@ -45,8 +45,9 @@ def test_it_migrates_forward_with_a_copy_kept(tmp_path: Path) -> None:
     copies = files(kept(store, 1))
     assert copies == {name: before[name] for name in copies}
     assert copies.keys() == {
-        "store.json", *(f"campaigns/c/{n}" for n in ("campaign.json", "protocol.yaml", "rig.yaml"))
-    }  # fmt: skip
+        "store.json",
+        *(f"campaigns/c/{n}" for n in ("campaign.json", "protocol.yaml", "rig.yaml")),
+    }
     after = files(store.folder)
     assert all(after[name] == before[name] for name in before if "/trials/" in name)
     assert migrate(store) == []

@@ -33,8 +33,12 @@ from tests.storage.trial_files import campaign, commit
 
 CONTENT: dict[str, Any] = {
     "protocol": {
-        "name": "c", "file_sha256": "f" * 64, "text": "protocol: 1\n", "enabled": [],
-        "collection_hash": "c" * 64, "analysis_hash": "a" * 64,
+        "name": "c",
+        "file_sha256": "f" * 64,
+        "text": "protocol: 1\n",
+        "enabled": [],
+        "collection_hash": "c" * 64,
+        "analysis_hash": "a" * 64,
     },
     "analysis": {"windows": {"length_ms": 30}},
     "stopping": {"error": 0.05, "claims": []},
@@ -44,7 +48,7 @@ CONTENT: dict[str, Any] = {
     "versions": {"numpy": "2.0"},
     "taken": {"committed": 0, "attempts": 0},
     "registered": "2026-01-02T03:04:05+00:00",
-}  # fmt: skip
+}
 
 
 HEADS = {
@@ -277,5 +281,6 @@ def test_copies_are_the_files_and_their_stamps(tmp_path: Path) -> None:
     write_json(path.with_name("notes.json"), {})
     copy_registrations(where, tmp_path / "out" / "c")
     assert sorted(it.name for it in (tmp_path / "out" / "c").iterdir()) == [
-        "0001.json", "0001.json.ots",
-    ]  # fmt: skip
+        "0001.json",
+        "0001.json.ots",
+    ]

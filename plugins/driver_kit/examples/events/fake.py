@@ -37,9 +37,11 @@ class FakeExampleEvents(FakeStream):
         edges = (pulses.t_ns // 1000).astype(EDGE)
         if self._streaming:
             self.write(
-                HEAD.pack(EVENTS, len(events)) + events.tobytes()
-                + HEAD.pack(EDGES, len(edges)) + edges.tobytes()
-            )  # fmt: skip
+                HEAD.pack(EVENTS, len(events))
+                + events.tobytes()
+                + HEAD.pack(EDGES, len(edges))
+                + edges.tobytes()
+            )
 
     def stall(self) -> None:
         """Send and answer nothing from now on; the connection stays."""

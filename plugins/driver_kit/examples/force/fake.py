@@ -24,8 +24,10 @@ class FakeExampleForce(FakeStream):
         samples = np.zeros(len(chunk), SAMPLE)
         samples["kind"] = OVERLOAD if self._overloaded else LOAD
         samples["t"], samples["force"], samples["torque"] = (
-            chunk.t_ns, chunk.force_n, chunk.torque_nm,
-        )  # fmt: skip
+            chunk.t_ns,
+            chunk.force_n,
+            chunk.torque_nm,
+        )
         if len(samples):
             self._last = samples[-1:].copy()
         samples["force"] -= self._zero["force"]

@@ -68,9 +68,12 @@ class ExampleFrames:
         rows = np.array([row for _, *row in frames], np.int64).reshape(len(frames), 4)
         empty = np.empty((0, *self._region[::-1]), np.uint8)
         return FrameChunk(
-            np.stack(images) if images else empty, rows[:, 0], rows[:, 1], rows[:, 2],
+            np.stack(images) if images else empty,
+            rows[:, 0],
+            rows[:, 1],
+            rows[:, 2],
             rows[:, 3].astype(np.uint8),
-        )  # fmt: skip
+        )
 
     def read_clock(self) -> ClockReads:
         """Not available. Raises RigError."""

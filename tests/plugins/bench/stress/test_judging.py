@@ -129,9 +129,14 @@ def test_groups_hold_each_trial_once_at_each_level() -> None:
     trials = [trial(name, s) for name in ("none", "tap") for s in (50.0, 100.0) for _ in range(3)]
     sizes = {(name, s): sum(map(belongs, trials)) for name, s, belongs in groups(trials)}
     assert sizes == {
-        (ALL, None): 12, ("none", None): 6, ("none", 50.0): 3, ("none", 100.0): 3,
-        ("tap", None): 6, ("tap", 50.0): 3, ("tap", 100.0): 3,
-    }  # fmt: skip
+        (ALL, None): 12,
+        ("none", None): 6,
+        ("none", 50.0): 3,
+        ("none", 100.0): 3,
+        ("tap", None): 6,
+        ("tap", 50.0): 3,
+        ("tap", 100.0): 3,
+    }
 
 
 @dataclass(frozen=True)

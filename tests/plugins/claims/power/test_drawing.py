@@ -147,9 +147,7 @@ def test_undetected_trials_come_as_often_as_in_the_pilot() -> None:
     values[0] = np.nan
     pilot = pilot_of(plan, depths, {"latency_gross": values})
     grid = Grid.of(plan)
-    drawn = [
-        pilot.campaign(grid, np.random.default_rng(k))["latency_gross"] for k in range(20)
-    ]  # fmt: skip
+    drawn = [pilot.campaign(grid, np.random.default_rng(k))["latency_gross"] for k in range(20)]
     deepest = np.array([dict(trial.condition)["depth"] == DEPTHS[2] for trial in grid.trials])
     share = np.mean([np.isinf(each[deepest]).mean() for each in drawn])
     assert share == pytest.approx(0.5, abs=0.08)
@@ -172,9 +170,11 @@ def test_effects_of_factors_and_of_blocks_are_kept() -> None:
     of_block = rng.normal(0.0, 100.0, 20)[blocks]
     values = 300.0 * (np.arange(120) % 3) + of_block + rng.normal(0.0, 30.0, 120)
     pilot = Pilot(
-        pilot_of(plan, depths, {}).axes, tuple({"depth": depth} for depth in depths), blocks,
+        pilot_of(plan, depths, {}).axes,
+        tuple({"depth": depth} for depth in depths),
+        blocks,
         {"first_slip": values},
-    )  # fmt: skip
+    )
     grid = Grid.of(plan)
     drawn = np.array(
         [pilot.campaign(grid, np.random.default_rng(k))["first_slip"] for k in range(30)]
@@ -302,10 +302,12 @@ def test_a_pilot_of_sessions_shows_how_they_differ() -> None:
 def test_sessions_and_a_drift_are_drawn_in_the_order_of_trials() -> None:
     plan = plan_of([MEDIAN], stopping={"most": 90})
     grid, pilot = Grid.of(plan), pilot_of_sessions(plan, 150.0)
-    found = np.array([
-        pilot.over_time(plan, grid, Sessions(3), np.random.default_rng(k))["first_slip"][:90]
-        for k in range(200)
-    ])  # fmt: skip
+    found = np.array(
+        [
+            pilot.over_time(plan, grid, Sessions(3), np.random.default_rng(k))["first_slip"][:90]
+            for k in range(200)
+        ]
+    )
     of_session = found.reshape(200, 3, 30)
     assert np.ptp(of_session, axis=2).max() == 0.0
     size = pilot.between("first_slip", Sessions(3)) * pilot.scatter("first_slip")
@@ -343,8 +345,9 @@ def test_what_is_drawn_and_what_a_pilot_of_one_session_cannot_show_is_stated() -
     one, many = normal_pilot(plan, 36, 1), pilot_of_sessions(plan, 100.0)
     cannot = "a pilot of one session cannot show how sessions differ"
     assert list(sessions_text(one, Sessions())) == [
-        f"one session is drawn (see --sessions): {cannot}", "no drift is drawn (see --drift)",
-    ]  # fmt: skip
+        f"one session is drawn (see --sessions): {cannot}",
+        "no drift is drawn (see --drift)",
+    ]
     found, drift = sessions_text(one, Sessions(4, drift=0.5))
     assert found.startswith("4 sessions are drawn, which differ by 0.30 (first_slip)")
     assert found.endswith(f"which is assumed: {cannot}")

@@ -84,9 +84,17 @@ def test_a_plan_says_it_with_its_hours(ran: Ran, protocol: Path) -> None:
 
 def test_a_claim_that_cannot_be_had_is_said_so(ran: Ran, protocol: Path, tmp_path: Path) -> None:
     done = here(
-        "power", protocol, "--store", ran[0][0].store, "--out", tmp_path, "--draws", 10,
-        "--claim", "{figure: slip_duration, within: 1 ms}",
-    )  # fmt: skip
+        "power",
+        protocol,
+        "--store",
+        ran[0][0].store,
+        "--out",
+        tmp_path,
+        "--draws",
+        10,
+        "--claim",
+        "{figure: slip_duration, within: 1 ms}",
+    )
     assert done.returncode == 0
     assert "cannot be had by this plan" in done.stderr
     assert "repetitions of each condition in place of 20" in done.stderr
@@ -119,9 +127,19 @@ def test_a_learning_curve_is_trained_once(
     monkeypatch.setattr(power, "FEWEST_TRAINING", 2)
     model = shutil.copy(next((store / "models").glob("seed*.pt")), tmp_path / "other.pt")
     words = (
-        "power", protocol, "--store", store, "--claim", ACCURACY, "--model", model,
-        "--out", tmp_path, "--draws", 10,
-    )  # fmt: skip
+        "power",
+        protocol,
+        "--store",
+        store,
+        "--claim",
+        ACCURACY,
+        "--model",
+        model,
+        "--out",
+        tmp_path,
+        "--draws",
+        10,
+    )
     curve = answer(*words)["learning"]
     assert [point["trials"] for point in curve["points"]] == [1, 1, 2, 2]
     assert (curve["test_trials"], curve["planned"]) == (2, 40)
@@ -138,9 +156,17 @@ def test_a_learning_curve_is_trained_once(
 
 def test_sessions_are_drawn_and_printed(ran: Ran, protocol: Path, tmp_path: Path) -> None:
     words = (
-        "power", protocol, "--store", ran[0][0].store, "--claim", DURATION, "--out", tmp_path,
-        "--draws", 10,
-    )  # fmt: skip
+        "power",
+        protocol,
+        "--store",
+        ran[0][0].store,
+        "--claim",
+        DURATION,
+        "--out",
+        tmp_path,
+        "--draws",
+        10,
+    )
     done = here(*words, "--sessions", 4, "--drift", 0.5)
     assert done.returncode == 0
     told = " ".join((done.stdout + done.stderr).split())
@@ -200,14 +226,16 @@ def test_a_pause_or_another_skin_begins_a_session() -> None:
         ("{figure: accuracy, within: 1 %, error: 0}", "--claim error", "0"),
         (
             "{figure: lead, at_least: 1 ms, between: {factor: skin, levels: [a, b]}}",
-            "--claim between.factor", "skin",
+            "--claim between.factor",
+            "skin",
         ),
         (
             "{figure: lead, at_least: 1 ms, between: {factor: direction, levels: [0, 17]}}",
-            "--claim between.levels[1]", "17",
+            "--claim between.levels[1]",
+            "17",
         ),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_claim_names_option_key_and_value(
     claim: str, key: str, value: str | None, ran: Ran, protocol: Path
 ) -> None:
@@ -232,5 +260,7 @@ def test_a_protocol_without_claims_and_levels_outside_are_refused(
     other = write(tmp_path / "deeper.yaml", data)
     error = error_of(other, "--store", store, "--claim", DURATION)
     assert (error["file"], error["key"], error["value"]) == (
-        str(other), "collection.factors.depth", "2.8 mm",
-    )  # fmt: skip
+        str(other),
+        "collection.factors.depth",
+        "2.8 mm",
+    )

@@ -63,9 +63,19 @@ def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
         figures = {"mean_ms": [late], "false_early_either": [early], "lost_either": [missed]}
         operations = {"synaptic_operations_per_s": [work]}
         return Row(
-            PAPER, "trained", 30, "chosen", 4, 8.0, False, [0],
-            figures, {"mean_ms": [test]}, None, operations,
-        )  # fmt: skip
+            PAPER,
+            "trained",
+            30,
+            "chosen",
+            4,
+            8.0,
+            False,
+            [0],
+            figures,
+            {"mean_ms": [test]},
+            None,
+            operations,
+        )
 
     rows = [
         row(100, 0.02, 0.0, 5, 1),

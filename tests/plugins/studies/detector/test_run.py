@@ -161,8 +161,14 @@ def test_page_numbers_and_table_say_the_same(result: Any) -> None:
         assert line["front"] == str(row["front"])
     factors = {item["factor"] for item in found["comparisons"]}
     assert factors == {
-        "length_ms", "step_ms", "pool_px", "width", "stride_ms", "precision", "rule",
-    }  # fmt: skip
+        "length_ms",
+        "step_ms",
+        "pool_px",
+        "width",
+        "stride_ms",
+        "precision",
+        "rule",
+    }
     for item in found["comparisons"]:
         if item["paper"]:
             assert item["difference"]["strict"]["mean"] == 0
@@ -181,9 +187,7 @@ def test_a_kept_search_is_not_made_again_and_grows(
     assert plan["estimated_s"] > 0
     # other samples are another search beside it
     other = SearchSize(samples=41, epochs=2, trials=2, seeds=1, stride_ms=15)
-    found = tradeoff_detector(
-        store, collected(store), tmp_path / "o", other, AXES, minutes=0
-    )  # fmt: skip
+    found = tradeoff_detector(store, collected(store), tmp_path / "o", other, AXES, minutes=0)
     assert (found["kept"], found["rows"]) == (0, [])
     assert (tmp_path / "o" / PAGE).exists()
 
@@ -258,10 +262,34 @@ def test_the_command_takes_one_of_its_two_subjects(store: Store, tmp_path: Path)
         assert done.returncode == 2, done.stderr
         assert message in done.stderr.replace("\n", " ")
     done = here(
-        "tradeoff", "--detector", store.folder, "--dry-run", "--json", "--samples", 40, "--epochs",
-        2, "--trials", 2, "--seeds", 1, "--stride", 15, "--length", 15, "--length", 30,
-        "--step", 1, "--pool", 20, "--width", 0.5, "--width", 1,
-    )  # fmt: skip
+        "tradeoff",
+        "--detector",
+        store.folder,
+        "--dry-run",
+        "--json",
+        "--samples",
+        40,
+        "--epochs",
+        2,
+        "--trials",
+        2,
+        "--seeds",
+        1,
+        "--stride",
+        15,
+        "--length",
+        15,
+        "--length",
+        30,
+        "--step",
+        1,
+        "--pool",
+        20,
+        "--width",
+        0.5,
+        "--width",
+        1,
+    )
     assert done.returncode == 0, done.stderr
     reported = json.loads(done.stdout)
     assert (reported["runs"], reported["simulated"]) == (3, True)

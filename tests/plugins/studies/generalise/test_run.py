@@ -162,10 +162,17 @@ def test_the_file_is_the_same_to_the_byte(tmp_path: Path) -> None:
 def test_a_trained_level_has_these_keys(store: Store) -> None:
     kept = read_json(store.folder / "derived/generalisation/results.json")
     assert shape_of(kept["results"]["direction 0 deg"]) == {
-        "argmax": "float", "high": "NoneType", "key": "str", "low": "NoneType", "n": "int",
+        "argmax": "float",
+        "high": "NoneType",
+        "key": "str",
+        "low": "NoneType",
+        "n": "int",
         "recall": {"gross": "float", "incipient": "float", "no_slip": "float"},
-        "seen": "float", "share": "float", "trained_on": "int", "trials": "int",
-    }  # fmt: skip
+        "seen": "float",
+        "share": "float",
+        "trained_on": "int",
+        "trials": "int",
+    }
 
 
 def test_the_command_line(store: Store, tmp_path: Path) -> None:

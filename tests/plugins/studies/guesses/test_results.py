@@ -13,16 +13,24 @@ def setting(*latencies_ms: float | None) -> SettingScores:
     """Kinematic trials with these incipient latencies, None late; gross slip is always missed."""
     trials = [
         TrialAtSetting.model_construct(
-            campaign="c", trial=str(k), experiment="kinematic", depth_zero_mm=None,
+            campaign="c",
+            trial=str(k),
+            experiment="kinematic",
+            depth_zero_mm=None,
             latency=TrialLatency(
-                latency_incipient_ms=ms, latency_gross_ms=None, lead_ms=None,
-                late_incipient_ms=10.0 if ms is None else None, late_gross_ms=None,
-                missed_incipient=False, missed_gross=True, false_early_incipient=False,
+                latency_incipient_ms=ms,
+                latency_gross_ms=None,
+                lead_ms=None,
+                late_incipient_ms=10.0 if ms is None else None,
+                late_gross_ms=None,
+                missed_incipient=False,
+                missed_gross=True,
+                false_early_incipient=False,
                 false_early_gross=False,
             ),
         )
         for k, ms in enumerate(latencies_ms)
-    ]  # fmt: skip
+    ]
     return SettingScores.model_construct(trials=tuple(trials), windows={"c/0": (9, 10)})
 
 

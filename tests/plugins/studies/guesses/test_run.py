@@ -100,13 +100,18 @@ TRIAL = {
     "gross_ns": "int",
     "incipient_ns": "int",
     "latency": {
-        "false_early_gross": "bool", "false_early_incipient": "bool", "late_gross_ms": "NoneType",
-        "late_incipient_ms": "NoneType", "latency_gross_ms": "float",
-        "latency_incipient_ms": "float", "lead_ms": "float", "missed_gross": "bool",
+        "false_early_gross": "bool",
+        "false_early_incipient": "bool",
+        "late_gross_ms": "NoneType",
+        "late_incipient_ms": "NoneType",
+        "latency_gross_ms": "float",
+        "latency_incipient_ms": "float",
+        "lead_ms": "float",
+        "missed_gross": "bool",
         "missed_incipient": "bool",
     },
     "trial": "str",
-}  # fmt: skip
+}
 
 
 def test_a_setting_has_these_keys(store: Store) -> None:
@@ -128,8 +133,14 @@ def test_a_setting_has_these_keys(store: Store) -> None:
         "without_onsets": "int",
     }
     assert list(found) == [
-        "experiments", "factor", "key", "parameter", "trials", "value", "windows",
-    ]  # fmt: skip
+        "experiments",
+        "factor",
+        "key",
+        "parameter",
+        "trials",
+        "value",
+        "windows",
+    ]
     assert found["trials"] == [TRIAL]
     slides = {row["trial"] for row in lower["trials"] if row["campaign"] == "tiny"}
     assert found["windows"] == {name: ["int"] for name in slides}
@@ -196,7 +207,7 @@ def test_how_it_is_said_on_the_command_line(store: Store) -> None:
     assert list(reported) == ["simulated", "trials", "measured", "settings", "file"]
     assert reported["settings"] == {
         name: figures(setting) for name, setting in scores(store).items()
-    }  # fmt: skip
+    }
     assert reported["trials"] == {"tiny": 2, "tiny_gravity": 2}
     assert list(reported["settings"]) == list(kept(store))
     table = here("guesses", store.folder, "--guess", GUESS)

@@ -39,9 +39,12 @@ def events(*rows: tuple[int, int, int, int]) -> EventChunk:
 
 
 def seen(
-    chunk: EventChunk | None, markers: Onsets | None = (None, None), slips: Onsets = (None, None),
-    begin_us: int = 0, end_us: int = 300_000,
-) -> Seen:  # fmt: skip
+    chunk: EventChunk | None,
+    markers: Onsets | None = (None, None),
+    slips: Onsets = (None, None),
+    begin_us: int = 0,
+    end_us: int = 300_000,
+) -> Seen:
     return Seen(chunk, SIZE, begin_us, end_us, slips, markers)
 
 
@@ -70,9 +73,7 @@ def test_nothing_matches_nothing() -> None:
     assert (error.event_median_us, error.event_p95_us, error.tensor_l1) == (None, None, None)
 
 
-EVENT = st.tuples(
-    st.integers(0, 3), st.integers(0, 3), st.integers(0, 1), st.integers(0, 10**6)
-)  # fmt: skip
+EVENT = st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(0, 1), st.integers(0, 10**6))
 
 
 @given(st.lists(EVENT, max_size=40), st.lists(EVENT, max_size=40))
@@ -83,9 +84,10 @@ def test_matching_is_what_counting_by_hand_gives(
     expected = []
     for place in {row[:3] for row in a + b}:
         expected += zip(
-            [row for row in a if row[:3] == place], [row for row in b if row[:3] == place],
+            [row for row in a if row[:3] == place],
+            [row for row in b if row[:3] == place],
             strict=False,
-        )  # fmt: skip
+        )
     found = match_events(events(*a), events(*b))
     pairs = [(a[i], b[j]) for i, j in zip(found.first, found.second, strict=True)]
     assert sorted(pairs) == sorted(expected)
@@ -189,9 +191,14 @@ def test_the_lowest_level_within_two_seeds(
 def test_what_the_samples_hold() -> None:
     # hold of 1.2 s, incipient onset at 0.6 s, gross at 2.0 s, end at 2.9 s: 30 gross windows
     chunk = events(
-        (130, 50, 1, -1_000_000), (130, 50, 1, 15_000), (130, 50, 0, 100_000), (10, 10, 1, 200_000),
-        (130, 50, 1, 700_000), (130, 50, 1, 2_010_000), (130, 50, 1, 2_020_000),
-    )  # fmt: skip
+        (130, 50, 1, -1_000_000),
+        (130, 50, 1, 15_000),
+        (130, 50, 0, 100_000),
+        (10, 10, 1, 200_000),
+        (130, 50, 1, 700_000),
+        (130, 50, 1, 2_010_000),
+        (130, 50, 1, 2_020_000),
+    )
     run = seen(chunk, (600 * MS, 2000 * MS), begin_us=-1_200_000, end_us=2_900_000)
     found = look(run, WINDOWS, Samples(per_class=50), 0)
     assert found.samples == (50, 46, 30)

@@ -87,9 +87,15 @@ def test_the_numbers_say_what_was_asked(result: Any) -> None:
     assert len(found["trials"]) == 1
     rows = {(row["family"], row["name"]): row for row in found["variants"]}
     assert set(rows) == {
-        ("levels", "L0"), ("levels", "L1"), ("levels", "L2"), ("levels", "L3"),
-        ("cubic", "1"), ("cubic", "8"), ("chord", "1"), ("chord", "8"),
-    }  # fmt: skip
+        ("levels", "L0"),
+        ("levels", "L1"),
+        ("levels", "L2"),
+        ("levels", "L3"),
+        ("cubic", "1"),
+        ("cubic", "8"),
+        ("chord", "1"),
+        ("chord", "8"),
+    }
     assert all(row["wall_s"] > 0 for row in rows.values())
     assert set(rows["cubic", "1"]["error"].values()) == {0.0}
     # the path between rows is the camera's alone
@@ -130,8 +136,10 @@ def test_a_falling_plate_is_measured_at_its_own_step(
     found = tradeoff.tradeoff_scene(path, rig_path, tmp_path / "out", 1)
     families = [(row["family"], row["name"]) for row in found["variants"]]
     assert families == [
-        *(("levels", f"L{k}") for k in range(4)), ("cubic", "2"), ("chord", "2"),
-    ]  # fmt: skip
+        *(("levels", f"L{k}") for k in range(4)),
+        ("cubic", "2"),
+        ("chord", "2"),
+    ]
     assert any("by a millisecond" in sentence for sentence in found["left_out"])
     assert found["windows"]["samples"]["incipient"] > 0
 

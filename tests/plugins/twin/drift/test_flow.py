@@ -105,8 +105,18 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
 def test_friction_that_falls_is_found_and_nothing_else(
     store: Store, worn: dict[str, float], tmp_path: Path
 ) -> None:
-    words = ["calibrate", "drift", str(store.folder), "--rig", "rehearsal", "--worlds", "100",
-             "--out", str(tmp_path / "out"), "--json"]  # fmt: skip
+    words = [
+        "calibrate",
+        "drift",
+        str(store.folder),
+        "--rig",
+        "rehearsal",
+        "--worlds",
+        "100",
+        "--out",
+        str(tmp_path / "out"),
+        "--json",
+    ]
     done = CliRunner().invoke(app, [*words, "--limit", "20"])
     assert done.exit_code == 0, done.output
     fit = DriftFit.load(tmp_path / "out" / "drift.json")
@@ -130,9 +140,21 @@ def test_a_limit_that_is_exceeded_is_exit_1(
     store: Store, worn: dict[str, float], tmp_path: Path
 ) -> None:
     done = CliRunner().invoke(
-        app, ["calibrate", "drift", str(store.folder), "--rig", "rehearsal", "--worlds", "100",
-              "--out", str(tmp_path), "--limit", "5"],
-    )  # fmt: skip
+        app,
+        [
+            "calibrate",
+            "drift",
+            str(store.folder),
+            "--rig",
+            "rehearsal",
+            "--worlds",
+            "100",
+            "--out",
+            str(tmp_path),
+            "--limit",
+            "5",
+        ],
+    )
     assert done.exit_code == 1
     said = " ".join(done.output.split())
     assert "6 simulated reference trials; at most 5 % is allowed. The skin wears" in said
@@ -185,8 +207,9 @@ def change(tmp_path: Path, seed: int, per_m: float, limit: float | None = None) 
     """Drift of a simulated campaign of 54 slides of another skin than the one that is assumed."""
     data = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
     data["collection"]["references"] = {
-        "every": 4, "condition": {"depth": 2.8, "speed": 1.6, "direction": 0}
-    }  # fmt: skip
+        "every": 4,
+        "condition": {"depth": 2.8, "speed": 1.6, "direction": 0},
+    }
     faults = [{"kind": "skin_wear", "per_m": per_m}] if per_m else []
     tracks = {"scene": {"level": "L3"}, "frame_camera": {"level": "tracks"}}
     rig, base_file = tmp_path / "rig.yaml", tmp_path / "base.yaml"

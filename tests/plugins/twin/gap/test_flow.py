@@ -40,15 +40,22 @@ def twin_file(path: Path, extends: str = "rehearsal") -> Path:
     """A twin of another friction, and two samples of its posterior."""
     low, high = 2.4, 3.4
     record = {
-        "campaign": "pilot", "checksum": "c", "trials": 30, "simulated": True,
-        "fitted": "2026-11-26", "method": "by hand", "depth_mm": {"least": low, "most": high},
+        "campaign": "pilot",
+        "checksum": "c",
+        "trials": 30,
+        "simulated": True,
+        "fitted": "2026-11-26",
+        "method": "by hand",
+        "depth_mm": {"least": low, "most": high},
         "speed_mm_s": {"least": low, "most": high},
         "parameters": {},
-    }  # fmt: skip
+    }
     data = {
-        "extends": extends, "name": path.stem, "twin": record,
+        "extends": extends,
+        "name": path.stem,
+        "twin": record,
         "mock": {"scene": {"friction": {"kinetic": 0.75}}},
-    }  # fmt: skip
+    }
     names = tuple(
         Estimate(key, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, False, ()) for key in (FRICTION, NOISE)
     )
@@ -154,9 +161,18 @@ def test_numbers_and_page_are_kept_and_nothing_is_made_again(
     Draft7Validator(file_schema("gap")).validate(written)
     before = made(wanted.out)
     done = here(
-        "calibrate", "gap", store.folder, "--rig", wanted.rig, "--protocol", wanted.plan.file,
-        "--out", wanted.out, "--worlds", DRAWN,
-    )  # fmt: skip
+        "calibrate",
+        "gap",
+        store.folder,
+        "--rig",
+        wanted.rig,
+        "--protocol",
+        wanted.plan.file,
+        "--out",
+        wanted.out,
+        "--worlds",
+        DRAWN,
+    )
     assert done.returncode == 0, done.stderr
     assert made(wanted.out) == before
     assert read_json(wanted.out / "gap.json") == written

@@ -151,8 +151,16 @@ def test_a_trade_off_on_a_twin_says_what_its_pilot_asked_for() -> None:
 
 
 def test_documents_of_needs_are_read_as_they_were_written() -> None:
-    whole = EffectNeed(title="a", verdict="asked for", shown_by="slips", loss=1.0, low=0.5,
-                       high=1.5, limit=0.1, time=0.9)  # fmt: skip
+    whole = EffectNeed(
+        title="a",
+        verdict="asked for",
+        shown_by="slips",
+        loss=1.0,
+        low=0.5,
+        high=1.5,
+        limit=0.1,
+        time=0.9,
+    )
     for it in (whole, EffectNeed(title="b", verdict="not in the scene")):
         assert EffectNeed.model_validate(it.model_dump(mode="json")) == it
     cheap = CheapestScene(loss=0.0, low=-0.1, high=0.1, seconds=0.2, time=0.8)

@@ -92,8 +92,12 @@ def test_too_few_trials_or_worlds_are_an_error() -> None:
 
 
 def test_marks_of_a_trial() -> None:
-    seen = events([-900_000, -900_000, 100_000, 100_000, 100_400], [5, 9, 300, 301, 300],
-                  [5] * 5, [1, 0, 1, 1, 1])  # fmt: skip
+    seen = events(
+        [-900_000, -900_000, 100_000, 100_000, 100_400],
+        [5, 9, 300, 301, 300],
+        [5] * 5,
+        [1, 0, 1, 1, 1],
+    )
     found = marks(drawn(1.0, seen))
     assert found["slips"] == pytest.approx([2.1, 1.1, 4.0])  # the third never did: the end
     assert found["events over time"][0] == pytest.approx(np.log(4.0))

@@ -310,10 +310,16 @@ def test_what_the_box_refuses_is_said(
 @pytest.mark.parametrize(
     "line",
     [
-        b"ARM\n", seal("ARM 100"), seal("ARM x 1 0 lfsr"), seal("ARM 100 0 0 lfsr"),
-        seal("ARM 100 4294967295 0 lfsr"), seal("FLY"), seal("T?"), seal("T? x"),
+        b"ARM\n",
+        seal("ARM 100"),
+        seal("ARM x 1 0 lfsr"),
+        seal("ARM 100 0 0 lfsr"),
+        seal("ARM 100 4294967295 0 lfsr"),
+        seal("FLY"),
+        seal("T?"),
+        seal("T? x"),
     ],
-)  # fmt: skip
+)
 def test_the_stand_in_survives_nonsense(wire: FakeSyncBox, box: SerialSyncBox, line: bytes) -> None:
     with serial.Serial(wire.port, timeout=1.0) as port:
         port.write(line)
@@ -418,9 +424,23 @@ def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
 
 @pytest.mark.parametrize(
     "line",
-    ["X 0 99999999999999999999", "X 1 ", "X 1 -5", "X 1 1_000", "X 0 9999999999", "P", "P 1 1",
-     "P -1 1 10000", "D x", "D -3", "D 1 2", "OK STOP -1", "T 1 1e3", "X 0 0x10"],
-)  # fmt: skip
+    [
+        "X 0 99999999999999999999",
+        "X 1 ",
+        "X 1 -5",
+        "X 1 1_000",
+        "X 0 9999999999",
+        "P",
+        "P 1 1",
+        "P -1 1 10000",
+        "D x",
+        "D -3",
+        "D 1 2",
+        "OK STOP -1",
+        "T 1 1e3",
+        "X 0 0x10",
+    ],
+)
 def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
     wire: FakeSyncBox, box: SerialSyncBox, line: str
 ) -> None:

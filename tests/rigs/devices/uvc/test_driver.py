@@ -77,9 +77,14 @@ def configured(
 def test_settings_are_written_read_back_and_kept_as_the_camera_has_them() -> None:
     found, device = configured({cv2.CAP_PROP_EXPOSURE: 49.0}, exposure_us=5000, gain=12)
     assert found == {
-        "pixel_format": "MJPG", "width_px": 1280, "height_px": 720, "rate_hz": 30.0,
-        "auto_exposure": 1.0, "exposure_us": 4900.0, "gain": 12.0,
-    }  # fmt: skip
+        "pixel_format": "MJPG",
+        "width_px": 1280,
+        "height_px": 720,
+        "rate_hz": 30.0,
+        "auto_exposure": 1.0,
+        "exposure_us": 4900.0,
+        "gain": 12.0,
+    }
     assert device.values[cv2.CAP_PROP_AUTO_WB] == device.values[cv2.CAP_PROP_AUTOFOCUS] == 0.0
 
 
@@ -100,11 +105,12 @@ def test_a_camera_without_a_control_of_its_exposure_says_so() -> None:
         (cv2.CAP_PROP_AUTO_EXPOSURE, 3.0, "auto_exposure = 1.0: the camera has 3"),
         (cv2.CAP_PROP_EXPOSURE, 156.0, "exposure_us = 5000.0: the camera has 15600"),
         (
-            cv2.CAP_PROP_FOURCC, float(cv2.VideoWriter.fourcc(*"YUYV")),
+            cv2.CAP_PROP_FOURCC,
+            float(cv2.VideoWriter.fourcc(*"YUYV")),
             "pixel_format = MJPG: the camera has YUYV",
         ),
     ],
-)  # fmt: skip
+)
 def test_a_setting_that_the_camera_does_not_take_is_refused(
     code: int, kept: float, message: str
 ) -> None:
