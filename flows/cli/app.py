@@ -21,6 +21,7 @@ from sliplab.flows.cli import (
     store,
     study,
 )
+from sliplab.flows.cli.common import RESEARCH
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
@@ -30,7 +31,6 @@ app = typer.Typer(
     name="sliplab",
     help="Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -54,18 +54,19 @@ def options(
     """Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report."""
 
 
+# panels of the help stand in the order of their first commands
 for part in (
     collect.app,
     register.app,
-    steps.app,
-    study.app,
-    store.app,
-    rigs.app,
+    schema.app,
     control.app,
-    exchange.app,
+    rigs.app,
+    steps.app,
     review.app,
     detect.app,
-    schema.app,
+    study.app,
+    store.app,
+    exchange.app,
 ):
     app.add_typer(part)
 
@@ -116,4 +117,7 @@ def _add(word: str, place: str, needed: bool) -> None:
             raise InputError("COMMAND", "", word, f"cannot be loaded: {error}") from None
         return
     _added.add(place)
+    if word not in GROUPS:
+        for command in part.registered_commands:
+            command.rich_help_panel = command.rich_help_panel or RESEARCH
     GROUPS.get(word, app).add_typer(part)

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from sliplab.flows.cli.common import (
+    COLLECT,
+    PLAN,
     EnableOption,
     JsonOption,
     ProtocolArgument,
@@ -21,7 +23,7 @@ from sliplab.flows.steps import prepare_store
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel=PLAN, epilog="Example: sliplab plan kinematic --rig mock")
 def plan(
     protocol: ProtocolArgument,
     rig: Annotated[
@@ -67,7 +69,9 @@ def plan(
         plan_view.print_plan(found, needed, scene, claims)
 
 
-@app.command()
+@app.command(
+    rich_help_panel=PLAN, epilog="Example: sliplab check pilot --rig mock --store my-store"
+)
 def check(
     protocol: ProtocolArgument,
     rig: RigOption,
@@ -89,7 +93,9 @@ def check(
         raise typer.Exit(console.FAILED)
 
 
-@app.command()
+@app.command(
+    rich_help_panel=COLLECT, epilog="Example: sliplab collect pilot --rig mock --store my-store"
+)
 def collect(
     protocol: ProtocolArgument,
     rig: RigOption,

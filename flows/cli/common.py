@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
     from sliplab.storage.trials.store import Store
 
+PLAN, COLLECT, RIG, ANALYSE, DATA = "Plan", "Collect", "Rig", "Analyse", "Data"
+RESEARCH = "Research"
+"""Panels of the help; commands of plug-ins are among those of research if they name no other."""
+
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="A store's folder.")]
 PlaceArgument = Annotated[

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption, StoreArgument, StoreOption
+from sliplab.flows.cli.common import COLLECT, JsonOption, RigOption, StoreArgument, StoreOption
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 
@@ -46,7 +46,7 @@ CampaignOption = Annotated[
 ]
 
 
-@app.command()
+@app.command(rich_help_panel=COLLECT, epilog="Example: sliplab pause my-store")
 def pause(
     store: StoreArgument,
     why: WhyOption = "",
@@ -59,7 +59,7 @@ def pause(
     _finish([outcome], as_json, _pause_words(store, outcome))
 
 
-@app.command()
+@app.command(rich_help_panel=COLLECT, epilog="Example: sliplab resume my-store")
 def resume(
     store: StoreArgument,
     why: WhyOption = "",
@@ -74,7 +74,7 @@ def resume(
     _finish([outcome], as_json, words)
 
 
-@app.command()
+@app.command(rich_help_panel=COLLECT, epilog="Example: sliplab stop my-store")
 def stop(
     store: StoreArgument,
     why: WhyOption = "",
@@ -95,7 +95,10 @@ def stop(
     _finish([outcome], as_json, words)
 
 
-@app.command()
+@app.command(
+    rich_help_panel=COLLECT,
+    epilog='Example: sliplab skip my-store TRIAL --why "the tip was worn"',
+)
 def skip(
     store: StoreArgument,
     trials: TrialsArgument,
@@ -109,7 +112,10 @@ def skip(
     _decide(store, "skip", trials, campaign, who, why, wait, as_json)
 
 
-@app.command()
+@app.command(
+    rich_help_panel=COLLECT,
+    epilog='Example: sliplab again my-store TRIAL --why "the plate was dirty"',
+)
 def again(
     store: StoreArgument,
     trials: TrialsArgument,
@@ -187,7 +193,10 @@ def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
         raise typer.Exit(console.FAILED)
 
 
-@app.command()
+@app.command(
+    rich_help_panel=COLLECT,
+    epilog="Example: sliplab serve schedules.yaml --store my-store --rig mock",
+)
 def serve(
     store: StoreOption,
     rig: RigOption,

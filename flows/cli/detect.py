@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import EnableOption, JsonOption, RigOption
+from sliplab.flows.cli.common import ANALYSE, EnableOption, JsonOption, RigOption
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command(
+    rich_help_panel=ANALYSE,
+    epilog="Example: sliplab detect --rig mock --model my-store/models/seed0.pt --protocol pilot",
+)
 def detect(
     rig: RigOption,
     model: Annotated[

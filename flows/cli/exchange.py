@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sliplab.flows.cli.common import (
+    DATA,
     FAULTS,
     JsonOption,
     StoreArgument,
@@ -23,7 +24,11 @@ from sliplab.protocols.shown import one_of
 app = typer.Typer()
 
 
-@app.command("import")
+@app.command(
+    "import",
+    rich_help_panel=DATA,
+    epilog="Example: sliplab import recordings --store my-store --name old",
+)
 def import_(
     kind_or_path: Annotated[
         str, typer.Argument(metavar="[KIND] PATH", help="A file, or a folder of files.")
@@ -119,7 +124,10 @@ def import_(
         raise typer.Exit(console.FAILED)
 
 
-@app.command()
+@app.command(
+    rich_help_panel=DATA,
+    epilog="Example: sliplab export my-store pilot --labels --output labels.csv",
+)
 def export(
     store: StoreArgument,
     what: Annotated[str, typer.Argument(help="A campaign name or a trial id.")],

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sliplab.flows.cli.common import (
+    PLAN,
     EnableOption,
     JsonOption,
     ProtocolArgument,
@@ -20,7 +21,7 @@ from sliplab.protocols.errors import InputError
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel=PLAN, epilog="Example: sliplab register pilot --store my-store")
 def register(
     protocol: ProtocolArgument,
     store: StoreOption,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
+from sliplab.flows.cli.common import ANALYSE, CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
@@ -21,7 +21,7 @@ COUNT = 20
 """Trials that `--next` prints by default."""
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab review my-store")
 def review(
     store: StoreArgument,
     port: Annotated[
@@ -185,7 +185,7 @@ def _amount(value: float, unit: str) -> str:
     return f"{value:.2f} ms" if unit == "ms" else f"{100 * value:.2f} %"
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab view my-store TRIAL")
 def view(
     store: StoreArgument,
     trial: Annotated[str, typer.Argument(help="A trial's id, as in `sliplab trials`.")],

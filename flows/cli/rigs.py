@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption
+from sliplab.flows.cli.common import RIG, JsonOption, RigOption
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
@@ -21,8 +21,8 @@ app = typer.Typer()
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
 teach_app = typer.Typer(help="Teach plane, depth zero and tool of a rig.", **_SETTINGS)  # type: ignore[arg-type]
 calibrate_app = typer.Typer(help="Calibrate cameras, or a simulated scene.", **_SETTINGS)  # type: ignore[arg-type]
-app.add_typer(teach_app, name="teach")
-app.add_typer(calibrate_app, name="calibrate")
+app.add_typer(teach_app, name="teach", rich_help_panel=RIG)
+app.add_typer(calibrate_app, name="calibrate", rich_help_panel=RIG)
 
 OutOption = Annotated[
     Path | None,
@@ -62,7 +62,7 @@ RowsOption = Annotated[int, typer.Option("--rows", min=0, max=1000, help="Board 
 COLUMNS = {"name": "name", "driver": "driver", "arm": "arm", "cameras": "cameras", "answer": "says"}
 
 
-@app.command()
+@app.command(rich_help_panel=RIG, epilog="Example: sliplab rigs my-rig.yaml --ask")
 def rigs(
     files: Annotated[
         list[Path] | None,
@@ -232,7 +232,7 @@ class ZeroBy(StrEnum):
     EVENTS = "events"
 
 
-@teach_app.command("plane")
+@teach_app.command("plane", epilog="Example: sliplab teach plane --rig my-rig.yaml")
 def teach_plane(
     rig: RigOption,
     by: Annotated[
@@ -272,7 +272,7 @@ def teach_plane(
     )
 
 
-@teach_app.command("zero")
+@teach_app.command("zero", epilog="Example: sliplab teach zero --rig my-rig.yaml")
 def teach_zero(
     rig: RigOption,
     by: Annotated[ZeroBy, typer.Option("--by", help="Events and markers, or events alone.")] = (
@@ -303,7 +303,7 @@ def teach_zero(
     )
 
 
-@teach_app.command("tool")
+@teach_app.command("tool", epilog="Example: sliplab teach tool --rig my-rig.yaml")
 def teach_tool(
     rig: RigOption,
     poses: Annotated[int, typer.Option("--poses", min=4, max=50, help="Number of poses.")] = 8,
@@ -336,7 +336,7 @@ def teach_tool(
     )
 
 
-@calibrate_app.command("lens")
+@calibrate_app.command("lens", epilog="Example: sliplab calibrate lens --rig my-rig.yaml")
 def calibrate_lens(
     rig: RigOption,
     views: Annotated[int, typer.Option("--views", min=4, max=60, help="Images to take.")] = 8,
@@ -370,7 +370,7 @@ def calibrate_lens(
     command.run([], True, dry_run, measure, "nothing moves", with_arm=False)
 
 
-@calibrate_app.command("crop")
+@calibrate_app.command("crop", epilog="Example: sliplab calibrate crop --rig my-rig.yaml")
 def calibrate_crop(
     rig: RigOption,
     depth: Annotated[
@@ -400,7 +400,7 @@ def calibrate_crop(
     command.run(moves, yes, dry_run, lambda session: steps.calibrate_crop(session, depth, radius))
 
 
-@calibrate_app.command("board")
+@calibrate_app.command("board", epilog="Example: sliplab calibrate board --out board.pdf")
 def calibrate_board(
     out: Annotated[Path, typer.Option("--out", help="Output file, .pdf or .png.")] = Path(
         "sliplab-board.pdf"

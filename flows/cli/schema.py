@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, finish
+from sliplab.flows.cli.common import PLAN, JsonOption, finish
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import one_of
@@ -15,7 +15,9 @@ from sliplab.protocols.shown import one_of
 app = typer.Typer()
 
 
-@app.command()
+@app.command(
+    rich_help_panel=PLAN, epilog="Example: sliplab schema protocol --out protocol.schema.json"
+)
 def schema(
     kind: Annotated[
         str,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from sliplab.flows.cli.common import (
+    ANALYSE,
     CampaignOption,
     DaskOption,
     JsonOption,
@@ -41,7 +42,7 @@ ReviewedOption = Annotated[
 ]
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab sync my-store")
 def sync(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -65,7 +66,7 @@ def sync(
     console.show(f"Page{simulated}: {Path(result['page']).resolve()}")
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab label my-store")
 def label(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -76,7 +77,7 @@ def label(
     step(store, campaign, as_json, "label", dask=dask)
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab train my-store")
 def train(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -88,7 +89,7 @@ def train(
     step(store, campaign, as_json, "train", dask=dask, reviewed=reviewed)
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab evaluate my-store")
 def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -190,7 +191,7 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
     return shown
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab report my-store")
 def report(
     store: PlaceArgument,
     campaign: CampaignOption = None,

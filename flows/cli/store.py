@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sliplab.flows.cli.common import (
+    DATA,
     CampaignOption,
     JsonOption,
     PlaceArgument,
@@ -38,7 +39,7 @@ SHOWN = (
 """Columns of the catalogue that fit a terminal."""
 
 
-@app.command()
+@app.command(rich_help_panel=DATA, epilog="Example: sliplab trials my-store")
 def trials(
     store: PlaceArgument,
     where: Annotated[
@@ -96,7 +97,7 @@ def trials(
         )
 
 
-@app.command()
+@app.command(rich_help_panel=DATA, epilog="Example: sliplab verify my-store")
 def verify(
     store: PlaceArgument,
     quarantine: Annotated[
@@ -178,7 +179,7 @@ def verify(
         raise typer.Exit(console.FAILED)
 
 
-@app.command()
+@app.command(rich_help_panel=DATA, epilog="Example: sliplab migrate my-store")
 def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     """Migrate an older store to the current format; changed files are backed up first.
 
@@ -215,7 +216,7 @@ FOLLOW_S = 30.0
 """Period of `push --follow`, s."""
 
 
-@app.command()
+@app.command(rich_help_panel=DATA, epilog="Example: sliplab push my-store s3://bucket/my-store")
 def push(
     store: StoreArgument,
     url: UrlArgument,
@@ -276,7 +277,7 @@ def push(
     _finish({"url": remote.url, "simulated": opened.simulated, **vars(done)}, "push", as_json)
 
 
-@app.command()
+@app.command(rich_help_panel=DATA, epilog="Example: sliplab pull s3://bucket/my-store my-copy")
 def pull(
     url: UrlArgument,
     store: Annotated[Path, typer.Argument(help="The store's folder; created if missing.")],

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.flows.cli.common import (
+    ANALYSE,
     CampaignOption,
     JsonOption,
     RigOption,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab study my-study --rig mock --pilot")
 def study(
     folder: Annotated[Path, typer.Argument(help="The study's store; created if missing.")],
     rig: RigOption = Path("rehearsal"),
@@ -91,7 +92,7 @@ def _status(folder: Path, as_json: bool) -> None:
         print_rows(rows)
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab demo")
 def demo(
     folder: Annotated[Path, typer.Argument(help="Folder for the demo's store.")] = Path(
         "sliplab-demo"
@@ -153,7 +154,7 @@ def _chain(
     console.show(f"Report{simulated}: {page.resolve()}")
 
 
-@app.command()
+@app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab holdout my-study")
 def holdout(
     folder: StoreArgument,
     trials: Annotated[

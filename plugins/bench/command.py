@@ -14,7 +14,7 @@ from sliplab.flows.running import console
 app = typer.Typer()
 
 
-@app.command()
+@app.command(epilog="Example: sliplab bench --small")
 def bench(
     detectors: Annotated[
         list[str] | None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption
+from sliplab.flows.cli.common import DATA, CampaignOption, JsonOption
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command("export-model")
+@app.command(
+    "export-model",
+    rich_help_panel=DATA,
+    epilog="Example: sliplab export-model my-store/models/seed0.pt --out exported",
+)
 def export_model(
     model: Annotated[Path, typer.Argument(help="A trained network: STORE/models/seed0.pt.")],
     out: Annotated[Path, typer.Option("--out", help="Output folder; created if missing.")],

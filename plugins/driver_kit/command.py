@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, finish
+from sliplab.flows.cli.common import PLAN, JsonOption, finish
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import one_of
 
@@ -17,7 +17,7 @@ new_app = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.add_typer(new_app, name="new")
+app.add_typer(new_app, name="new", rich_help_panel=PLAN)
 
 
 @new_app.callback()
@@ -25,7 +25,7 @@ def new() -> None:
     """Write a package to start from."""
 
 
-@new_app.command("driver")
+@new_app.command("driver", epilog="Example: sliplab new driver my_arm --kind arm")
 def driver(
     name: Annotated[
         str, typer.Argument(help="Name of the driver, as rig files will write it: my_arm.")

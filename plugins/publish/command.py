@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption, PlaceArgument, finish, located
+from sliplab.flows.cli.common import (
+    DATA,
+    CampaignOption,
+    JsonOption,
+    PlaceArgument,
+    finish,
+    located,
+)
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, one_of
@@ -20,7 +27,10 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command(
+    rich_help_panel=DATA,
+    epilog="Example: sliplab publish my-store --as croissant --output published",
+)
 def publish(
     store: PlaceArgument,
     form: Annotated[str, typer.Option("--as", help="Format: croissant or mcap or lerobot.")],

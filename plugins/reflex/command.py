@@ -13,7 +13,7 @@ from sliplab.flows.running import console
 app = typer.Typer()
 
 
-@app.command()
+@app.command(epilog="Example: sliplab reflex my-study --rig mock_gripper")
 def reflex(
     model: Annotated[
         Path,

@@ -28,7 +28,7 @@ SCENE_OUT = Path("sliplab-tradeoff")
 app = typer.Typer()
 
 
-@app.command()
+@app.command(epilog="Example: sliplab tradeoff --detector my-study")
 def tradeoff(
     scene: Annotated[
         Path | None, typer.Option("--scene", help="The protocol whose scene is simulated (YAML).")
@@ -268,7 +268,7 @@ def _detector(
     console.show(f"Page{simulated}: {(target / PAGE).resolve()}")
 
 
-@app.command()
+@app.command(epilog="Example: sliplab generalise my-study")
 def generalise(
     folder: StoreArgument,
     factor: Annotated[
@@ -315,7 +315,7 @@ def generalise(
     console.say(f"stored in {result.file}; the next report shows it")
 
 
-@app.command()
+@app.command(epilog="Example: sliplab guesses my-study")
 def guesses(
     folder: StoreArgument,
     guess: Annotated[

@@ -52,7 +52,9 @@ def _only(found: list[Collected]) -> Collected:
     return found[0]
 
 
-@app.command("scene")
+@app.command(
+    "scene", epilog="Example: sliplab calibrate scene my-store --rig my-rig.yaml --out twin.yaml"
+)
 def calibrate_scene(
     folder: StoreArgument,
     rig: RigOption,
@@ -135,7 +137,7 @@ def calibrate_scene(
         raise typer.Exit(console.FAILED)
 
 
-@app.command("drift")
+@app.command("drift", epilog="Example: sliplab calibrate drift my-store --rig twin.yaml")
 def calibrate_drift(
     folder: StoreArgument,
     rig: RigOption,
@@ -195,7 +197,10 @@ def calibrate_drift(
         raise typer.Exit(console.FAILED)
 
 
-@app.command("gap")
+@app.command(
+    "gap",
+    epilog="Example: sliplab calibrate gap my-store --rig twin.yaml --protocol kinematic --out gap",
+)
 def calibrate_gap(
     folder: StoreArgument,
     rig: Annotated[Path, typer.Option("--rig", help="The twin's rig file (YAML).")],

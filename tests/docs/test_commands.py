@@ -6,7 +6,8 @@ Commands in blocks must be complete. In prose a command may be named without its
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,31 @@ def test_every_printed_command_is_one_that_there_is(page: Path) -> None:
         if (fault := _fault(command)) is not None
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def _leaves(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, each in getattr(command, "commands", {}).items():
+        yield from _leaves(each, (*words, name))
+    if not hasattr(command, "commands"):
+        yield words, command
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [pytest.param(*leaf, id=" ".join(leaf[0])) for leaf in _leaves(ROOT_COMMAND)],
+)
+def test_help_ends_with_an_example_that_can_be_run(words: tuple[str, ...], command: Any) -> None:
+    start, program, *example = shlex.split(command.epilog)
+    assert (start, program) == ("Example:", "sliplab")
+    assert tuple(example[: len(words)]) == words
+    assert _sliplab_fault(example, whole=True) is None
+
+
+def test_commands_stand_in_groups_research_last() -> None:
+    panels = dict.fromkeys(
+        getattr(each, "rich_help_panel", None) for each in ROOT_COMMAND.commands.values()
+    )
+    assert list(panels) == ["Plan", "Collect", "Rig", "Analyse", "Data", "Research"]
 
 
 def _fault(command: Command) -> str | None:

@@ -14,7 +14,7 @@ from sliplab.protocols.shown import plural
 app = typer.Typer()
 
 
-@app.command()
+@app.command(epilog="Example: sliplab stress my-study")
 def stress(
     store: StoreArgument,
     names: CampaignOption = None,

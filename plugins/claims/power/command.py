@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command(epilog="Example: sliplab power my-protocol.yaml --store my-store")
 def power(
     protocol: ProtocolArgument,
     store: Annotated[
