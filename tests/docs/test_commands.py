@@ -75,6 +75,8 @@ def _sliplab_fault(words: Sequence[str], whole: bool) -> str | None:
     while hasattr(command, "commands"):
         if not rest or rest[0] == "COMMAND":
             return None  # `sliplab` by itself
+        if rest == ["--help"]:
+            return None
         command, rest = command.commands.get(rest[0]), rest[1:]
         if command is None:
             return "no such command"
