@@ -4,6 +4,8 @@ BIN := .venv/bin
 # several workers share the cores: threads of one would wait for those of the others
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 DONE := .venv/.installed
+DEMO := .venv/.demo
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
 # what one worker or program has compiled, the others need not
 unexport PYTHONDONTWRITEBYTECODE
@@ -13,12 +15,19 @@ unexport PYTHONDONTWRITEBYTECODE
 
 setup: $(DONE)
 
-$(DONE): pyproject.toml setup.py constraints.txt
+NEEDS := pyproject.toml setup.py constraints.txt
+$(DONE): $(NEEDS)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $(DONE)
+	$(PIP) '.[dev]'
+	touch $(DEMO) $(DONE)
 
-demo: $(DONE)
+# only what the demo needs: no drivers, linters and formats
+$(DEMO): $(NEEDS)
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(PIP) '.[learn]'
+	touch $(DEMO)
+
+demo: $(DEMO)
 	$(BIN)/sliplab demo
 
 QUICK := -n 2 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not programs and not long'
