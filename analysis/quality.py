@@ -431,7 +431,7 @@ def _hold_slip_px(frame_ns: I64, tracks: list[Any], sync: TrialSync, moving_ns: 
 
 
 @njit(cache=True, nogil=True)
-def _event_burst(event_us):  # type: ignore[no-untyped-def]
+def _event_burst(event_us: I64) -> int:
     """Count the most events in any 10 ms that begin with an event."""
     most, end = 0, 0
     for begin in range(len(event_us)):

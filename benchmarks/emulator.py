@@ -102,7 +102,7 @@ def emulate(emulator: Any, path: F64, optics: EventOptics, threshold: F64) -> Ev
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw(discs, contrast, edge, picture):  # type: ignore[no-untyped-def]
+def draw(discs: F64, contrast: float, edge: float, picture: F64) -> None:
     """Intensity of discs on their ground, 255 at most, into `picture` (height, width).
 
     Args:

@@ -133,7 +133,7 @@ def truth(stated: Stated, values: F64, grid: Grid) -> float:
     if stated.between is None:
         return quantile(values, share)
     name, *levels = stated.between
-    of = np.array([float(dict(trial.condition)[name]) for trial in grid.trials])  # type: ignore[arg-type]
+    of = np.array([float(dict(trial.condition)[name]) for trial in grid.trials])
     first, second = (quantile(values[:, of == level], share) for level in levels)
     return abs(second - first)
 

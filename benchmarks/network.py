@@ -123,7 +123,7 @@ def _training(
                     out = forward(torch.from_numpy(kept[rows].astype(np.float32)))
                     loss = nn.functional.cross_entropy(out, torch.from_numpy(y[rows]))
                     optimizer.zero_grad()
-                    loss.backward()  # type: ignore[no-untyped-call]
+                    loss.backward()
                     optimizer.step()
                 with torch.no_grad():
                     forward(torch.from_numpy(kept[split:].astype(np.float32)))

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.storage.kernels import njit
-
-Floats = NDArray[np.float64]
+from sliplab.storage.streams import F64, I64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def median(values):  # type: ignore[no-untyped-def]
+def median(values: F64) -> float:
     """Return the same as np.median for at least one float and no NaN."""
     half = values.size // 2
     parted = np.partition(values, half)
@@ -37,7 +36,7 @@ def quantile(values: NDArray[np.float64 | np.int64], share: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pair(predicted, y, gate):  # type: ignore[no-untyped-def]
+def pair(predicted: F64, y: F64, gate: float) -> tuple[I64, I64]:
     """Pulses that are each other's nearest and closer than `gate`.
 
     Args:
@@ -68,7 +67,7 @@ def pair(predicted, y, gate):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def partners(predicted, y, reach):  # type: ignore[no-untyped-def]
+def partners(predicted: F64, y: F64, reach: float) -> tuple[I64, I64]:
     """Indices of all pairs of pulses less than `reach` ns apart (as far, if y is the earlier)."""
     low = high = count = 0
     for k in range(predicted.size):
@@ -91,7 +90,7 @@ def partners(predicted, y, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fullest(ordered, window):  # type: ignore[no-untyped-def]
+def fullest(ordered: F64, window: float) -> float:
     """Return the first ascending number from which the most lie within `window`; 0 of none."""
     best, start, end = 0, 0.0, 0
     for k in range(ordered.size):
@@ -103,7 +102,7 @@ def fullest(ordered, window):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def places_of(x, knots):  # type: ignore[no-untyped-def]
+def places_of(x: F64, knots: F64) -> tuple[I64, F64]:
     """Return the piece between two knots for each rising x, and its place on it, from 0 to 1."""
     piece, share = np.empty(x.size, np.int64), np.empty(x.size)
     k = 0
@@ -115,7 +114,9 @@ def places_of(x, knots):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(piece, share, y, residuals, gate, limit, n):  # type: ignore[no-untyped-def]
+def normal_equations(
+    piece: I64, share: F64, y: F64, residuals: F64, gate: float, limit: float, n: int
+) -> tuple[F64, F64]:
     """Normal equations of the values at n knots: matrix (n, n) and right side (n,).
 
     Args:
@@ -143,7 +144,7 @@ def normal_equations(piece, share, y, residuals, gate, limit, n):  # type: ignor
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def residuals_at(piece, share, y, values):  # type: ignore[no-untyped-def]
+def residuals_at(piece: I64, share: F64, y: F64, values: F64) -> F64:
     """y less the line at every pulse."""
     result = np.empty(y.size)
     for j in range(y.size):
@@ -153,7 +154,17 @@ def residuals_at(piece, share, y, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # type: ignore[no-untyped-def]
+def robust_values(
+    piece: I64,
+    share: F64,
+    y: F64,
+    line: F64,
+    values: F64,
+    floor: float,
+    gate: float,
+    huber: float,
+    until: float,
+) -> tuple[F64, F64, NDArray[np.bool_]]:
     """Huber's M-estimate of the values at knots, by weights again and again, 20 times at the most.
 
     Args:
@@ -208,7 +219,18 @@ def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def changes(x, piece, share, residuals, gate, limit, clip, inverse, every, apart):  # type: ignore[no-untyped-def]
+def changes(
+    x: F64,
+    piece: I64,
+    share: F64,
+    residuals: F64,
+    gate: float,
+    limit: float,
+    clip: float,
+    inverse: F64,
+    every: int,
+    apart: int,
+) -> tuple[float, int, float, float, float, float, float, float, int]:
     """Test the residuals of a line with knots for a change of its slope, and for a step.
 
     Each is tried at pulse after pulse, in addition to the line's own freedom: what is left of
@@ -309,7 +331,7 @@ def changes(x, piece, share, residuals, gate, limit, clip, inverse, every, apart
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def largest_sizes(draws, root):  # type: ignore[no-untyped-def]
+def largest_sizes(draws: F64, root: F64) -> F64:
     """Return the largest absolute element of each of (m, k) draws times a lower triangle.
 
     Draws that are stored column by column are the quickest.
@@ -327,7 +349,7 @@ def largest_sizes(draws, root):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def most_off(width, fits, low, high, at_ends):  # type: ignore[no-untyped-def]
+def most_off(width: int, fits: I64, low: I64, high: I64, at_ends: bool) -> int:
     """Of windows of `width` reference pulses: how many are off the line while the device has some.
 
     Args:
@@ -347,7 +369,7 @@ def most_off(width, fits, low, high, at_ends):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_shift(there, at, most):  # type: ignore[no-untyped-def]
+def best_shift(there: NDArray[np.int8], at: I64, most: int) -> tuple[int, int]:
     """Of pulses up to one, or behind one: how many more have a partner some ticks away, at most.
 
     Args:

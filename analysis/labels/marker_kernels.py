@@ -12,8 +12,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, U8
 
 LOST, WHOLE, PARTIAL = 0, 1, 2
 FLANK = 0.06
@@ -31,7 +33,7 @@ _KEEPS_UP = 0.02
 
 
 @njit(cache=True, nogil=True)
-def _line(frame, y, left, right):  # type: ignore[no-untyped-def]
+def _line(frame: U8, y: int, left: int, right: int) -> tuple[float, int, float]:
     """Sum, pixels, and sum of squared steps of a piece of a row; none of it outside the picture."""
     left, right = max(left, 0), min(right, frame.shape[1])
     if not 0 <= y < frame.shape[0] or left >= right:
@@ -78,7 +80,16 @@ def _levels(frame: Any, left: int, top: int, side: int, radius: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _box_sums(frame, left, top, side, low, high, c, y):  # type: ignore[no-untyped-def]
+def _box_sums(
+    frame: U8,
+    left: int,
+    top: int,
+    side: int,
+    low: int,
+    high: int,
+    c: npt.NDArray[np.int32],
+    y: npt.NDArray[np.int32],
+) -> tuple[int, int, int]:
     """Weight and weighted sums of x and y in a square box; four rows at a time.
 
     `c` and `y` are scratch, int32: column sums, and their running sums, which hold y.
@@ -107,7 +118,9 @@ def _box_sums(frame, left, top, side, low, high, c, y):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def _disc_sums(frame, cx, cy, reach, cuts, low, high):  # type: ignore[no-untyped-def]
+def _disc_sums(
+    frame: U8, cx: int, cy: int, reach: float, cuts: F64, low: int, high: int
+) -> tuple[int, int, int]:
     """The same in a disc, less what lies beyond a cut (x0, y0) in its direction (dx, dy)."""
     height, width = frame.shape
     far = int(np.ceil(reach))
@@ -145,7 +158,9 @@ def _near_cuts(xy: Any, k: int, x: float, y: float, known: Any, reach: float, cu
 
 
 @njit(cache=True, nogil=True)
-def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-untyped-def]
+def _stands_free(
+    xy: F64, k: int, left: int, top: int, side: int, radius: float, shape: tuple[int, int]
+) -> bool:
     """Return True where a box lies in the image and no other marker can appear in it."""
     if left < 0 or top < 0 or left + side > shape[1] or top + side > shape[0]:
         return False

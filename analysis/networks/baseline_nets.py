@@ -220,7 +220,7 @@ def _one_epoch(
             net(_dense(windows.take(rows))), torch.from_numpy(train.y[rows])
         )
         optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        loss.backward()
         optimizer.step()
         falling.step()
 

@@ -207,7 +207,7 @@ class ExactConvolution(nn.Conv2d):
             for side, pad, kernel, step in zip(x.shape[2:], pads, size, stride, strict=True)
         )
         taps = nn.functional.unfold(x, size, padding=pads, stride=stride)
-        return (self.weight.flatten(1) @ taps).unflatten(2, (rows, columns))  # type: ignore[no-untyped-call]
+        return (self.weight.flatten(1) @ taps).unflatten(2, (rows, columns))
 
 
 def exact_net(net: nn.Sequential) -> nn.Sequential:

@@ -239,7 +239,7 @@ def print_board(board: Board, path: Path) -> dict[str, float]:
     }
 
 
-def _squares(board: Board, axes: object, corner: tuple[float, float]) -> None:
+def _squares(board: Board, axes: Any, corner: tuple[float, float]) -> None:
     """Draw the board as black rectangles, row by row of the markers' modules."""
     from matplotlib.collections import PolyCollection
 
@@ -276,4 +276,4 @@ def _squares(board: Board, axes: object, corner: tuple[float, float]) -> None:
                         module,
                     )
     shapes = PolyCollection(quads, facecolors="black", edgecolors="none", antialiased=False)
-    axes.add_collection(shapes)  # type: ignore[attr-defined]
+    axes.add_collection(shapes)

@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from sliplab.rigs.rig_file import RigFile
 
 app = typer.Typer()
-_SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
-teach_app = typer.Typer(help="Teach plane, depth zero and tool of a rig.", **_SETTINGS)  # type: ignore[arg-type]
-calibrate_app = typer.Typer(help="Calibrate cameras, or a simulated scene.", **_SETTINGS)  # type: ignore[arg-type]
+_SETTINGS: dict[str, Any] = {
+    "no_args_is_help": True,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+teach_app = typer.Typer(help="Teach plane, depth zero and tool of a rig.", **_SETTINGS)
+calibrate_app = typer.Typer(help="Calibrate cameras, or a simulated scene.", **_SETTINGS)
 app.add_typer(teach_app, name="teach", rich_help_panel=RIG)
 app.add_typer(calibrate_app, name="calibrate", rich_help_panel=RIG)
 

@@ -27,7 +27,7 @@ from sliplab.storage.formats.foreign import (
 from sliplab.storage.formats.format import Format
 from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Lost
-from sliplab.storage.streams import EventChunk
+from sliplab.storage.streams import U8, EventChunk
 
 LIBRARY = "faery"
 EVENT_STREAM = b"Event Stream"
@@ -121,7 +121,7 @@ def _rest(path: Path, begin: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _rest_of(content, overflow):  # type: ignore[no-untyped-def]
+def _rest_of(content: U8, overflow: np.uint8) -> int:
     """Return the bytes behind the last whole event: 5 bytes each, or 1 that lets time pass."""
     at = whole = 0
     while at < len(content):

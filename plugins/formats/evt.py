@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from sliplab.storage.formats.foreign import LATEST_US
 from sliplab.storage.kernels import njit
-from sliplab.storage.streams import I64
+from sliplab.storage.streams import I64, U8, U16
 
 OUTSIDE, FELL, LATE = 1, 2, 3
 """Faults of a word: a pixel that the camera has not, a high part that fell, a time too late."""
@@ -116,7 +116,7 @@ class Encoding:
 
 
 @njit(cache=True, nogil=True)
-def _any_edge(words, type_bit):  # type: ignore[no-untyped-def]
+def _any_edge(words: npt.NDArray[Any], type_bit: int) -> bool:
     found = False
     for i in range(len(words)):
         found |= np.uint64(words[i]) >> np.uint64(type_bit) == _EXT_TRIGGER
@@ -141,7 +141,7 @@ def new_state(t0_us: int, x_bits: int = 0, y_bits: int = 0) -> I64:
 
 
 @njit(cache=True, nogil=True)
-def _turned(value, high, high_us, highs, unit_us):  # type: ignore[no-untyped-def]
+def _turned(value: int, high: int, high_us: int, highs: int, unit_us: int) -> tuple[int, int]:
     """Return the time of a new high part, us, and 0 or a fault.
 
     It begins again at 0 if it falls by half of its range or more. A step ahead by nearly all of it
@@ -166,7 +166,7 @@ def _turned(value, high, high_us, highs, unit_us):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def _raised(at, now, state):  # type: ignore[no-untyped-def]
+def _raised(at: int, now: int, state: I64) -> int:
     """Return the time of an event at a time, which is not before `now`."""
     if at < now:
         state[RAISED] += 1
@@ -176,7 +176,7 @@ def _raised(at, now, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _last_bit(valid):  # type: ignore[no-untyped-def]
+def _last_bit(valid: int) -> int:
     """Return the number of the highest bit that is set; there is one."""
     bit = 0
     while valid >> (bit + 1):
@@ -185,7 +185,19 @@ def _last_bit(valid):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+def decode_evt3(
+    words: U16,
+    at: int,
+    filled: int,
+    state: I64,
+    width: int,
+    height: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    t: I64,
+    edges: I64,
+) -> tuple[int, int]:
     """Decode 16-bit words, which say what changed: time, row, and columns alone or as vectors.
 
     A vector stands at the last base, which it moves on; a single event leaves that alone.
@@ -223,7 +235,7 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
             low = value
         elif kind in (_VECT_12, _VECT_8):
             size = 12 if kind == _VECT_12 else 8
-            valid = value & ((1 << size) - 1)
+            valid: Any = value & ((1 << size) - 1)
             if valid and high >= 0:
                 last = _last_bit(valid)
                 if base + last >= width or row >= height:
@@ -257,7 +269,19 @@ def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # 
 
 
 @njit(cache=True, nogil=True)
-def decode_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+def decode_evt2(
+    words: npt.NDArray[np.uint32],
+    at: int,
+    filled: int,
+    state: I64,
+    width: int,
+    height: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    t: I64,
+    edges: I64,
+) -> tuple[int, int]:
     """Decode 32-bit words, each with a pixel and 6 bits of time; otherwise as `decode_evt3`."""
     state[FAULT] = 0
     while at < len(words) and filled <= len(t) - ROOM and state[EDGES] < len(edges):
@@ -275,7 +299,16 @@ def decode_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # 
 
 
 @njit(cache=True, nogil=True)
-def _plain_evt2(words, state, width, height, x, y, p, t):  # type: ignore[no-untyped-def]
+def _plain_evt2(
+    words: npt.NDArray[np.uint32],
+    state: I64,
+    width: int,
+    height: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    t: I64,
+) -> int:
     """Decode events and high parts, without a branch: which comes next is hard to foresee.
 
     Returns:
@@ -311,7 +344,19 @@ def _plain_evt2(words, state, width, height, x, y, p, t):  # type: ignore[no-unt
 
 
 @njit(cache=True, nogil=True)
-def _each_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+def _each_evt2(
+    words: npt.NDArray[np.uint32],
+    at: int,
+    filled: int,
+    state: I64,
+    width: int,
+    height: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    t: I64,
+    edges: I64,
+) -> tuple[int, int]:
     """Decode words of EVT 2.0 of any kind, one by one."""
     now, high_us, high, edge = state[NOW], state[HIGH_US], state[HIGH], state[EDGES]
     fault = 0
@@ -346,13 +391,25 @@ def _each_evt2(words, at, filled, state, width, height, x, y, p, t, edges):  # t
 
 
 @njit(cache=True, nogil=True)
-def decode_evt21(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+def decode_evt21(
+    words: npt.NDArray[np.uint64],
+    at: int,
+    filled: int,
+    state: I64,
+    width: int,
+    height: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    t: I64,
+    edges: I64,
+) -> tuple[int, int]:
     """Decode 64-bit words: one of EVT 2.0, and 32 bits that say which pixels from its column on."""
     now, high_us, high, edge = state[NOW], state[HIGH_US], state[HIGH], state[EDGES]
     fault = 0
     while at < len(words) and filled <= len(t) - ROOM and edge < len(edges):
         word = np.int64(words[np.uintp(at)] >> np.uint64(32))
-        valid = np.int64(words[np.uintp(at)] & np.uint64(0xFFFFFFFF))
+        valid: Any = np.int64(words[np.uintp(at)] & np.uint64(0xFFFFFFFF))
         kind, value = word >> 28, word & (_HIGHS_2 - 1)
         if kind == _TIME_HIGH:
             found, fault = _turned(value, high, high_us, _HIGHS_2, 64)
@@ -382,7 +439,19 @@ def decode_evt21(words, at, filled, state, width, height, x, y, p, t, edges):  #
 
 
 @njit(cache=True, nogil=True)
-def decode_dat(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
+def decode_dat(
+    words: npt.NDArray[np.uint64],
+    at: int,
+    filled: int,
+    state: I64,
+    width: int,
+    height: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    t: I64,
+    edges: I64,
+) -> tuple[int, int]:
     """Decode 64-bit words: 32 bits of time, column, row, and 4 bits above, 0 of an OFF event.
 
     A time that falls by more than half of its range has begun again at 0.
@@ -409,7 +478,9 @@ def decode_dat(words, at, filled, state, width, height, x, y, p, t, edges):  # t
 
 
 @njit(cache=True, nogil=True)
-def _split_places(words, x_bits, y_bits, x, y):  # type: ignore[no-untyped-def]
+def _split_places(
+    words: npt.NDArray[np.uint64], x_bits: int, y_bits: int, x: U16, y: U16
+) -> tuple[np.uint16, np.uint16]:
     """Fill columns and rows, without a branch in the loop; return the largest of each."""
     most_x = most_y = np.uint16(0)
     for i in range(len(words)):
@@ -420,7 +491,9 @@ def _split_places(words, x_bits, y_bits, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _split_times(words, place_bits, turns_us, p, t):  # type: ignore[no-untyped-def]
+def _split_times(
+    words: npt.NDArray[np.uint64], place_bits: int, turns_us: int, p: U8, t: I64
+) -> bool:
     """Fill polarities and times, the latter after `turns_us`; return whether a time falls."""
     for i in range(len(words)):
         p[i] = words[i] >> np.uint64(32 + place_bits) & np.uint64(0xF) != 0
@@ -432,7 +505,7 @@ def _split_times(words, place_bits, turns_us, p, t):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _mend(x, y, t, state, width, height):  # type: ignore[no-untyped-def]
+def _mend(x: U16, y: U16, t: I64, state: I64, width: int, height: int) -> int:
     """Raise times that fall, count turns of the clock, and stop at a fault; return rows before."""
     now, turned_us = state[NOW], 0
     for i in range(len(t)):

@@ -226,7 +226,7 @@ class MockFrameCamera:
 
 
 @njit(cache=True, nogil=True)
-def _blank_cut(place_px, reach_px, width, height):  # type: ignore[no-untyped-def]
+def _blank_cut(place_px: F64, reach_px: F64, width: int, height: int) -> None:
     """NaN where a square about a place, (k, m, 2), leaves the picture; half sides (k, m)."""
     for k in range(place_px.shape[0]):
         for i in range(place_px.shape[1]):

@@ -98,7 +98,7 @@ class History:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _join(times, rows, after, t_ns, result):  # type: ignore[no-untyped-def]
+def _join(times: I64, rows: F64, after: I64, t_ns: I64, result: F64) -> None:
     """Interpolate rows linearly at `t_ns` into `result`; `after` is the first row not before."""
     last = len(times) - 1
     for k in range(len(t_ns)):

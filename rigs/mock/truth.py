@@ -199,7 +199,9 @@ def _onsets(
 
 
 @njit(cache=True, nogil=True)
-def _first_beyond(rows, start, n, moved_mm, slid_mm):  # type: ignore[no-untyped-def]
+def _first_beyond(
+    rows: F64, start: F64, n: int, moved_mm: float, slid_mm: float
+) -> tuple[I64, I64]:
     """Return the first rows in which a marker has moved and its tip has slid farther; else 0."""
     moved, slid = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for k in range(1, len(rows)):

@@ -40,7 +40,7 @@ _L1, _L2, _L3, _L4, _L5, _L6, _L7 = (
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def exp_minus(exponent):  # type: ignore[no-untyped-def]
+def exp_minus(exponent: float) -> float:
     """Return exp(-exponent) for an `exponent` >= 0; above 700 it counts as 700."""
     x = exponent if exponent < _LARGEST else _LARGEST
     marked = x * _PER_LN2 + _WHOLE
@@ -57,7 +57,7 @@ def exp_minus(exponent):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def logarithm(x):  # type: ignore[no-untyped-def]
+def logarithm(x: float) -> float:
     """Natural logarithm of a normal number above 0."""
     bits = np.float64(x).view(np.int64) + (_ONE - _ROOT_HALF)
     # the exponent as a float, from its bits: wide registers have no other conversion

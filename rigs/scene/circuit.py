@@ -90,7 +90,7 @@ def new_circuit(on: F64, off: F64, leak_hz: F64, cutoff_hz: float) -> Circuit:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def memorise_image(circuit, discs, contrast, edge, phase):  # type: ignore[no-untyped-def]
+def memorise_image(circuit: Circuit, discs: F64, contrast: float, edge: float, phase: F64) -> None:
     """Set every cell to the image of `discs` (column, row, radius; (n, 3)), settled.
 
     Args:
@@ -120,7 +120,7 @@ def memorise_image(circuit, discs, contrast, edge, phase):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def start_cells(circuit, t_ns):  # type: ignore[no-untyped-def]
+def start_cells(circuit: Circuit, t_ns: int) -> None:
     """Set every cell to rest from `t_ns` on."""
     height, width = circuit.since.shape
     for y in range(height):
@@ -129,7 +129,7 @@ def start_cells(circuit, t_ns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _rest(circuit, x, y, t_ns):  # type: ignore[no-untyped-def]
+def _rest(circuit: Circuit, x: int, y: int, t_ns: int) -> None:
     """The cell's input does not change from `t_ns` on, and its low pass has settled."""
     cell = circuit.cells[y, x]
     circuit.since[y, x] = t_ns
@@ -141,7 +141,7 @@ def _rest(circuit, x, y, t_ns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _wake(circuit, x, y, t_ns):  # type: ignore[no-untyped-def]
+def _wake(circuit: Circuit, x: int, y: int, t_ns: int) -> None:
     """The cell's input may change from `t_ns` on."""
     if circuit.due[y, x] == NEVER:
         return
@@ -153,7 +153,9 @@ def _wake(circuit, x, y, t_ns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _difference(t, p0, p1, p2, rest, pace, leak):  # type: ignore[no-untyped-def]
+def _difference(
+    t: float, p0: float, p1: float, p2: float, rest: float, pace: float, leak: float
+) -> tuple[float, float]:
     """Seen less memorised level of a pixel at t of a part, and its rate."""
     value, rate = p0 + t * (p1 + leak + t * p2), p1 + leak + 2.0 * t * p2
     if pace > 0.0:
@@ -164,7 +166,19 @@ def _difference(t, p0, p1, p2, rest, pace, leak):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance(cell, h, middle, end, pace, contrast, fires, head, begin, out, n):  # type: ignore[no-untyped-def]
+def advance(
+    cell: F64,
+    h: float,
+    middle: float,
+    end: float,
+    pace: float,
+    contrast: float,
+    fires: bool,
+    head: int,
+    begin: float,
+    out: I64,
+    n: int,
+) -> int:
     """Apply a parabolic input to a cell for `h` ns.
 
     Args:
@@ -225,7 +239,7 @@ def advance(cell, h, middle, end, pace, contrast, fires, head, begin, out, n):  
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pace(cutoff, level, contrast):  # type: ignore[no-untyped-def]
+def _pace(cutoff: float, level: float, contrast: float) -> float:
     """Rate of the low pass of a pixel that sees `level`, 1/ns."""
     if cutoff <= 0.0:
         return 0.0
@@ -233,25 +247,25 @@ def _pace(cutoff, level, contrast):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pass_rim(  # type: ignore[no-untyped-def]
-    cell,
-    x,
-    y,
-    first,
-    last,
-    fires,
-    since,
-    until,
-    inverse,
-    curve,
-    arcs,
-    cutoff,
-    contrast,
-    edge,
-    head,
-    out,
-    n,
-):
+def _pass_rim(
+    cell: F64,
+    x: int,
+    y: int,
+    first: int,
+    last: int,
+    fires: bool,
+    since: F64,
+    until: F64,
+    inverse: F64,
+    curve: F64,
+    arcs: F64,
+    cutoff: float,
+    contrast: float,
+    edge: float,
+    head: int,
+    out: I64,
+    n: int,
+) -> int:
     """Apply a passing marker to a cell; see `advance`. `arcs`: largest path in each step, px."""
     for k in range(first, last):
         parts = max(int(np.ceil(arcs[k] / _PART_PX)), 1)
@@ -270,30 +284,30 @@ def _pass_rim(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def events_of_circuit(  # type: ignore[no-untyped-def]
-    circuit,
-    path,
-    row,
-    row_ns,
-    first,
-    blocks,
-    rows,
-    since,
-    until,
-    chord,
-    inverse,
-    weights,
-    inner,
-    curve,
-    spread,
-    contrast,
-    edge,
-    seen,
-    base_ns,
-    pixels,
-    events,
-    n,
-):
+def events_of_circuit(
+    circuit: Circuit,
+    path: F64,
+    row: int,
+    row_ns: I64,
+    first: I64,
+    blocks: int,
+    rows: F64,
+    since: F64,
+    until: F64,
+    chord: bool,
+    inverse: F64,
+    weights: F64,
+    inner: F64,
+    curve: F64,
+    spread: F64,
+    contrast: float,
+    edge: float,
+    seen: F64,
+    base_ns: int,
+    pixels: I64,
+    events: I64,
+    n: int,
+) -> tuple[I64, int]:
     """Events of all pixels over some blocks.
 
     Args:

@@ -24,6 +24,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.rigs.scene import springs as of
 from sliplab.rigs.scene.friction import (
@@ -60,8 +61,9 @@ from sliplab.rigs.scene.slip import (
     slows_down,
     strengthened,
 )
-from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK
+from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK, Law
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, I64
 
 LANES = 20
 """Nineteen papillae, and one more for whole registers of four."""
@@ -97,6 +99,9 @@ BLOCK = np.dtype(
 )
 """A block of tips: a row of lanes for each quantity. A processor computes four or eight numbers at
 once if they lie next to each other and if it is known beforehand how many there are."""
+Block = np.record
+Blocks = npt.NDArray[np.record]
+"""As kernels see one of them, and several."""
 _ROWS, _STATES, _CONSTANTS = len(BLOCK.names or ()), 18, 8
 _AWAY_MM = 1e6
 _LETS_GO, _SLOWS = 1.0, 2.0
@@ -119,7 +124,7 @@ class Step(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def make_blocks(table, field, state):  # type: ignore[no-untyped-def]
+def make_blocks(table: F64, field: F64, state: F64) -> Blocks:
     """Blocks for n tips, (ceil(n / LANES),); lanes left over hold papillae out of reach."""
     n = state.shape[0]
     blocks = np.zeros((n + LANES - 1) // LANES, BLOCK)
@@ -139,7 +144,7 @@ def make_blocks(table, field, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def store_state(blocks, state):  # type: ignore[no-untyped-def]
+def store_state(blocks: Blocks, state: F64) -> None:
     """Write the state of the tips in `blocks` back into rows of their own, (n, 18)."""
     flat = blocks.view(np.float64)
     for i in range(state.shape[0]):
@@ -148,14 +153,14 @@ def store_state(blocks, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _take_knot(w, field, i, j, knot):  # type: ignore[no-untyped-def]
+def _take_knot(w: Block, field: F64, i: int, j: int, knot: float) -> None:
     """Let lane `j` hold the friction of tip `i` behind a knot."""
     w.knot[j] = knot
     w.c0[j], w.c1[j], w.c2[j], w.c3[j] = cubic_at(field, i, knot)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def feel_spots(blocks, n, clean, field, spots, factors):  # type: ignore[no-untyped-def]
+def feel_spots(blocks: Blocks, n: int, clean: F64, field: F64, spots: F64, factors: F64) -> None:
     """Let every tip feel the friction of the spots on which it stands when a step begins.
 
     It keeps that friction for the step, so that it feels a spot's border a step late: a few
@@ -182,7 +187,9 @@ def feel_spots(blocks, n, clean, field, spots, factors):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def respond(w, field, law, first, count, sensor, plate_y, step):  # type: ignore[no-untyped-def]
+def respond(
+    w: Block, field: F64, law: Law, first: int, count: int, sensor: F64, plate_y: float, step: Step
+) -> None:
     """Find how a block's tips end a step; the state stays.
 
     Args:
@@ -224,7 +231,19 @@ def respond(w, field, law, first, count, sensor, plate_y, step):  # type: ignore
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _approach(w, law, x, y, depth, slope_x, slope_y, cosine, sine, plate_y, step):  # type: ignore[no-untyped-def]
+def _approach(
+    w: Block,
+    law: Law,
+    x: float,
+    y: float,
+    depth: float,
+    slope_x: float,
+    slope_y: float,
+    cosine: float,
+    sine: float,
+    plate_y: float,
+    step: Step,
+) -> tuple[int, int]:
     """Move the bases, and begin to seek the bends.
 
     Returns:
@@ -250,7 +269,7 @@ def _approach(w, law, x, y, depth, slope_x, slope_y, cosine, sine, plate_y, step
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _load(w, law, j, h, decay, gain):  # type: ignore[no-untyped-def]
+def _load(w: Block, law: Law, j: int, h: float, decay: float, gain: float) -> None:
     """Press a tip, and begin to seek the bend that it has if it sticks."""
     along, was, deep = w.along[j], w.indentation[j], w.deep[j]
     was = was if was > 0.0 else 0.0
@@ -265,13 +284,13 @@ def _load(w, law, j, h, decay, gain):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _touches_at(was, deep):  # type: ignore[no-untyped-def]
+def _touches_at(was: float, deep: float) -> float:
     """Share of a step at which a tip meets the plate; 1 if where it came from is not known."""
     return was / (was - deep) if was < 0.0 else 1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touch(w, law, j, step):  # type: ignore[no-untyped-def]
+def _touch(w: Block, law: Law, j: int, step: Step) -> None:
     """Let a tip that meets the plate in this step stand under its base where it does so."""
     was, gain = w.indentation[j], step.gain
     w.foot_x[j], w.foot_y[j] = w.to_x[j], w.to_y[j]
@@ -285,7 +304,7 @@ def _touch(w, law, j, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _bend(w):  # type: ignore[no-untyped-def]
+def _bend(w: Block) -> int:
     """Take a step of every tip towards its bend if it sticks; return how many have not found it."""
     seek = 0
     for j in range(LANES):
@@ -310,7 +329,7 @@ def _bend(w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _decide(w, law, step):  # type: ignore[no-untyped-def]
+def _decide(w: Block, law: Law, step: Step) -> tuple[int, int]:
     """Find the forces if all tips stick, and which tips do.
 
     Returns:
@@ -358,7 +377,7 @@ def _decide(w, law, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def settle(w, law, start_s, h, decay):  # type: ignore[no-untyped-def]
+def settle(w: Block, law: Law, start_s: float, h: float, decay: float) -> None:
     """Take what `respond` found as the state; `start_s`: when the step began, s."""
     for j in range(LANES):
         end, deep = w.end_mode[j], w.deep[j]
@@ -392,7 +411,7 @@ def settle(w, law, start_s, h, decay):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _slide(w, field, law, first, count, step, rare):  # type: ignore[no-untyped-def]
+def _slide(w: Block, field: F64, law: Law, first: int, count: int, step: Step, rare: int) -> None:
     """Let the tips slide whose `end_mode` says so; `rare`: how many are prepared one by one."""
     rough = field.shape[1] > 1
     if rare > 0:
@@ -450,7 +469,7 @@ def _slide(w, field, law, first, count, step, rare):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _aim(w, law):  # type: ignore[no-untyped-def]
+def _aim(w: Block, law: Law) -> None:
     """Find the directions of the slips."""
     if law.exact_turns:
         for j in range(LANES):
@@ -482,7 +501,7 @@ def _aim(w, law):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _begin(w, law, rough, step):  # type: ignore[no-untyped-def]
+def _begin(w: Block, law: Law, rough: bool, step: Step) -> None:
     """Begin the search of every slip where its earlier speeds lead."""
     per_s = 1.0 / step.h
     for j in range(LANES):
@@ -491,7 +510,17 @@ def _begin(w, law, rough, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _begin_search(w, law, j, quick, lag, slides, rough, per_s, step):  # type: ignore[no-untyped-def]
+def _begin_search(
+    w: Block,
+    law: Law,
+    j: int,
+    quick: float,
+    lag: float,
+    slides: float,
+    rough: bool,
+    per_s: float,
+    step: Step,
+) -> None:
     """Begin to seek a slip, given the speed at its end (see `strengthened`) and a guess of it."""
     new_x, new_y = w.to_x[j] - w.foot_x[j], w.to_y[j] - w.foot_y[j]
     old_x, old_y = w.old_x[j], w.old_y[j]
@@ -538,7 +567,7 @@ def _begin_search(w, law, j, quick, lag, slides, rough, per_s, step):  # type: i
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _search(w, field, law, first, count):  # type: ignore[no-untyped-def]
+def _search(w: Block, field: F64, law: Law, first: int, count: int) -> None:
     """Seek the slips of all lanes that are seeking; `seeks` is then 0 where one is found."""
     for _ in range(PASSES):
         stale = 0
@@ -555,7 +584,7 @@ def _search(w, field, law, first, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _seek(w, law):  # type: ignore[no-untyped-def]
+def _seek(w: Block, law: Law) -> int:
     """Take a step of every tip towards its slip; return how many are still searching."""
     seek = 0
     for j in range(LANES):
@@ -594,7 +623,7 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _doubtful(w):  # type: ignore[no-untyped-def]
+def _doubtful(w: Block) -> int:
     """Count the slips that were not found, or jump too far to be believed."""
     doubts = 0
     for j in range(LANES):
@@ -604,7 +633,7 @@ def _doubtful(w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _arrive(w):  # type: ignore[no-untyped-def]
+def _arrive(w: Block) -> int:
     """Move the tips that slid to their places; return how many need another knot."""
     stale = 0
     for j in range(LANES):
@@ -619,7 +648,7 @@ def _arrive(w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _pull(w, law):  # type: ignore[no-untyped-def]
+def _pull(w: Block, law: Law) -> None:
     """Find the forces of the tips that slid: on the cone at the end of the slip, to the bit."""
     for j in range(LANES):
         slides, slip = w.end_mode[j] == SLIDING, w.slip[j]
@@ -649,7 +678,7 @@ def _pull(w, law):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _let_go(w, law, j, step):  # type: ignore[no-untyped-def]
+def _let_go(w: Block, law: Law, j: int, step: Step) -> None:
     """Find when in the step a tip lets go, and with which force its slip begins."""
     grip, _ = grip_between(w.path[j], w.knot[j], w.c0[j], w.c1[j], w.c2[j], w.c3[j])
     static, before, after = 1.0 + law.static_excess, grip * w.normal[j], grip * w.end_normal[j]
@@ -672,7 +701,7 @@ def _let_go(w, law, j, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lets_go_at(guess, w, law, j, limit, step):  # type: ignore[no-untyped-def]
+def _lets_go_at(guess: float, w: Block, law: Law, j: int, limit: float, step: Step) -> float:
     """Share of a step at which a stuck tip's force meets its cone: a root of the law itself.
 
     While a tip sticks its force is a known function of time, relaxation included, so that the
@@ -702,7 +731,7 @@ def _lets_go_at(guess, w, law, j, limit, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _excess(share, w, law, j, limit, step):  # type: ignore[no-untyped-def]
+def _excess(share: float, w: Block, law: Law, j: int, limit: float, step: Step) -> float:
     """Force less `limit` times normal force of a tip that has stuck up to a share of a step, N."""
     h, swerve = step.h, step.swerve
     decay, gain = relaxing(max(share * h, 1e-12), law.relaxation_s)
@@ -727,7 +756,7 @@ def _excess(share, w, law, j, limit, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _begin_rare(w, field, law, i, j, rough, step):  # type: ignore[no-untyped-def]
+def _begin_rare(w: Block, field: F64, law: Law, i: int, j: int, rough: bool, step: Step) -> None:
     """Begin to seek the slip of tip `i` in lane `j`, which lets go or slows down fast."""
     before, after = w.before[j], w.after[j]
     if w.rare[j] == _LETS_GO:
@@ -760,13 +789,13 @@ def _begin_rare(w, field, law, i, j, rough, step):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _needs_speed(law, cone, slides_s):  # type: ignore[no-untyped-def]
+def _needs_speed(law: Law, cone: float, slides_s: float) -> bool:
     """Return whether the speed of a rare slip follows from how its force relaxes."""
     return law.strengthening > 0.0 and law.damping_s == 0.0 and cone > 0.0 and slides_s > 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _speed_at_end(w, field, law, i, j):  # type: ignore[no-untyped-def]
+def _speed_at_end(w: Block, field: F64, law: Law, i: int, j: int) -> int:
     """Take the speed of a tip that let go anew, which is soon as it is where its slip ends.
 
     Returns:
@@ -784,7 +813,19 @@ def _speed_at_end(w, field, law, i, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _take_speed(w, field, law, i, j, slip, bend, before, after, cone, more):  # type: ignore[no-untyped-def]
+def _take_speed(
+    w: Block,
+    field: F64,
+    law: Law,
+    i: int,
+    j: int,
+    slip: float,
+    bend: float,
+    before: float,
+    after: float,
+    cone: float,
+    more: float,
+) -> None:
     """Take the speed at the end of a slip from `relaxed_speed`.
 
     Args:
@@ -825,7 +866,16 @@ def _take_speed(w, field, law, i, j, slip, bend, before, after, cone, more):  # 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move_tips(blocks, n, field, law, sensor, plate_y, start_s, step):  # type: ignore[no-untyped-def]
+def move_tips(
+    blocks: Blocks,
+    n: int,
+    field: F64,
+    law: Law,
+    sensor: F64,
+    plate_y: float,
+    start_s: float,
+    step: Step,
+) -> None:
     """Advance every tip by one step; `start_s`: when it begins, s; see `respond`."""
     for k in range(blocks.shape[0]):
         first = k * LANES
@@ -834,7 +884,7 @@ def move_tips(blocks, n, field, law, sensor, plate_y, start_s, step):  # type: i
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def record(blocks, n, plate_y, track, load):  # type: ignore[no-untyped-def]
+def record(blocks: Blocks, n: int, plate_y: float, track: F64, load: F64) -> None:
     """Write the state into a row of `track` (see `track_width`) and of `load` if that has room."""
     for k in range(blocks.shape[0]):
         w, first = blocks[k], k * LANES
@@ -850,9 +900,18 @@ def record(blocks, n, plate_y, track, load):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance(  # type: ignore[no-untyped-def]
-    table, friction, law, state, t_ns, sensor, plate_y, track, load, spots
-):
+def advance(
+    table: F64,
+    friction: F64,
+    law: Law,
+    state: F64,
+    t_ns: I64,
+    sensor: F64,
+    plate_y: F64,
+    track: F64,
+    load: F64,
+    spots: F64,
+) -> None:
     """Advance tips from row to row with the plate where it is prescribed.
 
     Args:

@@ -16,12 +16,13 @@ import numpy as np
 
 from sliplab.rigs.scene.edges import CUT, rim_of
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, I64
 
 _DONE_PX = 1e-10
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def step_at(t, since, until, guess):  # type: ignore[no-untyped-def]
+def step_at(t: float, since: F64, until: F64, guess: int) -> int:
     """The step of the path that holds the time `t` of its block, searched from `guess` on."""
     k = guess
     while t > until[k]:
@@ -32,7 +33,9 @@ def step_at(t, since, until, guess):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distance_at(x, y, t, k, since, inverse, curve):  # type: ignore[no-untyped-def]
+def distance_at(
+    x: float, y: float, t: float, k: int, since: F64, inverse: F64, curve: F64
+) -> tuple[float, float, float]:
     """Distance of a pixel from the rim at a time `t` of its block, in step k, px, and its rate.
 
     Returns:
@@ -52,7 +55,7 @@ def distance_at(x, y, t, k, since, inverse, curve):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def turning(share):  # type: ignore[no-untyped-def]
+def turning(share: float) -> float:
     """Bound the turn of a unit vector whose end moves by a `share` of its distance.
 
     |u - u'| <= 2 |e - e'| / (|e| + |e'|) (Dunkl and Williams 1964), and never above 2.
@@ -61,7 +64,16 @@ def turning(share):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore[no-untyped-def]
+def may_reach(
+    ga: float,
+    gb: float,
+    slowest: float,
+    fastest: float,
+    length: float,
+    on: float,
+    off: float,
+    reach: float,
+) -> bool:
     """Return whether a distance from ga to gb in `length` ns can meet a threshold in between.
 
     Its rate lies between `slowest` <= 0 and `fastest` >= 0: both lines from each end bound it.
@@ -77,14 +89,16 @@ def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _at_row(x, y, k, curve):  # type: ignore[no-untyped-def]
+def _at_row(x: float, y: float, k: int, curve: F64) -> float:
     """Distance of a pixel from the rim at row k, px."""
     dx, dy = x - curve[0, k], y - curve[4, k]
     return np.sqrt(dx * dx + dy * dy) - curve[8, k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _node_rates(node, dx, dy, away, length, tree):  # type: ignore[no-untyped-def]
+def _node_rates(
+    node: int, dx: float, dy: float, away: float, length: float, tree: F64
+) -> tuple[float, float]:
     """Bounds of the distance's rate over the steps of a node; (dx, dy): to the pixel at its end."""
     inverse = 1.0 / away if away > 0.0 else 0.0
     ux, uy = dx * inverse, dy * inverse
@@ -98,7 +112,9 @@ def _node_rates(node, dx, dy, away, length, tree):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
+def _part_rates(
+    x: float, y: float, sa: float, sb: float, k: int, h: float, curve: F64
+) -> tuple[float, float]:
     """Bounds of the distance's rate on the part sa to sb of step k.
 
     The control points of the part of a quadratic Bezier curve are its blossom at (sa, sa),
@@ -123,7 +139,7 @@ def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def time_between(s, length, scale_a, scale_b):  # type: ignore[no-untyped-def]
+def time_between(s: float, length: float, scale_a: float, scale_b: float) -> float:
     """Time, ns, at a share `s` of the distance that a monotone segment covers in `length` ns.
 
     The cubic through both ends; `scale_a`, `scale_b`: its slopes there, ns.
@@ -133,7 +149,21 @@ def time_between(s, length, scale_a, scale_b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, curve):  # type: ignore[no-untyped-def]
+def solve(
+    x: float,
+    y: float,
+    target: float,
+    falling: bool,
+    low: float,
+    high: float,
+    t: float,
+    k: int,
+    fine: float,
+    since: F64,
+    until: F64,
+    inverse: F64,
+    curve: F64,
+) -> float:
     """Find when a distance that falls (or rises) is `target`, between the times `low` and `high`.
 
     Args:
@@ -160,31 +190,31 @@ def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def events_of_segment(  # type: ignore[no-untyped-def]
-    x,
-    y,
-    on,
-    off,
-    last_one,
-    level,
-    step,
-    ga,
-    segment,
-    base,
-    begin,
-    final,
-    since,
-    until,
-    inverse,
-    curve,
-    tree,
-    contrast,
-    edge,
-    head,
-    stack,
-    out,
-    n,
-):
+def events_of_segment(
+    x: float,
+    y: float,
+    on: float,
+    off: float,
+    last_one: float,
+    level: float,
+    step: float,
+    ga: float,
+    segment: np.record,
+    base: int,
+    begin: int,
+    final: int,
+    since: F64,
+    until: F64,
+    inverse: F64,
+    curve: F64,
+    tree: F64,
+    contrast: float,
+    edge: float,
+    head: int,
+    stack: F64,
+    out: I64,
+    n: int,
+) -> tuple[float, float, float, float, int]:
     """Events of one pixel on a segment of a block, for any course of its distance.
 
     Args:

@@ -7,8 +7,10 @@ drawn only round discs: over the whole image it would cost more than everything 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, U8
 
 SHIFTS = 128
 """A noise tile is this much wider than anything drawn from it: there are so many shifts."""
@@ -19,7 +21,7 @@ HALF_DIAGONAL = 0.7072
 
 
 @njit(cache=True, nogil=True)
-def _mix(value):  # type: ignore[no-untyped-def]
+def _mix(value: np.uint64) -> np.uint64:
     """The finaliser of SplitMix64 (Steele, Lea and Flood 2014)."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -27,14 +29,14 @@ def _mix(value):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _shift(frame_key, index):  # type: ignore[no-untyped-def]
+def _shift(frame_key: np.uint64, index: int) -> tuple[int, int]:
     """Place in the noise tile at which a patch of a picture begins: row and column, 0 to 127."""
     turn = _mix(frame_key + np.uint64(index))
     return int(turn & np.uint64(127)), int((turn >> np.uint64(8)) & np.uint64(127))
 
 
 @njit(cache=True, nogil=True)
-def add_noise(image, noise, frame_key):  # type: ignore[no-untyped-def]
+def add_noise(image: U8, noise: npt.NDArray[np.int8], frame_key: np.uint64) -> None:
     """Add a shifted patch of the tile `noise` (int8, (h, w), repeated) to `image` in place."""
     down, along = _shift(frame_key, 0)
     height, width = noise.shape
@@ -47,7 +49,7 @@ def add_noise(image, noise, frame_key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _covered(dx, dy, radius):  # type: ignore[no-untyped-def]
+def _covered(dx: float, dy: float, radius: float) -> float:
     """Share of a unit pixel at (dx, dy) >= 0 from a disc's centre that lies inside the disc.
 
     The rim is taken as straight within the pixel; a distance alone would shift centroids by
@@ -65,7 +67,9 @@ def _covered(dx, dy, radius):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _row(cx, across, outer, inner, width):  # type: ignore[no-untyped-def]
+def _row(
+    cx: float, across: float, outer: float, inner: float, width: int
+) -> tuple[int, int, int, int]:
     """A disc's row `across` pixels from its centre: first, last, and its whole pixels (end open).
 
     `outer` and `inner` are the radii between which pixels may be cut by the rim.
@@ -80,14 +84,16 @@ def _row(cx, across, outer, inner, width):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _copy(target, source):  # type: ignore[no-untyped-def]
+def _copy(target: U8, source: U8) -> None:
     """Copy a short row; assigning a slice to a slice costs three times as much."""
     for x in range(target.size):
         target[x] = source[x]
 
 
 @njit(cache=True, nogil=True)
-def _ground(image, low_x, low_y, high_x, high_y, dark, down, along):  # type: ignore[no-untyped-def]
+def _ground(
+    image: U8, low_x: int, low_y: int, high_x: int, high_y: int, dark: U8, down: int, along: int
+) -> None:
     """Noisy ground in a box; the noise sticks to the box wherever the picture cuts it off."""
     height, width = image.shape
     left, right = max(low_x, 0), min(high_x + 1, width)
@@ -105,7 +111,18 @@ def _ground(image, low_x, low_y, high_x, high_y, dark, down, along):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _sharp(image, cx, cy, radius, ground, level, dark, bright, down, along):  # type: ignore[no-untyped-def]
+def _sharp(
+    image: U8,
+    cx: float,
+    cy: float,
+    radius: float,
+    ground: int,
+    level: int,
+    dark: U8,
+    bright: U8,
+    down: int,
+    along: int,
+) -> None:
     """One disc that stands still; row + down, column + along are its places in the noise tiles."""
     height, width = image.shape
     outer, inner = radius + HALF_DIAGONAL, radius - HALF_DIAGONAL
@@ -123,7 +140,20 @@ def _sharp(image, cx, cy, radius, ground, level, dark, bright, down, along):  # 
 
 
 @njit(cache=True, nogil=True)
-def _smeared(image, path, radius, ground, level, dark, low_x, low_y, high_x, high_y, down, along):  # type: ignore[no-untyped-def]
+def _smeared(
+    image: U8,
+    path: F64,
+    radius: float,
+    ground: int,
+    level: int,
+    dark: U8,
+    low_x: int,
+    low_y: int,
+    high_x: int,
+    high_y: int,
+    down: int,
+    along: int,
+) -> None:
     """Draw the mean of one disc over its positions `path`, (s, 2)."""
     height, width = image.shape
     rows, columns = dark.shape
@@ -159,7 +189,18 @@ def _smeared(image, path, radius, ground, level, dark, low_x, low_y, high_x, hig
 
 
 @njit(cache=True, nogil=True)
-def draw_discs(image, centres, radii, paths, smeared, ground, level, dark, bright, frame_key):  # type: ignore[no-untyped-def]
+def draw_discs(
+    image: U8,
+    centres: F64,
+    radii: F64,
+    paths: F64,
+    smeared: npt.NDArray[np.bool_],
+    ground: int,
+    level: int,
+    dark: U8,
+    bright: U8,
+    frame_key: np.uint64,
+) -> None:
     """Discs with anti-aliased rims, and noise in boxes round them, on an even ground.
 
     Args:
@@ -221,7 +262,17 @@ def draw_discs(image, centres, radii, paths, smeared, ground, level, dark, brigh
 
 
 @njit(cache=True, nogil=True)
-def draw_still(images, centres, radii, drawn, ground, level, dark, bright, frame_keys):  # type: ignore[no-untyped-def]
+def draw_still(
+    images: U8,
+    centres: F64,
+    radii: F64,
+    drawn: npt.NDArray[np.bool_],
+    ground: int,
+    level: int,
+    dark: U8,
+    bright: U8,
+    frame_keys: npt.NDArray[np.uint64],
+) -> None:
     """`draw_discs` for those of k pictures, `drawn` (k,), in which nothing is smeared.
 
     `centres` are (k, n, 2), `radii` (k, n), `frame_keys` (k,) uint64.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64
 
 CUT = 5.0
 """End of the logistic edge, in units of its scale."""
@@ -23,7 +24,7 @@ FAR = 1e6
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def level_at(distance, contrast, edge):  # type: ignore[no-untyped-def]
+def level_at(distance: float, contrast: float, edge: float) -> float:
     """Log intensity over the background at a distance from the rim, px outwards."""
     if distance >= CUT * edge:
         return 0.0
@@ -34,7 +35,7 @@ def level_at(distance, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rim_of(level, contrast, edge):  # type: ignore[no-untyped-def]
+def rim_of(level: float, contrast: float, edge: float) -> float:
     """Distance from the rim at which a level is met; a large number if it never is.
 
     The two flat levels are met where the edge ends, so that what a disc does to a pixel in
@@ -50,7 +51,7 @@ def rim_of(level, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def dark_pixels(threshold, contrast, edge):  # type: ignore[no-untyped-def]
+def dark_pixels(threshold: F64, contrast: float, edge: float) -> F64:
     """State of pixels that see no disc, (height, width, 4), for their thresholds."""
     height, width = threshold.shape
     state = np.empty((height, width, 4))
@@ -64,7 +65,9 @@ def dark_pixels(threshold, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def memorise_discs(discs, contrast, edge, threshold, state, seen):  # type: ignore[no-untyped-def]
+def memorise_discs(
+    discs: F64, contrast: float, edge: float, threshold: F64, state: F64, seen: F64
+) -> None:
     """Set the reference of the pixels that see one of `discs` to its image.
 
     Args:
@@ -92,7 +95,7 @@ def memorise_discs(discs, contrast, edge, threshold, state, seen):  # type: igno
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def darken(seen, dark, state):  # type: ignore[no-untyped-def]
+def darken(seen: F64, dark: F64, state: F64) -> None:
     """Reset pixels to the dark background.
 
     Args:
@@ -112,7 +115,7 @@ def darken(seen, dark, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def widen(i, column, row, reach, seen):  # type: ignore[no-untyped-def]
+def widen(i: int, column: float, row: float, reach: float, seen: F64) -> None:
     """Widen rectangle i of `seen` to hold all within `reach` px of a place."""
     seen[i, 0], seen[i, 1] = min(seen[i, 0], column - reach), max(seen[i, 1], column + reach)
     seen[i, 2], seen[i, 3] = min(seen[i, 2], row - reach), max(seen[i, 3], row + reach)

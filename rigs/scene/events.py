@@ -62,6 +62,7 @@ from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.readout import NEVER_NS, Scans, larger, read_each, read_scans
 from sliplab.rigs.scene.rim_pixels import (
     REACH_PX,
+    RimLists,
     make_list,
     may_fire,
     near_rim,
@@ -357,7 +358,7 @@ SPAN_NS = 96_000_000
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
+def find_blocks(row_ns: I64, begin: int, block_ns: int, first: I64) -> int:
     """Blocks of a grid of `block_ns` from row `begin` on, as many as are computed together.
 
     Args:
@@ -379,20 +380,20 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def trace(  # type: ignore[no-untyped-def]
-    loads,
-    layout_mm,
-    projection,
-    row_ns,
-    camera,
-    phase_ns,
-    of_pixels,
-    lists,
-    circuit,
-    noise,
-    light,
-    pending,
-):
+def trace(
+    loads: F64,
+    layout_mm: F64,
+    projection: tuple[float, float, float, float, float, float],
+    row_ns: I64,
+    camera: Camera,
+    phase_ns: int,
+    of_pixels: Pixels,
+    lists: RimLists,
+    circuit: Circuit,
+    noise: Candidates,
+    light: Flicker,
+    pending: I64,
+) -> tuple[I64, U16, U16, U8, I64]:
     """Return signal and noise events under `loads`, as the camera delivers them.
 
     In a block each marker's path is fitted and cut into segments, the pixels that may fire are

@@ -75,13 +75,15 @@ def new_flicker(share: float, hz: float, on: F64, off: F64, since_ns: int, seed:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _level_at(t_ns, share, hz, origin_ns):  # type: ignore[no-untyped-def]
+def _level_at(t_ns: float, share: float, hz: float, origin_ns: float) -> float:
     """Log intensity at a true time over that of the mean."""
     return np.log1p(share * np.sin(2e-9 * np.pi * hz * (t_ns - origin_ns)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def flicker_events(light, begin_ns, end_ns, base_ns, events, n):  # type: ignore[no-untyped-def]
+def flicker_events(
+    light: Flicker, begin_ns: int, end_ns: int, base_ns: int, events: I64, n: int
+) -> tuple[I64, int]:
     """Append the events of a block of true time, and move the reference levels.
 
     Args:

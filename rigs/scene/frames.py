@@ -244,7 +244,7 @@ def _length(vector: F64) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
+def _average(tips: F64, plate: F64, px_per_mm: float) -> tuple[F64, F64, F64, F64]:
     """Simpson's mean of tips (m, 3, n, 2) and plate (m, 3) over beginning, middle and end.
 
     Also the longest path in each exposure, and its largest bend, px, (m,).

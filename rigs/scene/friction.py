@@ -65,7 +65,7 @@ def _kernel(correlation_mm: float) -> F64:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smoothed(white, kernel, mean, variation):  # type: ignore[no-untyped-def]
+def _smoothed(white: F64, kernel: F64, mean: F64, variation: float) -> F64:
     """Rows round which noise is folded with a kernel; term by term: the same bits everywhere."""
     rows, count = white.shape
     reach = kernel.shape[0] // 2
@@ -87,7 +87,7 @@ def _smoothed(white, kernel, mean, variation):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def friction_field(knots):  # type: ignore[no-untyped-def]
+def friction_field(knots: F64) -> F64:
     """Cubics through periodic knots with central slopes (Catmull-Rom), shape (n, knots, 4).
 
     Between knot k and the next the coefficient is c0 + s (c1 + s (c2 + s c3)), s from 0 to 1.
@@ -108,13 +108,15 @@ def friction_field(knots):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def knot_at(path_mm):  # type: ignore[no-untyped-def]
+def knot_at(path_mm: float) -> float:
     """The last knot before a place on the path, counted on without end, as a float."""
     return np.floor(path_mm * (1.0 / KNOT_MM))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def grip_between(path_mm, knot, c0, c1, c2, c3):  # type: ignore[no-untyped-def]
+def grip_between(
+    path_mm: float, knot: float, c0: float, c1: float, c2: float, c3: float
+) -> tuple[float, float]:
     """Coefficient on a path behind a knot whose cubic is c0 to c3, and its slope, 1/mm."""
     s = path_mm * (1.0 / KNOT_MM) - knot
     grip = c0 + s * (c1 + s * (c2 + s * c3))
@@ -122,7 +124,7 @@ def grip_between(path_mm, knot, c0, c1, c2, c3):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def grip_at(field, i, path_mm):  # type: ignore[no-untyped-def]
+def grip_at(field: F64, i: int, path_mm: float) -> tuple[float, float]:
     """Coefficient of tip `i` after it slid `path_mm`, and its slope along the path, 1/mm."""
     knot = knot_at(path_mm)
     c0, c1, c2, c3 = cubic_at(field, i, knot)
@@ -130,14 +132,14 @@ def grip_at(field, i, path_mm):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def cubic_at(field, i, knot):  # type: ignore[no-untyped-def]
+def cubic_at(field: F64, i: int, knot: float) -> tuple[float, float, float, float]:
     """Coefficients c0 to c3 of tip `i` behind a knot."""
     k = int(knot) & (field.shape[1] - 1)  # a power of two
     return field[i, k, 0], field[i, k, 1], field[i, k, 2], field[i, k, 3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def spot_factor(x_mm, y_mm, spots):  # type: ignore[no-untyped-def]
+def spot_factor(x_mm: float, y_mm: float, spots: F64) -> float:
     """Factor of friction at a place of the plate; `spots` as in `rigs.scene.springs.Springs`."""
     factor = 1.0
     for k in range(spots.shape[0]):
@@ -151,7 +153,9 @@ _BETWEEN = 1.0 - 1e-9
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def keeps_sliding(fx, fy, dx, dy, start, end, strengthening):  # type: ignore[no-untyped-def]
+def keeps_sliding(
+    fx: float, fy: float, dx: float, dy: float, start: float, end: float, strengthening: float
+) -> bool:
     """Return whether the force f + s d of a sliding tip stays outside its cone and ends outside.
 
     A tip slides as long as its speed is above zero. Where friction rises with speed, its force then
@@ -166,7 +170,7 @@ def keeps_sliding(fx, fy, dx, dy, start, end, strengthening):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def raised_cone(fx, fy, before, after):  # type: ignore[no-untyped-def]
+def raised_cone(fx: float, fy: float, before: float, after: float) -> tuple[float, float]:
     """Radii of a cone at both ends of a step, made as large as the force is that lies on it.
 
     The speed of sliding raises friction, and goes on as it does.
@@ -176,7 +180,7 @@ def raised_cone(fx, fy, before, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def leaves_cone_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
+def leaves_cone_at(fx: float, fy: float, dx: float, dy: float, start: float, end: float) -> float:
     """Share of a step at which the force f + s d last leaves a cone from `start` to `end`."""
     a = dx * dx + dy * dy - (end - start) ** 2
     half_b = fx * dx + fy * dy - start * (end - start)
@@ -192,7 +196,9 @@ def leaves_cone_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def tractrix(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
+def tractrix(
+    fx: float, fy: float, dx: float, dy: float, before: float, after: float
+) -> tuple[float, float, float, float, float]:
     """Set up the tractrix on which the drive d drags a sliding tip's force, for `tractrix_end`.
 
     `before`, `after`: the cone's radius at both ends.
@@ -222,7 +228,7 @@ def tractrix(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def tractrix_end(ux, uy, high, low, arc):  # type: ignore[no-untyped-def]
+def tractrix_end(ux: float, uy: float, high: float, low: float, arc: float) -> tuple[float, float]:
     """Direction of a sliding tip's force after the drive: the tractrix. A unit vector."""
     # exactly against the drive, the force keeps its direction
     high *= exp_minus(max(arc, 0.0)) if low != 0.0 else 1.0
@@ -234,7 +240,9 @@ def tractrix_end(ux, uy, high, low, arc):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slip_direction(fx, fy, to_x, to_y, ux, uy, after):  # type: ignore[no-untyped-def]
+def slip_direction(
+    fx: float, fy: float, to_x: float, to_y: float, ux: float, uy: float, after: float
+) -> tuple[float, float]:
     """Direction of a step's slip: a unit vector.
 
     Args:

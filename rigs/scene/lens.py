@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from sliplab.storage.kernels import njit
-
-F64 = npt.NDArray[np.float64]
+from sliplab.storage.streams import F32, F64, U8
 
 
 class Lens:
@@ -93,8 +91,6 @@ class Lens:
         r2 = (seen**2).sum(axis=-1) * self._per_mm**2
         return seen * (1.0 + self.k1 * r2)[..., None], depth, r2
 
-
-U8 = npt.NDArray[np.uint8]
 
 _FINE = 2
 """Rays a pixel, along each axis."""
@@ -240,7 +236,9 @@ def draw_board(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meet(matrix, coefficients, rotation, shift, offset, scale, where):  # type: ignore[no-untyped-def]
+def _meet(
+    matrix: F64, coefficients: F64, rotation: F64, shift: F64, offset: F64, scale: float, where: F32
+) -> None:
     """Find where in the print each ray meets the board, column and row, (2, rows, columns)."""
     k1, k2, p1, p2, k3 = coefficients
     # in the board's axes: the camera's place, and each ray's direction

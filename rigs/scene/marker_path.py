@@ -15,8 +15,10 @@ are cut up: their discs turn a pixel's direction too far in one go.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, I64
 
 COLUMN, ROW, RADIUS = 0, 1, 2
 """First index of the path's coordinates, all in px."""
@@ -25,7 +27,9 @@ UNEVEN = 8.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def markers_in_image(loads, layout_mm, projection):  # type: ignore[no-untyped-def]
+def markers_in_image(
+    loads: F64, layout_mm: F64, projection: tuple[float, float, float, float, float, float]
+) -> F64:
     """Column, row and radius of every marker under `loads`, px, (n, 3, m).
 
     A papilla is dragged along by friction, which is opposite to its force on the plate.
@@ -51,7 +55,7 @@ def markers_in_image(loads, layout_mm, projection):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def largest(values, row, n):  # type: ignore[no-untyped-def]
+def largest(values: F64, row: int, n: int) -> float:
     """The largest of the first n of a row of numbers that are not below 0.
 
     Of their bits, as integers, for only these have a maximum that is done side by side.
@@ -64,7 +68,7 @@ def largest(values, row, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
+def stands_still(path: F64, i: int, begin: int, stop: int) -> bool:
     """Return whether marker i is the same, to the bit, in all rows from `begin` to `stop`."""
     for c in range(3):
         if path[i, c, begin] != path[i, c, stop]:
@@ -77,7 +81,7 @@ def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-untyped-def]
+def slope_weights(t: F64, first: int, last: int, shift: int, inverse: F64, weights: F64) -> None:
     """Weigh the rows for the slope at each row of a block, from its own rows alone.
 
     The slope is that of the cubic through the four nearest rows (Lagrange), at both ends of a
@@ -113,7 +117,7 @@ def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _without_twins(t, low, k, points, used):  # type: ignore[no-untyped-def]
+def _without_twins(t: F64, low: int, k: int, points: int, used: npt.NDArray[np.bool_]) -> None:
     """Mark of the rows from `low` on those that do not nearly coincide with row k or a nearer one.
 
     Args:
@@ -133,13 +137,13 @@ def _without_twins(t, low, k, points, used):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest_row(k, first, last):  # type: ignore[no-untyped-def]
+def nearest_row(k: int, first: int, last: int) -> int:
     """The first of the rows through which the slope at row k is taken."""
     return max(min(k - 1, last - 3), first)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def inner_weights(first, blocks, weights, inner):  # type: ignore[no-untyped-def]
+def inner_weights(first: I64, blocks: int, weights: F64, inner: F64) -> None:
     """Weights of rows inside blocks, where a slope is taken through one row before and two after.
 
     Args:
@@ -157,7 +161,7 @@ def inner_weights(first, blocks, weights, inner):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slope(c, k, first, last, shift, weights, curve):  # type: ignore[no-untyped-def]
+def _slope(c: int, k: int, first: int, last: int, shift: int, weights: F64, curve: F64) -> float:
     """Slope of coordinate c at row k of a block."""
     # differences: of what stands still, the slope is 0 to the bit
     here, low, slope = curve[4 * c, k], nearest_row(k, first, last), 0.0
@@ -167,7 +171,18 @@ def _slope(c, k, first, last, shift, weights, curve):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_blocks(path, i, row, first, blocks, chord, inverse, weights, inner, curve):  # type: ignore[no-untyped-def]
+def fit_blocks(
+    path: F64,
+    i: int,
+    row: int,
+    first: I64,
+    blocks: int,
+    chord: bool,
+    inverse: F64,
+    weights: F64,
+    inner: F64,
+    curve: F64,
+) -> None:
     """Marker i as cubics between the rows of some blocks.
 
     Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
@@ -219,7 +234,7 @@ def fit_blocks(path, i, row, first, blocks, chord, inverse, weights, inner, curv
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bound_rates(curve, first, last, base, tree):  # type: ignore[no-untyped-def]
+def bound_rates(curve: F64, first: int, last: int, base: int, tree: F64) -> None:
     """Bounds of a block's rates as a tree.
 
     A step's rates stay between the control points of the derivative as a Bezier curve. Node 1
@@ -255,7 +270,7 @@ def bound_rates(curve, first, last, base, tree):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
+def excursion(t: F64, curve: F64, last: int, spread: F64) -> tuple[float, float]:
     """Bound how far a marker strays up to a row, px: (from its start, from the chord to its end).
 
     At most: the rows' distances from the chord, and how far a cubic is from the line between its
@@ -325,12 +340,17 @@ SEGMENT = np.dtype(
     ]
 )
 """A part of a marker's path on which it does not move far."""
+Segment = np.record
+Segments = npt.NDArray[np.record]
+"""As kernels see one of them, and several."""
 _MOST_PX = 2.0
 _CLOSE = 1e-4  # of the block: after a step as small as that the next error is below 1e-7
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: ignore[no-untyped-def]
+def deviation(
+    first: int, last: int, mean_x: float, mean_y: float, mean_r: float, curve: F64, spread: F64
+) -> tuple[float, float]:
     """Bound how far rates stray from their means, px/ns: of the centre, and of the radius.
 
     Args:
@@ -359,7 +379,19 @@ def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: igno
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_block(first, last, block, zero, reach, since, until, curve, spread, segments, n):  # type: ignore[no-untyped-def]
+def cut_block(
+    first: int,
+    last: int,
+    block: int,
+    zero: float,
+    reach: float,
+    since: F64,
+    until: F64,
+    curve: F64,
+    spread: F64,
+    segments: Segments,
+    n: int,
+) -> int:
     """Cut a block into segments on which the marker does not move far.
 
     What is done follows from the block's own rows alone.
@@ -424,6 +456,6 @@ def cut_block(first, last, block, zero, reach, since, until, curve, spread, segm
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def farthest(segment):  # type: ignore[no-untyped-def]
+def farthest(segment: Segment) -> float:
     """Bound the length of the paths of centre and radius on a segment, together, px."""
     return (segment.speed + abs(segment.mr) + segment.deviation) * (segment.end - segment.begin)

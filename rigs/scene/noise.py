@@ -10,7 +10,7 @@ neither chunks nor what the camera sees change which candidates there are.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -96,7 +96,9 @@ def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _spread(gaps, draws, begin_ns, width, height, hot_share, hot):  # type: ignore[no-untyped-def]
+def _spread(
+    gaps: F64, draws: F64, begin_ns: Any, width: int, height: int, hot_share: float, hot: I64
+) -> tuple[I64, I64, F64]:
     """Times from exponential gaps, and places and lots from uniform numbers."""
     n = draws.shape[1]
     t_ns, place, lot = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
@@ -119,7 +121,7 @@ def _spread(gaps, draws, begin_ns, width, height, hot_share, hot):  # type: igno
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def brightness(x, y, discs, contrast, edge):  # type: ignore[no-untyped-def]
+def brightness(x: int, y: int, discs: F64, contrast: float, edge: float) -> float:
     """Intensity of a pixel between that of the ground (0) and that of a disc (1).
 
     Args:
@@ -136,9 +138,18 @@ def brightness(x, y, discs, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def noise_events(  # type: ignore[no-untyped-def]
-    candidates, begin, end_ns, base_ns, leak_below, contrast, edge, discs, events, n
-):
+def noise_events(
+    candidates: Candidates,
+    begin: int,
+    end_ns: int,
+    base_ns: int,
+    leak_below: float,
+    contrast: float,
+    edge: float,
+    discs: F64,
+    events: I64,
+    n: int,
+) -> tuple[int, int]:
     """Turn candidates from `begin` on, and before `end_ns`, into events where their pixel is.
 
     Args:

@@ -25,9 +25,12 @@ from sliplab.rigs.scene.branchless import logarithm
 from sliplab.rigs.scene.crossings import events_of_segment, solve, time_between, turning
 from sliplab.rigs.scene.edges import CUT, FAR, LAST, LEVEL, OFF, ON, TAIL
 from sliplab.rigs.scene.marker_path import (
+    Segment,
+    Segments,
     bound_rates,
 )
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, I64
 
 LANES = 256
 STRIDE = LANES + 8
@@ -57,7 +60,7 @@ _DONE_PX = 1e-10
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def place_pixels(tile, n, column, row, radius):  # type: ignore[no-untyped-def]
+def place_pixels(tile: F64, n: int, column: float, row: float, radius: float) -> None:
     """Distances from the rim at the begin of the first segment."""
     for j in range(n):
         dx, dy = tile[P_X + j] - column, tile[P_Y + j] - row
@@ -65,7 +68,7 @@ def place_pixels(tile, n, column, row, radius):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
+def classify(tile: F64, n: int, segment: Segment, reach: float) -> None:
     """Classify what each of n pixels does on a segment.
 
     Args:
@@ -149,7 +152,7 @@ _TICK = float(1 << 25)  # a nanosecond in a packed event
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def begin_segment(fire, n, segment):  # type: ignore[no-untyped-def]
+def begin_segment(fire: F64, n: int, segment: Segment) -> None:
     """Set up what is the same for all thresholds: limits, and slopes at both ends."""
     a, b = segment.begin, segment.end
     for j in range(n):
@@ -175,7 +178,7 @@ def begin_segment(fire, n, segment):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def guess(fire, n, segment, pace):  # type: ignore[no-untyped-def]
+def guess(fire: F64, n: int, segment: Segment, pace: float) -> None:
     """First guesses of time, and of the step in which it lies.
 
     Args:
@@ -194,7 +197,7 @@ def guess(fire, n, segment, pace):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
+def next_thresholds(fire: F64, n: int, contrast: float, edge: float) -> None:
     """After an event at TARGET: the new reference level, and the rim distance of the next event.
 
     As `edges.rim_of`, with a logarithm that has no branches.
@@ -215,7 +218,7 @@ def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pack_steps(n, since, inverse, curve, steps):  # type: ignore[no-untyped-def]
+def pack_steps(n: int, since: F64, inverse: F64, curve: F64, steps: F64) -> None:
     """Pack what `fetch` needs of each step: `steps` (r, STEP_FIELDS), written."""
     for k in range(n):
         steps[k, 0], steps[k, 1] = since[k], inverse[k]
@@ -224,7 +227,7 @@ def pack_steps(n, since, inverse, curve, steps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
+def fetch(roots: F64, n: int, since: F64, until: F64, steps: F64) -> None:
     """Find the step in which each time lies, and fetch what is known of it."""
     for j in range(n):
         k, t = np.uint64(roots[R_STEP + j]), roots[R_TIME + j]
@@ -238,7 +241,7 @@ def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refine(roots, n):  # type: ignore[no-untyped-def]
+def refine(roots: F64, n: int) -> None:
     """One step of Chebyshev's method; where SINCE was, the packed event stands then."""
     for j in range(n):
         t, target = roots[R_TIME + j], roots[R_TARGET + j]
@@ -293,7 +296,17 @@ def refine(roots, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def finish(wait, n, since, until, steps, inverse, curve, out, count):  # type: ignore[no-untyped-def]
+def finish(
+    wait: F64,
+    n: int,
+    since: F64,
+    until: F64,
+    steps: F64,
+    inverse: F64,
+    curve: F64,
+    out: I64,
+    count: int,
+) -> int:
     """More steps for the n roots that wait, until all of them are events.
 
     Returns:
@@ -335,37 +348,37 @@ def finish(wait, n, since, until, steps, inverse, curve, out, count):  # type: i
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move(source, j, target, k):  # type: ignore[no-untyped-def]
+def move(source: F64, j: int, target: F64, k: int) -> None:
     """Copy the root in lane j of `source` to lane k of `target`."""
     for field in range(9):
         target[STRIDE * field + k] = source[STRIDE * field + j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels,
-    count,
-    segments,
-    first,
-    since,
-    until,
-    inverse,
-    curve,
-    steps,
-    tree,
-    threshold,
-    contrast,
-    edge,
-    origin,
-    stack,
-    tile,
-    fire,
-    wait,
-    state,
-    gaps,
-    out,
-    n,
-):
+def events_of_pixels(
+    pixels: I64,
+    count: int,
+    segments: Segments,
+    first: I64,
+    since: F64,
+    until: F64,
+    inverse: F64,
+    curve: F64,
+    steps: F64,
+    tree: F64,
+    threshold: F64,
+    contrast: float,
+    edge: float,
+    origin: int,
+    stack: F64,
+    tile: F64,
+    fire: F64,
+    wait: F64,
+    state: F64,
+    gaps: F64,
+    out: I64,
+    n: int,
+) -> int:
     """Events of pixels over some blocks.
 
     Args:
@@ -502,7 +515,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def settle(tile, fire, n):  # type: ignore[no-untyped-def]
+def settle(tile: F64, fire: F64, n: int) -> int:
     """After an event of each of n pixels: those that have another one go on, the others go back.
 
     Returns:

@@ -17,6 +17,8 @@ import numpy as np
 
 from sliplab.rigs.scene.contact import (
     LANES,
+    Block,
+    Blocks,
     Step,
     feel_spots,
     make_blocks,
@@ -28,6 +30,7 @@ from sliplab.rigs.scene.contact import (
 from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import ACROSS, STUCK, Law
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64, I64
 
 _ITERATIONS = 200
 _NEVER = 1e9
@@ -35,7 +38,16 @@ _NEVER = 1e9
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pull(blocks, n, field, law, sensor, plate_y, step, new):  # type: ignore[no-untyped-def]
+def _pull(
+    blocks: Blocks,
+    n: int,
+    field: F64,
+    law: Law,
+    sensor: F64,
+    plate_y: float,
+    step: Step,
+    new: float,
+) -> float:
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N.
 
     It is what must stand for the end of the step, so that its mean with the beginning (`new`) is
@@ -55,9 +67,20 @@ def _pull(blocks, n, field, law, sensor, plate_y, step, new):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(  # type: ignore[no-untyped-def]
-    blocks, n, field, law, sensor, motion, step, mass, weight, stiction, new, pulls
-):
+def _solve(
+    blocks: Blocks,
+    n: int,
+    field: F64,
+    law: Law,
+    sensor: F64,
+    motion: F64,
+    step: Step,
+    mass: float,
+    weight: float,
+    stiction: float,
+    new: float,
+    pulls: float,
+) -> float:
     """The plate's speed at the end of the step, mm/s upwards; mass in kg, forces in N.
 
     Args:
@@ -104,22 +127,22 @@ def _solve(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_free(  # type: ignore[no-untyped-def]
-    table,
-    friction,
-    law,
-    state,
-    t_ns,
-    sensor,
-    motion,
-    mass,
-    weight,
-    stiction,
-    stop,
-    track,
-    load,
-    spots,
-):
+def advance_free(
+    table: F64,
+    friction: F64,
+    law: Law,
+    state: F64,
+    t_ns: I64,
+    sensor: F64,
+    motion: F64,
+    mass: float,
+    weight: F64,
+    stiction: float,
+    stop: float,
+    track: F64,
+    load: F64,
+    spots: F64,
+) -> tuple[int, bool]:
     """Advance tips and plate together until the steps end or the plate meets its stop.
 
     Args:
@@ -260,7 +283,7 @@ def advance_free(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lets_go_first(blocks, n):  # type: ignore[no-untyped-def]
+def _lets_go_first(blocks: Blocks, n: int) -> float:
     """Share of a step at which the first of the tips that stuck lets go; above 1: none does."""
     first = 2.0
     for i in range(n):
@@ -271,7 +294,7 @@ def _lets_go_first(blocks, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _between(w, plate_y, sensor, share):  # type: ignore[no-untyped-def]
+def _between(w: Block, plate_y: float, sensor: F64, share: float) -> F64:
     """The sensor's pose at a share of a step, from where the first tip's base was; (5,)."""
     at = sensor.copy()
     x, y = w.layout_x[0], w.layout_y[0]
@@ -285,7 +308,7 @@ def _between(w, plate_y, sensor, share):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lands_at(above, rise, bow):  # type: ignore[no-untyped-def]
+def _lands_at(above: float, rise: float, bow: float) -> float:
     """Share of a step at which a plate that was `above` its stop meets it.
 
     Its height changes by s `rise` + s (1 - s) `bow` in a share s of the step, all in mm.

@@ -21,15 +21,16 @@ bits), polarity (1 bit). They are sorted by radix, for a comparison sort costs m
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import I64, U8, U16
 
 NEVER_NS = -(1 << 62)
 _TIME_BITS = 27
-_I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -50,17 +51,17 @@ class Scans:
         """From the begin of a scan until its last column has been read."""
         return int(self.width * self.column_ns)
 
-    def begin(self, t_ns: _I64) -> _I64:
+    def begin(self, t_ns: I64) -> I64:
         """Begin of the scan that reads what happened at `t_ns`, int64, (n,)."""
         return self.phase_ns - (self.phase_ns - t_ns) // self.period_ns * self.period_ns
 
-    def stamp(self, begin_ns: _I64, x: npt.NDArray[np.uint16]) -> _I64:
+    def stamp(self, begin_ns: I64, x: U16) -> I64:
         """Time at which columns `x` of the scans that begin at `begin_ns` are read, int64, (n,)."""
         return begin_ns + (x * self.column_ns).astype(np.int64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bits_for(largest):  # type: ignore[no-untyped-def]
+def bits_for(largest: int) -> int:
     """Count the bits that hold the numbers 0 to `largest`."""
     n = 0
     while largest >> n > 0:
@@ -69,19 +70,30 @@ def bits_for(largest):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _row_of(where, y_bits):  # type: ignore[no-untyped-def]
+def _row_of(where: int, y_bits: int) -> int:
     return where & ((1 << y_bits) - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _column_of(where, y_bits, x_bits):  # type: ignore[no-untyped-def]
+def _column_of(where: int, y_bits: int, x_bits: int) -> int:
     return (where >> y_bits) & ((1 << x_bits) - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def read_each(  # type: ignore[no-untyped-def]
-    events, n, other, base_ns, span_ns, refractory_ns, fired, t_ns, xs, ys, ps, kept
-):
+def read_each(
+    events: I64,
+    n: int,
+    other: I64,
+    base_ns: int,
+    span_ns: int,
+    refractory_ns: int,
+    fired: I64,
+    t_ns: I64,
+    xs: U16,
+    ys: U16,
+    ps: U8,
+    kept: int,
+) -> int:
     """Deliver a block's events with their own times.
 
     Args:
@@ -108,23 +120,23 @@ def read_each(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def read_scans(  # type: ignore[no-untyped-def]
-    events,
-    n,
-    other,
-    base_ns,
-    end_ns,
-    period_ns,
-    phase_ns,
-    column_ns,
-    refractory_ns,
-    fired,
-    t_ns,
-    xs,
-    ys,
-    ps,
-    kept,
-):
+def read_scans(
+    events: I64,
+    n: int,
+    other: I64,
+    base_ns: int,
+    end_ns: int,
+    period_ns: int,
+    phase_ns: int,
+    column_ns: float,
+    refractory_ns: int,
+    fired: I64,
+    t_ns: I64,
+    xs: U16,
+    ys: U16,
+    ps: U8,
+    kept: int,
+) -> tuple[int, int]:
     """Deliver the scans that are read to their last column by `end_ns`; see `read_each`.
 
     Args:
@@ -186,7 +198,7 @@ _SHORT = 24
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def larger(array, capacity):  # type: ignore[no-untyped-def]
+def larger(array: npt.NDArray[Any], capacity: int) -> npt.NDArray[Any]:
     """`array` with room for `capacity` elements."""
     grown = np.empty(capacity, array.dtype)
     grown[: array.shape[0]] = array
@@ -194,7 +206,7 @@ def larger(array, capacity):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sort_packed(keys, n, other, low, high):  # type: ignore[no-untyped-def]
+def sort_packed(keys: I64, n: int, other: I64, low: int, high: int) -> None:
     """Sort the first `n` of `keys` (int64, not negative) in place.
 
     Bits `low` to `high` (without) are sorted by counting, 9 at a time; what is equal in them is

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.scene.edges import CUT, OFF, ON
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F32, F64, I64, U8
 
 REACH_PX = 1.5
 """Distance that a marker may move, and grow, before its list is made again."""
@@ -28,10 +29,10 @@ _SPARE_PX = np.float32(2e-6)  # rounding of single precision cannot hide a pixel
 class RimLists(NamedTuple):
     """Lists of n markers with room for s pixels each."""
 
-    origin: npt.NDArray[np.float64]
+    origin: F64
     """Column, row and radius when the list was made, how many pixels there are (0: no list), and
     the least rho, (n, 5)."""
-    aim: npt.NDArray[np.float32]
+    aim: F32
     """Both components of u, 1 / (2 rho), and what q must rise to and fall to (negated) for a
     positive and a negative event, (n, 5, s)."""
     place: npt.NDArray[np.int32]
@@ -48,7 +49,9 @@ def no_lists(markers: int, slots: int) -> RimLists:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[no-untyped-def]
+def near_rim(
+    column: float, row: float, radius: float, band: float, height: int, width: int, pixels: I64
+) -> int:
     """Pixels within `band` px of a disc's rim, into `pixels`; how many there are.
 
     Where there are more than `pixels` has room for, the rest is counted and not kept.
@@ -76,7 +79,7 @@ def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
+def thresholds(gap: float, on: float, off: float, reach: float) -> tuple[float, float]:
     """Distance by which a pixel must fall for a positive, and rise for a negative event, px.
 
     Outside the edge (`reach`) the pixel may be another marker's: only the distance up to the edge
@@ -88,7 +91,18 @@ def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place):  # type: ignore[no-untyped-def]
+def make_list(
+    i: int,
+    column: float,
+    row: float,
+    radius: float,
+    state: F64,
+    edge: float,
+    pixels: I64,
+    origin: F64,
+    aim: F32,
+    place: npt.NDArray[np.int32],
+) -> bool:
     """Make marker i's list anew, where it is now; False where it cannot have one.
 
     There is none where the list has too few slots, or the disc is so small that the rim's
@@ -127,7 +141,7 @@ def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place): 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def reaches(i, column, row, radius, strays, origin):  # type: ignore[no-untyped-def]
+def reaches(i: int, column: float, row: float, radius: float, strays: float, origin: F64) -> bool:
     """Return whether marker i's list still holds if it strays so far from (column, row, radius)."""
     dx, dy = column - origin[i, 0], row - origin[i, 1]
     moved = np.sqrt(dx * dx + dy * dy) + abs(radius - origin[i, 2])
@@ -135,9 +149,22 @@ def reaches(i, column, row, radius, strays, origin):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def may_fire(  # type: ignore[no-untyped-def]
-    i, column, row, radius, dx, dy, dr, stray, origin, aim, place, hit, slots, pixels
-):
+def may_fire(
+    i: int,
+    column: float,
+    row: float,
+    radius: float,
+    dx: float,
+    dy: float,
+    dr: float,
+    stray: float,
+    origin: F64,
+    aim: F32,
+    place: npt.NDArray[np.int32],
+    hit: U8,
+    slots: I64,
+    pixels: I64,
+) -> int:
     """Find the pixels that may fire while marker i goes from (column, row, radius) by (dx, dy, dr).
 
     Args:
@@ -184,7 +211,20 @@ def may_fire(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def renew(i, column, row, radius, slots, pixels, gaps, count, state, edge, origin, aim):  # type: ignore[no-untyped-def]
+def renew(
+    i: int,
+    column: float,
+    row: float,
+    radius: float,
+    slots: I64,
+    pixels: I64,
+    gaps: F64,
+    count: int,
+    state: F64,
+    edge: float,
+    origin: F64,
+    aim: F32,
+) -> None:
     """Give slots new thresholds after their pixels were computed.
 
     Args:

@@ -21,7 +21,9 @@ import numpy as np
 
 from sliplab.rigs.scene.branchless import logarithm
 from sliplab.rigs.scene.friction import KNOT_MM, grip_at
+from sliplab.rigs.scene.springs import Law
 from sliplab.storage.kernels import njit
+from sliplab.storage.streams import F64
 
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""
@@ -35,7 +37,9 @@ _CLOSE_SPEED = 1e-3
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped-def]
+def strengthened(
+    grip: float, slope: float, slip: float, quick: float, lag: float, law: Law
+) -> tuple[float, float]:
     """A coefficient of friction and its slope over the slip, raised by the speed of sliding.
 
     The speed at the end of the step is `quick` (1/s) times the slip plus `lag` (mm/s).
@@ -50,22 +54,22 @@ def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def along_slip(  # type: ignore[no-untyped-def]
-    new_x,
-    new_y,
-    old_x,
-    old_y,
-    branch_x,
-    branch_y,
-    soft,
-    damp,
-    per_s,
-    swerve,
-    unit_x,
-    unit_y,
-    quick,
-    lag,
-):
+def along_slip(
+    new_x: float,
+    new_y: float,
+    old_x: float,
+    old_y: float,
+    branch_x: float,
+    branch_y: float,
+    soft: float,
+    damp: float,
+    per_s: float,
+    swerve: float,
+    unit_x: float,
+    unit_y: float,
+    quick: float,
+    lag: float,
+) -> tuple[float, float, float, float, float, float]:
     """Arguments of `force_after` for a tip whose slip has the direction `unit`.
 
     Args:
@@ -94,20 +98,20 @@ def along_slip(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def first_slip(  # type: ignore[no-untyped-def]
-    moved_x,
-    moved_y,
-    unit_x,
-    unit_y,
-    slides,
-    bent,
-    bending,
-    shortening,
-    compliance,
-    pressed,
-    pressing,
-    rough,
-):
+def first_slip(
+    moved_x: float,
+    moved_y: float,
+    unit_x: float,
+    unit_y: float,
+    slides: float,
+    bent: float,
+    bending: float,
+    shortening: float,
+    compliance: float,
+    pressed: float,
+    pressing: float,
+    rough: bool,
+) -> tuple[float, float, float]:
     """Slip and bend at which the search begins, and the longest plausible slip, mm.
 
     `slides` and `bent` are the predicted ones. A tip that slips much farther than its base moved
@@ -128,7 +132,9 @@ def first_slip(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def onto_cone(force_x, force_y, unit_x, unit_y, limit):  # type: ignore[no-untyped-def]
+def onto_cone(
+    force_x: float, force_y: float, unit_x: float, unit_y: float, limit: float
+) -> tuple[float, float]:
     """A force along and across the slip, made as large as `limit`, in x and y."""
     size = np.sqrt(force_x * force_x + force_y * force_y)
     scale = limit / size if size > 0.0 else 0.0
@@ -137,9 +143,20 @@ def onto_cone(force_x, force_y, unit_x, unit_y, limit):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def force_after(  # type: ignore[no-untyped-def]
-    slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening
-):
+def force_after(
+    slip: float,
+    bent: float,
+    ahead: float,
+    aside: float,
+    rest_x: float,
+    rest_y: float,
+    soft_x: float,
+    soft_y: float,
+    pressed: float,
+    pressing: float,
+    bending: float,
+    shortening: float,
+) -> tuple[float, float, float]:
     """Force of a tip that slipped and is bent, and its normal force, N.
 
     Args:
@@ -159,25 +176,25 @@ def force_after(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slip_step(  # type: ignore[no-untyped-def]
-    slip,
-    bent,
-    ahead,
-    aside,
-    rest_x,
-    rest_y,
-    soft_x,
-    soft_y,
-    pressed,
-    pressing,
-    bending,
-    shortening,
-    compliance,
-    grip,
-    grip_slope,
-    quick,
-    weak,
-):
+def slip_step(
+    slip: float,
+    bent: float,
+    ahead: float,
+    aside: float,
+    rest_x: float,
+    rest_y: float,
+    soft_x: float,
+    soft_y: float,
+    pressed: float,
+    pressing: float,
+    bending: float,
+    shortening: float,
+    compliance: float,
+    grip: float,
+    grip_slope: float,
+    quick: float,
+    weak: float,
+) -> tuple[float, float, bool, bool, float]:
     """One Newton step towards the slip that leaves the force on the friction cone.
 
     Args:
@@ -225,26 +242,26 @@ def slip_step(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def march_to_slip(  # type: ignore[no-untyped-def]
-    guess,
-    ahead,
-    aside,
-    rest_x,
-    rest_y,
-    soft_x,
-    soft_y,
-    pressed,
-    pressing,
-    bending,
-    shortening,
-    compliance,
-    field,
-    i,
-    path,
-    quick,
-    lag,
-    law,
-):
+def march_to_slip(
+    guess: float,
+    ahead: float,
+    aside: float,
+    rest_x: float,
+    rest_y: float,
+    soft_x: float,
+    soft_y: float,
+    pressed: float,
+    pressing: float,
+    bending: float,
+    shortening: float,
+    compliance: float,
+    field: F64,
+    i: int,
+    path: float,
+    quick: float,
+    lag: float,
+    law: Law,
+) -> tuple[float, float]:
     """Return the first slip after which friction holds the force, and the bend, mm.
 
     Steps forward until the force is below the limit, then regula falsi.
@@ -300,7 +317,16 @@ def march_to_slip(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slows_down(slid_s, speed, fx, fy, moved_x, moved_y, h, law):  # type: ignore[no-untyped-def]
+def slows_down(
+    slid_s: float,
+    speed: float,
+    fx: float,
+    fy: float,
+    moved_x: float,
+    moved_y: float,
+    h: float,
+    law: Law,
+) -> bool:
     """Return whether a tip's earlier speeds do not predict its next one: see `relaxed_speed`.
 
     Args:
@@ -315,13 +341,22 @@ def slows_down(slid_s, speed, fx, fy, moved_x, moved_y, h, law):  # type: ignore
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def is_steady(earlier, speed):  # type: ignore[no-untyped-def]
+def is_steady(earlier: float, speed: float) -> bool:
     """Return whether the speeds of two steps, mm/s, predict the next one."""
     return earlier <= _STEADY * speed
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # type: ignore[no-untyped-def]
+def relaxed_speed(
+    force: float,
+    rise: float,
+    before: float,
+    after: float,
+    cone: float,
+    steepness: float,
+    slid_s: float,
+    law: Law,
+) -> float:
     """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds predict nothing, mm/s.
 
     With x = (|f| / cone - 1) / strengthening the speed is weak (e^x - 1), and x' = a - b (e^x - 1)
@@ -348,7 +383,7 @@ def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def force_kept(force, cone, damp, law):  # type: ignore[no-untyped-def]
+def force_kept(force: float, cone: float, damp: float, law: Law) -> float:
     """Share of its force that a tip keeps in the moment in which it lets go.
 
     It slides at once at the speed w at which the damper and friction together hold the force:
@@ -373,7 +408,9 @@ def force_kept(force, cone, damp, law):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def predicted_speed(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
+def predicted_speed(
+    slid_s: float, per_s: float, earlier_s: float, speed: float, earlier: float
+) -> tuple[float, float, float]:
     """Speed at the end of a step from the slip in it and the mean speeds of the steps before.
 
     A line through two of them, a parabola through three if all took as long. `per_s` is
@@ -401,7 +438,9 @@ CLOSE = 1e-7
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-untyped-def]
+def column(
+    bent: float, bending: float, shortening: float, pressed: float, pressing: float
+) -> tuple[float, float, float, float]:
     """Tangential and normal force of a bent column, and their slopes over the bend.
 
     N = pressed - pressing * shortening * bent^2, not negative.
@@ -419,14 +458,26 @@ def column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-unt
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def first_bend(stretch, guess, bending, shortening, compliance):  # type: ignore[no-untyped-def]
+def first_bend(
+    stretch: float, guess: float, bending: float, shortening: float, compliance: float
+) -> float:
     """Begin of the search for a bend: its solution, if the papilla is not shortened."""
     straight = stretch / (1.0 + compliance * bending)
     return straight if shortening == 0.0 else min(guess, stretch)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def bend_step(bent, low, high, stretch, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
+def bend_step(
+    bent: float,
+    low: float,
+    high: float,
+    stretch: float,
+    bending: float,
+    shortening: float,
+    compliance: float,
+    pressed: float,
+    pressing: float,
+) -> tuple[float, float, float, bool]:
     """One guarded Newton step towards the bend at a stretch.
 
     Returns:
@@ -443,7 +494,15 @@ def bend_step(bent, low, high, stretch, bending, shortening, compliance, pressed
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
+def bend_for(
+    stretch: float,
+    guess: float,
+    bending: float,
+    shortening: float,
+    compliance: float,
+    pressed: float,
+    pressing: float,
+) -> float:
     """The bend of a papilla whose tip is `stretch` mm from under its base."""
     low, high = 0.0, stretch
     bent = first_bend(stretch, guess, bending, shortening, compliance)
@@ -457,7 +516,7 @@ def bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def relaxing(h, relaxation_s):  # type: ignore[no-untyped-def]
+def relaxing(h: float, relaxation_s: float) -> tuple[float, float]:
     """Decay of the relaxing branch over `h` s, and its gain for a linear motion in that time.
 
     q' = -q / tau + k x' with x' constant gives q+ = q e^(-h/tau) + k tau (1 - e^(-h/tau)) dx / h.

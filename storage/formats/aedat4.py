@@ -17,6 +17,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from sliplab.storage.formats.flatbuffers import (
@@ -41,7 +42,7 @@ from sliplab.storage.formats.foreign import (
 )
 from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Lost
-from sliplab.storage.streams import U8, EventChunk, FrameChunk
+from sliplab.storage.streams import I64, U8, U16, EventChunk, FrameChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
 EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"
@@ -347,7 +348,7 @@ def _split(words: Any, chunk: EventChunk) -> EventChunk:
 
 
 @njit(cache=True, nogil=True)
-def _split_events(words, x, y, p, t):  # type: ignore[no-untyped-def]
+def _split_events(words: npt.NDArray[np.uint64], x: U16, y: U16, p: U8, t: I64) -> bool:
     """Fill the columns of events from two 64-bit words each: time, and pixel with polarity.
 
     Returns:

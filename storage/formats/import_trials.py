@@ -282,12 +282,16 @@ class _Content:
         if count and (count >= kept or count > max(_SOME, _SHARE * (kept + count))):
             named = ", ".join(f"{count:,} {reason}" for reason, count in wrong.items())
             if set(wrong) == {OUTSIDE} and self.size_px is not None:
-                width, height = self.size_px
-                named = (
-                    f"events up to column {self.latest_px[0]} and row {self.latest_px[1]}, outside "
-                    f"of the {width} x {height} pixels that it gives its camera: {named}"
+                (width, height), (column, row) = self.size_px, self.latest_px
+                far = column >= width or row >= height
+                where = (
+                    f"up to column {column} and row {row}" if far else "at negative columns or rows"
                 )
-            raise FormatError(f"holds {named}, and {kept:,} that can be right")
+                named = (
+                    f"{count:,} {where}, outside of the {width} x {height} pixels that the file "
+                    "gives its camera"
+                )
+            raise FormatError(f"{what}: {named}; {kept:,} can be right")
 
     def check_order(self, stream: str, kept: int, rows: int) -> None:
         """Check that enough rows of a stream are in order of time. Raises FormatError."""

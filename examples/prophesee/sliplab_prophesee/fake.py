@@ -12,7 +12,7 @@ import socket
 import numpy as np
 
 from sliplab.rigs.core.fakes import Connections, LoopThread
-from sliplab.storage.streams import EventChunk, PulseChunk
+from sliplab.storage.streams import I64, EventChunk, PulseChunk
 from sliplab_prophesee.evt import Evt3Encoder, Header
 
 HOST = "127.0.0.1"
@@ -62,7 +62,7 @@ class FakeProphesee:
             self._thread.call(self._connections.cut)
             self._thread.close()
 
-    def _write(self, chunk: EventChunk, edges_us: np.ndarray) -> None:  # type: ignore[type-arg]
+    def _write(self, chunk: EventChunk, edges_us: I64) -> None:
         for writer, encoder in self._clients.items():
             if self._silent or writer.is_closing():
                 continue

@@ -110,12 +110,12 @@ class _Answer(pickle.Unpickler):
         return _array
 
 
-def _array(kind: str, byte_order: str, shape: tuple[int, ...], order: Any, content: Any) -> Any:
+def _array(kind: str, byte_order: Any, shape: tuple[int, ...], order: Any, content: Any) -> Any:
     """Return an array that the child described; it checked that the sizes agree."""
     if kind == "O":
         objects = np.empty(len(content), object)
         for index, item in enumerate(content):  # a slice would look into lists of equal length
             objects[index] = item
         return objects.reshape(shape)  # numpy lists objects in C order, whatever the array's is
-    dtype: np.dtype[Any] = np.dtype(kind).newbyteorder(byte_order)  # type: ignore[arg-type]
+    dtype: np.dtype[Any] = np.dtype(kind).newbyteorder(byte_order)
     return np.frombuffer(bytes(content), dtype).reshape(shape, order=order)

@@ -29,7 +29,7 @@ from sliplab.plugins.formats.evt import OUTSIDE as PLACE
 from sliplab.plugins.formats.ros.messages import EVENTS, MONO, EventPacket, Fields, unpack_mono
 from sliplab.storage.formats.foreign import MOST_PX, OUTSIDE, ForeignChunk, FormatError
 from sliplab.storage.kernels import njit
-from sliplab.storage.streams import I64, EventChunk
+from sliplab.storage.streams import I64, U8, U16, EventChunk
 
 PACKETS = (EVENTS, "event_array_msgs/msg/EventArray")
 """Types of messages with encoded events; the second is the former name of the first."""
@@ -244,7 +244,7 @@ def _unpack_libcaer_cmp(packet: EventPacket, words: npt.NDArray[np.uint16]) -> E
 
 
 @njit(cache=True, nogil=True)
-def _decode_libcaer_cmp(words, x, y, p, t):  # type: ignore[no-untyped-def]
+def _decode_libcaer_cmp(words: U16, x: U16, y: U16, p: U8, t: I64) -> int:
     """Fill the columns; return the rows filled.
 
     libcaer_driver writes 4 of the 12 bits of the high part, and no word where it changes from one

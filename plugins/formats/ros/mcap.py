@@ -176,8 +176,8 @@ def _messages_said(path: Path, topic: str | None) -> int | None:
         if topic is None or code != _FOOTER_CODE or not 0 < start < size:
             return None
         handle.seek(start)
-        within = _Within(handle, size)
-        reader = StreamReader(within, skip_magic=True, record_size_limit=_MOST_RECORD)  # type: ignore[arg-type]  # it calls read alone
+        within: Any = _Within(handle, size)  # StreamReader calls read alone
+        reader = StreamReader(within, skip_magic=True, record_size_limit=_MOST_RECORD)
         for record in reader.records:
             if isinstance(record, Channel) and record.topic == topic:
                 channels.add(record.id)
@@ -267,8 +267,8 @@ def _messages(
     part = part or _Part()
     try:
         with path.open("rb") as handle:
-            within = _Within(handle, path.stat().st_size)
-            reader = StreamReader(within, emit_chunks=True, record_size_limit=_MOST_RECORD)  # type: ignore[arg-type]  # it calls read alone
+            within: Any = _Within(handle, path.stat().st_size)  # StreamReader calls read alone
+            reader = StreamReader(within, emit_chunks=True, record_size_limit=_MOST_RECORD)
             records = iter(reader.records)
             while part.at < part.end and (record := next(records, None)) is not None:
                 if not isinstance(record, DataEnd):
@@ -399,7 +399,7 @@ def _document(found: _Found, name: str, kind: type[DocumentT]) -> DocumentT:
 
 
 def _campaign(path: Path, found: _Found) -> CampaignTexts:
-    info = _json(found, INFO)
+    info: Any = _json(found, INFO)  # checked as far as it is used
     if not isinstance(info.get("name"), str) or not isinstance(info.get("simulated"), bool):
         raise FormatError(f"has a damaged {INFO}: it lacks name or simulated")
     texts = []
@@ -409,7 +409,7 @@ def _campaign(path: Path, found: _Found) -> CampaignTexts:
             parse_yaml(texts[-1], path)
         except (ValueError, InputError) as error:
             raise FormatError(f"has a damaged {name}: {error}") from None
-    return CampaignTexts(info, *texts)  # type: ignore[arg-type]  # checked as far as it is used
+    return CampaignTexts(info, *texts)
 
 
 def _column(parts: list[ros2.Rows]) -> npt.NDArray[np.generic]:

@@ -79,7 +79,7 @@ def write_mcap(
         trial = _Trial(writer, store, campaign, recording)
         counts = trial.write()
         trial.attach(personal)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return counts
 
 

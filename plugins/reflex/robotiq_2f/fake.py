@@ -9,6 +9,7 @@ import contextlib
 import socketserver
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -176,9 +177,9 @@ class _Server(socketserver.ThreadingTCPServer):
 
     allow_reuse_address, daemon_threads, block_on_close = True, True, False
 
-    def __init__(self, *arguments: object) -> None:
+    def __init__(self, *arguments: Any) -> None:
         self.open: set[socketserver.StreamRequestHandler] = set()
-        super().__init__(*arguments)  # type: ignore[arg-type]
+        super().__init__(*arguments)
 
     def end(self) -> None:
         """Close the port and every connection."""

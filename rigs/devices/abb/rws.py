@@ -72,7 +72,7 @@ class _Pool(HTTPConnectionPool):
     ConnectionCls = _Connection
 
 
-class _Bounded(HTTPAdapter):  # type: ignore[misc, unused-ignore]
+class _Bounded(HTTPAdapter):
     """An HTTP adapter with a timeout of connections and of whole answers."""
 
     def init_poolmanager(self, *what: Any, **how: Any) -> None:

@@ -206,7 +206,7 @@ def test_a_file_of_many_wrong_events_is_not_imported(tmp_path: Path) -> None:
     _dsec(tmp_path / "a.h5", np.r_[np.full(60, -5), np.arange(COUNT - 60)])
     done = here("import", tmp_path / "a.h5", "--store", tmp_path / "store", "--name", "x")
     assert done.returncode == 2
-    assert f"holds 60 {NO_TIME}, and 440 that can be right" in done.stderr
+    assert f"events: 60 {NO_TIME}; 440 can be right" in done.stderr
     assert not (tmp_path / "store").exists()
 
 

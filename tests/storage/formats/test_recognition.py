@@ -198,12 +198,12 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "aedat4 outside of its camera": (
         "a.aedat4",
         lambda path: _aedat4(path, _events([3, 64])),
-        r"a\.aedat4: holds events up to column 64 and row 32, outside of the 64 x 48 pixels",
+        r"a\.aedat4: events: 1 up to column 64 and row 32, outside of the 64 x 48 pixels",
     ),
     "a stream outside of its camera": (
         "a.h5",
         lambda path: _stream(path, [64, 48], [3, 64], [3, 64]),
-        r"a\.h5: holds events up to column 64 and row 64, outside of the 64 x 48 pixels",
+        r"a\.h5: events: 1 up to column 64 and row 64, outside of the 64 x 48 pixels",
     ),
     "an older aedat": (
         "a.aedat4",
