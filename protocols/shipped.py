@@ -20,10 +20,11 @@ def find_shipped(given: Path, known: dict[str, Path]) -> Path | None:
 
     A hyphen in the name is an underscore in the file's.
     """
-    if len(given.parts) != 1 or given.suffix or given.is_file():
+    # os.path: a name that is too long is no file, where pathlib raises an error
+    if len(given.parts) != 1 or given.suffix or os.path.isfile(given):
         return given
     named = known.get(given.name.replace("-", "_"))
-    return given if named is None and given.exists() else named  # reading a folder says so
+    return given if named is None and os.path.exists(given) else named  # reading fails on a folder
 
 
 def shipped_protocols() -> dict[str, Path]:

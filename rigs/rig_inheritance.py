@@ -6,6 +6,7 @@ merged content, which is self-contained, is stored with the data.
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from decimal import Decimal
@@ -81,7 +82,7 @@ def read_rig(path: Path) -> RigSource:
         if not isinstance(parent, str) or "\0" in parent:
             raise InputError(here, KEY, parent, "must be the path of a rig file")
         there = _parent_file(here, parent)
-        if not there.exists():
+        if not os.path.exists(there):  # pathlib raises for a name that is too long
             known = shipped_rigs()
             near = did_you_mean(there.name, [*known, *neighbours(there)])
             text = f"no such file, nor a shipped rig ({', '.join(known)}){near}"
@@ -107,7 +108,7 @@ def read_rig(path: Path) -> RigSource:
 def _parent_file(here: Path, parent: str) -> Path:
     """Return the file that `extends` names: a path from the file's folder, or a shipped rig."""
     there = here.parent / parent
-    if there.exists():
+    if os.path.exists(there):
         return there
     return shipped_rigs().get(parent.replace("-", "_"), there)
 

@@ -8,6 +8,7 @@ faults were found, ``"faults"`` lists each with its file, key, value and message
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
@@ -25,6 +26,8 @@ from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
 
+LONGEST_SHOWN = 80
+"""Characters of a file name that is too long."""
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _WITH_TRIALS = {
     "collect",
@@ -135,6 +138,10 @@ def failure(error: Exception) -> Failure:
     if isinstance(error, FileNotFoundError | NotADirectoryError) and error.filename:
         place = os.fsdecode(error.filename)
         return Failure(f"{place}: {os.strerror(error.errno or 0).lower()}", console.FAILED, place)
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        place = os.fsdecode(error.filename or "")
+        shown = place if len(place) <= LONGEST_SHOWN else f"{place[:LONGEST_SHOWN]}..."
+        return Failure(f"{shown}: the file name is too long", console.WRONG_INPUT, shown or None)
     if isinstance(error, OSError) and error.filename:
         # of a copy the second file is the one that is written
         place = os.fsdecode(error.filename2 or error.filename)

@@ -9,6 +9,7 @@ import yaml
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.page import render_section
+from sliplab.analysis.report.plugin_sections import ReportData
 from sliplab.plugins.claims.document import ClaimState, Look, StoppingRecord
 from sliplab.plugins.claims.section import claims_key, claims_section
 from sliplab.storage.files import write_json
@@ -56,7 +57,7 @@ def test_a_claim_stands_with_the_look_that_called_it(tmp_path: Path, small: dict
         Look(round=3, taken=27, claims=(state(61.0, holds=True),)),
     )
     found = campaign(tmp_path, small, looks)
-    section = claims_section(*found, True)
+    section = claims_section(ReportData(*found, True))
     assert section is not None
     (shown,) = section.campaigns
     assert (shown.taken, shown.planned, shown.error, shown.chosen) == (27, 36, 10.0, False)
@@ -87,6 +88,6 @@ def test_a_claim_stands_with_the_look_that_called_it(tmp_path: Path, small: dict
 
 
 def test_a_campaign_without_looks_has_no_section(tmp_path: Path, small: dict[str, Any]) -> None:
-    assert claims_section(*campaign(tmp_path / "a", small, None), True) is None
-    assert claims_section(*campaign(tmp_path / "b", small, ()), True) is None
+    assert claims_section(ReportData(*campaign(tmp_path / "a", small, None), True)) is None
+    assert claims_section(ReportData(*campaign(tmp_path / "b", small, ()), True)) is None
     assert claims_key(*campaign(tmp_path / "c", small, None)) == []

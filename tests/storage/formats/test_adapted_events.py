@@ -279,11 +279,11 @@ def test_rows_out_of_order_are_sorted_and_polarities_are_those_named(tmp_path: P
         ("time x y p\n1 2 3 1\n\n1 5 2 3 1\n", "5 cells in row 4 below a heading of 4 columns"),
         ("time,x,y,p\r1,2,3,1\r", "is not CSV"),
         ("time,x,y,p\n1,2,3,1\n1,2\n", "no number in column y: row 3"),
-        ("time,x,y,p\n1,2.5,3,1\n", "holds .* 1 events outside of the sensor, and 0 that"),
-        ("time,x,y,p\n1,2,-3,1\n", "holds .* 1 events outside of the sensor, and 0 that"),
+        ("time,x,y,p\n1,2.5,3,1\n", "events: 1 .*outside of the .* gives its camera; 0 can"),
+        ("time,x,y,p\n1,2,-3,1\n", "events: 1 .*outside of the .* gives its camera; 0 can"),
         ("time,x,y,p\n1,2,3,1\n2,2,3,2\n", "polarities from 1 to 2, all above 0; `positive` says"),
         ("time,x,y,p\n1,2,3,-1\n2,2,3,0\n", "polarities from -1 to 0, none above 0; `positive`"),
-        ("time,x,y,p\n-1,2,3,1\n", "holds 1 events without a valid time, and 0 that"),
+        ("time,x,y,p\n-1,2,3,1\n", "events: 1 events without a valid time; 0 can"),
         ("", "has no column time"),
         ("time,x,y,p\n", "contains no event: its length is unknown"),
     ],
@@ -304,8 +304,8 @@ def test_arrays_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
     for wrong, message in (
         (np.zeros(3), r"array of shape \(3,\); a table has rows and columns"),
         (np.zeros((2, 3)), "has no column 3; there are 0, 1, 2"),
-        (np.full((2, 4), np.nan), "holds .*2 events outside of the sensor, and 0 that"),
-        (np.array([[1.0, 2, 3, np.nan]]), "holds 1 events with an unknown polarity, and 0 that"),
+        (np.full((2, 4), np.nan), "events: 2 .*outside of the .* gives its camera; 0 can"),
+        (np.array([[1.0, 2, 3, np.nan]]), "events: 1 events with an unknown polarity; 0 can"),
         (np.array([[1, 2, 3, 1]], object), "holds Python objects"),
     ):
         np.save(folder / "events.npy", wrong)

@@ -81,7 +81,7 @@ def declare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, P
         monkeypatch.syspath_prepend(str(tmp_path / "code"))
         monkeypatch.setitem(sys.modules, "lab_ticks", None)  # forgotten again at the end
         del sys.modules["lab_ticks"]
-        found = Plugins({**plugins().found, "lab_ticks": declared}, ())
+        found = Plugins({**plugins().found, "lab_ticks": declared}, {}, ())
         monkeypatch.setattr(known, "plugins", lambda: found)
         known._load.cache_clear()
 

@@ -329,7 +329,7 @@ def test_lab_files_of_unknown_polarities_are_refused(tmp_path: Path) -> None:
     _lab(tmp_path / "a.h5", np.arange(COUNT) / 100, ps=1 + np.arange(COUNT) % 2)
     done = here("import", tmp_path / "a.h5", "--store", tmp_path / "s", "--name", "x")
     assert done.returncode == 2
-    assert "holds 250 events with an unknown polarity" in done.stderr
+    assert "events: 250 events with an unknown polarity" in done.stderr
 
 
 @pytest.mark.usefixtures("small")
