@@ -47,8 +47,8 @@ from sliplab.storage.trials.recording import Recording
 
 Rows = tuple[tuple[float, float, float], ...]
 UNVOUCHED_S = 0.3
-"""A recording may begin and end this much before and after the pulses on which a clock's fit
-stands: the code may be silent for 16 ticks."""
+"""A recording may begin and end this much before and after the pulses of a clock's fit: the code
+may be silent for 16 ticks."""
 BURST_US = 10_000
 """The interval in which `gates.event_burst` counts events."""
 WINDOW_S = 0.5

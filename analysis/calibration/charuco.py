@@ -1,8 +1,8 @@
 """Lens and scale of the outside camera from pictures of a printed ChArUco board.
 
-OpenCV finds corners and fits pinhole and distortion. Around it stands what keeps a bad set of
-pictures from giving numbers that look good: how much of the picture the corners cover, how well
-the focal length is known, and how many coefficients the pictures can really tell.
+OpenCV finds corners and fits pinhole and distortion. This module rejects image sets whose results
+only look good: it checks how much of the image the corners cover, how well the focal length is
+determined, and how many coefficients the images support.
 """
 
 from __future__ import annotations

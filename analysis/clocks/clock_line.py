@@ -52,11 +52,11 @@ _MOVED_KNOTS = 4
 """Up to this number of knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
 _CHANCE = 1e-4
-"""Share of straight clocks with locked stamps that are taken for bent."""
+"""False-positive rate of knots for straight clocks with locked stamps."""
 _KNOT = 3.5
 """Change of the drift, in standard deviations, that adds a knot."""
 STEP, STEP_AT_END = 5.5, 4.5
-"""A clock has jumped where a step stands out by so many, among thousands of places or at an end."""
+"""Detection thresholds of a clock's jump, in sigma: among thousands of places, or at an end."""
 _MORE_LIKELY, _MORE = 12.0, 1.1
 """By how much and by what share more of the squares a step must explain than a change of drift: of
 a clock that bends smoothly a step explains less than a bend does, of one that jumps 1.5 times as
@@ -83,8 +83,8 @@ _UNITS = 0.6
 def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
     """Median of the slopes between pulses half the train apart, and the median level at x = 0.
 
-    Not all pairs, as in Theil (1950) and Sen (1968): the near ones say little of the slope, and
-    there are n**2 of them. It stands a quarter of bad points.
+    Not all n**2 pairs, as in Theil (1950) and Sen (1968): near pairs say little about the slope.
+    The breakdown point is 25 %.
     """
     half = x.size // 2
     run = x[half : 2 * half] - x[:half]
@@ -269,7 +269,7 @@ def _cut(x: Floats, knots: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Changes:
-    """The most that stands out of the residuals, in standard deviations of chance, and where.
+    """Largest deviations in the residuals, in standard deviations under chance, and their places.
 
     knot, knot_at: a change of the drift, and its pulse.
     step, step_size: a step, and its size in ns.

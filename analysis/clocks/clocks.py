@@ -55,8 +55,8 @@ MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
 MIN_LOSSY, MIN_LIFT = 100, 1.5
 """A smaller share will do where both trains lost many pulses: of so many pulses and so many times
-what a wrong lag gives. In such a train a clock that jumps by whole ticks, after which half of the
-pulses meet others, stands out only where there are many."""
+what a wrong lag gives. In such a train a jump by whole ticks, after which half of the pulses match
+others, shows only where there are many."""
 MOST_STAGGERED = 8
 """So many pulses may lie before one train begins and behind the end of the other: noise. More mean
 that only a stretch of two trials' codes is the same."""
@@ -84,7 +84,7 @@ class ClockRefused(ValueError):
     """No clock map can be trusted for these pulses.
 
     Attributes:
-        reason: which gate said no: ``too_few_pulses``, ``ambiguous`` (the train fits in more than
+        reason: the gate that failed: ``too_few_pulses``, ``ambiguous`` (the train fits in more than
             one place), ``no_match`` (it fits nowhere), ``drift`` or ``residuals``.
     """
 
@@ -99,7 +99,7 @@ class ClockFit:
 
     Attributes:
         map: device ns to reference ns; more than one piece where the clocks bend.
-        pulses_seen: pulses on which the line stands.
+        pulses_seen: pulses that the line is fitted to.
         pulses_late: pulses that found a partner but lie outside the gate; not in the line.
         pulses_missed: reference pulses inside the device's train that found no partner.
         pulses_spurious: device pulses without a partner (a second report of a pulse is one).

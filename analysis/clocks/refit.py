@@ -18,7 +18,7 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import SYNC
 
 POINTS = 200
-"""Residuals that are kept of a device in a trial, evenly spread over it."""
+"""Number of residuals stored for a device in a trial, evenly spread over it."""
 _SAME = 1e-9
 """Figures that differ by less than this share came from the same fit on another processor."""
 _SAME_DRIFT = 10**6

@@ -43,7 +43,7 @@ RIDGE = 1e-3
 # all this model knows besides what a window looks like in each state, and it is why it can detect
 # a weak change earlier than an average can: evidence adds up over windows instead of being
 # forgotten. The recursion is the forward one of Rabiner (1989), equation 19, normalised at every
-# step and kept in logarithms, so that neither thousands of windows nor an impossible one
+# step and stored as logarithms, so that neither thousands of windows nor an impossible one
 # underflow.
 
 
@@ -73,7 +73,7 @@ def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
     """The chain of labelled trials: how often each state was left, by the windows spent in it.
 
     The share of the windows after which a state was left is the likeliest value; one departure in
-    two windows is added, so that a state nobody saw, or nobody left, still has one.
+    two windows is added, so that a state that was never seen, or never left, has one, too.
 
     Args:
         labels: states of each trial's windows in the order of time, integer (n,); a trial may
@@ -90,7 +90,7 @@ def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
         if trial.min() < 0 or trial.max() >= states or (np.diff(trial) < 0).any():
             raise ValueError(f"labels must ascend within 0..{states - 1}")
         spent += np.bincount(trial, minlength=states)[:-1]
-        # a state between two windows was passed through without a window of its own
+        # a state between two windows was passed through without its own window
         left[trial[0] : trial[-1]] += 1
     return Chain((left + 1) / (np.maximum(spent, left) + 2))
 

@@ -97,7 +97,7 @@ def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> Trial
     """Judge one trial; see the module.
 
     Args:
-        detections: what the detector said.
+        detections: the detector's onsets.
         slip: what is true, on the same time line.
         false_early_ns: a detection earlier than the label's onset by MORE than this is false.
 

@@ -1,7 +1,7 @@
 """The detector on a running stream: events in as they come, one decision out for each window.
 
-Events are counted into the windows that are open when they arrive, so nothing of the past is kept
-or binned again, and a window is evaluated by the very functions that judge a stored trial: the same
+Events are counted into the windows that are open when they arrive, so no past event is stored or
+binned again, and a window is evaluated by the very functions that judge a stored trial: the same
 events give the same windows, counts and decisions. What a stream does that a file does not
 (silence, events out of order, events too late, a clock that leaps) has one outcome each:
 
@@ -181,7 +181,7 @@ class StepDetector:
     """A detector at its levels, window by window.
 
     A window is of gross slip once that was detected, of incipient slip where its evidence exceeds
-    the level. After an interruption evidence begins anew; onsets stay.
+    the level. After an interruption evidence is reset; onsets stay.
     """
 
     width = 1

@@ -71,7 +71,7 @@ VERSION = 4
 BY_SEED_VERSION = 2
 NAME = "evaluation"
 FORMAT = (VERSION, WINDOWS_VERSION)
-"""Stands in an evaluation, so that who reads it knows that its keys are those of today."""
+"""Format version stored in an evaluation, to detect keys of an older version."""
 
 
 def make_job(

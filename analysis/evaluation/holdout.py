@@ -21,7 +21,7 @@ STEP, NAME, VERSION = "holdout", "results", 1
 
 
 class Holdout:
-    """The hold-out campaign of a study, and what is kept of it.
+    """The hold-out campaign of a study, and its stored results.
 
     Args:
         store: evaluated, its slides simulated.
@@ -53,7 +53,7 @@ class Holdout:
         self.key = make_key(STEP, VERSION, [self.model.key, made_of, *used], rule)
 
     def result(self) -> HoldoutResult:
-        """Read what is kept.
+        """Read the stored result.
 
         Raises:
             FileNotFoundError: the campaign was never judged.

@@ -54,7 +54,7 @@ class OtherNetwork:
     """A network that is evaluated in addition to the store's own.
 
     Attributes:
-        name: of what is kept, safe as a file's name.
+        name: of the stored results, safe as a file name.
         title: for people.
         content: its file's bytes: a model file of this program, or weights of `description`.
         windows: what it takes.
@@ -239,7 +239,7 @@ def file_judgement(
     margin: float | None = None,
     smoothing: int | None = None,
 ) -> Judgement:
-    """Return a network of a file with the protocols' rules, in spikes of its own outputs.
+    """Return a network of a file with the protocols' rules, in spikes of the network's outputs.
 
     Args:
         margin, smoothing: instead of the protocols' own.
@@ -359,7 +359,7 @@ def _counter(
 
 
 def score_network(job: Judgement) -> None:
-    """Windows, detections and latencies, kept as one result."""
+    """Windows, detections and latencies, stored as one result."""
     network = job.network
     rows: list[TrialScore] = []
     counts: list[I64] = []

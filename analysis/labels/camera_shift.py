@@ -1,10 +1,10 @@
 """The camera was knocked: what all markers have in common is not theirs.
 
-While papillae are stuck their markers stand still on a plate that stands still, so the median of
-what they have moved is the camera's own motion, and it is taken out. Once all but the last have
-slipped nothing shows where the camera points; a sudden step that all take together is still told
-from slip, anything slower is not, and labels are doubted where that happens. Trials with a sliding
-plate are measured from the plate's own marker and need none of this.
+While papillae are stuck their markers do not move on a plate at rest, so the median of their motion
+is the camera's own motion, and it is subtracted. Once all but the last have slipped nothing shows
+where the camera points. A sudden step of all markers is still distinguished from slip, a slower
+motion is not, and labels are flagged as doubtful where that happens. Trials with a sliding plate
+are measured from the plate's own marker and need none of this.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _followed(away: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _all_took(step: Any, new: Any, known: Any, stuck: Any, velocity: Any) -> bool:
-    """Return whether a median step is the camera's: then no marker goes on as it did.
+    """Return whether a median step is the camera's: then all markers jump.
 
     It is asked once a marker has moved by more than a knock in a frame, as in slides above some
     2 mm/s. There many may let go in a few frames, and each steps so far; but others still stand, or

@@ -297,7 +297,7 @@ def _wide(intervals: tuple[Interval | None, Interval | None]) -> Doubts:
 
 
 def _near_lost(onsets: Onsets, lost_ns: I64) -> Doubts:
-    """Doubts of onsets beside lost events."""
+    """Return doubts about onsets near lost events."""
 
     def of(onset: int | None) -> str | None:
         near = onset is not None and bool((np.abs(lost_ns - onset) < NEAR_LOST_NS).any())

@@ -1,10 +1,10 @@
 """Slip of each papilla from its marker's track inside the sensor, and the sensor's own motion.
 
 A papilla that sticks to the plate is left behind by the sensor: its marker moves in the inner
-picture in proportion to the sensor's way, by a gain that changes slowly (bending, relaxation) and
-that nobody needs to know. One that slips is dragged along, and its marker stays where it is. So the
-beginning of a slip is a knee in the marker's displacement over the sensor's way, and what the
-displacement lacks from then on, by the gain at the knee, is the distance slid.
+picture in proportion to the sensor's travel, by an unknown gain that changes slowly (bending,
+relaxation). One that slips is dragged along, and its marker stays where it is. So the beginning of
+a slip is a knee in the marker's displacement over the sensor's way, and what the displacement lacks
+from then on, by the gain at the knee, is the distance slid.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def slips(way_mm: F64, moved_px: F64, sigma_px: F64, first: int, backlash_px: fl
         moved_px: (n, m) displacement of each marker along its base's motion, NaN where unknown.
         sigma_px: (n, m).
         first: the first slice of the motion.
-        backlash_px: of the track, once a marker no longer goes on.
+        backlash_px: of the track, after a marker's reversal.
     """
     n, m = way_mm.shape
     knees, gains = np.full((3, m), np.nan), np.full(m, np.nan)

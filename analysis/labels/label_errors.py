@@ -23,7 +23,7 @@ from sliplab.storage.trials.store import Store
 
 REFERENCES = ("hold_start", "hold_end")
 CHECK = "label-check"
-"""The step that checks labels from drawn video, and the folder of its own store."""
+"""The step that checks labels from drawn video, and the folder of its store."""
 _TRUTH: dict[Rule, dict[Kind, str]] = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},

@@ -1,6 +1,6 @@
 """Locate markers in a frame near their predicted positions: the compiled part of tracking.
 
-Each marker has a square box of its own. Grey levels are taken relative to the ground around it and
+Each marker has its own square box. Grey levels are taken relative to the ground around it and
 the white in its middle, cut off just above the one and just below the other, and summed with their
 places: noise and light on the ground or inside the disc then weigh nothing, and the sum is the
 disc's area to a twentieth of a percent, which is how a hidden part is noticed. Where boxes would

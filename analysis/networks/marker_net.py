@@ -106,7 +106,7 @@ class MarkerNet:
 
 
 def fit(train: MarkerSamples, validation: MarkerSamples, seed: int) -> MarkerNet:
-    """Train; the epoch with the best strict validation accuracy is kept, of equals the lower loss.
+    """Train, and select the epoch of best strict validation accuracy; ties by the lower loss.
 
     Args:
         seed: of the first weights and of the order of the samples.

@@ -60,7 +60,7 @@ def build(
         settings: channels, kernels, hidden neurons, outputs, weight scale.
         windows: shape of a sample.
         seed: the same seed gives the same weights to the bit.
-        classes: that it tells apart, at least 2; `classes_of` the network says it again.
+        classes: number of classes, at least 2; `classes_of` the network returns it.
     """
     side = math.ceil(windows.cells / 2)
     k1, k2 = settings.conv1_kernel, settings.conv2_kernel
@@ -106,7 +106,7 @@ def build(
 
 
 def classes_of(net: nn.Sequential) -> int:
-    """Return the number of classes that a network of `build`, or a copy of one, tells apart."""
+    """Return the number of classes of a network of `build`, or of a copy of one."""
     classes: Any = net.classes
     return int(classes)
 

@@ -296,7 +296,7 @@ def windows_loss(
     Args:
         rows, labels: int64 (n,), which windows, and their classes.
         gain: what a spike counts in the cross-entropy.
-        memory: (state, scratch, kept (potentials, lists, ends), planes) of one thread.
+        memory: (state, scratch, record (potentials, lists, ends), planes) of one thread.
         outputs: output neurons; neuron j is of class ``j % classes``.
         by_count: scratch float32, zero beyond the outputs.
         out: int64 (n, classes), grows by the output spikes.

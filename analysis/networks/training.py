@@ -255,8 +255,8 @@ class Fitted:
         history: one record an epoch.
         chosen_epoch: the epoch the weights are from.
         warnings: as text, what is wrong with the chosen network; empty when nothing is.
-        epoch_seconds: wall time of each epoch. Kept apart from the records and not saved, so
-            that the same training gives the same file.
+        epoch_seconds: wall time of each epoch. Separate from the records and not saved, so that the
+            same training gives the same file.
         classes: names of the classes, in the order of the outputs.
     """
 

@@ -153,7 +153,7 @@ def shuffled_chance(
 
     Args:
         how: `epochs` and the rest of the training.
-        runs: shuffles, each with weights of its own.
+        runs: shuffles, each with its own weights.
         per_class: windows of a class to learn from at most, and as many to choose an epoch by.
         deal: how labels are shuffled; `shuffle` but in tests.
 

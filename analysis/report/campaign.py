@@ -43,7 +43,7 @@ class CollectedSection(Content):
     """Committed trials compared with the plans.
 
     Attributes:
-        source: what was kept of the outside camera, as text.
+        source: the stored data of the outside camera, as text.
         grids: trials by the first two factors of each campaign, with its name and theirs.
     """
 
@@ -99,7 +99,7 @@ def collected_section(
 
 
 def tracks_words(simulated: bool) -> str:
-    """Return tracks as text that nobody mistakes for a video."""
+    """Return a description of tracks that cannot be mistaken for a video."""
     if simulated:
         return "simulated tracks of the markers (no video was drawn)"
     return "the camera's own tracks of the markers (no video was kept)"

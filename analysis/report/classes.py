@@ -178,7 +178,7 @@ class ClassDataSection(Content):
 
     Attributes:
         one_each: each recording shows one class.
-        campaigns: name, origin, and what is said about it.
+        campaigns: name, origin, and description.
         missing: classes without training windows.
     """
 
@@ -411,7 +411,7 @@ def _error_section(summary: ClassSummary) -> ErrorSection:
     by_factor: Mapping[str, Mapping[str, Share]] = {
         factor: levels
         for factor, levels in scores.by_factor.items()
-        # a factor that is the class itself stands under the classes already
+        # a factor that is the class itself is listed under the classes already
         if 2 <= len(levels) <= SHOWN and not levels.keys() <= set(scores.classes)
     }
     rows = [

@@ -1,4 +1,4 @@
-"""The report on a rig with one camera: what can be said, and what needs the other camera."""
+"""The report on a rig with one camera: its results, and those that need the other camera."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from sliplab.storage.files import make_folder, safe_name, write_text
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture (SVG text) and its data; what to see in it is said by a template.
+    """A picture (SVG text) and its data; a template has its caption.
 
     Attributes:
         name: of its files in the page's folder, without an ending; none are written without a name.

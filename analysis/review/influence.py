@@ -1,9 +1,9 @@
 """Figures of an evaluation over trials, and their change where reviews find other onsets.
 
-Nothing is approximated but by the draws of what reviews may find: a trial is judged anew by the
-evaluation's own bounds for each draw, and each figure is computed anew with it in place. Windows
-keep the network's answer and have the class of the phase that their middle lies in, as in the
-evaluation's tenths; a trial that comes in has no windows.
+The only approximation is Monte Carlo over review outcomes: for each draw a trial is scored again by
+the evaluation's bounds, and each figure is computed again with that score. Windows keep the
+network's answer and have the class of the phase that their middle lies in, as in the evaluation's
+tenths; a trial that comes in has no windows.
 """
 
 from __future__ import annotations
