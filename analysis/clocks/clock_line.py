@@ -476,7 +476,7 @@ def _judged(
 
 
 def _influence(residuals: Floats, sigma: float) -> Floats:
-    """What each pulse does to Huber's estimate (Huber 1964): psi / E psi', ns.
+    """Return each pulse's influence on Huber's estimate (Huber 1964): psi / E psi', ns.
 
     Their mean square is the estimate's asymptotic variance for a single pulse.
     """
@@ -488,7 +488,7 @@ def _influence(residuals: Floats, sigma: float) -> Floats:
 
 @dataclass(frozen=True)
 class _Hidden:
-    """What a straight line may be off by at some knots, ns: chance, and a bend that it hides.
+    """Possible error of a straight line at some knots, ns: chance, and an undetected bend.
 
     Attributes:
         bend, covariance: (k,) mean and (k, k) covariance of the error.

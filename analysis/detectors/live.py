@@ -157,10 +157,10 @@ class Step:
 
 
 class LiveRule(Protocol):
-    """What is decided after each window.
+    """The decision rule applied after each window.
 
     Attributes:
-        width: windows that a decision rests on at least.
+        width: fewest windows that a decision is based on.
     """
 
     width: int

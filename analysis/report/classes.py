@@ -287,7 +287,7 @@ def _argmax_words(scores: JudgedClasses) -> str:
 
 @dataclass(frozen=True)
 class ConfusionSection(Content):
-    """What is taken for what, and each class by itself.
+    """The confusion matrix, and the scores of each class.
 
     Attributes:
         left_out: classes that the figure of recall leaves out.

@@ -216,7 +216,7 @@ def headline(summary: OneCameraSummary) -> list[Number]:
 
 @dataclass(frozen=True)
 class LeftOutSection(Content):
-    """What this report does not show, and why."""
+    """Sections that this report leaves out, and the reason."""
 
     template: ClassVar[str] = "left_out.html"
     camera: str

@@ -31,7 +31,7 @@ class ReportData:
 
     @property
     def collected_here(self) -> bool:
-        """Whether some of the campaigns are none of imported recordings."""
+        """True if any of the campaigns was collected here rather than imported."""
         return any(item.recorded is None for item in self.campaigns)
 
 

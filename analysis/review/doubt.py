@@ -68,7 +68,7 @@ class Labelled:
 
 @dataclass(frozen=True)
 class LabelDoubt:
-    """What a review may find of a trial.
+    """Uncertainty of a trial's label: possible outcomes of its review.
 
     Attributes:
         onsets: the label's, or those that its rule suggests; None where nothing suggests one.

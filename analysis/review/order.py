@@ -85,7 +85,7 @@ class Waiting:
 
 @dataclass(frozen=True)
 class Gain:
-    """What reviews do for one figure.
+    """Effect of the reviews on one figure.
 
     Attributes:
         value: now. width: of its 95 % interval over trials.
