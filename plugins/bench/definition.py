@@ -50,7 +50,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Definition:
-    """What the scenes are drawn from.
+    """Distributions that the scenes are drawn from.
 
     Attributes:
         spread: of the worlds' parameters: the largest factor less 1, either way.

@@ -105,7 +105,7 @@ def check_page(page: Path) -> None:
 
 
 def write_leaderboard(page: Path, found: BenchResult) -> None:
-    """Write the table into a page, between its two comments, and the plot beside it.
+    """Write the table into a page, between its two comments, and the plot next to it.
 
     Raises:
         InputError: as `check_page`.

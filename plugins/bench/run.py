@@ -1,7 +1,7 @@
 """`sliplab bench`: detectors on the scenes of the bench.
 
-Whatever is chosen is chosen by `prepare`, which has no test scene. What a detector gave is kept as
-soon as it is complete, so that a run that was stopped resumes with the next detector.
+All choices are made by `prepare`, which has no test scene. A detector's evidence is stored as soon
+as it is complete, so that a stopped run resumes with the next detector.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class Bench:
 def _give_memory_back() -> None:
     """Return what a simulation has freed.
 
-    It lies between the events of scenes that are kept, where glibc's allocator keeps it: 15 MB a
+    It lies between the events of retained scenes, where glibc's allocator does not free it: 15 MB a
     scene, 11 GB in the full set.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -1,4 +1,4 @@
-"""How strong the evidence must be at each look, so that all looks together are wrong seldom enough.
+"""Boundaries of the evidence at each look that limit the error rate over all looks.
 
 The chance of a wrong call that is allowed is spent by a power of the share of the trials that have
 been taken (Kim and DeMets 1987): little of it early, most of it at the planned end, where the
@@ -47,7 +47,7 @@ def boundaries(shares: Sequence[float], error: float) -> F64:
             later looks have an infinite boundary.
         error: chance that any look exceeds its boundary where nothing is there to find.
     """
-    whole = tuple(shares)  # each look is made from the one before, which was kept
+    whole = tuple(shares)  # each look is computed from the one before, which is cached
     return np.array([_stage(whole[: k + 1], error).limit for k in range(len(whole))])
 
 

@@ -1,4 +1,4 @@
-"""What a campaign's trials show: figures of each trial, in the order in which they were taken."""
+"""Evidence of a campaign: figures of each trial, in the order in which they were taken."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What trials that were not taken are expected to give, by factors and without interactions.
+"""Expected figures of trials that were not taken, by factors and without interactions.
 
 Effects of levels are shrunk to their mean by ridge regression, as random effects are; leaving one
 trial out chooses by how much. The spread of a trial is expected in the same way.

@@ -1,9 +1,9 @@
 """Claims of a campaign while it is collected: which trials next, and when it may end.
 
-Figures of each trial are made in another process while the arm goes on. Between two rounds the
-claims are looked at, by methods that allow it. An adaptive campaign chooses a batch by all that is
-known of the batches before the last one, so that nobody waits for the last one's figures, and
-whoever resumes chooses the same.
+Figures of each trial are computed in another process while the arm continues. Between two rounds
+the claims are evaluated, by methods that allow interim looks. An adaptive campaign chooses a batch
+by the figures of the batches before the last one, so that it need not wait for the last one's
+figures, and a resumed campaign chooses the same.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class ClaimWatch:
     def _planned(self) -> list[list[Trial]]:
         """The plan's trials by round."""
         rounds: list[list[Trial]] = []
-        waiting: list[Trial] = []  # a reference trial stands before the one that it belongs to
+        waiting: list[Trial] = []  # a reference trial comes before the one that it belongs to
         for trial in self._run_request.plan:
             waiting.append(trial)
             if trial.role == "measured":

@@ -25,7 +25,7 @@ PERCENT = 100.0
 
 @dataclass(frozen=True)
 class Called:
-    """How a claim came out.
+    """Outcome of a claim.
 
     Attributes:
         look: number of the look at which it was called; None: never.
@@ -38,7 +38,7 @@ class Called:
 
 @dataclass(frozen=True)
 class Course:
-    """How a campaign went.
+    """Course of a campaign.
 
     Attributes:
         evidence: at its end; its looks are all that a campaign of a given order might have had.
@@ -152,7 +152,7 @@ def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures |
 def chosen_evidence(
     plan: Plan, grid: Grid, values: Figures, fits: Fits, over_time: Figures | None = None
 ) -> Iterator[Evidence]:
-    """Yield what an adaptive campaign has seen after each round; it goes on to the whole grid.
+    """Yield an adaptive campaign's evidence after each round, up to the whole grid.
 
     Args:
         fits: as for `states`. over_time: as for `course`.

@@ -1,4 +1,4 @@
-"""What the evidence says of each claim: its estimate, its interval, and whether it is settled.
+"""State of each claim by the evidence: its estimate, its interval, and whether it is settled.
 
 Trials without a figure could have had any: a claim is called only if it is so whatever they would
 have shown.
@@ -30,7 +30,7 @@ from sliplab.protocols.claims import FIGURES, QUANTILES, Claim, Stopping
 PERCENT = 100.0
 _HALVINGS = 50
 Fits = dict[tuple[str, bytes], Expectation]
-"""What the first figures of a campaign let expect: the same at each later look."""
+"""Expectations from a campaign's first figures, cached: they are the same at each later look."""
 
 
 def states(

@@ -1,7 +1,6 @@
 """A trained network as ONNX, on a Speck, and with a card.
 
-Everything that is said of the network is measured on windows of a store, by default the one that
-the model lies in.
+Every stated property of the network is measured on windows of a store, by default the model's own.
 """
 
 from __future__ import annotations

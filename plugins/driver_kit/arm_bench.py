@@ -193,7 +193,7 @@ class ArmBench(Bench):
         return min(SPEED_MM_S, self.limits.speed_mm_s)
 
     def to(self, y_mm: float) -> Segment:
-        """Return a move to a place beside the centre of the workspace, without turning."""
+        """Return a move to a place off the centre of the workspace, without turning."""
         x, y, z = self.home.xyz_mm
         turn = self.arm.pose().rotvec_deg
         return Segment(Pose((x, y + y_mm, z), turn), self.speed_mm_s)

@@ -1,4 +1,4 @@
-"""Reports of an arm's driver during a path, beside the true motion of its fake."""
+"""Reports of an arm's driver during a path, with the true motion of its fake."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class Bench(ABC):
         threading.Event().wait(seconds)
 
     def call(self, name: str, work: Callable[[], T], within_s: float | None = None) -> T:
-        """Return the result of a call of the driver, made in a thread of its own.
+        """Return the result of a call of the driver, made in a separate thread.
 
         Args:
             within_s: its time limit; that of most calls if left out.

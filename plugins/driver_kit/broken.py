@@ -67,7 +67,7 @@ class StopWaits(ExampleArm):
 
 
 class StopSendsNothing(ExampleArm):
-    """Stop ends the path in the driver only: the controller goes on with its move."""
+    """Stop ends the path in the driver only: the controller continues its move."""
 
     def stop(self) -> None:
         """Follow the path no longer."""
@@ -181,7 +181,7 @@ class OldClock(ExampleSync):
     """A late answer is taken for that of the next request."""
 
     def read_clock(self) -> ClockReads:
-        """Read the box's clock, anew where nothing came."""
+        """Read the box's clock, again where nothing came."""
         try:
             return super().read_clock()
         except RigError:

@@ -48,7 +48,7 @@ def reports(base: type[Any], change: Change, *methods: str) -> type[Any]:
 
 
 def takes(base: type[Any], name: str, change: Callable[..., tuple[Any, ...]]) -> type[Any]:
-    """Derive a driver one of whose methods gets the arguments that `change` makes of its own."""
+    """Derive a driver one of whose methods gets its arguments changed by `change`."""
 
     def method(self: Any, *arguments: Any) -> Any:
         return getattr(base, name)(self, *change(self, *arguments))
@@ -795,7 +795,7 @@ BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
 
 
 class TargetReported(ExampleGripper):
-    """The opening is that which was asked for."""
+    """The reported opening is the requested one."""
 
     target: float | None = None
 

@@ -75,7 +75,7 @@ def salvage_es(path: Path, name: str) -> ForeignTrial:
     except FormatError as error:
         packets = _whole_blocks(path)
         at, reason = begin + packets * _BLOCK, str(error)
-        if at >= size:  # faery reads on: nobody knows where that is
+        if at >= size:  # faery reads ahead: the position is unknown
             raise
     if reason is None:
         return trial

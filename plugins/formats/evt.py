@@ -186,9 +186,9 @@ def _last_bit(valid):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def decode_evt3(words, at, filled, state, width, height, x, y, p, t, edges):  # type: ignore[no-untyped-def]
-    """Decode 16-bit words, which say what changed: time, row, and columns alone or as vectors.
+    """Decode 16-bit words, which state changes: time, row, and columns alone or as vectors.
 
-    A vector stands at the last base, which it moves on; a single event leaves that alone.
+    A vector starts at the last base and advances it; a single event does not change it.
 
     Args:
         words: shape (n,). at: index of the first to decode.

@@ -79,11 +79,11 @@ _BLOCK = 1 << 18
 
 @dataclass(frozen=True)
 class Header:
-    """What the beginning of a file says.
+    """Header of a file.
 
     Attributes:
         begin: byte of the first word; end: byte behind the last whole one.
-        size: columns and rows; None where it does not say.
+        size: columns and rows; None if not stated.
         t0_us: what times count from.
         bits: of a column and a row, in DAT.
         swapped: EVT 2.1 with the upper half of each word first.
@@ -262,7 +262,7 @@ def _rest(path: Path, header: Header) -> Lost | None:
 
 
 def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
-    """Return a trial of the words that a header tells of."""
+    """Return a trial of the words that a header describes."""
     with as_damage():
         triggers, left_out = _triggers(path, header)
 
@@ -324,7 +324,7 @@ def _decoded(
     left out; times may run back where a high part fell.
 
     Raises:
-        DamagedWord: after what stands before it was yielded.
+        DamagedWord: after everything before it was yielded.
     """
     most = header.encoding.most_px
     width, height = header.size or (most, most)

@@ -1,7 +1,7 @@
-"""What the trials of a study of reflexes come to: drops prevented, way fallen, force, reaction.
+"""Results of a study of reflexes: drops prevented, distance fallen, force, reaction.
 
 A drop is prevented where the plate falls without a reflex, and is held by one that was triggered
-after the first tip had slipped: a detector that cries always prevents nothing.
+after the first tip had slipped: a detector that always triggers prevents nothing.
 """
 
 from __future__ import annotations

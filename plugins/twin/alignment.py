@@ -1,4 +1,4 @@
-"""How frames and forces lie in space and time against the arm: scale, turn, distortion, delays.
+"""Alignment of frames and forces with the arm: scale, rotation, distortion, delays.
 
 A tip that slides steadily moves as its base does. What differs between both is the camera's: its
 scale, its turn about its axis, pixels that are not square, a tilt, a lens. What a tip lags behind
@@ -37,7 +37,7 @@ ROUNDS, OUTLIER = 6, 2.5
 
 @dataclass(frozen=True)
 class View:
-    """How frames show motions of the arm; all numbers are 0 for a camera that is aligned with it.
+    """Alignment of frames with the arm's motion; all numbers are 0 for an aligned camera.
 
     Attributes:
         scale: of displacements in frames over those of the arm, less 1.

@@ -4,8 +4,8 @@ Each is near to one parameter of the camera, or to what of several can be seen t
 computed from events alone where that can be done. They need not be without bias: what simulated
 worlds give is computed in the same way, and compared.
 
-Log intensity has no scale of its own: contrast and threshold, and the threshold's mismatch, are
-seen as ratios only. What a force does to the image is seen as a product with that force.
+Log intensity has no absolute scale: contrast and threshold, and the threshold's mismatch, are
+observed as ratios only. What a force does to the image is seen as a product with that force.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ CONTRAST_TREND, NOISE_TREND, SHIFT_TREND, PICTURE_TURN, EVENT_DELAY = CHECKED = 
     "picture_turn_deg",
     "event_delay_ms",
 )
-"""What events show of effects that no parameter of the camera makes."""
+"""Statistics of effects that no parameter of the camera causes."""
 
 
 def camera_estimates(trials: Sequence[PilotTrial]) -> dict[str, float]:
@@ -549,7 +549,7 @@ def _growth(discs: F64, normal_n: F64, px_per_mm: float) -> dict[str, float]:
 
 
 def _papillae(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
-    """How discs differ in the deepest slides: between rings, and inside them.
+    """Return differences of discs in the deepest slides: between rings, and inside them.
 
     Radii grow with normal forces and displacements with tangential ones, so these say how loads
     differ between papillae, which one force of all cannot.

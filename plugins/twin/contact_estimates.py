@@ -233,7 +233,7 @@ class Papillae:
 
 
 def papillae(contact: Contact) -> Papillae | None:
-    """Return what a pilot tells of each papilla; None where it tells nothing."""
+    """Return a pilot's estimates of each papilla; None without a fit."""
     fit, ring, place = contact.springs, contact.ring, contact.place_mm
     if fit is None:
         return None

@@ -62,11 +62,11 @@ def gross_forces(slips: Slips) -> F64:
 
 
 def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
-    """Force over lag of each ring's tips at each depth, N/mm, (levels, rings); NaN where not known.
+    """Return force over lag of each ring's tips by depth, N/mm, (levels, rings); NaN if unknown.
 
     Stuck or sliding, a tip pulls with its spring, and its lag is seen: the measured force along
-    the slide is a sum of the rings' lags, with their stiffnesses as factors. What relaxes is
-    counted in as a lag of its own, q' = -q / tau + m lag'.
+    the slide is a sum of the rings' lags, with their stiffnesses as factors. Relaxation is modelled
+    as a separate lag, q' = -q / tau + m lag'.
     """
     levels, which = slips.depths
     rings = np.arange(ring.max(initial=0) + 1)

@@ -27,7 +27,7 @@ LEAST_STRETCH_MM = 0.15
 
 @dataclass(frozen=True)
 class Growth:
-    """How a lag grows after a slip while the stretched spring relaxes.
+    """Growth of a lag after a slip while the stretched spring relaxes.
 
     Attributes:
         maxwell: stiffness of the relaxing branch over the other. relaxation_s: its time.

@@ -24,7 +24,7 @@ _NEWTON = 20
 
 @dataclass(frozen=True)
 class Guess:
-    """What is known or supposed of the skin before the pilot.
+    """Prior knowledge and assumptions of the skin before the pilot.
 
     Attributes:
         height_mm: of the centre papilla. radius_mm: of a papilla. spacing_mm: between rings.
@@ -60,7 +60,7 @@ class Lags:
         depth_mm: (l,). ring: (m,), -1 for a papilla that is not there.
         lag_mm: NaN where not known, 0 where a papilla does not touch, (l, m). error_mm: (l, m).
         normal_n: normal force at rest, (l,); NaN without. ratio: of the forces in gross slip.
-        kept: normal force in gross slip over that at rest, (l,).
+        kept: ratio of normal force in gross slip to that at rest, (l,).
         stiffness_n_per_mm: of all tips together while they stick, (l,).
         pull_n_per_mm: force over lag of each ring's tips, (l, rings).
     """

@@ -72,7 +72,7 @@ CONTACT_KEYS = frozenset(it.key for it in CONTACT)
 CAMERA_KEYS = frozenset(it.key for it in CAMERA)
 FORCE_KEYS = frozenset(it.key for it in PARAMETERS if "force" in it.streams)
 IN_MM = CONTACT_KEYS | {f"event_camera.{name}" for name in ("px_per_mm", "radius_mm")} | FORCE_KEYS
-"""What frames give a length to."""
+"""Parameters whose lengths are measured by frames."""
 NOISE_KEYS = frozenset(
     f"event_camera.{name}" for name in ("noise_hz", "leak_share", "hot_pixels", "hot_hz")
 )
@@ -88,8 +88,8 @@ class Check:
         floor: values that differ by less than this are alike.
         touches: parameters whose intervals do not hold with the effect.
         signed: the number is the distance from its median in worlds, either way.
-        setup: tells of places, times or trends that are wrong. These show in others, too, so that
-            it comes first; and its number is near to normal, see `Tail`.
+        setup: whether it shows places, times or trends that are wrong. These show in others, too,
+            so that it comes first; and its number is near to normal, see `Tail`.
     """
 
     key: str

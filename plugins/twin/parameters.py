@@ -39,7 +39,7 @@ class Parameter:
 
 
 LAYER_STEP = "scene.skin.layer_step_mm"
-"""Stands for `scene.skin.heights_mm`: all steps are changed by one factor, the centre stays."""
+"""Scale of `scene.skin.heights_mm`: one factor changes all steps, the centre is fixed."""
 
 CONTACT = (
     Parameter("scene.friction.kinetic", "kinetic friction", "", ("frames", "force")),

@@ -1,6 +1,6 @@
 """Regression of parameters on many statistics, of which most may say nothing.
 
-Sparse Bayesian regression in which every statistic has a prior variance of its own, found by
+Sparse Bayesian regression in which every statistic has its own prior variance, found by
 maximising the evidence (MacKay 1994, "automatic relevance determination"; Tipping 2001). Where a
 parameter depends on the statistics in a curved way, products of the linear predictions are added
 and treated the same. Statistics that are not correlated with any parameter are left out first.

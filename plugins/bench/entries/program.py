@@ -126,7 +126,7 @@ class Program(Detector):
                     else:
                         try:
                             left = left[os.write(self._input, left[:_PIPE]) :]
-                        except BrokenPipeError:  # its end is said by what is read
+                        except BrokenPipeError:  # the reader reports the end
                             left = left[:0]
                         if not left:
                             waiting.unregister(self._input)

@@ -19,7 +19,7 @@ from sliplab.protocols.claims import FIGURES, Claim
 
 SHARES = (0.1, 0.5, 0.9)
 LINES = 10
-"""Campaigns of which widths are kept."""
+"""Number of campaigns whose widths are stored."""
 POINTS = 8
 """Looks at which they are, at most."""
 MOST_OPEN = 0.5
@@ -34,7 +34,7 @@ class Drawn:
         called: of each claim, trials after which it was called; None: never.
         states: of each claim, then or at the end. trials: taken, and known at the last look.
         ended: trials where the claims ended the campaign; None: they did not.
-        widths: of each claim; empty where they are not kept.
+        widths: of each claim; empty where they are not stored.
     """
 
     called: tuple[int | None, ...]

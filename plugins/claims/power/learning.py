@@ -93,7 +93,7 @@ def learning_of(classifier: str, trials: F64, accuracy: F64, planned: int) -> Le
     """Return the curve, and what all planned training trials are expected to give.
 
     Its uncertainty is that of the test trials and of which training trials came first: both are
-    drawn anew (a bootstrap), and the curve is fitted again.
+    resampled (a bootstrap), and the curve is fitted again.
 
     Args:
         trials: (s,) training trials. accuracy: (orders, s, test trials).

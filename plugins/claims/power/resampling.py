@@ -1,14 +1,14 @@
-"""Campaigns as a pilot lets expect them: figures of trials that nobody has taken.
+"""Campaigns drawn from a pilot: figures of trials that were not taken.
 
 A trial's figure is that of one of the pilot's trials of the same condition, or of the nearest
 ones, moved by what the factors' effects differ between the two conditions. So undetected and
 missing ones come as often as the pilot has them there, and all figures of a trial belong together.
 Blocks differ as much as the pilot's do, sessions as much as is stated or as the pilot's do; a
 drift is drawn where one is stated. The pilot is itself one of many that might have been: it is
-drawn anew in the same way before each campaign (a hierarchical bootstrap: Davison and Hinkley 1997,
+resampled in the same way before each campaign (a hierarchical bootstrap: Davison and Hinkley 1997,
 Bootstrap Methods and their Application, section 3.8). Few values, drawn again and again, would give
-percentiles in steps, so each is moved by a little more chance, and their spread is kept (Silverman
-and Young 1987, The bootstrap: to smooth or not to smooth?).
+percentiles in steps, so each is moved by a little more chance, and their spread is preserved
+(Silverman and Young 1987, The bootstrap: to smooth or not to smooth?).
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Pilot:
 
     @cached_property
     def _off(self) -> dict[str, F64]:
-        """What each trial is off its condition's expected figure, (n,) by figure."""
+        """Residual of each trial from its condition's expected figure, (n,) by figure."""
         own = [tuple(condition[axis.name] for axis in self.axes) for condition in self.conditions]
         code, _ = self._coded(own, np.random.default_rng(0))
         return {
@@ -165,7 +165,7 @@ class Pilot:
             return ASSUMED
         off, of, scatter = self._off[figure], self.sessions, self.scatter(figure)
         first, block = np.unique(self.blocks, return_index=True, return_inverse=True)[1:]
-        if len(first) >= 2 * self.session_count:  # else sessions and blocks cannot be told apart
+        if len(first) >= 2 * self.session_count:  # else sessions and blocks cannot be distinguished
             there = np.isfinite(off)
             count = np.bincount(block[there], minlength=len(first))
             total = np.bincount(block[there], off[there], minlength=len(first))
@@ -223,7 +223,7 @@ class Pilot:
         return self._again(rng)._drawn(conditions, blocks if in_blocks else None, rng)
 
     def _again(self, rng: np.random.Generator) -> Pilot:
-        """Draw the pilot anew."""
+        """Resample the pilot."""
         return replace(self, values=self._drawn(self.conditions, self.blocks, rng))
 
     def _drawn(

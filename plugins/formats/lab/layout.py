@@ -1,4 +1,4 @@
-"""The lab's recordings in their folders: two pickles or an HDF5 file each, and what lies beside."""
+"""The lab's recordings in their folders: two pickles or an HDF5 file each, and further files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the lab's scripts leave beside the events of a recording: a second copy, video and forces.
+"""Further files of the lab's scripts for a recording: a second copy, video and forces.
 
 A run's folder has `meta.json`, the events below `events`, videos below `videos`, and the times of
 the videos' frames in one pickle a camera, `timestamps_CAMERA.pkl`, written when the run ends. All

@@ -42,7 +42,7 @@ _LEAST_ROW = 8
 """Bytes of a row of a database, at least."""
 _ENDING = re.compile(r"\.(db3|mcap)(\.zstd)?$")
 _FAULTS = (Exception,)
-"""What rosbags raises where a file is damaged: errors of its own, of Python and of assertions."""
+"""Exceptions of rosbags for a damaged file: its own, Python's and failed assertions."""
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -64,7 +64,7 @@ def read_bag(path: Path, name: str) -> ForeignTrial:
 
 
 def salvage_bag(path: Path, name: str) -> ForeignTrial:
-    """Read what stands whole in a `.db3` that is cut short, and any other recording as it is.
+    """Read the intact part of a truncated `.db3`, and any other recording as it is.
 
     Raises:
         FormatError: as `read_bag`.
@@ -248,7 +248,7 @@ def _size(path: Path) -> int:
 @contextmanager
 def _opened_sqlite(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a database that is not written to. Raises Damage for what sqlite finds inside."""
-    # nothing is written beside a file that may be on a read-only disk
+    # no files are written next to the database: the disk may be read-only
     address = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(address, uri=True)) as database:

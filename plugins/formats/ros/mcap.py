@@ -69,7 +69,7 @@ _FAULTS = (
     OSError,
     EOFError,
 )
-"""What the `mcap` library raises, besides its own errors, where a file is damaged."""
+"""Exceptions of the `mcap` library for a damaged file, besides its own errors."""
 _MOST_MESSAGES = 1 << 62
 _SCHEMAS = ("ros2msg", "ros2idl", "ros1msg")
 """Encodings of the definitions of ROS messages."""
@@ -78,7 +78,7 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 
 @dataclass
 class _Found:
-    """What a file holds, but its events and frames."""
+    """Contents of a file, except events and frames."""
 
     topics: dict[str, str] = field(default_factory=dict)
     """Message type by topic, in the order of the file."""

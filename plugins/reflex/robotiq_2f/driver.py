@@ -38,7 +38,7 @@ class Robotiq2f:
         self.range = protocol.range_of(settings.model)
         self._link: BoundedSocket | None = None
         self._broken: str | None = None
-        """Why nothing more is asked over this connection."""
+        """Reason that this connection is no longer used."""
         self._asking = threading.Lock()
         """Held from a request to its answer; a stop does not wait for it."""
         self._sending = threading.Lock()

@@ -200,7 +200,7 @@ def _true_onsets(part: Sequence[LabelledTrial]) -> Trials:
 def make_rows(
     search: DetectorSearch, advance: Callable[[], None] = lambda: None
 ) -> tuple[list[Row], dict[str, str]]:
-    """Return the rows of all kept runs, and what is left out, with the reason.
+    """Return the rows of all stored runs, and those left out, with the reason.
 
     Args:
         advance: called after each setting.
@@ -347,7 +347,7 @@ def comparisons(rows: Sequence[Row]) -> list[Json]:
     """Return each line through the paper's setting, the paper's own value among them.
 
     Networks are compared with the pair that validation trials chose for each, at a stride of a
-    window's length: the paper's own pair is of its own windows and says little of others.
+    window's length: the paper's pair belongs to its windows and says little of others.
 
     Returns:
         one for each value: ``factor``, ``value``, ``paper``, ``row`` (the place among `rows`), and
@@ -460,7 +460,7 @@ _UNITS = {
 def search_result(
     search: DetectorSearch, full: bool, simulated: bool, advance: Callable[[], None] = lambda: None
 ) -> Json:
-    """Return all numbers of the runs that are kept, as plain data.
+    """Return all numbers of the stored runs, as plain data.
 
     Args:
         full: every value of the factors was tried with every other.

@@ -1,7 +1,7 @@
 """Generalisation: networks trained without a level of a factor, and tested on it alone.
 
-15 % of the other trials choose the epoch. Results of other skins are in the same table. Each
-result is kept as soon as it is there; a stopped training resumes at its last epoch.
+15 % of the other trials choose the epoch. Results of other skins are in the same table. Each result
+is stored as soon as it is complete; a stopped training resumes at its last epoch.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ class _Results(ResultFile[GeneralisationResults]):
 
 
 class Generalisation:
-    """A store's samples, what can be left out of them, and the results that are kept.
+    """A store's samples, what can be left out of them, and the stored results.
 
     Args:
         store: labelled, with a trained network.
@@ -284,7 +284,7 @@ def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, li
 
 
 def _same_level(given: str, texts: Sequence[str]) -> list[str]:
-    """Return the levels, as text, that one stands for: with their unit, another one, or none."""
+    """Return the levels, as text, that one matches: with their unit, another one, or none."""
     found = []
     for text in texts:
         number, _, unit = text.partition(" ")

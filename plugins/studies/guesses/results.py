@@ -48,7 +48,7 @@ Figures = dict[str, float | None]
 
 
 class StudySensitivity:
-    """The test trials of a study that are repeated at each setting, and what is kept of them.
+    """The test trials of a study that are repeated at each setting, and their stored results.
 
     Args:
         trials: of each campaign, test trials spread over its conditions.

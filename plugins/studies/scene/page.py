@@ -165,7 +165,7 @@ def short_table(result: Result) -> tuple[list[str], list[list[str]]]:
 
 
 def choice_pairs(result: Result) -> dict[str, str]:
-    """Return both choices of a level, each with its reason, and what a twin's pilot asked for."""
+    """Return both choices of a level, each with its reason, and effects that a pilot requires."""
     names = {"by measured windows": "measured", "by closed forms": "closed_form"}
     choice = result["choice"]
     pairs = {
