@@ -36,7 +36,7 @@ class Deviation(NamedTuple):
 
 
 def _hash(sha256: str | None) -> str:
-    """Return the first digits of a hash, which tell two files apart."""
+    """Return the first digits of a hash, enough to distinguish two files."""
     return f"SHA-256 {sha256[:16]}" if sha256 else _NONE
 
 

@@ -71,8 +71,8 @@ UNEVEN = 3.5
 MIN_EITHER = 0.75
 """Both trains lost many pulses where less than this share of each fits."""
 UNVOUCHED = 3
-"""A clock that jumps at the last two pulses looks the same as two late ones, and a second report
-of one of three may stand where that pulse belongs."""
+"""A clock that jumps at the last two pulses looks the same as two late ones, and a second report of
+one of three may be in that pulse's place."""
 UNDISTURBED = "let nothing set or restart a clock during a trial, and take it again"
 SAME_TRIAL = "check that both recordings are of the same trial, and the cable of the sync line"
 BEND_PPM_S = 2.0
@@ -95,7 +95,7 @@ class ClockRefused(ValueError):
 
 @dataclass(frozen=True)
 class ClockFit:
-    """A clock map with what is known about its quality.
+    """A clock map and its quality.
 
     Attributes:
         map: device ns to reference ns; more than one piece where the clocks bend.
@@ -162,9 +162,9 @@ def fit_clock(
         resolution_ns: the unit to which the device cuts its stamps.
         rounding: which way it cuts them: an input that is looked at now and then stamps ``up``. The
             map takes the middle of what a stamp may mean.
-        in_order: the stamps stand in the order in which the pulses came, so that a clock that
-            jumps back is seen to do so. It must be known: once they are sorted, such a train looks
-            like one that began earlier than the reference and ended earlier.
+        in_order: the stamps are in the order in which the pulses came, so that a clock that jumps
+            back is detected. It must be known: once they are sorted, such a train looks like one
+            that began earlier than the reference and ended earlier.
         start_marker_ns: the train is regular, and begins with a pulse and this much silence, ns;
             without it a regular train is refused.
 

@@ -287,7 +287,7 @@ def _follow(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[Ints, Int
     i, j = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(i, kind="stable")
     i, j = i[order], j[order]
-    # at the strips' borders two may want the same partner
+    # at the strips' borders two may match the same partner
     once = np.concatenate([np.diff(j) > 0, [True]]) if j.size else np.zeros(0, np.bool_)
     return i[once], j[once]
 

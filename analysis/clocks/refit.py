@@ -1,7 +1,7 @@
-"""One trial's clocks fitted again, and held against its record.
+"""One trial's clocks fitted again, and compared with its record.
 
 A trial's clocks are fitted when it is taken, by the program of that day. Where fitting has improved
-since, the new clocks stand among the derived results; the record stays as it was committed.
+since, the new clocks are among the derived results; the record stays as it was committed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Causal detectors side by side: each turns a trial's windows into evidence, window by window.
 
-A detector says how strongly everything up to a window speaks for slip having begun; a threshold
-on that makes it a detection. So detectors of any kind can be set to the same rate of false alarms
-(`detectors.detector_comparison`) and then compared by how late they are. No other comparison
-is fair: each can be made as quick as one likes by allowing it more false alarms.
+A detector returns the evidence, from all windows so far, that slip has begun; a threshold on the
+evidence makes it a detection. So detectors of any kind can be set to the same rate of false alarms
+(`detectors.detector_comparison`) and then compared by how late they are. No other comparison is
+fair: each becomes arbitrarily quick when it is allowed more false alarms.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def cusum(log_ratio: FloatArray, level: float = 0.0) -> FloatArray:
 
 
 # --------------------------------------------------------------------------------------------------
-# How likely what a window shows is without slip, in incipient and in gross slip.
+# Likelihood of a window's counts without slip, in incipient and in gross slip.
 #
 # Two models, both fitted on training trials alone. Histograms take the three spike counts for
 # independent given the state, which they are not; they say what counting alone reaches. The other
@@ -377,7 +377,7 @@ class Evidence:
 
     Attributes:
         end_ns: int64 (n,), end of each window.
-        incipient: float64 (n,), how strongly everything up to each window speaks for slip.
+        incipient: float64 (n,), evidence for slip from all windows up to each one.
         gross_after: the same for gross slip, given the window in which incipient slip was
             detected; only values after that window mean anything.
     """

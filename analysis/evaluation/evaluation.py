@@ -1,4 +1,4 @@
-"""The evaluation of a store: its inputs, and the figures that it keeps."""
+"""The evaluation of a store: its inputs and its stored figures."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def make_job(
     smoothing: int | None = None,
     reviewed: bool = False,
 ) -> Job:
-    """Find what is to be evaluated, and by what detection settings.
+    """Find the inputs of the evaluation, and its detection settings.
 
     Args:
         margin, smoothing: instead of the protocols' own, and of what these would choose.

@@ -241,7 +241,7 @@ def judge(
     store: Store,
     campaigns: list[Collected],
 ) -> Judged:
-    """Judge the labelled test trials of a store by a network that another store trained.
+    """Score the labelled test trials of a store by a network that another store trained.
 
     Args:
         detection: smoothing, margin and stride by campaign.

@@ -68,7 +68,7 @@ class Counted:
 
 @dataclass(frozen=True)
 class Label:
-    """Onsets of one trial and what they were read from.
+    """Onsets of one trial, and the data that they were read from.
 
     Attributes:
         rule: which onsets rule.
@@ -393,7 +393,7 @@ def label_places(
 
 
 def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:
-    """Doubts of onsets after the camera moved while too little stood still."""
+    """Return doubts about onsets after the camera moved while too few markers were at rest."""
     moved = frame_ns[camera.unsure]
 
     def doubts(onsets: Onsets) -> Doubts:

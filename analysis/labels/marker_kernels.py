@@ -266,7 +266,7 @@ def follow(
     known = state != LOST
     cuts = np.empty((xy.shape[0], 4))
     c, y_sums = np.empty(256, np.int32), np.empty(256, np.int32)
-    # again when something moved far: the cuts stood where the neighbours no longer are
+    # again when something moved far: the cuts were at the neighbours' old places
     for _ in range(3):
         farthest = 0.0
         for k in range(xy.shape[0]):

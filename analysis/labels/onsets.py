@@ -1,4 +1,4 @@
-"""The ground truth: when the first marker slips, when the centre does, when a plate rests again.
+"""Ground truth: slip onsets of the first marker and of the centre, and a plate's time of rest.
 
 The rule is the paper's, taken literally: a marker slips in the first frame in which it is more than
 2 pixels from its position when the recording began. Every accuracy and latency the project reports

@@ -77,7 +77,7 @@ do."""
 
 
 def work_on(device: str, net: nn.Sequential, cells: int, gain: float) -> Work:
-    """The way to compute batches on a device.
+    """Computation of batches on a device.
 
     Args:
         device: ``cpu``, ``cuda`` or ``cuda:1``, ...

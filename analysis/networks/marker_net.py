@@ -164,7 +164,7 @@ def fit(train: MarkerSamples, validation: MarkerSamples, seed: int) -> MarkerNet
 
 
 def _inputs(x: F32) -> F64:
-    """Return what the network sees of windows, (n, k)."""
+    """Return the network's inputs for windows, (n, k)."""
     return np.arcsinh(x.reshape(len(x), -1).astype(np.float64))
 
 

@@ -106,7 +106,7 @@ def tracks_words(simulated: bool) -> str:
 
 
 def source_words(summary: Summary | OneCameraSummary) -> str:
-    """Return what the labels were read from."""
+    """Return the source of the labels."""
     if summary.labels is None:
         return "nothing yet"
     words = {
@@ -315,7 +315,7 @@ def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, Ref
 
 
 def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
-    """Return what each committed reference trial measured, in the plan's order."""
+    """Return the measurements of each committed reference trial, in the plan's order."""
     labels = Derived.of(store, LABELS, item.name)
     found = []
     for trial, recording in item.trials:

@@ -56,7 +56,7 @@ _ALMOST = 0.95
 
 
 def class_report_key(store: Store, campaigns: list[Collected]) -> str:
-    """Return the key of all that the report is made of.
+    """Return the key of all inputs of the report.
 
     Raises:
         StoreError: there is no evaluation of this version yet.

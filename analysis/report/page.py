@@ -61,7 +61,7 @@ class Table:
 
     @property
     def texts(self) -> set[int]:
-        """Columns of words, which read from the left; numbers stand below each other's ends."""
+        """Columns of words, aligned left; numbers are aligned right."""
         columns = (
             [row[k] for row in self.rows if k < len(row) and row[k] not in ("", "–")]
             for k in range(len(self.columns))

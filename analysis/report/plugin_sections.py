@@ -64,7 +64,7 @@ def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content
     """Make the sections of plug-ins, in the order of the plug-ins' names; then what is lost.
 
     Args:
-        last: those that stand among the results of longer studies.
+        last: those that are among the results of longer studies.
     """
     faults = []
     for name, place in plugins().declared("sections").items():

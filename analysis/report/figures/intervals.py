@@ -49,7 +49,7 @@ def by_condition(
 
     Args:
         rows: names, from top to bottom.
-        breaks: a thin line goes above each of these rows, which begin a new group.
+        breaks: rows that begin a new group; a thin line is drawn above each.
     """
     height = 0.26 * max(len(rows), 3) + 1.25
     with plt.rc_context(STYLE):
