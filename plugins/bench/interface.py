@@ -114,7 +114,7 @@ class Detector(ABC):
     """A detector of slip; see the module."""
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:  # noqa: B027
-        """Learn from scenes; the others choose among what was learned. By default nothing."""
+        """Train on scenes, and select by the validation scenes. Does nothing by default."""
 
     @abstractmethod
     def begin(self, width: int, height: int) -> None:

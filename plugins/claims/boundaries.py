@@ -27,7 +27,7 @@ _HALVINGS = 50
 
 @dataclass(frozen=True)
 class _Stage:
-    """A look: its boundary, and the density of what has not crossed it (a grid, with weights)."""
+    """A look: its boundary, and the density of paths that have not crossed it (weighted grid)."""
 
     limit: float
     places: F64
@@ -40,7 +40,7 @@ _START = _Stage(np.inf, np.zeros(1), np.ones(1), 0.0, 0.0)
 
 
 def boundaries(shares: Sequence[float], error: float) -> F64:
-    """Return what a standard normal statistic must exceed at each look, (k,).
+    """Return the boundaries of a standard normal statistic at each look, (k,).
 
     Args:
         shares: of the planned trials that are taken at each look, rising; at 1 all is spent, and

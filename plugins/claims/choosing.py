@@ -31,7 +31,7 @@ def next_batch(
     seed: int,
     fits: Fits | None = None,
 ) -> Batch | None:
-    """Choose the trials that follow `chosen`; None where nothing is left.
+    """Choose the trials that follow `chosen`; None if none are left.
 
     A round has a batch of every stretch between two changes by a person. The first round fills the
     grid evenly, without chance. The same arguments give the same trials.

@@ -118,7 +118,7 @@ class ClaimWatch:
         return TrialFigures.model_validate(self._kept.read(trial))
 
     def next_trials(self) -> list[Trial]:
-        """Return what is pending of the earliest round that is not complete; none at the end."""
+        """Return the pending trials of the earliest incomplete round; none at the end."""
         pending = {trial.id for trial in pending_trials(self._run_request.plan, self._campaign)}
         begun, last = 0, -1
         for last, trials in enumerate(self._rounds()):
@@ -168,7 +168,7 @@ class ClaimWatch:
     # choice
 
     def _chosen(self, first: int, count: int) -> list[Trial] | None:
-        """Return the trials of some batches by number; choose what is missing of them."""
+        """Return the trials of some batches by number; choose those that are missing."""
         assert self._choice is not None
         batches = list(self._batches)
         seed = self._run_request.plan.seed
@@ -202,7 +202,7 @@ class ClaimWatch:
     # evidence and looks
 
     def _evidence(self, last: int) -> Evidence:
-        """Return what the rounds up to one show."""
+        """Return the evidence of the rounds up to one."""
         grid, there = self._grid, self._campaign.committed()
         taken: list[int] = []
         looks: list[int] = []

@@ -52,7 +52,7 @@ class Course:
 
 
 def course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None) -> Course:
-    """Return how a campaign of a plan with claims goes.
+    """Return the course of a campaign of a plan with claims.
 
     Args:
         grid: of the plan. values: (N,) by figure, of its trials in its order.
@@ -96,7 +96,7 @@ def _shown(values: Figures, taken: I64, over_time: Figures | None) -> Figures:
 def planned_evidence(
     plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None
 ) -> Evidence:
-    """Return all that a campaign sees whose order its plan gives, with a look after each round.
+    """Return all evidence of a campaign in its plan's order, with a look after each round.
 
     A round with which it would take more trials than it may is left out.
     """
@@ -124,7 +124,7 @@ def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
 
 
 def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None) -> Course:
-    """Return how an adaptive campaign goes: it takes one more round than it needs."""
+    """Return the course of an adaptive campaign: it takes one more round than it needs."""
     stopping = claims_of(plan)
     called: dict[int, Called] = {}
     claims: tuple[Called, ...] = ()
@@ -182,7 +182,7 @@ def _seen(
     values: Figures,
     over_time: Figures | None,
 ) -> Evidence:
-    """Return what rounds that end at `looks` show."""
+    """Return the evidence of rounds that end at `looks`."""
     items = [(item, batch) for batch in batches for item in batch.trials]
     items = items[: looks[-1] if looks else 0]
     taken = np.array([grid.number[item.trial] for item, _ in items], np.int64)

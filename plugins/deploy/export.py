@@ -262,7 +262,7 @@ def export_files(
     checked: int | None,
     advance: Callable[[str], None],
 ) -> tuple[dict[str, bytes | str], ExportFigures]:
-    """Make the files of a model, and say of the result what matters.
+    """Make the files of a model, and report its main figures.
 
     Args:
         checked: windows that the ONNX file is compared with Sinabs on; None for no such file.

@@ -31,9 +31,9 @@ SPEED_MM_S = 40.0
 """Speed of the bench's moves, where the limits allow it."""
 SHORT_MM = 3.0
 LONG_SHARE = 0.8
-"""Length of a long move, as a share of the way from the centre of the workspace to its side."""
+"""Length of a long move, as a share of the distance from the workspace's centre to its side."""
 BEGUN_MM = 0.5
-"""A motion has begun after this way."""
+"""A motion has begun after this distance."""
 CLOCK_S = 1000.0
 """Time of the fake controller's clock when it is made, s."""
 PULSE_S, PULSE_EVERY_S = 0.14, 0.4
@@ -200,7 +200,7 @@ class ArmBench(Bench):
 
     @property
     def long_mm(self) -> float:
-        """Way of a long move from the centre."""
+        """Return the length of a long move from the centre."""
         return LONG_SHARE * (self.limits.high_mm[1] - self.limits.low_mm[1]) / 2
 
     def start(self, *path: Segment) -> None:

@@ -119,7 +119,7 @@ def clock_offset_ns(bench: ArmBench) -> int:
 
 
 def follow(bench: ArmBench, *path: Segment) -> Report:
-    """Follow a path to its end, and record all that the driver reports on the way.
+    """Follow a path to its end, and record all reports of the driver meanwhile.
 
     Raises:
         Seen: it does not end in time.

@@ -82,7 +82,7 @@ class Bench(ABC):
         self.close_fake()
 
     def left_open(self) -> str:
-        """Return what this process has more than before the fake was made; empty if nothing."""
+        """Return the resources opened since before the fake and still open; empty if none."""
         words = ("threads", "child processes", "files or sockets")
         return ", ".join(
             f"{now - then} {word}"

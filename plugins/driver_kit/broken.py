@@ -1,4 +1,4 @@
-"""Broken drivers: what the rules of conformance catch.
+"""Broken drivers that the rules of conformance must catch.
 
 Each is an example driver with one defect, as real drivers have had them. None can be named in a
 rig file.
@@ -34,7 +34,7 @@ class Broken:
     rules: tuple[str, ...]
     """All rules that it breaks; the first one is about the defect itself."""
     seen: str
-    """Regular expression of what the first rule sees."""
+    """Regular expression of the first rule's finding."""
 
 
 class NewestFirst(ExampleArm):
@@ -240,4 +240,4 @@ BROKEN = (
         "the (clock|host's times)",
     ),
 )
-"""Each broken driver, with what the rules see of it."""
+"""Each broken driver, with the rules' findings."""

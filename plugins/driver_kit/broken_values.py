@@ -246,7 +246,7 @@ class StopsOnce(ExampleArm):
 
 
 class MovesAfterStop(ExampleArm):
-    """A move that is on its way to the controller is sent after the stop."""
+    """A pending move is sent to the controller after the stop."""
 
     def _follow_path(self, run: Any) -> None:
         threading.Event().wait(0.08)
@@ -282,7 +282,7 @@ def averaged(chunk: PoseChunk) -> PoseChunk:
 
 
 def always_ready(progress: Progress) -> Progress:
-    """Take an arm for ready, whatever its state is."""
+    """Report an arm as ready in every state."""
     return replace(progress, state=ArmState.READY)
 
 
@@ -520,7 +520,7 @@ class OldPulses(ExampleEvents):
 
 
 class SizeSwapped(ExampleEvents):
-    """Columns are taken for rows."""
+    """Columns and rows are swapped."""
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -915,4 +915,4 @@ WRONG_VALUES = tuple(
     )
     for name, (device, rules, seen) in table.items()
 )
-"""Each driver with wrong magnitudes, with the rules about them and what the first one sees."""
+"""Each driver with wrong magnitudes, with the rules that apply and the first rule's finding."""

@@ -14,7 +14,7 @@ from sliplab.rigs.core.capabilities import Gripper, GripperState
 
 RULES = Rules[GripperBench]()
 CLOSED_MM = 10.0
-"""Way that the fingers close in a rule."""
+"""Distance that the fingers close in a rule."""
 EPS_MM = 1e-3
 SHARE = 0.1
 """Largest relative deviation of a speed, and shortfall of a force below the requested one."""

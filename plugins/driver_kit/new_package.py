@@ -113,7 +113,7 @@ _ARGUMENTS = {
 
 
 def name_fault(name: str) -> str:
-    """Return what is wrong with the name of a new driver; empty if nothing is."""
+    """Return the fault in the name of a new driver; empty if there is none."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         return "must be lower-case letters, digits and underscores, a letter first"
     if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in {"sliplab", "tests"}:

@@ -1,4 +1,4 @@
-"""Bench of a device that streams, and what all kinds of them share."""
+"""Bench of a streaming device: the base of all kinds."""
 
 from __future__ import annotations
 

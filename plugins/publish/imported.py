@@ -119,7 +119,7 @@ def _texts(where: Campaign) -> CampaignTexts:
 
 
 def _plain(file: Path) -> Path:
-    """Return a file. Raises DamagedFile where it is none; links may lead anywhere."""
+    """Return a file. Raises DamagedFile if it is not a regular file; links may lead anywhere."""
     try:
         plain = S_ISREG(file.lstat().st_mode)
     except OSError:

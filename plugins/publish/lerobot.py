@@ -307,7 +307,7 @@ def _at(ends: I64, times: I64, values: Array) -> Array:
 
 
 def _turned(ends: I64, times: I64, rotvec_deg: Array) -> Array:
-    """Interpolate rotations on the shortest way between two of them."""
+    """Interpolate rotations along the shortest path between two of them."""
     from scipy.spatial.transform import Rotation, Slerp
 
     times, first = np.unique(times, return_index=True)

@@ -96,7 +96,7 @@ class Publication:
     """Trials to be published.
 
     Attributes:
-        splits: part of the split of each trial, by campaign and id; of imported ones there is none.
+        splits: part of the split of each trial, by campaign and id; imported ones have none.
     """
 
     store: Store

@@ -15,7 +15,7 @@ from sliplab.plugins.reflex.document import ReactionParts, ReflexRow, ReflexTria
 
 PARTS = ("window", "sensor", "network", "command", "actuator")
 SLIDING_MM_S = 0.1
-"""Speed above which a plate that has not come to its stop still slides."""
+"""Speed above which a plate that has not stopped still slides."""
 STOP_MM = 0.1
 """Distance from its stop at which a plate counts as dropped."""
 _LAST_S = 0.05

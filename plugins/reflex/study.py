@@ -53,7 +53,7 @@ def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
 
 
 _NEVER: Counting = _no_slip
-"""Sees no slip: for trials without a reflex, where nothing is to be detected."""
+"""No-slip outputs for trials without a reflex, in which nothing is detected."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
 
 @contextmanager
 def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
-    """Yield what builds the rig of a trial; a loopback rig's fakes run for all of them."""
+    """Yield a function that builds the rig of a trial; a loopback rig's fakes run for all."""
     if file.in_virtual_time:
         yield build_rig
         return
@@ -211,7 +211,7 @@ class Seen:
     course: PlateCourse | None = None
 
     def by(self, build: Callable[[RigFile], Rig]) -> Callable[[RigFile], Rig]:
-        """Return what builds the same rig, observed."""
+        """Return a function that builds the same rig, observed."""
 
         def observed(file: RigFile) -> Rig:
             rig = build(file)

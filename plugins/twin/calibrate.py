@@ -136,7 +136,7 @@ def fitted_rig(rig_path: Path) -> RigFile:
 
 @dataclass(frozen=True)
 class SceneFit:
-    """A pilot, the worlds that it was compared with, and what follows for the scene.
+    """A pilot, the worlds that it was compared with, and the fitted scene.
 
     Attributes:
         observed: what the pilot shows. seen: what each world shows. bank: of these worlds.
@@ -327,7 +327,7 @@ def judging_worlds(scene: SceneFit) -> list[World]:
 
 @dataclass(frozen=True)
 class Predicted:
-    """The test trials in a world: what is compared of them, and their numbers for scores."""
+    """The test trials in a world: their compared quantities, and their numbers for scores."""
 
     shown: list[Shown]
     marks: list[Marks]

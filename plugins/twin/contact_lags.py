@@ -1,4 +1,4 @@
-"""Lags of sliding tips: how they grow while springs relax, and what they are in steady slip.
+"""Lags of sliding tips: their growth while springs relax, and their values in steady slip.
 
 A tip that let go follows its base at the distance at which its spring pulls with friction.
 """
@@ -22,7 +22,7 @@ from sliplab.storage.streams import F64
 VARIATION, CORRELATION_MM, TREMOR_MM = 0.05, 0.5, 0.007
 """Supposed for weights only: friction's variation along a path, its length, the arm's tremor."""
 LEAST_STRETCH_MM = 0.15
-"""Slips of springs that were stretched less tell more of the tremor than of friction."""
+"""Slips of springs that were stretched less depend more on the tremor than on friction."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The arm's tremor, from what all sliding tips do together."""
+"""The arm's tremor, from the common motion of all sliding tips."""
 
 from __future__ import annotations
 

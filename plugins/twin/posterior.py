@@ -33,7 +33,7 @@ _NEAR = 0.5
 _NOTHING = 0.02
 """Share of variance explained in worlds not fitted to, below which the prediction is dropped."""
 _SEEN = 0.8
-"""Share of the worlds in which a statistic must be had to be used."""
+"""Share of the worlds in which a statistic must be defined to be used."""
 _FAR = 5.0
 """Standard deviations at which a statistic is cut off: one wild value must not outweigh all."""
 _LEVELS = (0.025, 0.5, 0.975)
@@ -46,7 +46,7 @@ class Bank:
     Attributes:
         parameters: names, p of them. statistics: names, q of them.
         theta: parameters of k worlds, (k, p), usually logarithms.
-        s: their statistics, (k, q), NaN where one could not be had.
+        s: their statistics, (k, q), NaN where undefined.
         lower, upper: bounds of the prior, (p,).
 
     Raises:

@@ -19,7 +19,7 @@ MOST = 120
 ROUNDS = 12
 """Of the re-estimation of variances: more change predictions by less than they err."""
 _LEAST_NOISE = 1e-6
-"""Smallest share of a parameter's variance that is taken for noise, so that copies of an exact
+"""Smallest share of a parameter's variance that is treated as noise, so that copies of an exact
 statistic leave a matrix that can be inverted."""
 _SKILLED = 0.1
 """Share of variance explained from which on a prediction is used for others' curvature."""

@@ -44,7 +44,7 @@ class Fall(WindowDetector):
 
     @abstractmethod
     def measured(self, x: SparseWindows) -> npt.NDArray[np.float64]:
-        """Return what falls, (n,)."""
+        """Return the quantity that falls, (n,)."""
 
 
 class Rate(Fall):

@@ -1,4 +1,4 @@
-"""Detectors that know no slip: a fair table has them at its bottom.
+"""Detectors that ignore slip: a fair table ranks them last.
 
 The hash is that of splitmix64 (Steele, Lea and Flood 2014).
 """
@@ -18,7 +18,7 @@ STRIDE_US = 10_000
 
 
 class Blind(Detector):
-    """A detector that knows the time and nothing else."""
+    """A detector that knows only the time."""
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`."""

@@ -1,4 +1,4 @@
-"""After how many trials the claims of a plan are called, over campaigns drawn from a pilot."""
+"""Numbers of trials after which a plan's claims are called, over campaigns drawn from a pilot."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LINES = 10
 POINTS = 8
 """Looks at which they are, at most."""
 MOST_OPEN = 0.5
-"""A claim that is open at the end of more campaigns than this share cannot be had by the plan."""
+"""A claim that is open at the end of more campaigns than this share is out of the plan's reach."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def spread(trials: Sequence[int | None]) -> Spread:
 
 
 def claim_powers(drawing: Drawing, campaigns: Sequence[Drawn]) -> tuple[ClaimPower, ...]:
-    """Return what drawn campaigns say of each claim."""
+    """Return the statistics of each claim over drawn campaigns."""
     found = []
     for k, claim in enumerate(claims_of(drawing.plan).claims):
         ends = [it.states[k] for it in campaigns]

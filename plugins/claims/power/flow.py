@@ -224,7 +224,7 @@ def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
     """Draw campaigns of a plan by a pilot's trials, without a learning curve.
 
     Raises:
-        InputError: the plan has no claims, or the pilot cannot tell.
+        InputError: the plan has no claims, or the pilot is not sufficient.
     """
     if plan.protocol.collection.stopping is None:
         raise InputError(
@@ -251,7 +251,7 @@ def measure_power(asked: Request, out: Path) -> PowerRecord:
 
 
 def foretell(asked: Request) -> PowerRecord:
-    """Draw campaigns, and return what they say of each claim.
+    """Draw campaigns, and return their statistics of each claim.
 
     Raises:
         InputError: the pilot has too few figures, or lacks levels of the protocol.
@@ -290,7 +290,7 @@ def foretell(asked: Request) -> PowerRecord:
 
 
 def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
-    """Return the figures of the pilot's trials, and what it does not tell.
+    """Return the figures of the pilot's trials, and what it does not determine.
 
     Raises:
         InputError: they are too few, or the pilot lacks levels of the protocol.

@@ -187,9 +187,9 @@ class Pilot:
     def over_time(
         self, plan: Plan, grid: Grid, sessions: Sessions, rng: np.random.Generator
     ) -> dict[str, F64]:
-        """Draw what time adds to a campaign's trials, (N,) by figure, in the order taken.
+        """Draw the effects of time on a campaign's trials, (N,) by figure, in the order taken.
 
-        That is of sessions, of a drift, and of the batches of an adaptive campaign, which are its
+        These are of sessions, of a drift, and of the batches of an adaptive campaign, which are its
         blocks.
         """
         choice, stopping = plan.protocol.collection.adaptive, plan.protocol.collection.stopping
@@ -281,7 +281,7 @@ class Pilot:
 
 
 def sessions_text(pilot: Pilot, sessions: Sessions) -> Iterator[str]:
-    """Yield which sessions and drift are drawn, and what the pilot does not show of them."""
+    """Yield which sessions and drift are drawn, and the limits of the pilot for them."""
     there, only = pilot.session_count, "a pilot of one session cannot show how sessions differ"
     sizes = ", ".join(f"{pilot.between(name, sessions):.2f} ({name})" for name in pilot.values)
     sizes += " of the scatter between trials"
@@ -318,7 +318,7 @@ def _smoothing(off: F64) -> tuple[float, float]:
 
 
 def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis, ...], list[str]]:
-    """Return the factors that a pilot and a plan share, and what the pilot does not tell of others.
+    """Return the factors that a pilot and a plan share, and the limits of the pilot for others.
 
     Args:
         conditions: of the pilot's trials.
@@ -357,7 +357,7 @@ def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis
 
 
 def _unknown(axis: Axis, factor: Factor, levels: Sequence[Level], compared: bool) -> Iterator[str]:
-    """Yield what to say of levels that the pilot lacks.
+    """Yield notes on levels that the pilot lacks.
 
     Raises:
         KeyedError: nothing is known of one of them.

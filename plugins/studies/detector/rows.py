@@ -6,8 +6,8 @@ only judge. The front is over figures of test trials; which rows would be on it 
 trials is also given, because a front chosen on test trials is biased in its favour.
 
 Factors are compared one at a time with the paper's value: which differences are more than seed
-noise. Differences are taken seed by seed; the intervals are each by itself, so of twenty one would
-leave zero out by chance.
+noise. Differences are taken seed by seed; the intervals are not corrected for multiple comparisons:
+one in twenty would exclude zero by chance.
 """
 
 from __future__ import annotations
@@ -288,7 +288,7 @@ def _work(measured: Sequence[Json], per_s: float) -> BySeed:
 
 
 def _costs(rows: Sequence[Row], part: str) -> npt.NDArray[np.float64]:
-    """Return the objectives, all to be low; what is not there is infinitely bad."""
+    """Return the objectives, all to be minimised; missing ones are infinite."""
     values = [
         [
             None if (v := row.objective(name, part)) is None else sign * v
@@ -488,7 +488,7 @@ def search_result(
 
 
 def plan(search: DetectorSearch, simulated: bool) -> Json:
-    """Return what there is to do."""
+    """Return the pending work."""
     pending = len(search.sweep.pending)
     return {
         "step": "tradeoff",

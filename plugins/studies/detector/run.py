@@ -1,4 +1,4 @@
-"""`sliplab tradeoff --detector`: what a detector's speed costs in errors, over a store's trials.
+"""`sliplab tradeoff --detector`: speed of a detector against its errors, over a store's trials.
 
 A search is stored run by run, so it may be stopped, resumed, and made larger later.
 """

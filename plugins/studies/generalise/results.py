@@ -107,7 +107,7 @@ def train_without(
     """Train without a level and test on it, or say why that cannot be.
 
     Args:
-        state: file that keeps the training after each epoch; goes when the training is over.
+        state: checkpoint file, written after each epoch and deleted when the training is over.
     """
     rows = trials.without(factor, level)
     lacking = sorted(part for part, of in rows.items() if not len(of))

@@ -89,7 +89,7 @@ class StudySensitivity:
     def score(
         self, setting: Setting, value: float | None, store: Store, campaigns: list[Collected]
     ) -> SettingScores:
-        """Judge the trials that were repeated at a setting.
+        """Score the trials that were repeated at a setting.
 
         Args:
             value: of the changed parameter.

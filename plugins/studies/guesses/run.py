@@ -107,7 +107,7 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
 def measure_setting(
     work: StudySensitivity, setting: Setting, scenes: Mapping[str, MockSettings]
 ) -> SettingScores:
-    """Take, label and judge the trials at one setting, and let them go.
+    """Take, label and score the trials at one setting, and delete them.
 
     Args:
         scenes: settings of the simulated rig of each campaign.

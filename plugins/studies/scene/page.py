@@ -62,7 +62,7 @@ Error = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class SceneCost:
-    """Cost and error of a scene's variants; `cost.html` has the words.
+    """Cost and error of a scene's variants; `cost.html` has the text.
 
     Attributes:
         trials: ids of the trials that were simulated.

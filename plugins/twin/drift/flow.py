@@ -261,7 +261,7 @@ def beyond(it: ParameterDrift, limit_percent: float) -> bool:
 
 
 def verdict(fit: DriftFit) -> str:
-    """Return what a person reads of the limit."""
+    """Return the verdict on the drift as text."""
     friction = next(it for it in fit.parameters if it.key == FRICTION)
     simulated = "simulated " if fit.simulated else ""
     found = (

@@ -208,7 +208,7 @@ def cheapest_path(twin: Path) -> Path:
 
 
 def write_cheapest(twin: Path, needs: Needs) -> None:
-    """Write the cheapest scene as a rig file that extends the twin's; none if there is none."""
+    """Write the cheapest scene, if there is one, as a rig file that extends the twin's."""
     path = cheapest_path(twin)
     it = needs.cheapest
     if it is None:

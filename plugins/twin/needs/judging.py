@@ -32,9 +32,9 @@ SOON_US = 1_000
 APART_S = 0.05
 """Speeds are differences of places so far apart in time."""
 STILL = 1e-5
-"""Less motion than this is none: mm, or mm/s."""
+"""Motion below this counts as rest: mm, or mm/s."""
 NEGLIGIBLE = 0.02
-"""A loss of so many scatters is none: no twin is exact."""
+"""Losses below so many scatters are negligible: no twin is exact."""
 FEWEST_TRIALS = FEWEST_WORLDS = 3
 
 
