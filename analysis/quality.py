@@ -47,8 +47,8 @@ from sliplab.storage.trials.recording import Recording
 
 Rows = tuple[tuple[float, float, float], ...]
 UNVOUCHED_S = 0.3
-"""A recording may begin and end this much before and after the pulses on which a clock's fit
-stands: the code may be silent for 16 ticks."""
+"""A recording may begin and end this much before and after the pulses of a clock's fit: the code
+may be silent for 16 ticks."""
 BURST_US = 10_000
 """The interval in which `gates.event_burst` counts events."""
 WINDOW_S = 0.5
@@ -521,7 +521,7 @@ def _speeds(t_s: F64, gone_mm: F64, speed: float, shortest_s: float) -> F64:
     intervals = max(1, int(seconds / shortest_s))
     width = seconds / intervals
     begins = np.linspace(t_s[0], t_s[-1] - width, 2 * intervals - 1)
-    # the pose before and the one behind belong to it: no gap between poses goes unseen
+    # it includes the poses before and after, so that no gap between poses is missed
     firsts = np.maximum(np.searchsorted(t_s, begins, "right") - 1, 0)
     ends = np.searchsorted(t_s, begins + width, "left") + 1
     slopes = [

@@ -36,7 +36,7 @@ class Deviation(NamedTuple):
 
 
 def _hash(sha256: str | None) -> str:
-    """Return the first digits of a hash, which tell two files apart."""
+    """Return the first digits of a hash, enough to distinguish two files."""
     return f"SHA-256 {sha256[:16]}" if sha256 else _NONE
 
 
@@ -208,7 +208,7 @@ def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
 
 
 def _by(by: Mapping[str, Any]) -> str:
-    """Return who asked for something, when and why."""
+    """Return who requested a deviation, when and why."""
     why = f" ({by['why']})" if by.get("why") else ""
     return f"by {by.get('who') or 'unknown'}, {by.get('when') or 'at an unknown time'}{why}"
 

@@ -1,1 +1,1 @@
-"""Subjects that not every lab needs; each is complete in its own folder."""
+"""Optional features, one self-contained folder each."""

@@ -1,8 +1,8 @@
 """Lens and scale of the outside camera from pictures of a printed ChArUco board.
 
-OpenCV finds corners and fits pinhole and distortion. Around it stands what keeps a bad set of
-pictures from giving numbers that look good: how much of the picture the corners cover, how well
-the focal length is known, and how many coefficients the pictures can really tell.
+OpenCV finds corners and fits pinhole and distortion. This module rejects image sets whose results
+only look good: it checks how much of the image the corners cover, how well the focal length is
+determined, and how many coefficients the images support.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CELLS = (4, 3)
 LEAST_COVER = 0.75
 """Share of the picture's 4 x 3 cells that must have seen corners."""
 LEAST_LEAN_DEG = 20.0
-"""Between some two of the boards; boards that all stand alike tell no focal length."""
+"""Between some two of the boards; the focal length is not observable from parallel boards."""
 MOST_FOCAL_DOUBT = 0.01
 """Largest standard deviation of the focal length, as a share of it."""
 _MODELS = {
@@ -36,7 +36,7 @@ _MODELS = {
 
 
 class BoardError(ValueError):
-    """Pictures from which the lens cannot be found; the text says what to do."""
+    """Images from which the lens cannot be estimated; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def fit_lens(views: Sequence[Corners], board: Board, size_px: tuple[int, int]) -
 
     Raises:
         BoardError: too few views or corners, corners in one part of the picture only, or boards
-            that lean too little to tell the focal length.
+            that lean too little to determine the focal length.
     """
     if not views or len(views[0]) < LEAST_CORNERS:
         seen = len(views[0]) if views else 0

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 LEAST_POSES = 4
 LEAST_SPREAD = 0.1
-"""Least root mean square way of the flange, in mm for a mm of tip, in the worst known direction."""
+"""Least RMS travel of the flange, in mm for a mm of tip, in the worst known direction."""
 
 
 class PivotError(ValueError):
@@ -33,7 +33,7 @@ class Pivot:
         point_mm: the fixed point, in the base's axes, (3,).
         residual_mm: root mean square distance of the tip from the point.
         errors_mm: that distance of each pose, (n,).
-        spread: how well the orientations tell the worst known direction, 0 to about 1.
+        spread: how well the orientations determine the worst known direction, 0 to about 1.
         uncertainty_mm: one standard deviation of the tip in that direction.
     """
 
@@ -53,8 +53,8 @@ def find_tip(xyz_mm: Floats, rotvec_deg: Floats) -> Pivot:
         rotvec_deg: its rotation vectors, degrees, (n, 3).
 
     Raises:
-        PivotError: fewer than four poses, numbers that are none, or orientations that lie in a
-            row: all alike, or turned about one axis only.
+        PivotError: fewer than four poses, non-finite numbers, or degenerate orientations (all
+            alike, or turned about one axis only).
     """
     xyz, turns = np.asarray(xyz_mm, np.float64), np.asarray(rotvec_deg, np.float64)
     if xyz.shape != turns.shape or xyz.ndim != 2 or xyz.shape[1] != 3:

@@ -1,4 +1,4 @@
-"""A clock map from what a host can say of a device's clock: not before, and not after.
+"""Clock map from a host's bounds on a device's clock: not before, and not after.
 
 Where no pulse reaches a device, the computer still knows bounds. A clock that is read is read
 between the question and the answer; a message was sent before it arrived, and not longer before

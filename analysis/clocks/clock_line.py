@@ -52,11 +52,11 @@ _MOVED_KNOTS = 4
 """Up to this number of knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
 _CHANCE = 1e-4
-"""Share of straight clocks with locked stamps that are taken for bent."""
+"""False-positive rate of knots for straight clocks with locked stamps."""
 _KNOT = 3.5
 """Change of the drift, in standard deviations, that adds a knot."""
 STEP, STEP_AT_END = 5.5, 4.5
-"""A clock has jumped where a step stands out by so many, among thousands of places or at an end."""
+"""Detection thresholds of a clock's jump, in sigma: among thousands of places, or at an end."""
 _MORE_LIKELY, _MORE = 12.0, 1.1
 """By how much and by what share more of the squares a step must explain than a change of drift: of
 a clock that bends smoothly a step explains less than a bend does, of one that jumps 1.5 times as
@@ -83,8 +83,8 @@ _UNITS = 0.6
 def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
     """Median of the slopes between pulses half the train apart, and the median level at x = 0.
 
-    Not all pairs, as in Theil (1950) and Sen (1968): the near ones say little of the slope, and
-    there are n**2 of them. It stands a quarter of bad points.
+    Not all n**2 pairs, as in Theil (1950) and Sen (1968): near pairs say little about the slope.
+    The breakdown point is 25 %.
     """
     half = x.size // 2
     run = x[half : 2 * half] - x[:half]
@@ -177,7 +177,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         doubtful = found.tail > max(_DOUBT_AT_END, 0.0 if straight else found.knot)
         doubtful = doubtful and found.knot < STEP and not (step or locked)
         if doubtful and left_out < 2 and tail <= min(_TAIL, x.size // 4):
-            # a jump, a bend or chance: what would tell comes after the end
+            # a jump, a bend or chance: the data that would distinguish them come after the end
             left_out += 1
             behind = found.tail_at
             stays = slice(behind, None) if 2 * behind < x.size else slice(behind)
@@ -221,7 +221,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
 
 
 def _followed(line: ClockLine, x: Floats, y: Floats) -> ClockLine:
-    """The line with a piece more over the pulses that were left out, which nothing confirms."""
+    """Return the line with a further, unconfirmed piece over the pulses that were left out."""
     (knots, values), unverified = (line.knots, line.values), [0, 0]
     for end in (0, -1):
         away = x - line.knots[end]
@@ -269,7 +269,7 @@ def _cut(x: Floats, knots: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Changes:
-    """The most that stands out of the residuals, in standard deviations of chance, and where.
+    """Largest deviations in the residuals, in standard deviations under chance, and their places.
 
     knot, knot_at: a change of the drift, and its pulse.
     step, step_size: a step, and its size in ns.
@@ -323,7 +323,7 @@ def _changes(
 
 
 def _jump(found: _Changes, hidden: float) -> float:
-    """The size of a step that is none by chance, no change of the drift, and not hidden; else 0."""
+    """Return the size of a step that is significant, no drift change, and not hidden; else 0."""
     bent = max(found.knot**2 + _MORE_LIKELY, _MORE * found.knot**2)
     if found.step**2 > max(STEP**2, bent) and abs(found.step_size) > hidden:
         return found.step_size
@@ -363,7 +363,7 @@ def _moved(x: Floats, y: Floats, knots: Floats, inside: Bools, noise: float) -> 
 def line_within_unit(x: Floats, y: Floats, resolution: float, drift: float) -> ClockLine | None:
     """The straight line that is never further from a stamp than its unit explains.
 
-    Stamps cut to a unit in step with the ticks, such as 2 ms and 10 ms, stand still until the
+    Stamps cut to a unit in step with the ticks, such as 2 ms and 10 ms, do not change until the
     clocks have drifted past a unit's edge, and then all move by one unit: in a short train a
     regression takes that for a drift. Every stamp bounds the clock all the same.
 
@@ -476,7 +476,7 @@ def _judged(
 
 
 def _influence(residuals: Floats, sigma: float) -> Floats:
-    """What each pulse does to Huber's estimate (Huber 1964): psi / E psi', ns.
+    """Return each pulse's influence on Huber's estimate (Huber 1964): psi / E psi', ns.
 
     Their mean square is the estimate's asymptotic variance for a single pulse.
     """
@@ -488,7 +488,7 @@ def _influence(residuals: Floats, sigma: float) -> Floats:
 
 @dataclass(frozen=True)
 class _Hidden:
-    """What a straight line may be off by at some knots, ns: chance, and a bend that it hides.
+    """Possible error of a straight line at some knots, ns: chance, and an undetected bend.
 
     Attributes:
         bend, covariance: (k,) mean and (k, k) covariance of the error.
@@ -503,9 +503,10 @@ def _hidden(
 ) -> _Hidden | None:
     """Judge the residuals of a straight line for bends between pieces; None if there are some.
 
-    Pieces have equally many pulses, so a stretch without any is in none. Which bends are hidden is
-    judged for halves of them: a bend near an end lies within the first. Each bend has mean 0 and
-    `_HIDDEN` times the variance with which the pulses show it (the g-prior of Zellner 1986).
+    Pieces have equally many pulses, so a stretch without pulses is in no piece. Which bends are
+    hidden is judged for halves of them: a bend near an end lies within the first. Each bend has
+    mean 0 and `_HIDDEN` times the variance with which the pulses show it (the g-prior of Zellner
+    1986).
     """
     x, apparent = x[inside], _influence(residuals[inside], sigma)
     finer = x[np.linspace(0, x.size - 1, 2 * pieces + 1).astype(np.int64)]
@@ -528,7 +529,7 @@ def _hidden(
 
 
 def _between(knots: Floats, x: Floats) -> Floats:
-    """Return what makes values at x of values at knots, (x, knots)."""
+    """Return the interpolation matrix from knots to x, (x, knots)."""
     piece, share = places_of(x, knots)
     result, row = np.zeros((x.size, knots.size)), np.arange(x.size)
     result[row, piece], result[row, piece + 1] = 1.0 - share, share

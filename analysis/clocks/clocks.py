@@ -55,8 +55,8 @@ MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
 MIN_LOSSY, MIN_LIFT = 100, 1.5
 """A smaller share will do where both trains lost many pulses: of so many pulses and so many times
-what a wrong lag gives. In such a train a clock that jumps by whole ticks, after which half of the
-pulses meet others, stands out only where there are many."""
+what a wrong lag gives. In such a train a jump by whole ticks, after which half of the pulses match
+others, shows only where there are many."""
 MOST_STAGGERED = 8
 """So many pulses may lie before one train begins and behind the end of the other: noise. More mean
 that only a stretch of two trials' codes is the same."""
@@ -71,8 +71,8 @@ UNEVEN = 3.5
 MIN_EITHER = 0.75
 """Both trains lost many pulses where less than this share of each fits."""
 UNVOUCHED = 3
-"""A clock that jumps at the last two pulses looks the same as two late ones, and a second report
-of one of three may stand where that pulse belongs."""
+"""A clock that jumps at the last two pulses looks the same as two late ones, and a second report of
+one of three may be in that pulse's place."""
 UNDISTURBED = "let nothing set or restart a clock during a trial, and take it again"
 SAME_TRIAL = "check that both recordings are of the same trial, and the cable of the sync line"
 BEND_PPM_S = 2.0
@@ -84,7 +84,7 @@ class ClockRefused(ValueError):
     """No clock map can be trusted for these pulses.
 
     Attributes:
-        reason: which gate said no: ``too_few_pulses``, ``ambiguous`` (the train fits in more than
+        reason: the gate that failed: ``too_few_pulses``, ``ambiguous`` (the train fits in more than
             one place), ``no_match`` (it fits nowhere), ``drift`` or ``residuals``.
     """
 
@@ -95,11 +95,11 @@ class ClockRefused(ValueError):
 
 @dataclass(frozen=True)
 class ClockFit:
-    """A clock map with what is known about its quality.
+    """A clock map and its quality.
 
     Attributes:
         map: device ns to reference ns; more than one piece where the clocks bend.
-        pulses_seen: pulses on which the line stands.
+        pulses_seen: pulses that the line is fitted to.
         pulses_late: pulses that found a partner but lie outside the gate; not in the line.
         pulses_missed: reference pulses inside the device's train that found no partner.
         pulses_spurious: device pulses without a partner (a second report of a pulse is one).
@@ -162,9 +162,9 @@ def fit_clock(
         resolution_ns: the unit to which the device cuts its stamps.
         rounding: which way it cuts them: an input that is looked at now and then stamps ``up``. The
             map takes the middle of what a stamp may mean.
-        in_order: the stamps stand in the order in which the pulses came, so that a clock that
-            jumps back is seen to do so. It must be known: once they are sorted, such a train looks
-            like one that began earlier than the reference and ended earlier.
+        in_order: the stamps are in the order in which the pulses came, so that a clock that jumps
+            back is detected. It must be known: once they are sorted, such a train looks like one
+            that began earlier than the reference and ended earlier.
         start_marker_ns: the train is regular, and begins with a pulse and this much silence, ns;
             without it a regular train is refused.
 

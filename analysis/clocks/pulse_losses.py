@@ -42,7 +42,7 @@ END_TICKS = 32
 """Ticks beyond a train's end in which the other's pulses count: noise lies on so few by accident
 once in hundreds of trains. A code is silent for no longer."""
 JUMP_TICKS = 100
-"""Largest jump that is looked for, either way, ticks."""
+"""Largest jump that is searched, in either direction, ticks."""
 
 
 def stray_stretch(

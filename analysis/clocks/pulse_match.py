@@ -223,7 +223,7 @@ def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
     """Find the only pulse with the marker's silence after it, and one as long before it."""
     found = []
     for name, train in (("device", x), ("reference", y)):
-        # a second report of a pulse is none of its own
+        # a second report of a pulse is not another pulse
         once = train[np.concatenate([[True], np.diff(train) > tick / 4])]
         steps = np.diff(once)
         quiet_before = np.concatenate([[True], steps[:-1] > 0.9 * silence])
@@ -287,7 +287,7 @@ def _follow(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[Ints, Int
     i, j = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(i, kind="stable")
     i, j = i[order], j[order]
-    # at the strips' borders two may want the same partner
+    # at the strips' borders two may match the same partner
     once = np.concatenate([np.diff(j) > 0, [True]]) if j.size else np.zeros(0, np.bool_)
     return i[once], j[once]
 

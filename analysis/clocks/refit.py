@@ -1,7 +1,7 @@
-"""One trial's clocks fitted again, and held against its record.
+"""One trial's clocks fitted again, and compared with its record.
 
 A trial's clocks are fitted when it is taken, by the program of that day. Where fitting has improved
-since, the new clocks stand among the derived results; the record stays as it was committed.
+since, the new clocks are among the derived results; the record stays as it was committed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import SYNC
 
 POINTS = 200
-"""Residuals that are kept of a device in a trial, evenly spread over it."""
+"""Number of residuals stored for a device in a trial, evenly spread over it."""
 _SAME = 1e-9
 """Figures that differ by less than this share came from the same fit on another processor."""
 _SAME_DRIFT = 10**6

@@ -2,8 +2,7 @@
 
 Detectors are fitted on training trials, their thresholds are set on validation trials to the same
 number of false early detections, and they are evaluated on test trials, which select nothing.
-The numbers are small, a percent of 130 trials is one of them, so each rate stands with its exact
-interval.
+The numbers are small (a percent of 130 trials is one trial), so each rate has its exact interval.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Causal detectors side by side: each turns a trial's windows into evidence, window by window.
 
-A detector says how strongly everything up to a window speaks for slip having begun; a threshold
-on that makes it a detection. So detectors of any kind can be set to the same rate of false alarms
-(`detectors.detector_comparison`) and then compared by how late they are. No other comparison
-is fair: each can be made as quick as one likes by allowing it more false alarms.
+A detector returns the evidence, from all windows so far, that slip has begun; a threshold on the
+evidence makes it a detection. So detectors of any kind can be set to the same rate of false alarms
+(`detectors.detector_comparison`) and then compared by how late they are. No other comparison is
+fair: each becomes arbitrarily quick when it is allowed more false alarms.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ RIDGE = 1e-3
 # all this model knows besides what a window looks like in each state, and it is why it can detect
 # a weak change earlier than an average can: evidence adds up over windows instead of being
 # forgotten. The recursion is the forward one of Rabiner (1989), equation 19, normalised at every
-# step and kept in logarithms, so that neither thousands of windows nor an impossible one
+# step and stored as logarithms, so that neither thousands of windows nor an impossible one
 # underflow.
 
 
@@ -73,7 +73,7 @@ def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
     """The chain of labelled trials: how often each state was left, by the windows spent in it.
 
     The share of the windows after which a state was left is the likeliest value; one departure in
-    two windows is added, so that a state nobody saw, or nobody left, still has one.
+    two windows is added, so that a state that was never seen, or never left, has one, too.
 
     Args:
         labels: states of each trial's windows in the order of time, integer (n,); a trial may
@@ -90,7 +90,7 @@ def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
         if trial.min() < 0 or trial.max() >= states or (np.diff(trial) < 0).any():
             raise ValueError(f"labels must ascend within 0..{states - 1}")
         spent += np.bincount(trial, minlength=states)[:-1]
-        # a state between two windows was passed through without a window of its own
+        # a state between two windows was passed through without its own window
         left[trial[0] : trial[-1]] += 1
     return Chain((left + 1) / (np.maximum(spent, left) + 2))
 
@@ -200,7 +200,7 @@ def cusum(log_ratio: FloatArray, level: float = 0.0) -> FloatArray:
 
 
 # --------------------------------------------------------------------------------------------------
-# How likely what a window shows is without slip, in incipient and in gross slip.
+# Likelihood of a window's counts without slip, in incipient and in gross slip.
 #
 # Two models, both fitted on training trials alone. Histograms take the three spike counts for
 # independent given the state, which they are not; they say what counting alone reaches. The other
@@ -377,7 +377,7 @@ class Evidence:
 
     Attributes:
         end_ns: int64 (n,), end of each window.
-        incipient: float64 (n,), how strongly everything up to each window speaks for slip.
+        incipient: float64 (n,), evidence for slip from all windows up to each one.
         gross_after: the same for gross slip, given the window in which incipient slip was
             detected; only values after that window mean anything.
     """

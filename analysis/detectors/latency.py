@@ -28,7 +28,7 @@ from sliplab.storage.schema.evaluation import (
 from sliplab.storage.schema.label import KINDS, Kind, TrialLabel
 
 NEVER = int(np.iinfo(np.int64).max)
-"""The time of what was not detected, where times are held in an array."""
+"""The time of an onset that was not detected, in arrays of times."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,8 @@ def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> Trial
     """Judge one trial; see the module.
 
     Args:
-        detections: what the detector said.
-        slip: what is true, on the same time line.
+        detections: the detector's onsets.
+        slip: the true onsets, on the same time line.
         false_early_ns: a detection earlier than the label's onset by MORE than this is false.
 
     Raises:

@@ -1,7 +1,7 @@
 """The detector on a running stream: events in as they come, one decision out for each window.
 
-Events are counted into the windows that are open when they arrive, so nothing of the past is kept
-or binned again, and a window is evaluated by the very functions that judge a stored trial: the same
+Events are counted into the windows that are open when they arrive, so no past event is stored or
+binned again, and a window is evaluated by the functions that score a stored trial: the same
 events give the same windows, counts and decisions. What a stream does that a file does not
 (silence, events out of order, events too late, a clock that leaps) has one outcome each:
 
@@ -133,7 +133,7 @@ class Losses:
     """Faults of a live stream that stored trials do not have."""
 
     late: int = 0
-    """Events left out: their window had been judged."""
+    """Events left out: their window had been evaluated."""
     disordered: int = 0
     """Events that came after a younger one, the late ones among them."""
     gaps: int = 0
@@ -157,10 +157,10 @@ class Step:
 
 
 class LiveRule(Protocol):
-    """What is decided after each window.
+    """The decision rule applied after each window.
 
     Attributes:
-        width: windows that a decision rests on at least.
+        width: fewest windows that a decision is based on.
     """
 
     width: int
@@ -181,7 +181,7 @@ class StepDetector:
     """A detector at its levels, window by window.
 
     A window is of gross slip once that was detected, of incipient slip where its evidence exceeds
-    the level. After an interruption evidence begins anew; onsets stay.
+    the level. After an interruption evidence is reset; onsets stay.
     """
 
     width = 1
@@ -345,7 +345,7 @@ class LiveDetector:
         self._bin(_NO_EVENTS, 0)  # raises where the crop does not fit
 
     def warm_up(self) -> None:
-        """Load and compile what the first window would have to wait for."""
+        """Load and compile everything in advance, so that the first window need not wait."""
         self._counts(self._empty())
 
     @property
@@ -471,7 +471,7 @@ class LiveDetector:
         return np.zeros((1, w.steps, w.channels, w.cells, w.cells), np.uint8)
 
     def _judge(self, number: int, *, by_event: bool) -> Decision:
-        """Close the first window that is not judged, `number`, and say what it is."""
+        """Close the first window that is not evaluated, `number`, and return its decision."""
         start_us = self._start(number)
         window = self._opened(number, start_us)
         del self._open[number]

@@ -2,9 +2,9 @@
 
 The paper's rule dates an onset when a marker has moved by 2 pixels, some time after it began to
 slip. A detection between the two is false early by the one and has a latency by the other. So
-decisions that were made once, at levels set by the label, are judged by each onset with the very
-function that judges them by the label, `latency.score_trial`. Only simulated trials have a true
-onset; it judges here, and sets, chooses and trains nothing.
+decisions that were made once, at levels set by the label, are judged by each onset with the
+function that scores them by the label, `latency.score_trial`. Only simulated trials have a true
+onset; it is used for scoring only, not for levels, choices or training.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Predictions that detectors read: spikes of all windows of a trial, at any stride, kept once made.
+"""Predictions that detectors read: spikes of all windows of a trial, at any stride, cached.
 
 Spike counts are of consecutive windows of the trials that are scored, by every trained network;
 predictions, which count events too, of windows that overlap and of the trials that detectors learn

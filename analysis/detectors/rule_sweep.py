@@ -1,15 +1,15 @@
 """The paper's rule at every smoothing and margin of a grid: detections, scores and the choice.
 
-A search asks for dozens of pairs on every trial of every network, so `sweep` makes the sums over
+A search needs dozens of pairs on every trial of every network, so `sweep` computes the sums over
 windows once for all margins. Tests hold each pair to `smoothing_rule.detect`, each
 figure to `analysis.detectors.latency` and `choose_pair` to `choose_smoothing`.
 
 The paper chose its window by the latency on test trials, and then reported that latency. Here the
-choice is made on validation trials unless somebody asks for the paper's way, and a bound on false
-early detections keeps the quickest setting from being the one that always cries slip. It holds for
-either onset: one margin serves both, and without a bound on the second the quickest first
-detection was bought with gross slip cried in nine trials of ten. As many may be missed or late and
-no more: a margin that one trial in four never reaches keeps any other bound.
+choice is made on validation trials unless the paper's way is requested. A bound on the rate of
+false early detections excludes settings that always report slip. It applies to both onsets, which
+share one margin: without a bound on the second, the quickest first detection came with false gross
+slip in nine trials of ten. The same bound limits missed and late detections: a margin that a
+quarter of the trials never reach would satisfy every other bound.
 """
 
 from __future__ import annotations

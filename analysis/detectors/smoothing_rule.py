@@ -1,8 +1,8 @@
 """Estimate two onsets from spike counts of consecutive windows.
 
-A single window is a weak witness. The paper averages counts over a sliding window and believes
-a class only when it leads by a margin; this file is that rule, with each of its edges decided:
-when the average begins, what a tie is, and which moment a detection is dated by.
+A single window is unreliable. The paper averages counts over a sliding window and accepts a class
+only when it leads by a margin. This module implements that rule and defines its edge cases: the
+start of the average, ties, and the time of a detection.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Detections(Found):
-    """Result of the paper's rule on one trial, and what it saw.
+    """Result of the paper's rule on one trial, and its inputs.
 
     Attributes:
         smoothed: float64 (n, 3), trailing mean counts. The first ``smoothing - 1`` rows are means

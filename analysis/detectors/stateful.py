@@ -1,6 +1,6 @@
 """Stateful inference: the network runs through a whole trial and its neurons are never reset.
 
-Everywhere else a window is a sample of its own and every neuron starts it at zero. Here each step
+Everywhere else a window is a separate sample and every neuron starts it at zero. Here each step
 continues from the last, as it would on a chip without resets, and the spikes of the last 30 ms
 are counted whenever one likes, at no more cost. The weights were trained with resets, and these
 neurons neither leak nor have a lower bound, so what a quiet second adds up is still there in the
@@ -20,7 +20,7 @@ from sliplab.analysis.windows.sparse import SparseWindows
 
 
 def stateful_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
-    """Output spikes of every step of consecutive windows, states kept from each to the next.
+    """Return the output spikes of every step of consecutive windows, without resets in between.
 
     Args:
         engine: the network; see `analysis.networks.training.Fitted.engine`.

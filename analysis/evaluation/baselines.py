@@ -1,8 +1,8 @@
-"""Other methods on the same windows, each trained and kept: `sliplab evaluate --baselines`.
+"""Baselines on the same windows, each trained and stored: `sliplab evaluate --baselines`.
 
-They take minutes and do not depend on the spiking network, so each is kept on its own as soon as
-it is there, and is made again only when a sample changed. Networks are trained with several seeds
-and chosen among by validation windows, as the spiking network is.
+They take minutes and do not depend on the spiking network, so each is stored separately as soon as
+it is complete, and is trained again only when a sample changed. Networks are trained with several
+seeds and chosen among by validation windows, as the spiking network is.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class ClassJob:
 
 
 def make_class_job(labels: Labels, campaigns: list[Collected]) -> ClassJob:
-    """Find what is to be evaluated.
+    """Find the inputs of the evaluation.
 
     Raises:
         StoreError: a model or a label is missing or stale.

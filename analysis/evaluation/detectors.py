@@ -35,7 +35,7 @@ class KnownTrial:
 
 @dataclass(frozen=True)
 class DetectorWork:
-    """Everything that detectors need besides what is scored anyway.
+    """Further inputs of detectors, in addition to those that are scored anyway.
 
     Attributes:
         scored: windows of scored trials whose stride is not a window's length.

@@ -1,4 +1,4 @@
-"""The evaluation of a store: its inputs, and the figures that it keeps."""
+"""The evaluation of a store: its inputs and its stored figures."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ VERSION = 4
 BY_SEED_VERSION = 2
 NAME = "evaluation"
 FORMAT = (VERSION, WINDOWS_VERSION)
-"""Stands in an evaluation, so that who reads it knows that its keys are those of today."""
+"""Format version stored in an evaluation, to detect keys of an older version."""
 
 
 def make_job(
@@ -81,7 +81,7 @@ def make_job(
     smoothing: int | None = None,
     reviewed: bool = False,
 ) -> Job:
-    """Find what is to be evaluated, and by what detection settings.
+    """Find the inputs of the evaluation, and its detection settings.
 
     Args:
         margin, smoothing: instead of the protocols' own, and of what these would choose.

@@ -21,7 +21,7 @@ STEP, NAME, VERSION = "holdout", "results", 1
 
 
 class Holdout:
-    """The hold-out campaign of a study, and what is kept of it.
+    """The hold-out campaign of a study, and its stored results.
 
     Args:
         store: evaluated, its slides simulated.
@@ -53,10 +53,10 @@ class Holdout:
         self.key = make_key(STEP, VERSION, [self.model.key, made_of, *used], rule)
 
     def result(self) -> HoldoutResult:
-        """Read what is kept.
+        """Read the stored result.
 
         Raises:
-            FileNotFoundError: the campaign was never judged.
+            FileNotFoundError: the campaign was never evaluated.
             StoreError: it is damaged.
         """
         return self.results.load(NAME, HoldoutResult)
@@ -69,11 +69,11 @@ class Holdout:
             return ()
 
     def judged_by(self, program: str) -> bool:
-        """Return whether a version of the program judged the campaign already."""
+        """Return whether a version of the program evaluated the campaign already."""
         return program in [each.version for each in self.evaluations()]
 
     def score(self, store: Store, campaigns: list[Collected]) -> HoldoutResult:
-        """Judge the labelled trials of the campaign; return figures and ledger."""
+        """Score the labelled trials of the campaign; return figures and ledger."""
         fitted = model_file.load(self.model.path)
         judged = judge(fitted, {self.item.name: self.detection}, store, campaigns)
         windows = judged.window_scores(self.detection.margin)

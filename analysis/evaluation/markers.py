@@ -145,7 +145,7 @@ def make_marker_job(
     margin: float | None = None,
     smoothing: int | None = None,
 ) -> MarkerJob:
-    """Find what is to be evaluated, and by what rule.
+    """Find the inputs of the evaluation, and its rule.
 
     Args:
         margin: points; smoothing: frames. With either nothing is chosen by validation trials.

@@ -1,6 +1,6 @@
 """Other networks on the store's test trials: the preset that `also` names, and models of files.
 
-They are evaluated by the very functions that judge the store's own network, on the same windows and
+They are evaluated by the functions that score the store's own network, on the same windows and
 trials, and by the rule in spikes of their own outputs.
 """
 
@@ -54,12 +54,12 @@ class OtherNetwork:
     """A network that is evaluated in addition to the store's own.
 
     Attributes:
-        name: of what is kept, safe as a file's name.
+        name: of the stored results, safe as a file name.
         title: for people.
         content: its file's bytes: a model file of this program, or weights of `description`.
         windows: what it takes.
         outputs_per_class: in the mean.
-        engine: what counts its spikes: the event-driven kernels, or Sinabs.
+        engine: counts its spikes: the event-driven kernels, or Sinabs.
         exact: whether both give the same counts by arithmetic.
     """
 
@@ -93,7 +93,7 @@ class _Judging:
 
 
 def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
-    """A model file of this program, or a state_dict with its description, as a network to judge.
+    """Return a network to evaluate from a model file, or from a state_dict with its description.
 
     Args:
         path: the model file, the description (YAML or JSON), or the weights with a description of
@@ -173,7 +173,7 @@ class About(TypedDict):
 
 @dataclass(frozen=True)
 class Judgement:
-    """A network, trials and rules to judge it by, found before anything is computed."""
+    """A network, and the trials and rules of its evaluation, found before anything is computed."""
 
     store: Store
     campaigns: list[Collected]
@@ -239,7 +239,7 @@ def file_judgement(
     margin: float | None = None,
     smoothing: int | None = None,
 ) -> Judgement:
-    """Return a network of a file with the protocols' rules, in spikes of its own outputs.
+    """Return a network of a file with the protocols' rules, in spikes of the network's outputs.
 
     Args:
         margin, smoothing: instead of the protocols' own.
@@ -255,7 +255,7 @@ def file_judgement(
 
 
 def comparison_judgements(labels: Labels, campaigns: list[Collected]) -> list[Judgement]:
-    """Return the networks that `analysis.also` asks for, each with its preset's rule.
+    """Return the networks that `analysis.also` names, each with its preset's rule.
 
     Raises:
         StoreError: a network is missing or stale.
@@ -359,7 +359,7 @@ def _counter(
 
 
 def score_network(job: Judgement) -> None:
-    """Windows, detections and latencies, kept as one result."""
+    """Windows, detections and latencies, stored as one result."""
     network = job.network
     rows: list[TrialScore] = []
     counts: list[I64] = []

@@ -212,7 +212,7 @@ class Judged:
         """Return by trial its windows that were classified correctly, and all of its windows.
 
         Args:
-            with_campaign: the campaign stands before the trial in its name.
+            with_campaign: prefix the trial's name with the campaign.
         """
         trial, known = self.samples.trial, self.samples.trials
         names = [f"{c}/{name}" if with_campaign else name for c, name in known]
@@ -241,7 +241,7 @@ def judge(
     store: Store,
     campaigns: list[Collected],
 ) -> Judged:
-    """Judge the labelled test trials of a store by a network that another store trained.
+    """Score the labelled test trials of a store by a network that another store trained.
 
     Args:
         detection: smoothing, margin and stride by campaign.

@@ -44,7 +44,7 @@ from sliplab.storage.trials.store import Store
 
 VERSION = 4
 STEP = "windows"
-"""The network's counts of the test windows are kept under it, for what is compared later."""
+"""Step that stores the network's counts of the test windows, for later comparisons."""
 NAME = "test"
 
 
@@ -62,7 +62,7 @@ def score_windows(
 
     Args:
         models: of all seeds, the chosen one among them.
-        key: the evaluation's, under which the counts are kept.
+        key: the evaluation's, under which the counts are stored.
         margin: the lead in spikes by which windows and trials are evaluated alike.
     """
     settings = training_settings(campaigns)
@@ -226,14 +226,14 @@ def kept_counts(
     None where they are not of the evaluation with this key.
 
     Args:
-        of: begins the name that they are kept by.
+        of: prefix of the name that they are stored under.
     """
     kept, name = Derived.of(store, STEP), f"{of}{NAME}"
     return kept.arrays(name) if evaluated is not None and kept.fresh(name, evaluated) else None
 
 
 def window_intervals(store: Store, evaluated: str | None) -> WindowIntervals | None:
-    """Intervals over trials of the test windows' figures; None where the evaluation kept none.
+    """Return intervals over trials of the test windows' figures; None without stored counts.
 
     Args:
         evaluated: the evaluation's key.

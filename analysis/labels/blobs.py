@@ -1,6 +1,6 @@
 """White round blobs in a frame, and which papilla each of them is.
 
-The paper's way of looking for markers: threshold, then blobs. It is the slow way, used on the first
+The paper's method of finding markers: threshold, then blobs. It is the slow one, used on the first
 frame of a video and wherever a marker was lost; `analysis.labels.markers` follows them from there.
 """
 

@@ -1,10 +1,10 @@
-"""The camera was knocked: what all markers have in common is not theirs.
+"""Motion of a knocked camera: the common motion of all markers, which is subtracted.
 
-While papillae are stuck their markers stand still on a plate that stands still, so the median of
-what they have moved is the camera's own motion, and it is taken out. Once all but the last have
-slipped nothing shows where the camera points; a sudden step that all take together is still told
-from slip, anything slower is not, and labels are doubted where that happens. Trials with a sliding
-plate are measured from the plate's own marker and need none of this.
+While papillae are stuck their markers do not move on a plate at rest, so the median of their motion
+is the camera's own motion, and it is subtracted. Once all but the last have slipped nothing shows
+where the camera points. A sudden step of all markers is still distinguished from slip, a slower
+motion is not, and labels are flagged as doubtful where that happens. Trials with a sliding plate
+are measured from the plate's own marker and need none of this.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sliplab.storage.kernels import njit
 Floats = NDArray[np.float64]
 
 LEAST_PX = 0.15
-"""A common shift of many that stand still; below it there is none, and the rule stays literal."""
+"""Smallest common shift of many markers at rest; below it nothing is corrected."""
 KNOCK_PX = 0.4
 """A common step from one frame to the next that no slip makes."""
 ANCHORS, MANY = 5, 10
@@ -42,7 +42,7 @@ class CameraShift:
 
     Attributes:
         px: (n, 2) common shift, 0 if there is none.
-        unsure: (n,) bool, True where it moved and too little stood still to say by how much.
+        unsure: (n,) bool, True where it moved and too few markers were at rest to measure it.
     """
 
     px: Floats
@@ -60,7 +60,7 @@ def camera_shift(away: Floats) -> CameraShift:
     """The common shift of markers.
 
     Args:
-        away: (n, m, 2) offsets from where they stood at rest, px, NaN where unknown.
+        away: (n, m, 2) offsets from their positions at rest, px, NaN where unknown.
     """
     shift, unsure, sigma, drifted = _followed(np.asarray(away, np.float64))
     knocked = np.hypot(*np.diff(shift, axis=0, prepend=0.0).T).max(initial=0.0) > KNOCK_PX
@@ -71,7 +71,7 @@ def camera_shift(away: Floats) -> CameraShift:
 
 @njit(cache=True, nogil=True)
 def _followed(away: Any) -> Any:
-    """Return shift, unsure and sigma of each frame, and whether many that stand still moved."""
+    """Return shift, unsure and sigma of each frame, and whether many markers at rest moved."""
     n, m, _ = away.shape
     shift, unsure, sigma = np.zeros((n, 2)), np.zeros(n, np.bool_), np.full(n, _UNANCHORED_PX)
     stuck, gone = np.ones(m, np.bool_), np.zeros(m, np.int64)
@@ -117,15 +117,15 @@ def _followed(away: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _all_took(step: Any, new: Any, known: Any, stuck: Any, velocity: Any) -> bool:
-    """Return whether a median step is the camera's: then no marker goes on as it did.
+    """Return whether a median step is the camera's: then all markers jump.
 
     It is asked once a marker has moved by more than a knock in a frame, as in slides above some
-    2 mm/s. There many may let go in a few frames, and each steps so far; but others still stand, or
-    slide on. Where all slide, they may slow down together, as the arm does.
+    2 mm/s. There many may let go in a few frames, and each steps so far; but others are still at
+    rest, or continue to slide. Where all slide, they may slow down together, as the arm does.
 
     Args:
         new, velocity: (m, 2) innovations, and motion per frame so far, px.
-        known, stuck: (m,) markers with an innovation; those that stood still.
+        known, stuck: (m,) markers with an innovation; those at rest.
     """
     standing = known & stuck
     witnesses = standing if standing.any() else known
@@ -160,5 +160,5 @@ def _length(vector: Any) -> float:
 
 
 def no_shift(n: int) -> CameraShift:
-    """Return the motion of a camera that stood still for n frames."""
+    """Return the motion of a camera at rest for n frames."""
     return CameraShift(np.zeros((n, 2)), np.zeros(n, np.bool_), np.zeros(n))

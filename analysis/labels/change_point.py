@@ -2,12 +2,12 @@
 
 The paper's rule dates a slip by the frame in which a marker has gone 2 pixels, which at 0.6 mm/s is
 a sixth of a second after it let go. Here the whole track about that moment is used. Before the slip
-the marker rests (a slow drift is allowed for); from then on it moves at a velocity that nobody
-knows and that wanders: stick-slip, friction that varies along the path. A stuck papilla holds more
-than a sliding one, so that it starts with a jerk, which dies away. So the way after the slip is a
-straight line, an exponential that saturates, and an integrated Wiener process: the frames
-nearest to the slip count most, and what a later frame says is discounted by how much the velocity
-may have changed until then.
+the marker rests (a slow drift is allowed for); from then on it moves at an unknown velocity that
+wanders: stick-slip, friction that varies along the path. A stuck papilla holds more than a sliding
+one, so that it starts with a jerk, which dies away. So the way after the slip is a straight line,
+an exponential that saturates, and an integrated Wiener process: the frames nearest to the slip
+count most, and what a later frame says is discounted by how much the velocity may have changed
+until then.
 
 Time of the slip, strength of the wandering, length of the jerk and everything linear are inferred
 together: the linear part is integrated out in closed form with flat priors, the rest on a grid. The

@@ -1,9 +1,9 @@
 """Reasons why an onset is ambiguous although a rule gives one, as text.
 
-A label is what everything downstream is measured against: a wrong one costs more than a missing
+Labels are the reference of everything downstream: a wrong one costs more than a missing
 one. An onset is in doubt where a marker that could have changed it was out of sight, where its
-place was too uncertain to say when it crossed the line, where the camera moved while too little
-stood still to tell by how much, and where a marker slipped in the hold.
+place was too uncertain to say when it crossed the line, where the camera moved while too few
+markers were at rest to measure it, and where a marker slipped in the hold.
 """
 
 from __future__ import annotations

@@ -35,11 +35,11 @@ VERSION = 1
 SLICE_NS = 5_000_000
 """Displacements are given every 5 ms."""
 FIRST_MM = 0.3
-"""Way of the sensor in which discs are looked for: less than most need to slip."""
+"""Travel of the sensor in which discs are searched: less than most need to slip."""
 WIDEST_NS = 300_000_000
 """An onset whose 95 % interval is wider is in doubt."""
 NEAR_LOST_NS = 1_000_000_000
-"""So near to lost events a slip may be nothing but motion that was not seen."""
+"""So near to lost events an apparent slip may be motion that was not seen."""
 TURNED_BACK_MM = 0.05
 POSE_NS = 20_000_000
 """Poses are means over so long: an arm reports them with noise."""
@@ -297,7 +297,7 @@ def _wide(intervals: tuple[Interval | None, Interval | None]) -> Doubts:
 
 
 def _near_lost(onsets: Onsets, lost_ns: I64) -> Doubts:
-    """Doubts of onsets beside lost events."""
+    """Return doubts about onsets near lost events."""
 
     def of(onset: int | None) -> str | None:
         near = onset is not None and bool((np.abs(lost_ns - onset) < NEAR_LOST_NS).any())
@@ -307,7 +307,7 @@ def _near_lost(onsets: Onsets, lost_ns: I64) -> Doubts:
 
 
 def _refused(t_ns: I64, markers: int, centre: int, reason: str) -> EventOnsets:
-    """Return a trial of which nothing is known, and why."""
+    """Return the result of a trial that cannot be labelled, with the reason."""
     none = np.full(markers, NO_ONSET, np.int64)
     unknown = np.full((len(t_ns), markers), np.nan)
     doubts = Doubts(reason, reason)

@@ -1,10 +1,10 @@
 """Slip of each papilla from its marker's track inside the sensor, and the sensor's own motion.
 
 A papilla that sticks to the plate is left behind by the sensor: its marker moves in the inner
-picture in proportion to the sensor's way, by a gain that changes slowly (bending, relaxation) and
-that nobody needs to know. One that slips is dragged along, and its marker stays where it is. So the
-beginning of a slip is a knee in the marker's displacement over the sensor's way, and what the
-displacement lacks from then on, by the gain at the knee, is the distance slid.
+picture in proportion to the sensor's travel, by an unknown gain that changes slowly (bending,
+relaxation). One that slips is dragged along, and its marker stays where it is. So the beginning of
+a slip is a knee in the marker's displacement over the sensor's travel, and what the displacement
+lacks from then on, by the gain at the knee, is the distance slid.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 BEFORE_MM = 0.5
-"""Way before a knee over which the gain is fitted, by a parabola where it is long enough."""
+"""Travel before a knee over which the gain is fitted, by a parabola if it is long enough."""
 _CURVED_MM = 0.35
 AT_REST_MM = 0.2
 """A papilla whose base never gets so far, as on the axis of a twist, cannot slip further."""
@@ -72,7 +72,7 @@ def slips(way_mm: F64, moved_px: F64, sigma_px: F64, first: int, backlash_px: fl
         moved_px: (n, m) displacement of each marker along its base's motion, NaN where unknown.
         sigma_px: (n, m).
         first: the first slice of the motion.
-        backlash_px: of the track, once a marker no longer goes on.
+        backlash_px: of the track, after a marker's reversal.
     """
     n, m = way_mm.shape
     knees, gains = np.full((3, m), np.nan), np.full(m, np.nan)
@@ -122,7 +122,7 @@ def _smooth(s: F64, y: F64) -> F64:
 
 
 def _slope(s: F64, y: F64) -> float:
-    """Return the gain over the last part of a way, px/mm."""
+    """Return the gain over the last part of the travel, px/mm."""
     part = s > s[-1] - BEFORE_MM
     return float(np.polyfit(s[part], y[part], 1)[0]) if part.sum() > 4 else float("nan")
 

@@ -110,7 +110,7 @@ def without_hot_pixels(events: EventChunk, size_px: tuple[int, int]) -> EventChu
 
 
 def find_discs(events: EventChunk, layout_mm: F64, size_px: tuple[int, int]) -> Discs | None:
-    """Find discs by the events of their first motion, at a scale that nobody needs to know.
+    """Find discs by the events of their first motion, at an unknown scale.
 
     Args:
         events: of a motion by much less than a radius.

@@ -23,7 +23,7 @@ from sliplab.storage.trials.store import Store
 
 REFERENCES = ("hold_start", "hold_end")
 CHECK = "label-check"
-"""The step that checks labels from drawn video, and the folder of its own store."""
+"""The step that checks labels from drawn video, and the folder of its store."""
 _TRUTH: dict[Rule, dict[Kind, str]] = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},
@@ -33,7 +33,7 @@ the hold, or the true start of the slip in the motion."""
 
 
 def label_errors(store: Store, campaigns: list[Collected]) -> LabelErrors:
-    """Ruling labels against what is true of their rule, over every labelled simulated trial; ms."""
+    """Errors of ruling labels against their rule's true onsets, over all simulated trials; ms."""
     rules = {item.settings.labelling.rule for item in campaigns}
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for rule, kind, label, truth in _cases(store, campaigns):

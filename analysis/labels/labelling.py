@@ -1,8 +1,8 @@
 """Ground truth of one recorded trial: its markers' places, and its onsets by both rules.
 
 The positions come from the trial's video, tracked once, or from a camera that provides tracks; of
-a trial without frames, from the events of its markers. The paper's rule and the change points are
-both kept; the protocol says which of them rules.
+a trial without frames, from the events of its markers. The onsets by the paper's rule and by change
+points are both stored; the protocol selects one of them.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Counted:
 
 @dataclass(frozen=True)
 class Label:
-    """Onsets of one trial and what they were read from.
+    """Onsets of one trial, and the data that they were read from.
 
     Attributes:
         rule: which onsets rule.
@@ -218,7 +218,7 @@ class Label:
         return label.model_copy(update=only_some) if only_some else label
 
     def as_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays that are kept; displacements to a thousandth of a pixel."""
+        """Return the arrays to store; displacements to a thousandth of a pixel."""
         places = self.places
         arrays: dict[str, npt.NDArray[Any]] = {
             "frame_ns": self.frame_ns,
@@ -238,7 +238,7 @@ class Label:
 def label_results(
     recording: Recording, settings: Labelling
 ) -> tuple[TrialLabel, dict[str, npt.NDArray[Any]]]:
-    """Label a trial; return the document and the arrays that are kept."""
+    """Label a trial; return the document and the arrays to store."""
     if settings.rule == "given":
         return given_label(recording), {}
     label = label_recording(recording, settings)
@@ -393,7 +393,7 @@ def label_places(
 
 
 def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:
-    """Doubts of onsets after the camera moved while too little stood still."""
+    """Return doubts about onsets after the camera moved while too few markers were at rest."""
     moved = frame_ns[camera.unsure]
 
     def doubts(onsets: Onsets) -> Doubts:

@@ -1,6 +1,6 @@
 """Locate markers in a frame near their predicted positions: the compiled part of tracking.
 
-Each marker has a square box of its own. Grey levels are taken relative to the ground around it and
+Each marker has its own square box. Grey levels are taken relative to the ground around it and
 the white in its middle, cut off just above the one and just below the other, and summed with their
 places: noise and light on the ground or inside the disc then weigh nothing, and the sum is the
 disc's area to a twentieth of a percent, which is how a hidden part is noticed. Where boxes would
@@ -281,7 +281,7 @@ def follow(
     known = state != LOST
     cuts = np.empty((xy.shape[0], 4))
     c, y_sums = np.empty(256, np.int32), np.empty(256, np.int32)
-    # again when something moved far: the cuts stood where the neighbours no longer are
+    # again when something moved far: the cuts were at the neighbours' old places
     for _ in range(3):
         farthest = 0.0
         for k in range(xy.shape[0]):

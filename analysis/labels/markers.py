@@ -42,10 +42,10 @@ from sliplab.analysis.labels.marker_kernels import (
 AREA_TOLERANCE = 0.06
 """A marker whose area differs by more than this share from what it was is lost."""
 _COARSE_PX = 50.0
-"""With markers so far apart the first search looks at every other pixel."""
+"""With markers so far apart the first search examines every other pixel."""
 _EAGER_FRAMES = 20
 _PATIENT_EVERY = 4
-"""A marker lost for more than 20 frames is looked for in every fourth."""
+"""A marker lost for more than 20 frames is searched in every fourth."""
 
 
 class Measured(NamedTuple):

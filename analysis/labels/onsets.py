@@ -1,9 +1,9 @@
-"""The ground truth: when the first marker slips, when the centre does, when a plate rests again.
+"""Ground truth: slip onsets of the first marker and of the centre, and a plate's time of rest.
 
-The rule is the paper's and is kept literal: a marker slips in the first frame in which it is more
-than 2 pixels from where it stood when the recording began. Every accuracy and latency the project
-reports rests on these two times, so the rule stands alone here, over plain arrays, with nothing
-smoothed and nothing guessed: a frame in which a marker was not seen says nothing about it.
+The rule is the paper's, taken literally: a marker slips in the first frame in which it is more than
+2 pixels from its position when the recording began. Every accuracy and latency the project reports
+depends on these two times, so the rule is a separate module over plain arrays. Nothing is smoothed
+or interpolated: a frame in which a marker was not seen says nothing about it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sliplab.protocols.settings import Labelling
 
 NO_ONSET = -1
-"""Stands in `Onsets.per_marker_ns` for a marker that never slipped."""
+"""Value in `Onsets.per_marker_ns` of a marker that never slipped."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 Seen askew, a plate that falls takes the papillae's markers and its own by different ways, and their
 difference is not the motion on the plate. The marker is a square of one size wherever the plate is,
-so its corners along a trial tell the perspective; what they cannot tell, and need not, is where the
-plane's own axes point. Straight on, nothing is found and nothing is changed.
+so its corners along a trial determine the perspective; the directions of the plane's axes are
+neither observable nor needed. Straight on, nothing is found and nothing is changed.
 """
 
 from __future__ import annotations

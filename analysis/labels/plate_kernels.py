@@ -1,9 +1,9 @@
 """The four sides of a dark square on white, each a line to a hundredth of a pixel.
 
 Refining a corner looks at a few pixels about a point and depends on how the pixel grid lies there;
-a side is seen in a hundred. Each is measured along its normals: what is white of a short profile,
-as a share, tells where black ends. Profiles that disagree with the rest are left out, so that a
-marker which is partly hidden or glares in places is still measured.
+a side is seen in a hundred. Each is measured along its normals: the white share of a short profile
+gives the edge of the black. Profiles that disagree with the rest are left out, so that a marker
+which is partly hidden or glares in places is still measured.
 """
 
 from __future__ import annotations

@@ -208,7 +208,7 @@ def track_video(
     """Track papillae and, on request, the plate in one pass over the frames.
 
     Args:
-        frames: (h, w) uint8 frames in order; each is checked once, and none is kept.
+        frames: (h, w) uint8 frames in order; each is checked once, and none is retained.
         layout_px: (m, 2) nominal marker positions in pixels, relative to the centre marker.
         with_plate: follow the plate's ArUco marker too.
         threshold: see `MarkerTracker`.

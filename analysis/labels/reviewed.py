@@ -1,8 +1,8 @@
 """Labels as later steps read them: automatic, or with people's decisions applied.
 
 A decision counts only for the very label it was made on. Where that label has changed since, the
-automatic one is used and the decision is counted as stale, so that nobody's word is put on
-something they never saw.
+automatic one is used and the decision is counted as stale, so that no decision is applied to a
+label that its reviewer never saw.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def slip_times(
         if not (far[first:, marker] > threshold_px).any():
             continue
         left = departure(away[:, marker], sigma[:, marker], first)
-        if left is None:  # it crept there, or was hardly ever seen
+        if left is None:  # it crept there, or was rarely seen
             over = first + int((far[first:, marker] > threshold_px).argmax())
             at[marker], low[marker], high[marker] = frame_ns[over], not_before_ns, frame_ns[over]
             continue

@@ -1,8 +1,8 @@
 """The Pareto front: rows that no other row dominates.
 
-Exact, by comparing. Rows in the order of their first objective can only be beaten by rows before
-them, and whoever is beaten at all is beaten by a row of the front; so each row is compared with the
-front so far and no other.
+The method is exact. Rows sorted by their first objective can be dominated only by earlier rows, and
+a dominated row is always dominated by a row of the front; so each row is compared only with the
+front so far.
 """
 
 from __future__ import annotations

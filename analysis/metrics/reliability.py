@@ -93,7 +93,7 @@ def cross_entropy(counts: Counts, labels: Labels, temperature: float) -> float:
 def expected_calibration_error(
     probabilities: FloatArray, labels: Labels, bins: int = BINS
 ) -> float:
-    """Mean distance between what was said and what was right, 0..1, weighted by windows.
+    """Expected calibration error, 0..1: mean distance of confidence from accuracy over windows.
 
     Windows are put by their highest probability into bins of equal width. Where classes tie, each
     has its share of being right, so that the order of classes does not matter.

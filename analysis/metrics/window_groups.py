@@ -1,4 +1,4 @@
-"""Accuracy of groups of windows, with intervals that know that windows of a trial go together.
+"""Accuracy of groups of windows, with intervals clustered by trial.
 
 Fifty windows of a trial see the same papillae slip: they are right together and wrong together. An
 interval that counts them as fifty independent ones is several times too narrow. So intervals are
@@ -138,7 +138,7 @@ def by_trial(
     named: Callable[[int], TrialName],
     names: Sequence[str] = CLASSES,
 ) -> list[TrialWindows]:
-    """One row a trial, the worst first: windows, errors, and what was taken for what.
+    """Return one row a trial, the worst first: windows, errors, and confusions.
 
     Args:
         named: gives campaign, id and condition of a trial.

@@ -4,7 +4,8 @@ Each has a few ten thousand weights like the spiking network: convolutions on th
 (where), convolutions on the volume of steps (where and when), a gated recurrent unit over the steps
 (when), and of taxels, which have no frame, convolutions over the steps. They see log(1 + counts).
 Their learning rate falls as the spiking network's does, and the best epoch by validation accuracy
-is kept; everything random comes from one seed, so that it repeats on the same number of threads.
+is selected; everything random comes from one seed, so that it repeats on the same number of
+threads.
 """
 
 from __future__ import annotations

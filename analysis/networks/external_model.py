@@ -217,7 +217,7 @@ class SinabsNet:
 
 
 class EntryError(ValueError):
-    """An entry of a state_dict that is missing, surplus, or not what its layer takes."""
+    """An entry of a state_dict that is missing, surplus, or does not fit its layer."""
 
     def __init__(self, entry: str, tensor: torch.Tensor | None, expected: str) -> None:
         super().__init__(expected)

@@ -77,7 +77,7 @@ do."""
 
 
 def work_on(device: str, net: nn.Sequential, cells: int, gain: float) -> Work:
-    """The way to compute batches on a device.
+    """Computation of batches on a device.
 
     Args:
         device: ``cpu``, ``cuda`` or ``cuda:1``, ...
@@ -196,7 +196,7 @@ class CompiledNeurons(nn.Module):
 
 
 class ExactConvolution(nn.Conv2d):
-    """A convolution as one product of matrices: sums of its own terms and of nothing else."""
+    """A convolution as one matrix product, which sums its terms and nothing else."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the convolution of `torch.nn.Conv2d`, in full float32."""
@@ -298,7 +298,7 @@ class OnDevice:
 
     def _count(self, name: str) -> Any:
         def note(_module: nn.Module, _given: Any, spikes: torch.Tensor) -> None:
-            self._fired[name] = spikes.detach().mean()  # asked for at the end: a GPU need not wait
+            self._fired[name] = spikes.detach().mean()  # read at the end: no GPU sync here
 
         return note
 

@@ -1,10 +1,10 @@
-"""Vector instructions for compiled loops: what a compiler would not find by itself.
+"""SIMD instructions for compiled loops that a compiler would not vectorise by itself.
 
-Two things cost the spiking kernels most: loops over a few dozen numbers, each of which asked first
-whether its arrays overlap, and the search for the few neurons that fired. Here a loop over a run
-is written as the vectors that it is, and a comparison of 64 neurons gives 64 bits at once. The
-code is LLVM's own vector code, so it runs on any processor and gives the same bits as a plain loop
-(`test_lanes.py`); nothing is rounded otherwise, and nothing is looked up twice.
+Two things cost the spiking kernels most: loops over a few dozen numbers, each of which first
+checked whether its arrays overlap, and the search for the few neurons that fired. Here a loop over
+a run is written as the vectors that it is, and a comparison of 64 neurons gives 64 bits at once.
+The code is LLVM's own vector code, so it runs on any processor and gives the same bits as a plain
+loop (`test_lanes.py`); nothing is rounded otherwise, and nothing is looked up twice.
 
 Places are uint64 and are not checked: the callers' tables keep them inside the arrays.
 """

@@ -106,7 +106,7 @@ class MarkerNet:
 
 
 def fit(train: MarkerSamples, validation: MarkerSamples, seed: int) -> MarkerNet:
-    """Train; the epoch with the best strict validation accuracy is kept, of equals the lower loss.
+    """Train, and select the epoch of best strict validation accuracy; ties by the lower loss.
 
     Args:
         seed: of the first weights and of the order of the samples.
@@ -164,7 +164,7 @@ def fit(train: MarkerSamples, validation: MarkerSamples, seed: int) -> MarkerNet
 
 
 def _inputs(x: F32) -> F64:
-    """Return what the network sees of windows, (n, k)."""
+    """Return the network's inputs for windows, (n, k)."""
     return np.arcsinh(x.reshape(len(x), -1).astype(np.float64))
 
 

@@ -42,7 +42,7 @@ def save(path: Path, fitted: Fitted) -> None:
 
 
 def _canonical(value: Any) -> Any:
-    """The same content with one object a text: a pickle tells equal texts from the same one."""
+    """Return the same content with strings interned: a pickle depends on their identity."""
     if isinstance(value, str):
         return sys.intern(value)
     if isinstance(value, dict):

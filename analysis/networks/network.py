@@ -60,7 +60,7 @@ def build(
         settings: channels, kernels, hidden neurons, outputs, weight scale.
         windows: shape of a sample.
         seed: the same seed gives the same weights to the bit.
-        classes: that it tells apart, at least 2; `classes_of` the network says it again.
+        classes: number of classes, at least 2; `classes_of` the network returns it.
     """
     side = math.ceil(windows.cells / 2)
     k1, k2 = settings.conv1_kernel, settings.conv2_kernel
@@ -106,7 +106,7 @@ def build(
 
 
 def classes_of(net: nn.Sequential) -> int:
-    """Return the number of classes that a network of `build`, or a copy of one, tells apart."""
+    """Return the number of classes of a network of `build`, or of a copy of one."""
     classes: Any = net.classes
     return int(classes)
 
@@ -267,9 +267,9 @@ def on_grid(values: list[npt.NDArray[np.float32]]) -> list[npt.NDArray[np.float3
 
     On the grid every current is a whole multiple of it. Below `EXACT` multiples, 8192 thresholds
     in the first layer and 1024 in the others, float32 holds each partial sum exactly: then Sinabs,
-    the event-driven kernels and an exported model give the same spikes to the last one, whatever
-    order they add in, at any batch and on any number of threads. The step is 0.05 % of a threshold
-    in the first layer, whose inputs are counts of up to 255, and 0.006 % in the others.
+    the event-driven kernels and an exported model give exactly the same spikes in any order of
+    summation, at any batch and on any number of threads. The step is 0.05 % of a threshold in the
+    first layer, whose inputs are counts of up to 255, and 0.006 % in the others.
     """
     return [
         (np.rint(w / np.float32(step)) * np.float32(step)).astype(np.float32)

@@ -7,7 +7,7 @@ what an integer machine computes.
 
 On the fast kernels, which take one threshold for all layers: a whole potential u reaches a whole
 threshold s exactly where m u reaches any T above m (s - 1) and up to m s. So each layer's weights
-are multiplied by a whole number of its own, and one T serves them all. Sums stay whole, and float32
+are multiplied by a whole number per layer, and all layers share one T. Sums stay whole, and float32
 holds them exactly below 2^24, which is 2^24 / T thresholds. Potentials are not cut off at the
 chip's 16 bits there (`chip_run` does that): those that far down do not come back in a window.
 """

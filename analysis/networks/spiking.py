@@ -266,9 +266,9 @@ class Trainer:
         """The packed weights, by which `WindowLoss` is differentiated."""
 
     def borrow(self) -> tuple[Any, Any, Any, Any, F32]:
-        """State, scratch, kept, planes and a padded row for one thread.
+        """Return the state, scratch, record, planes and a padded row for one thread.
 
-        Kept are, of each layer and for one window: potentials float32 (steps, neurons), spikes
+        The record has, for each layer and one window: potentials float32 (steps, neurons), spikes
         uint64 and where each step's end, uint64 (steps + 1,).
         """
         try:

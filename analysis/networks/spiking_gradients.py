@@ -1,11 +1,11 @@
-"""The way back through the event-driven network: gradients of weights for windows of spikes.
+"""Backward pass of the event-driven network: gradients of weights for windows of spikes.
 
 With u the potential before the reset, g(t) the gradient by a neuron's spikes and s the surrogate
 slope, dL/du(t) = g(t) s(u(t)) + [no spike at t] dL/du(t+1) and du(t)/dI(t) = 1. The reset is not
 differentiated, as in Sinabs. s(u) = scale / width exp(-|u - threshold| / width) (Shrestha and
 Orchard, 2018). A weight's gradient is the sum of dL/dI over the spikes that went through it: a run
-of numbers a spike, as on the way forward (gather). Gradients by spikes have no zeros, so the way
-from a layer to the one below is dense; but it ends at the first event of a window.
+of numbers a spike, as in the forward pass (gather). Gradients by spikes have no zeros, so the
+backward pass from a layer to the one below is dense; but it ends at the first event of a window.
 
 The loss is the cross-entropy of a window's own output counts, so a window goes forward and back at
 once, while its potentials (some 0.8 MB) are in the cache.
@@ -51,7 +51,7 @@ def forward_kept(
     ends: Any,
     out: Any,
 ) -> None:
-    """One window forward, with what the way back needs.
+    """Run one window forward, and record what the backward pass needs.
 
     Args:
         spans: of each layer uint64 (n, 2), where its neurons lie; see `fire`.
@@ -153,7 +153,7 @@ def _back_in_time(
 
 @njit(cache=True, nogil=True)
 def _spread(taps: Any, pixels: Any, rows: int, stride: Any, g: Any) -> None:
-    """Gradient by the spikes of layer 1: what every pixel's taps add up to.
+    """Return the gradient by the spikes of layer 1: the sum over every pixel's taps.
 
     Args:
         taps: (pixels with the border, taps of a pixel), row by row of the kernel.
@@ -291,12 +291,12 @@ def windows_loss(
     fired: Any,
     grads: Any,
 ) -> float:
-    """Windows forward and back, one after the other: what a window leaves stays in the cache.
+    """Run windows forward and back one by one, so that a window's data stay in the cache.
 
     Args:
         rows, labels: int64 (n,), which windows, and their classes.
         gain: what a spike counts in the cross-entropy.
-        memory: (state, scratch, kept (potentials, lists, ends), planes) of one thread.
+        memory: (state, scratch, record (potentials, lists, ends), planes) of one thread.
         outputs: output neurons; neuron j is of class ``j % classes``.
         by_count: scratch float32, zero beyond the outputs.
         out: int64 (n, classes), grows by the output spikes.

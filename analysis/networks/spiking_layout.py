@@ -1,6 +1,6 @@
 """Memory layout of weights and neurons for the event-driven kernels, and back to torch's shapes.
 
-The kernels know nothing of convolutions: a layer is a table of what each source reaches
+The kernels are not specific to convolutions: a layer is a table of what each source reaches
 (`analysis.networks.spiking_kernels`). This file makes the four tables of the network and packs its
 weights.
 """
@@ -213,9 +213,9 @@ def full_layer(below: Plane, n: int) -> Table:
 
 
 def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
-    """For the way back through the second convolution: uint32 (pixels, 2).
+    """Return the table of the backward pass through the second convolution, uint32 (pixels, 2).
 
-    A pixel's place in its plane, and where tap (0, 0) falls in the plane below.
+    Its columns are a pixel's place in its plane, and that of tap (0, 0) in the plane below.
     """
     line = np.arange(plane.side)
     here = (line[:, None] + plane.pad) * plane.full + line + plane.pad

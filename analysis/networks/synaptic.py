@@ -59,7 +59,7 @@ def fan_out(trainer: Trainer, cells: int) -> list[I64]:
 
 
 def count_work(fitted: Fitted, x: SparseWindows) -> WindowWork | None:
-    """Count what a trained network does for each window, from rest; None without windows."""
+    """Count a trained network's operations for each window, from rest; None without windows."""
     return count_net_work(restore(fitted), fitted.windows.cells, x)
 
 

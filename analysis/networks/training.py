@@ -1,12 +1,12 @@
-"""Fitting the spiking network to windows, choosing an epoch, and keeping the result.
+"""Fitting the spiking network to windows, choosing an epoch, and saving the result.
 
 Surrogate gradients through the event-driven network of `networks.spiking`, cross-entropy on
 output spike counts, Adam. Spikes are those of weights on the grid
 (`networks.network.on_grid`), and their gradients move the fine weights behind it: the network
-that is trained, validated, saved and run is one, to the last spike. Two traps of spiking networks
-are dealt with here: a layer that never fires passes for a network that says "no slip" (it is named
-in the warnings), and a result that cannot be repeated (everything random comes from one seed; the
-same call gives the same bits on any number of threads, and after a stop at any epoch).
+that is trained, validated, saved and run is one, to the last spike. Two pitfalls of spiking
+networks are handled here: a dead layer looks like a network that predicts "no slip" (it is named in
+the warnings), and results that cannot be repeated (everything random comes from one seed; the same
+call gives the same bits on any number of threads, and after a stop at any epoch).
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class Run:
         return buffer.getvalue()
 
     def go_on(self, state: bytes) -> None:
-        """Take up what `state` gave.
+        """Resume from a checkpoint that `state` returned.
 
         Raises:
             ValueError: it is damaged, or of another network.
@@ -255,8 +255,8 @@ class Fitted:
         history: one record an epoch.
         chosen_epoch: the epoch the weights are from.
         warnings: as text, what is wrong with the chosen network; empty when nothing is.
-        epoch_seconds: wall time of each epoch. Kept apart from the records and not saved, so
-            that the same training gives the same file.
+        epoch_seconds: wall time of each epoch. Separate from the records and not saved, so that the
+            same training gives the same file.
         classes: names of the classes, in the order of the outputs.
     """
 

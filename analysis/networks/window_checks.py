@@ -54,7 +54,7 @@ def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
 def check_permutations(
     predict: Predict, labels: Labels, score: Callable[[Counts, Labels], Classification]
 ) -> int:
-    """Rename the classes in all six ways, in outputs and labels: nothing may change.
+    """Permute the classes in all six orders, in outputs and labels: nothing may change.
 
     Args:
         predict: gives the counts of a network with permuted outputs.
@@ -146,14 +146,14 @@ def shuffled_chance(
 ) -> Chance:
     """Train on shuffled labels, several times, and score on true test labels.
 
-    Chance is a third exactly, whatever the test windows are: training labels are dealt out in
+    Chance is exactly a third for any test windows: training labels are dealt out in
     equal numbers, so each class is as likely as another to be the one that a network calls some
     kind of window. One run may still be off by more than its windows' own scatter, because whole
     kinds of windows are called alike; so the interval is one of runs, not of windows.
 
     Args:
         how: `epochs` and the rest of the training.
-        runs: shuffles, each with weights of its own.
+        runs: shuffles, each with its own weights.
         per_class: windows of a class to learn from at most, and as many to choose an epoch by.
         deal: how labels are shuffled; `shuffle` but in tests.
 

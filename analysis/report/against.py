@@ -153,7 +153,7 @@ def load_other(place: Path) -> Summary:
         place: a store that has one, or a ``summary.json``.
 
     Raises:
-        InputError: it does not exist, or it is none of this version.
+        InputError: it does not exist, or has another version.
     """
     path = place.joinpath(*SUMMARY) if place.is_dir() else place
     try:

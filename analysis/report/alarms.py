@@ -47,7 +47,7 @@ def rate_words(rate: AlarmRate | None) -> str:
 
 
 def alarm_words(found: dict[str, AlarmRate]) -> str:
-    """Return what accuracy costs in false alarms as a sentence."""
+    """Return the cost of accuracy in false alarms, as a sentence."""
     quiet, disturbed = found.get(QUIET), found.get(DISTURBED)
     text = "False alarms an hour (95 %, over trials): "
     if quiet is None:

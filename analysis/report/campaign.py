@@ -43,7 +43,7 @@ class CollectedSection(Content):
     """Committed trials compared with the plans.
 
     Attributes:
-        source: what was kept of the outside camera, as text.
+        source: the stored data of the outside camera, as text.
         grids: trials by the first two factors of each campaign, with its name and theirs.
     """
 
@@ -99,14 +99,14 @@ def collected_section(
 
 
 def tracks_words(simulated: bool) -> str:
-    """Return tracks as text that nobody mistakes for a video."""
+    """Return a description of tracks that cannot be mistaken for a video."""
     if simulated:
         return "simulated tracks of the markers (no video was drawn)"
     return "the camera's own tracks of the markers (no video was kept)"
 
 
 def source_words(summary: Summary | OneCameraSummary) -> str:
-    """Return what the labels were read from."""
+    """Return the source of the labels."""
     if summary.labels is None:
         return "nothing yet"
     words = {
@@ -315,7 +315,7 @@ def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, Ref
 
 
 def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
-    """Return what each committed reference trial measured, in the plan's order."""
+    """Return the measurements of each committed reference trial, in the plan's order."""
     labels = Derived.of(store, LABELS, item.name)
     found = []
     for trial, recording in item.trials:

@@ -56,7 +56,7 @@ _ALMOST = 0.95
 
 
 def class_report_key(store: Store, campaigns: list[Collected]) -> str:
-    """Return the key of all that the report is made of.
+    """Return the key of all inputs of the report.
 
     Raises:
         StoreError: there is no evaluation of this version yet.
@@ -178,7 +178,7 @@ class ClassDataSection(Content):
 
     Attributes:
         one_each: each recording shows one class.
-        campaigns: name, origin, and what is said about it.
+        campaigns: name, origin, and description.
         missing: classes without training windows.
     """
 
@@ -287,7 +287,7 @@ def _argmax_words(scores: JudgedClasses) -> str:
 
 @dataclass(frozen=True)
 class ConfusionSection(Content):
-    """What is taken for what, and each class by itself.
+    """The confusion matrix, and the scores of each class.
 
     Attributes:
         left_out: classes that the figure of recall leaves out.
@@ -411,7 +411,7 @@ def _error_section(summary: ClassSummary) -> ErrorSection:
     by_factor: Mapping[str, Mapping[str, Share]] = {
         factor: levels
         for factor, levels in scores.by_factor.items()
-        # a factor that is the class itself stands under the classes already
+        # a factor that is the class itself is listed under the classes already
         if 2 <= len(levels) <= SHOWN and not levels.keys() <= set(scores.classes)
     }
     rows = [

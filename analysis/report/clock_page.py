@@ -276,7 +276,7 @@ def _named(trial: TrialClocks) -> list[str]:
 
 
 def _doubtful(shown: _Shown) -> Table:
-    """List committed trials that would not be kept today."""
+    """List committed trials that would be rejected today."""
     rows = [[trial.name, trial.campaign, trial.doubt] for _, trial in shown.rows if trial.doubt]
     return Table(("trial", "campaign", "why"), rows)
 

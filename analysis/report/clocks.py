@@ -1,4 +1,4 @@
-"""Clocks in the report: their uncertainty by trial, and what it means for latencies."""
+"""Clocks in the report: their uncertainty by trial, and its effect on latencies."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def given_note(labels: Labels) -> str:
 
 
 def latency_note(sync: Sync, labels: Labels | None = None) -> str:
-    """Return what is under every table of latencies: the grade, and how far off it may be.
+    """Return the note under every table of latencies: the clocks' grade and uncertainty.
 
     Args:
         labels: names the onsets' origin where they came with the recordings.

@@ -1,4 +1,4 @@
-"""Forces in the report: one trial's, its friction cone, and onsets by force beside the labels'."""
+"""Forces in the report: one trial's, its friction cone, and onsets by force and by label."""
 
 from __future__ import annotations
 

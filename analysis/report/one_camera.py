@@ -1,4 +1,4 @@
-"""The report on a rig with one camera: what can be said, and what needs the other camera."""
+"""The report on a rig with one camera: its results, and those that need the other camera."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def has_labels(store: Store, campaigns: Sequence[Collected]) -> bool:
 
 
 def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
-    """Return the key of all that the report is made of.
+    """Return the key of all inputs of the report.
 
     Raises:
         StoreError: there are frames, and a trial has no label yet.
@@ -216,7 +216,7 @@ def headline(summary: OneCameraSummary) -> list[Number]:
 
 @dataclass(frozen=True)
 class LeftOutSection(Content):
-    """What this report does not show, and why."""
+    """Sections that this report leaves out, and the reason."""
 
     template: ClassVar[str] = "left_out.html"
     camera: str
@@ -243,7 +243,7 @@ class RateSection(Content):
 
 
 def left_out_section(summary: OneCameraSummary) -> LeftOutSection:
-    """Say which camera is missing, and what is left out for it."""
+    """Return which camera is missing, and the sections that need it."""
     rows = [[each.name, each.reason] for each in summary.left_out]
     given = summary.labels is not None and "given" in summary.labels.error_ms.rule
     return LeftOutSection(summary.one_camera, given, Table(("step", "why it is left out"), rows))

@@ -49,7 +49,7 @@ class OnsetSection(Content):
     Attributes:
         own: of the store's own network and rule, by onset.
         allowed: validation trials that the detectors' levels allow to be false early; None where
-            detectors were not compared, or by a program that kept no figures by each onset.
+            detectors were not compared, or by a version that stored no figures by onset.
     """
 
     template: ClassVar[str] = "onsets.html"

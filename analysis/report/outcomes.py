@@ -83,7 +83,7 @@ def _verdict(found: TrialLatency | None, kind: str, counted: str) -> Any:
 def account(
     campaigns: Sequence[Collected], trials: Iterable[TrialOutcome], experiment: str
 ) -> Accounts:
-    """Count every trial that an experiment's plans want judged, by its outcome."""
+    """Count every trial to be scored by an experiment's plans, by its outcome."""
     judged = {(row.campaign, row.trial): row.outcome for row in trials}
     counts: Counter[str] = Counter()
     for item in campaigns:
@@ -127,7 +127,7 @@ def is_lost(row: TrialOutcome, name: str) -> bool:
 
 
 def lost_ms(name: str) -> float:
-    """Return as what a lost detection counts in a median: infinitely late, or no lead at all."""
+    """Return the value of a lost detection in a median: infinitely late, or no lead at all."""
     return -math.inf if name == "lead_ms" else math.inf
 
 

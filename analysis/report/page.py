@@ -32,7 +32,7 @@ from sliplab.storage.files import make_folder, safe_name, write_text
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture (SVG text) and its data; what to see in it is said by a template.
+    """A picture (SVG text) and its data; a template has its caption.
 
     Attributes:
         name: of its files in the page's folder, without an ending; none are written without a name.
@@ -61,7 +61,7 @@ class Table:
 
     @property
     def texts(self) -> set[int]:
-        """Columns of words, which read from the left; numbers stand below each other's ends."""
+        """Columns of words, aligned left; numbers are aligned right."""
         columns = (
             [row[k] for row in self.rows if k < len(row) and row[k] not in ("", "–")]
             for k in range(len(self.columns))

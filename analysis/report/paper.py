@@ -155,7 +155,7 @@ def _count(row: Share | None) -> str:
 
 
 def _confused(confusion: Sequence[Sequence[int]]) -> Row:
-    """Find the two classes that are most often taken for each other."""
+    """Find the two classes that are most often confused."""
     pairs = {(a, b): confusion[a][b] + confusion[b][a] for a in range(3) for b in range(a + 1, 3)}
     a, b = max(pairs, key=lambda pair: pairs[pair])
     name, paper = "most confused pair", PAPER["confused"].text

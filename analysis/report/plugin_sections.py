@@ -18,10 +18,10 @@ from sliplab.storage.trials.store import Store
 
 @dataclass(frozen=True)
 class ReportData:
-    """What a section is made of.
+    """Data that a section is made of.
 
     Attributes:
-        summary: the report's figures; None where only the key of a section is asked for.
+        summary: the report's figures; None where only the key of a section is needed.
     """
 
     store: Store
@@ -31,7 +31,7 @@ class ReportData:
 
     @property
     def collected_here(self) -> bool:
-        """Whether some of the campaigns are none of imported recordings."""
+        """True if any of the campaigns was collected here rather than imported."""
         return any(item.recorded is None for item in self.campaigns)
 
 
@@ -43,8 +43,8 @@ class ReportSection:
         make: returns what is shown; None where there is nothing to show. Names of its figures begin
             with the section's.
         key: returns what the section is made of, as plain data: the report is made again where it
-            has changed. Left out: the section itself, made whenever a report is asked for.
-        last: it stands among the results of longer studies, not behind the registrations.
+            has changed. Left out: the section itself, made for every report.
+        last: put it with the results of longer studies, not after the registrations.
     """
 
     make: Callable[[ReportData], Content | None]
@@ -64,7 +64,7 @@ def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content
     """Make the sections of plug-ins, in the order of the plug-ins' names; then what is lost.
 
     Args:
-        last: those that stand among the results of longer studies.
+        last: those that are among the results of longer studies.
     """
     faults = []
     for name, place in plugins().declared("sections").items():
@@ -117,7 +117,7 @@ def _rendered(name: str, section: ReportSection, data: ReportData) -> Rendered |
 
 
 def _check(figures: Sequence[Figure], section: str, simulated: bool) -> None:
-    """Check that figures can be written beside those of other sections."""
+    """Check that the names of figures do not clash with those of other sections."""
     names = [safe_name(figure.name) for figure in figures]
     for name in names:
         if not f"{name}-".startswith(f"{section}-"):

@@ -23,7 +23,7 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 
 @dataclass(frozen=True)
 class CommandResult:
-    """What another command keeps in a store.
+    """Result file that another command writes into a store.
 
     Attributes:
         file: in the store.

@@ -1,4 +1,4 @@
-"""What the seed of a network is worth, in words: networks of other seeds have other figures."""
+"""Effect of a network's seed, in words: networks of other seeds have other figures."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def read_sources(
     planned_bytes: Mapping[str, int],
     step_seconds: Mapping[str, float],
 ) -> Sources:
-    """Read the results that earlier steps kept.
+    """Read the results that earlier steps stored.
 
     Args:
         planned_bytes, step_seconds: as of `Sources`.

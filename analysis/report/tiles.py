@@ -10,7 +10,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.schema.summary import Experiment, Kinematic, OneCameraSummary, Summary
 
 _BODIES = {"kinematic": "the slide", "gravity": "the plate", "disturbance": "the plate"}
-"""What has stopped when gross slip has ended."""
+"""Bodies whose rest ends gross slip, by experiment."""
 
 
 def slip_tiles(summary: Summary | OneCameraSummary, note: str = "") -> list[Number]:

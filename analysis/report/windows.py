@@ -227,7 +227,7 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
 def factor_figure(
     by_factor: Mapping[str, Mapping[str, Share]], accuracy: Accuracy, *, simulated: bool
 ) -> Figure:
-    """Draw accuracy by each factor's levels, beside that of all windows."""
+    """Draw accuracy by each factor's levels, next to that of all windows."""
     strict = accuracy.strict
     groups = {
         factor: [

@@ -1,1 +1,1 @@
-"""Reviews of labels by people: the doubt of each label, and what a review would change."""
+"""Reviews of labels by people: the uncertainty of each label, and the effect of a review."""

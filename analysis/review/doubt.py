@@ -1,10 +1,10 @@
-"""Doubt of a label in numbers: how far a review may move its onsets, and if it may drop the trial.
+"""Uncertainty of a label in numbers: how far a review may move its onsets, or drop the trial.
 
 An onset's spread is a standard deviation. It comes from the 95 % interval that the label states, or
 from the frames between which a marker may have crossed the threshold, and from rules that are
-further apart than in like trials. An onset in doubt lies anywhere since the motion began, unless
-its own interval is what puts it in doubt. A spread of a frame or less is none: no reviewer could
-tell better.
+further apart than in like trials. An onset in doubt may lie anywhere since the motion began, unless
+the doubt is about its interval. A spread of a frame or less counts as zero: no reviewer could do
+better.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ UNUSABLE = {0: 0.0, SLIGHT: 0.05, ODD: 0.2, GRAVE: 0.5}
 ASSUMED_TRIALS = 10
 """Reviewed trials that the assumption counts as much as."""
 APART_DEVIATIONS = 3.0
-"""Rules disagree where they are further apart than this many deviations of like trials."""
+"""Rules disagree where they are further apart than this many deviations of similar trials."""
 SWEEPS = 5
 """Of the median polish; factors are not balanced in a campaign that still runs."""
 _NORMAL = 1.4826
@@ -68,7 +68,7 @@ class Labelled:
 
 @dataclass(frozen=True)
 class LabelDoubt:
-    """What a review may find of a trial.
+    """Uncertainty of a trial's label: possible outcomes of its review.
 
     Attributes:
         onsets: the label's, or those that its rule suggests; None where nothing suggests one.
@@ -221,7 +221,7 @@ def _severity(reasons: Sequence[tuple[int, str]]) -> int:
 
 
 def _frame_ms(case: Labelled) -> float:
-    """Interval of two frames, or of the slices that stand for them; 0 without either."""
+    """Return the interval of two frames, or of the slices that replace them; 0 without either."""
     record = case.recording.record
     if record.counts.frames and record.recorded_s:
         return 1000 * record.recorded_s / record.counts.frames
@@ -292,7 +292,7 @@ def _centre(case: Labelled, found: RuleOnsets) -> int:
 def _rules_apart(
     cases: Sequence[Labelled], onsets: Sequence[Onsets]
 ) -> dict[tuple[int, Kind], tuple[float, str]]:
-    """Return by how much rules are further apart than in like trials, ms, and which one is.
+    """Return the excess distance of rules over that in similar trials, ms, and the rule.
 
     By case and onset, of the rule that is furthest.
 

@@ -1,9 +1,9 @@
 """Figures of an evaluation over trials, and their change where reviews find other onsets.
 
-Nothing is approximated but by the draws of what reviews may find: a trial is judged anew by the
-evaluation's own bounds for each draw, and each figure is computed anew with it in place. Windows
-keep the network's answer and have the class of the phase that their middle lies in, as in the
-evaluation's tenths; a trial that comes in has no windows.
+The only approximation is Monte Carlo over review outcomes: for each draw a trial is scored again by
+the evaluation's bounds, and each figure is computed again with that score. Windows keep the
+network's answer and have the class of the phase that their middle lies in, as in the evaluation's
+tenths; a trial that comes in has no windows.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TIMES = {
 }
 """Times of a trial that figures are over, and their names."""
 LOST_MS = {"latency_incipient_ms": np.inf, "latency_gross_ms": np.inf, "lead_ms": -np.inf}
-"""What a missed or late detection counts as in a median."""
+"""Value of a missed or late detection in a median."""
 STATISTICS: tuple[Literal["median", "mean"], ...] = ("median", "mean")
 Name = tuple[str, str]
 """Campaign and trial."""
@@ -40,7 +40,7 @@ Name = tuple[str, str]
 
 @dataclass(frozen=True)
 class Drawn:
-    """What reviews may find of one trial: DRAWS of them, and as many again.
+    """Random review outcomes of one trial: 2 DRAWS of them.
 
     Attributes:
         incipient_ns, gross_ns: (2 DRAWS,) int64. usable: (2 DRAWS,), False where it has no onsets.

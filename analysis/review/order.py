@@ -85,7 +85,7 @@ class Waiting:
 
 @dataclass(frozen=True)
 class Gain:
-    """What reviews do for one figure.
+    """Effect of the reviews on one figure.
 
     Attributes:
         value: now. width: of its 95 % interval over trials.
@@ -138,7 +138,7 @@ class ReviewOrder:
 
 
 def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
-    """Order the labelled trials of some campaigns that nobody has decided on.
+    """Order the labelled trials of some campaigns that have no decision yet.
 
     Raises:
         StoreError: a label or a decision is damaged.
@@ -218,7 +218,7 @@ def _evaluation(store: Store, waiting: Sequence[Labelled]) -> tuple[Evaluation |
 def _windows(
     store: Store, campaigns: Sequence[Collected], evaluation: Evaluation, drawn: dict[Name, Drawn]
 ) -> tuple[list[Figure], dict[Name, float]]:
-    """Return the accuracy of the test windows, if they were kept, and shares of training windows.
+    """Return the accuracy of the test windows, if they were stored, and shares of training windows.
 
     The shares are by trial, of windows that its review changes.
     """
@@ -235,7 +235,7 @@ def _windows(
 
 
 def _samples(store: Store, split: str) -> SampleSet | None:
-    """Return the windows of a part of the split as they were last used; None if none are kept."""
+    """Return the windows of a part of the split as they were last used; None if none are stored."""
     try:
         return SampleSet.load(Derived.of(store, SAMPLES).folder / f"{split}.arrays")
     except (OSError, ValueError):

@@ -1,7 +1,7 @@
 """Runner of all sweeps: points in order, each measured once and stored at once; resumable.
 
-A point is a setting with the name that its result is kept under and the key of all that the result
-depends on. Which points are pending is asked of what is kept, so a sweep may be stopped anywhere,
+A point is a setting with the name that its result is stored under and the key of all that the
+result depends on. Points without a stored result are pending, so a sweep may be stopped anywhere,
 continued, and made larger later.
 """
 
@@ -76,7 +76,7 @@ class ResultFile(Generic[DocumentT]):
         """Read the document.
 
         Raises:
-            FileNotFoundError: nothing was kept yet.
+            FileNotFoundError: nothing was stored yet.
             StoreError: it is damaged, or was written by a newer version.
         """
         return load_document(self.path, self.kind)
@@ -106,7 +106,7 @@ P = TypeVar("P", bound=Point)
 
 @dataclass(frozen=True)
 class Sweep(Generic[P]):
-    """Points, how one is measured, and where results are kept.
+    """Points, the measurement of one, and the place of the results.
 
     Attributes:
         measure: returns the result of a point and its arrays; calls back as parts of it are done.
@@ -120,12 +120,12 @@ class Sweep(Generic[P]):
     estimate: Callable[[P], Mapping[str, float]] = lambda point: {"": 1.0}
 
     def done(self, point: P) -> bool:
-        """Return whether a point's result is kept."""
+        """Return whether a point's result is stored."""
         return self.results.fresh(point.name, point.key)
 
     @property
     def pending(self) -> list[P]:
-        """The points whose results are not kept, in order."""
+        """The points whose results are not stored, in order."""
         return [point for point in self.points if not self.done(point)]
 
     def expected(self, advance: Callable[[], None] = lambda: None) -> dict[str, dict[str, float]]:
@@ -148,7 +148,7 @@ class Sweep(Generic[P]):
         over: Callable[[], bool] = lambda: False,
         begin: Callable[[int, int, P], None] = lambda number, count, point: None,
     ) -> int:
-        """Measure the pending points, each kept when it is done; return how many.
+        """Measure the pending points, store each when it is done, and return their number.
 
         Args:
             expected: what `expected` returned.

@@ -5,8 +5,8 @@ window needs nothing that comes after it but the correction of a knocked camera.
 
 A slide to the left is as good as one to the right, and slip at one side of the rim as good as at
 the other. So displacements are turned into the direction in which the markers moved on average,
-and the markers stand in the order of how far they moved: what was learned from a few directions,
-and from slides, holds for all others, and for plates that fall.
+and the markers are sorted by how far they moved: a network trained on a few directions, and on
+slides, then generalises to all others, and to falling plates.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Windows as lists of their non-empty cells: two hundred numbers instead of twelve thousand.
 
-A millisecond holds few events, so a sample of (30, 1, 20, 20) counts is 98 % zeros. What is
-trained on and what is decided live is therefore kept and read as the cells that are not empty, in
+A millisecond holds few events, so a sample of (30, 1, 20, 20) counts is 98 % zeros. Samples for
+training and for live detection are therefore stored and read as the cells that are not empty, in
 the order of steps; a campaign's training set is 20 times smaller, and the event-driven network
 (`analysis.networks.spiking`) never looks at a zero.
 """

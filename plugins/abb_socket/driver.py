@@ -163,7 +163,7 @@ class AbbSocketArm(ThreadedArm):
             self._confirm_rest()
 
     def stopping_s(self, speed_mm_s: float) -> float:
-        """Longest time for which it goes on at full speed after a stop: one piece."""
+        """Return the longest time at full speed after a stop: one segment."""
         return self._settings.segment_s
 
     def close(self) -> None:

@@ -1,10 +1,10 @@
 """Alarms of evidence above a level, and the level of a rate of false ones.
 
 Evidence above the level is an alarm. It lasts a second, in which the detector says nothing else;
-evidence that is above the level afterwards is the next alarm. So a detector that cries always has
-an alarm each second. Alarms before the first tip slides are false, in a hold as in the motion that
-follows it. The first alarm after that, before gross slip, detects the slip; where a false alarm
-lasts until the slip, the slip counts as missed, since nobody could know it.
+evidence that is above the level afterwards is the next alarm. So a detector that always triggers
+has an alarm each second. Alarms before the first tip slides are false, in a hold as in the motion
+that follows it. The first alarm after that, before gross slip, detects the slip; where a false
+alarm lasts until the slip, the slip counts as missed, since the alarm does not show it.
 """
 
 from __future__ import annotations

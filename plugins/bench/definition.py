@@ -1,4 +1,4 @@
-"""Scenes of the bench, version 1. Frozen: whatever changes here is another version.
+"""Scenes of the bench, version 1. Frozen: any change here requires a new version.
 
 Worlds are simulated rigs around the shipped rig `rehearsal`, their parameters drawn uniformly in
 their logarithms. Those of training and validation have seeds that everybody knows; those of tests
@@ -50,7 +50,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Definition:
-    """What the scenes are drawn from.
+    """Distributions that the scenes are drawn from.
 
     Attributes:
         spread: of the worlds' parameters: the largest factor less 1, either way.

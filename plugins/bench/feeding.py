@@ -42,7 +42,7 @@ def feed(detector: Detector, scene: Scene, chunk_us: int = CHUNK_US) -> Evidence
     """Return a detector's evidence on a scene.
 
     Raises:
-        BenchError: it gives evidence that is not one, or of a time that it was not asked for.
+        BenchError: the evidence is invalid, or for a time that was not requested.
     """
     detector.begin(scene.width, scene.height)
     return Evidence.joined(

@@ -137,8 +137,8 @@ def ranked(rows: Sequence[BenchDetector]) -> list[BenchDetector]:
 
     By the median latency from the physical slip at the table's level. Those that detect less than
     half of the slips have none, and come last, by how many they miss. Of the others, those whose
-    test scenes show more false alarms than were asked for come after those that keep the rate: the
-    lower bound of their rate is above it.
+    test scenes exceed the requested rate of false alarms come after those that do not: the lower
+    bound of their rate is above it.
     """
 
     def key(row: BenchDetector) -> tuple[bool, bool, float, int, float, str]:

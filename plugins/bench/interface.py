@@ -2,7 +2,7 @@
 
 A detector is given a scene's events in the order of time, some at once, with the moment up to which
 they are complete. It answers with its evidence for slip and when that was known. The bench sets the
-level above which the evidence is an alarm, so a detector has no threshold of its own.
+level above which the evidence is an alarm, so a detector has no threshold.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Detector(ABC):
     """A detector of slip; see the module."""
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:  # noqa: B027
-        """Learn from scenes; the others choose among what was learned. By default nothing."""
+        """Train on scenes, and select by the validation scenes. Does nothing by default."""
 
     @abstractmethod
     def begin(self, width: int, height: int) -> None:

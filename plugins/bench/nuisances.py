@@ -1,4 +1,4 @@
-"""Nuisances of test scenes: those that protocols know, but for what the arm would do.
+"""Nuisances of test scenes: those of protocols, except motions of the arm.
 
 They act in the whole scene, in its hold as in its slide, at strengths that the scene's seed draws.
 """

@@ -38,7 +38,7 @@ def title(found: BenchResult) -> str:
 
 
 def interval_note(found: BenchResult) -> str:
-    """Return what the intervals of the table are over, and where they may be too narrow."""
+    """Return the note on the table's intervals: their units, and where they may be too narrow."""
     tests = [row.table.test for row in found.detectors]
     rates = [row.disturbed for row in found.detectors if row.disturbed is not None]
     disturbed = [rate.clusters for rate in rates if rate.clusters]
@@ -73,7 +73,7 @@ def _row(row: BenchDetector) -> list[str]:
 
 
 def _median(found: MedianLatency) -> str:
-    """Return a median with its interval; a dash for what is infinite."""
+    """Return a median with its interval; a dash for infinite values."""
     if found.value is None:
         return "–"
     low, high = ("–" if it is None else f"{it:.0f}" for it in (found.low, found.high))
@@ -105,7 +105,7 @@ def check_page(page: Path) -> None:
 
 
 def write_leaderboard(page: Path, found: BenchResult) -> None:
-    """Write the table into a page, between its two comments, and the plot beside it.
+    """Write the table into a page, between its two comments, and the plot next to it.
 
     Raises:
         InputError: as `check_page`.

@@ -5,7 +5,7 @@ A detector is named by
 - a name of `SHIPPED`, of a plug-in, or of the entry point group `sliplab.detectors`;
 - ``module:attribute``, a class or function that takes no argument and returns a `Detector`;
 - the path of an ONNX file (`entries.onnx_model`);
-- ``run:COMMAND``, a program that speaks on its standard input and output (`entries.program`).
+- ``run:COMMAND``, a program that reads standard input and answers on output (`entries.program`).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def make_detector(name: str) -> Detector:
     """Return the detector of a name; see the module.
 
     Raises:
-        InputError: there is none, or it cannot be made.
+        InputError: it does not exist, or cannot be created.
     """
     if name.startswith(PROGRAM):
         from sliplab.plugins.bench.entries.program import Program

@@ -1,7 +1,7 @@
 """`sliplab bench`: detectors on the scenes of the bench.
 
-Whatever is chosen is chosen by `prepare`, which has no test scene. What a detector gave is kept as
-soon as it is complete, so that a run that was stopped resumes with the next detector.
+All choices are made by `prepare`, which has no test scene. A detector's evidence is stored as soon
+as it is complete, so that a stopped run resumes with the next detector.
 """
 
 from __future__ import annotations
@@ -182,9 +182,9 @@ class Bench:
 
 
 def _give_memory_back() -> None:
-    """Return what a simulation has freed.
+    """Return memory that a simulation has freed to the system.
 
-    It lies between the events of scenes that are kept, where glibc's allocator keeps it: 15 MB a
+    It lies between the events of retained scenes, where glibc's allocator does not free it: 15 MB a
     scene, 11 GB in the full set.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
@@ -194,7 +194,7 @@ def _give_memory_back() -> None:
 
 @dataclass(frozen=True)
 class Job:
-    """A detector to judge."""
+    """A detector to evaluate."""
 
     name: str
     size: Size
@@ -208,7 +208,7 @@ def _bench(size: Size, seed: int) -> Bench:
 
 
 def _judge(job: Job, advance: Advance | None = None) -> KeptDetector:
-    """Judge a detector, in one thread of this process.
+    """Evaluate a detector, in one thread of this process.
 
     Raises:
         InputError: it breaks the rules of the bench.
@@ -231,7 +231,7 @@ def _judge(job: Job, advance: Advance | None = None) -> KeptDetector:
 
 
 def _judge_each(jobs: Sequence[Job], workers: int, done: Callable[[KeptDetector], None]) -> None:
-    """Judge detectors, several at once in processes of their own.
+    """Evaluate detectors, several at once in separate processes.
 
     Args:
         done: called with each as soon as it is complete.
@@ -263,7 +263,7 @@ def _judge_each(jobs: Sequence[Job], workers: int, done: Callable[[KeptDetector]
 def run_bench(
     names: Sequence[str], size: str, seed: int, folder: Path, workers: int = 1
 ) -> BenchResult:
-    """Judge detectors that were not judged yet; return the table of all that are named.
+    """Evaluate detectors without a result; return the table of all that are named.
 
     Args:
         names: of detectors, see `registry`. size: one of `SIZES`.

@@ -62,7 +62,7 @@ class WindowDetector(Detector):
         """Return evidence (n,) of the next windows, and their classes (n,) or None."""
 
     def restart(self) -> None:
-        """Forget the windows of the last scene. By default nothing is kept of them."""
+        """Forget the windows of the last scene. By default none are stored."""
 
 
 def samples(scenes: Sequence[Scene], windows: Windows, *, by_paper: bool = False) -> SampleSet:

@@ -1,4 +1,4 @@
-"""Claims about a campaign: what its trials show of them so far, and which trial tells most next."""
+"""Claims about a campaign: their evidence so far, and the most informative next trial."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _LEAST_CHANCE = 1e-300
 
 @dataclass(frozen=True)
 class Limit:
-    """What an estimate must exceed at a look.
+    """Limits that an estimate must exceed at a look.
 
     Attributes:
         boundary: of the standard normal statistic, by all looks.
@@ -64,7 +64,7 @@ class Estimate:
 
     @cached_property
     def _slope(self) -> float:
-        """What the estimate changes by from one block to the next."""
+        """Change of the estimate from one block to the next."""
         return float(self.scores @ self._place) / float(self._place @ self._place)
 
     @cached_property

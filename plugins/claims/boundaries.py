@@ -1,4 +1,4 @@
-"""How strong the evidence must be at each look, so that all looks together are wrong seldom enough.
+"""Boundaries of the evidence at each look that limit the error rate over all looks.
 
 The chance of a wrong call that is allowed is spent by a power of the share of the trials that have
 been taken (Kim and DeMets 1987): little of it early, most of it at the planned end, where the
@@ -27,7 +27,7 @@ _HALVINGS = 50
 
 @dataclass(frozen=True)
 class _Stage:
-    """A look: its boundary, and the density of what has not crossed it (a grid, with weights)."""
+    """A look: its boundary, and the density of paths that have not crossed it (weighted grid)."""
 
     limit: float
     places: F64
@@ -40,14 +40,14 @@ _START = _Stage(np.inf, np.zeros(1), np.ones(1), 0.0, 0.0)
 
 
 def boundaries(shares: Sequence[float], error: float) -> F64:
-    """Return what a standard normal statistic must exceed at each look, (k,).
+    """Return the boundaries of a standard normal statistic at each look, (k,).
 
     Args:
         shares: of the planned trials that are taken at each look, rising; at 1 all is spent, and
             later looks have an infinite boundary.
         error: chance that any look exceeds its boundary where nothing is there to find.
     """
-    whole = tuple(shares)  # each look is made from the one before, which was kept
+    whole = tuple(shares)  # each look is computed from the one before, which is cached
     return np.array([_stage(whole[: k + 1], error).limit for k in range(len(whole))])
 
 

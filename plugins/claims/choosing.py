@@ -1,4 +1,4 @@
-"""Which trials next: those whose figures would narrow the open claims most, and some by chance.
+"""Choice of the next trials: those that would narrow the open claims most, and some by chance.
 
 The spread of an estimate is smallest where trials are taken in proportion to their own spread
 (Neyman 1934). The spread is expected by factors; of a percentile it is that of lying below it. A
@@ -31,7 +31,7 @@ def next_batch(
     seed: int,
     fits: Fits | None = None,
 ) -> Batch | None:
-    """Choose the trials that follow `chosen`; None where nothing is left.
+    """Choose the trials that follow `chosen`; None if none are left.
 
     A round has a batch of every stretch between two changes by a person. The first round fills the
     grid evenly, without chance. The same arguments give the same trials.

@@ -1,4 +1,4 @@
-"""What a campaign's claims were at each look, and the trials that were chosen by them."""
+"""A campaign's claims at each look, and the trials that were chosen by them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sliplab.storage.schema.campaign_end import CHOICES, CampaignEnd
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
 TARGET = "conditions repeated for ever, each counted alike"
-"""What claims are about, whichever order gives the trials; not the trials of the grid alone."""
+"""Population that the claims are about, in whichever order trials come; not only the grid."""
 
 
 class ClaimState(Part):

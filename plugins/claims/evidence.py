@@ -1,4 +1,4 @@
-"""What a campaign's trials show: figures of each trial, in the order in which they were taken."""
+"""Evidence of a campaign: figures of each trial, in the order in which they were taken."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class Evidence:
 
     @cached_property
     def left(self) -> Mask:
-        """(k, N) what was left when each round began."""
+        """(k, N) trials that were left when each round began."""
         since = np.full(len(self.grid.trials), len(self.looks), np.int64)
         since[self.taken] = self.rounds
         return np.asarray(np.arange(len(self.looks))[:, None] <= since)

@@ -1,4 +1,4 @@
-"""What trials that were not taken are expected to give, by factors and without interactions.
+"""Expected figures of trials that were not taken, by factors and without interactions.
 
 Effects of levels are shrunk to their mean by ridge regression, as random effects are; leaving one
 trial out chooses by how much. The spread of a trial is expected in the same way.
@@ -63,7 +63,7 @@ def expectation(code: F64, taken: npt.NDArray[np.int64], y: F64) -> Expectation:
 
 
 def _ridge(rows: F64, y: F64, code: F64) -> tuple[F64, F64]:
-    """Return predictions for `code`, and what each of `rows` is off when it is left out."""
+    """Return predictions for `code`, and the leave-one-out residuals of `rows`."""
     centre = y.mean()
     u, s, vt = np.linalg.svd(rows - rows.mean(axis=0), full_matrices=False)
     best: tuple[float, F64, F64] | None = None

@@ -1,9 +1,9 @@
 """Claims of a campaign while it is collected: which trials next, and when it may end.
 
-Figures of each trial are made in another process while the arm goes on. Between two rounds the
-claims are looked at, by methods that allow it. An adaptive campaign chooses a batch by all that is
-known of the batches before the last one, so that nobody waits for the last one's figures, and
-whoever resumes chooses the same.
+Figures of each trial are computed in another process while the arm continues. Between two rounds
+the claims are evaluated, by methods that allow interim looks. An adaptive campaign chooses a batch
+by the figures of the batches before the last one, so that it need not wait for the last one's
+figures, and a resumed campaign chooses the same.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class ClaimWatch:
         return TrialFigures.model_validate(self._kept.read(trial))
 
     def next_trials(self) -> list[Trial]:
-        """Return what is pending of the earliest round that is not complete; none at the end."""
+        """Return the pending trials of the earliest incomplete round; none at the end."""
         pending = {trial.id for trial in pending_trials(self._run_request.plan, self._campaign)}
         begun, last = 0, -1
         for last, trials in enumerate(self._rounds()):
@@ -155,7 +155,7 @@ class ClaimWatch:
     def _planned(self) -> list[list[Trial]]:
         """The plan's trials by round."""
         rounds: list[list[Trial]] = []
-        waiting: list[Trial] = []  # a reference trial stands before the one that it belongs to
+        waiting: list[Trial] = []  # a reference trial comes before the one that it belongs to
         for trial in self._run_request.plan:
             waiting.append(trial)
             if trial.role == "measured":
@@ -168,7 +168,7 @@ class ClaimWatch:
     # choice
 
     def _chosen(self, first: int, count: int) -> list[Trial] | None:
-        """Return the trials of some batches by number; choose what is missing of them."""
+        """Return the trials of some batches by number; choose those that are missing."""
         assert self._choice is not None
         batches = list(self._batches)
         seed = self._run_request.plan.seed
@@ -202,7 +202,7 @@ class ClaimWatch:
     # evidence and looks
 
     def _evidence(self, last: int) -> Evidence:
-        """Return what the rounds up to one show."""
+        """Return the evidence of the rounds up to one."""
         grid, there = self._grid, self._campaign.committed()
         taken: list[int] = []
         looks: list[int] = []

@@ -73,7 +73,7 @@ class ClaimsSection(Content):
 
 
 def claims_key(store: Store, campaigns: Sequence[Collected]) -> list[str]:
-    """Return what a report with claims depends on besides; empty without any."""
+    """Return the further inputs of a report with claims; empty without any."""
     found = [StoppingRecord.of(item.campaign.folder) for item in campaigns]
     return [hash_data(each.to_json()) for each in found if each is not None]
 

@@ -7,7 +7,7 @@ from sliplab.protocols.shown import plural
 
 
 def verdict_text(state: ClaimState) -> str:
-    """Return the verdict, and what an open claim lacks."""
+    """Return the verdict, and the shortfall of an open claim."""
     if state.holds or state.refuted:
         return "holds" if state.holds else "refuted"
     if state.blocks < state.least_blocks:

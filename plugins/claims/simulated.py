@@ -25,7 +25,7 @@ PERCENT = 100.0
 
 @dataclass(frozen=True)
 class Called:
-    """How a claim came out.
+    """Outcome of a claim.
 
     Attributes:
         look: number of the look at which it was called; None: never.
@@ -38,7 +38,7 @@ class Called:
 
 @dataclass(frozen=True)
 class Course:
-    """How a campaign went.
+    """Course of a campaign.
 
     Attributes:
         evidence: at its end; its looks are all that a campaign of a given order might have had.
@@ -52,7 +52,7 @@ class Course:
 
 
 def course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None) -> Course:
-    """Return how a campaign of a plan with claims goes.
+    """Return the course of a campaign of a plan with claims.
 
     Args:
         grid: of the plan. values: (N,) by figure, of its trials in its order.
@@ -96,7 +96,7 @@ def _shown(values: Figures, taken: I64, over_time: Figures | None) -> Figures:
 def planned_evidence(
     plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None
 ) -> Evidence:
-    """Return all that a campaign sees whose order its plan gives, with a look after each round.
+    """Return all evidence of a campaign in its plan's order, with a look after each round.
 
     A round with which it would take more trials than it may is left out.
     """
@@ -124,7 +124,7 @@ def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
 
 
 def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None) -> Course:
-    """Return how an adaptive campaign goes: it takes one more round than it needs."""
+    """Return the course of an adaptive campaign: it takes one more round than it needs."""
     stopping = claims_of(plan)
     called: dict[int, Called] = {}
     claims: tuple[Called, ...] = ()
@@ -152,7 +152,7 @@ def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures |
 def chosen_evidence(
     plan: Plan, grid: Grid, values: Figures, fits: Fits, over_time: Figures | None = None
 ) -> Iterator[Evidence]:
-    """Yield what an adaptive campaign has seen after each round; it goes on to the whole grid.
+    """Yield an adaptive campaign's evidence after each round, up to the whole grid.
 
     Args:
         fits: as for `states`. over_time: as for `course`.
@@ -182,7 +182,7 @@ def _seen(
     values: Figures,
     over_time: Figures | None,
 ) -> Evidence:
-    """Return what rounds that end at `looks` show."""
+    """Return the evidence of rounds that end at `looks`."""
     items = [(item, batch) for batch in batches for item in batch.trials]
     items = items[: looks[-1] if looks else 0]
     taken = np.array([grid.number[item.trial] for item, _ in items], np.int64)

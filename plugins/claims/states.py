@@ -1,7 +1,7 @@
-"""What the evidence says of each claim: its estimate, its interval, and whether it is settled.
+"""State of each claim by the evidence: its estimate, its interval, and whether it is settled.
 
-Trials without a figure could have had any: a claim is called only if it is so whatever they would
-have shown.
+Trials without a figure could have had any: a claim is called only if it holds for every possible
+figure of theirs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sliplab.protocols.claims import FIGURES, QUANTILES, Claim, Stopping
 PERCENT = 100.0
 _HALVINGS = 50
 Fits = dict[tuple[str, bytes], Expectation]
-"""What the first figures of a campaign let expect: the same at each later look."""
+"""Expectations from a campaign's first figures, cached: they are the same at each later look."""
 
 
 def states(
@@ -71,7 +71,7 @@ def settled(found: Sequence[ClaimState]) -> bool:
 
 @dataclass(frozen=True)
 class History:
-    """Evidence, and what was expected of the grid when each round began."""
+    """Evidence, and the expectations over the grid when each round began."""
 
     evidence: Evidence
     stopping: Stopping
@@ -82,7 +82,7 @@ class History:
         return coded(self.evidence.grid.levels)
 
     def expected(self, figure: str) -> Expectation:
-        """Return what was expected of a figure in each round, (k, N)."""
+        """Return the expectations of a figure in each round, (k, N)."""
         if figure not in self._by_round:
             begins = [0, *(int(n) for n in self.evidence.looks[:-1])]
             each = [self.expected_after(figure, n) for n in begins]
@@ -92,7 +92,7 @@ class History:
         return self._by_round[figure]
 
     def expected_after(self, figure: str, n: int) -> Expectation:
-        """Return what the first `n` trials let expect of a figure."""
+        """Return the expectation of a figure from the first `n` trials."""
         values = self.evidence.values[figure][:n]
         key = figure, values.tobytes()
         if key not in self.fits:
@@ -104,7 +104,7 @@ class History:
         return {}
 
     def limit(self, claim: Claim, error: float) -> Limit:
-        """Return what a claim's estimate must exceed at the last look; infinite at early ones."""
+        """Return the limit of a claim's estimate at the last look; infinite at early ones."""
         evidence = self.evidence
         enough = evidence.block_count >= claim.least_blocks
         if not len(enough) or not enough[-1]:

@@ -29,7 +29,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Judge:
-    """How figures are made of a trial.
+    """Settings and network that a trial's figures are computed with.
 
     Attributes:
         settings: of the protocol. model: the network's file; None: only the label's figures.
@@ -44,7 +44,7 @@ class Judge:
         return None if self.model is None else hashlib.sha256(self.model.read_bytes()).hexdigest()
 
     def work(self, recording: Recording, campaign: str) -> TrialWork:
-        """Return a trial's figures as work, with the key that they are kept by."""
+        """Return a trial's figures as work, with the key that they are stored under."""
         settings = self.settings.model_dump(mode="json")
         key = make_key(STEP, VERSION, [recording.checksum, self.model_hash], settings)
         return TrialWork(recording, campaign, key, self)

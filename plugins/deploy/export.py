@@ -1,7 +1,6 @@
 """A trained network as ONNX, on a Speck, and with a card.
 
-Everything that is said of the network is measured on windows of a store, by default the one that
-the model lies in.
+Every stated property of the network is measured on windows of a store, by default the model's own.
 """
 
 from __future__ import annotations
@@ -263,7 +262,7 @@ def export_files(
     checked: int | None,
     advance: Callable[[str], None],
 ) -> tuple[dict[str, bytes | str], ExportFigures]:
-    """Make the files of a model, and say of the result what matters.
+    """Make the files of a model, and report its main figures.
 
     Args:
         checked: windows that the ONNX file is compared with Sinabs on; None for no such file.

@@ -44,7 +44,7 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
 
     Args:
         net: from `analysis.networks.network.build`.
-        about: kept in the file's metadata.
+        about: stored in the file's metadata.
 
     Raises:
         ModuleNotFoundError: the extra ``onnx`` is not installed.

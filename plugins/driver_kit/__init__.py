@@ -1,4 +1,4 @@
-"""What a driver's author needs: the rules that every driver keeps, and a package to start from."""
+"""Kit for authors of drivers: the rules that every driver must meet, and a package template."""
 
 from __future__ import annotations
 

@@ -31,9 +31,9 @@ SPEED_MM_S = 40.0
 """Speed of the bench's moves, where the limits allow it."""
 SHORT_MM = 3.0
 LONG_SHARE = 0.8
-"""Length of a long move, as a share of the way from the centre of the workspace to its side."""
+"""Length of a long move, as a share of the distance from the workspace's centre to its side."""
 BEGUN_MM = 0.5
-"""A motion has begun after this way."""
+"""A motion has begun after this distance."""
 CLOCK_S = 1000.0
 """Time of the fake controller's clock when it is made, s."""
 PULSE_S, PULSE_EVERY_S = 0.14, 0.4
@@ -193,14 +193,14 @@ class ArmBench(Bench):
         return min(SPEED_MM_S, self.limits.speed_mm_s)
 
     def to(self, y_mm: float) -> Segment:
-        """Return a move to a place beside the centre of the workspace, without turning."""
+        """Return a move to a place off the centre of the workspace, without turning."""
         x, y, z = self.home.xyz_mm
         turn = self.arm.pose().rotvec_deg
         return Segment(Pose((x, y + y_mm, z), turn), self.speed_mm_s)
 
     @property
     def long_mm(self) -> float:
-        """Way of a long move from the centre."""
+        """Return the length of a long move from the centre."""
         return LONG_SHARE * (self.limits.high_mm[1] - self.limits.low_mm[1]) / 2
 
     def start(self, *path: Segment) -> None:

@@ -1,4 +1,4 @@
-"""Reports of an arm's driver during a path, beside the true motion of its fake."""
+"""Reports of an arm's driver during a path, with the true motion of its fake."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def clock_offset_ns(bench: ArmBench) -> int:
 
 
 def follow(bench: ArmBench, *path: Segment) -> Report:
-    """Follow a path to its end, and record all that the driver reports on the way.
+    """Follow a path to its end, and record all reports of the driver meanwhile.
 
     Raises:
         Seen: it does not end in time.

@@ -82,7 +82,7 @@ class Bench(ABC):
         self.close_fake()
 
     def left_open(self) -> str:
-        """Return what this process has more than before the fake was made; empty if nothing."""
+        """Return the resources opened since before the fake and still open; empty if none."""
         words = ("threads", "child processes", "files or sockets")
         return ", ".join(
             f"{now - then} {word}"
@@ -107,7 +107,7 @@ class Bench(ABC):
         threading.Event().wait(seconds)
 
     def call(self, name: str, work: Callable[[], T], within_s: float | None = None) -> T:
-        """Return the result of a call of the driver, made in a thread of its own.
+        """Return the result of a call of the driver, made in a separate thread.
 
         Args:
             within_s: its time limit; that of most calls if left out.

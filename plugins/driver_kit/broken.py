@@ -1,4 +1,4 @@
-"""Broken drivers: what the rules of conformance catch.
+"""Broken drivers that the rules of conformance must catch.
 
 Each is an example driver with one defect, as real drivers have had them. None can be named in a
 rig file.
@@ -34,7 +34,7 @@ class Broken:
     rules: tuple[str, ...]
     """All rules that it breaks; the first one is about the defect itself."""
     seen: str
-    """Regular expression of what the first rule sees."""
+    """Regular expression of the first rule's finding."""
 
 
 class NewestFirst(ExampleArm):
@@ -67,7 +67,7 @@ class StopWaits(ExampleArm):
 
 
 class StopSendsNothing(ExampleArm):
-    """Stop ends the path in the driver only: the controller goes on with its move."""
+    """Stop ends the path in the driver only: the controller continues its move."""
 
     def stop(self) -> None:
         """Follow the path no longer."""
@@ -181,7 +181,7 @@ class OldClock(ExampleSync):
     """A late answer is taken for that of the next request."""
 
     def read_clock(self) -> ClockReads:
-        """Read the box's clock, anew where nothing came."""
+        """Read the box's clock, again where nothing came."""
         try:
             return super().read_clock()
         except RigError:
@@ -240,4 +240,4 @@ BROKEN = (
         "the (clock|host's times)",
     ),
 )
-"""Each broken driver, with what the rules see of it."""
+"""Each broken driver, with the rules' findings."""

@@ -48,7 +48,7 @@ def reports(base: type[Any], change: Change, *methods: str) -> type[Any]:
 
 
 def takes(base: type[Any], name: str, change: Callable[..., tuple[Any, ...]]) -> type[Any]:
-    """Derive a driver one of whose methods gets the arguments that `change` makes of its own."""
+    """Derive a driver one of whose methods gets its arguments changed by `change`."""
 
     def method(self: Any, *arguments: Any) -> Any:
         return getattr(base, name)(self, *change(self, *arguments))
@@ -246,7 +246,7 @@ class StopsOnce(ExampleArm):
 
 
 class MovesAfterStop(ExampleArm):
-    """A move that is on its way to the controller is sent after the stop."""
+    """A pending move is sent to the controller after the stop."""
 
     def _follow_path(self, run: Any) -> None:
         threading.Event().wait(0.08)
@@ -282,7 +282,7 @@ def averaged(chunk: PoseChunk) -> PoseChunk:
 
 
 def always_ready(progress: Progress) -> Progress:
-    """Take an arm for ready, whatever its state is."""
+    """Report an arm as ready in every state."""
     return replace(progress, state=ArmState.READY)
 
 
@@ -520,7 +520,7 @@ class OldPulses(ExampleEvents):
 
 
 class SizeSwapped(ExampleEvents):
-    """Columns are taken for rows."""
+    """Columns and rows are swapped."""
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -795,7 +795,7 @@ BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
 
 
 class TargetReported(ExampleGripper):
-    """The opening is that which was asked for."""
+    """The reported opening is the requested one."""
 
     target: float | None = None
 
@@ -915,4 +915,4 @@ WRONG_VALUES = tuple(
     )
     for name, (device, rules, seen) in table.items()
 )
-"""Each driver with wrong magnitudes, with the rules about them and what the first one sees."""
+"""Each driver with wrong magnitudes, with the rules that apply and the first rule's finding."""

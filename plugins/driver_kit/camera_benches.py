@@ -64,7 +64,7 @@ class EventBench(StreamBench):
         self.fake.send(chunk, pulse)
 
     def read(self) -> list[int]:
-        """Return the times of events, us; pulses are kept in `pulses`."""
+        """Return the times of events, us; pulses are appended to `pulses`."""
         self.pulses.extend(self.call("read_pulses", self.device.read_pulses).t_ns.tolist())
         return super().read()
 

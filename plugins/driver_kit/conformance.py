@@ -45,7 +45,7 @@ Make = Callable[[], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """One rule for one driver; every try has a device and a fake of its own."""
+    """One rule for one driver; every try has a new device and a new fake."""
 
     driver: str
     rule: Rule[Any]
@@ -146,7 +146,7 @@ def conformance(
 
 
 def free_port() -> int:
-    """Return a TCP port of this computer that nobody listens at now."""
+    """Return a free TCP port of this computer."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         found: int = probe.getsockname()[1]
         return found

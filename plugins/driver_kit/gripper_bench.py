@@ -49,7 +49,7 @@ class GripperBench(Bench):
         self.fake.close()
 
     def state(self) -> GripperState:
-        """Return what the driver reports."""
+        """Return the driver's report."""
         return self.call("state", self.device.state)
 
     def true_mm(self, *t_ns: int) -> list[float]:

@@ -14,10 +14,10 @@ from sliplab.rigs.core.capabilities import Gripper, GripperState
 
 RULES = Rules[GripperBench]()
 CLOSED_MM = 10.0
-"""Way that the fingers close in a rule."""
+"""Distance that the fingers close in a rule."""
 EPS_MM = 1e-3
 SHARE = 0.1
-"""Largest deviation of a speed, and how much weaker than asked for a force may be, as a share."""
+"""Largest relative deviation of a speed, and shortfall of a force below the requested one."""
 MIDDLE_OF_RANGE = 0.3
 """Speed and force of a move, as a share of their range."""
 LAG_S = 0.1

@@ -35,7 +35,7 @@ RULES = Rules[ArmBench]()
 SHARE = 0.1
 """Largest deviation of a speed or a length, as a share."""
 MEAN_SHARE = 0.25
-"""Largest deviation of a mean speed, as a share: an arm may slow down between pieces of a way."""
+"""Largest relative deviation of a mean speed: an arm may slow down between segments of a path."""
 PART = 0.3, 0.7
 """Part of a segment in which its speed is measured, between its ramps."""
 LONG_MM, SHORT_SHARE, SLOW_SHARE = 40.0, 0.2, 0.4
@@ -43,7 +43,7 @@ LONG_MM, SHORT_SHARE, SLOW_SHARE = 40.0, 0.2, 0.4
 WAYS = (0.6, -0.64, 0.48), (-0.48, 0.6, 0.64)
 """Directions of two segments; no two axes have the same share."""
 SLOW_MM, SLOW_MM_S = 3.0, 2.0
-"""Way and speed of a slow move, as in a trial."""
+"""Distance and speed of a slow move, as in a trial."""
 TURN_DEG, TURN_DEG_S = 30.0, 20.0
 OFF_LINE_MM, OFF_SPOT_MM, ORIENTED_DEG = 0.2, 0.1, 0.2
 LAG_S = 0.25

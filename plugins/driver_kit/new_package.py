@@ -92,7 +92,7 @@ _IN_RIG = {
         "mock: {gripper: {opening_mm: 40}}   # the fingers that its fake moves\n",
     ),
 }
-"""What a rig file needs besides the name of the driver, in the device's section and below it."""
+"""Further entries of a rig file, in the device's section and below it."""
 
 TEST = Template('''\
 """$name keeps the rules that SlipLab holds a driver of its kind to, on its fake."""
@@ -109,11 +109,11 @@ _ARGUMENTS = {
     ),
     "gripper": "opening_mm=40",
 }
-"""What the settings of the test need."""
+"""Arguments of the settings in the test."""
 
 
 def name_fault(name: str) -> str:
-    """Return what is wrong with the name of a new driver; empty if nothing is."""
+    """Return the fault in the name of a new driver; empty if there is none."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         return "must be lower-case letters, digits and underscores, a letter first"
     if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in {"sliplab", "tests"}:
@@ -162,7 +162,7 @@ def package_files(name: str, kind: str) -> dict[str, str]:
 
 
 def _own_imports_last(text: str, package: str) -> str:
-    """Move a module's imports of its own package behind those of others."""
+    """Move a module's imports of the same package after those of others."""
     pattern = re.compile(_OWN_IMPORT.format(package=package), re.MULTILINE)
     own = "".join(pattern.findall(text))
     rest = pattern.sub("", text)

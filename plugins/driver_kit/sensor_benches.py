@@ -36,7 +36,7 @@ def swinging(load: F64, t_s: F64, steady: bool) -> F64:
 
 
 class ForceBench(StreamBench):
-    """A force sensor with a fake of its own."""
+    """A force sensor with its own fake."""
 
     capability = ForceSensor
     fields = ("t_ns", "force_n", "torque_nm")

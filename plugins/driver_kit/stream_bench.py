@@ -1,4 +1,4 @@
-"""Bench of a device that streams, and what all kinds of them share."""
+"""Bench of a streaming device: the base of all kinds."""
 
 from __future__ import annotations
 
@@ -227,7 +227,7 @@ class StreamBench(Bench):
     def mark(self) -> int | None:
         """Return a time that all data from now on have reached, in the unit of the chunk.
 
-        None where the device begins each run with a clock of its own.
+        None where the device restarts its clock at each run.
         """
         return self._next_ns
 

@@ -60,7 +60,7 @@ def _declaration(bench: StreamBench) -> None:
     bench.connect()
     check_methods(bench.device, bench.capability)
     if isinstance(bench, FrameBench):
-        return  # a fake that the driver opens has no address of its own
+        return  # a fake that the driver opens has no address
     problem = bench.call("ping", lambda: bench.driver.ping(bench.settings), bench.bounds.connect_s)
     if problem is not None:
         raise Seen(f"ping of a fake that answers returned '{problem}'")

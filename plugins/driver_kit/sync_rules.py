@@ -16,7 +16,7 @@ from sliplab.rigs.core.pulse_code import SEEDS, CodeBits
 
 RULES = Rules[SyncBench]()
 LATE_S = 0.25
-"""Longest time from a call to what the box does on it, s."""
+"""Longest time from a call to the box's reaction, s."""
 SLOW_HZ = 1.0
 TICKS = 8
 """Ticks after a jump of which one at least is a pulse."""

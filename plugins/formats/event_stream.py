@@ -46,7 +46,7 @@ def read_es(path: Path, name: str) -> ForeignTrial:
 
     Raises:
         InputError: faery is not installed.
-        FormatError: it is none, is cut short, or faery cannot read it.
+        FormatError: the format is another, the file is truncated, or faery cannot read it.
     """
     begin = _begin(path)
     if rest := _rest(path, begin):
@@ -55,13 +55,13 @@ def read_es(path: Path, name: str) -> ForeignTrial:
 
 
 def salvage_es(path: Path, name: str) -> ForeignTrial:
-    """Read the events of a damaged file that stand before the damage.
+    """Read the events of a damaged file before the damage.
 
     faery reads blocks of 64 KiB, and returns nothing of the one in which it stops.
 
     Raises:
         InputError: faery is not installed.
-        FormatError: the file's header is damaged, or it is none.
+        FormatError: the file's header is damaged, or its format is another.
     """
     begin, size = _begin(path), path.stat().st_size
     rest = _rest(path, begin)
@@ -75,7 +75,7 @@ def salvage_es(path: Path, name: str) -> ForeignTrial:
     except FormatError as error:
         packets = _whole_blocks(path)
         at, reason = begin + packets * _BLOCK, str(error)
-        if at >= size:  # faery reads on: nobody knows where that is
+        if at >= size:  # faery reads ahead: the position is unknown
             raise
     if reason is None:
         return trial

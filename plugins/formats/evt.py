@@ -26,7 +26,7 @@ from sliplab.storage.kernels import njit
 from sliplab.storage.streams import I64, U8, U16
 
 OUTSIDE, FELL, LATE = 1, 2, 3
-"""Faults of a word: a pixel that the camera has not, a high part that fell, a time too late."""
+"""Faults of a word: a pixel outside the camera, a high part that decreased, a time too late."""
 (
     NOW,
     HIGH_US,
@@ -57,7 +57,7 @@ with events that were earlier than the event before them; RAISED_US: by at most 
 ROOM = 32
 """Rows that one word may fill."""
 LAST_TURN_US = LATEST_US - (1 << 35)
-"""Time at which no turn may begin any more; the longest turn has 2^34 us."""
+"""Latest time at which a turn may begin; the longest turn has 2^34 us."""
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8 = 0x0, 0x2, 0x3, 0x4, 0x5
 _TIME_LOW, _TIME_HIGH, _EXT_TRIGGER = 0x6, 0x8, 0xA
 _TILE = 1 << 11
@@ -80,7 +80,7 @@ class Encoding:
     Attributes:
         dtype: of its words, little-endian. decode: see `decode_evt3`.
         type_bit: the lowest of the four bits with a word's type; None if all words are events.
-        most_px: columns and rows that its words can tell.
+        most_px: columns and rows that its words can encode.
         high_us: one of its high parts, us; 0 if it has none.
     """
 
@@ -198,9 +198,9 @@ def decode_evt3(
     t: I64,
     edges: I64,
 ) -> tuple[int, int]:
-    """Decode 16-bit words, which say what changed: time, row, and columns alone or as vectors.
+    """Decode 16-bit words, each of which changes one part of the state: time, row, and columns alone or as vectors.
 
-    A vector stands at the last base, which it moves on; a single event leaves that alone.
+    A vector starts at the last base and advances it; a single event does not change it.
 
     Args:
         words: shape (n,). at: index of the first to decode.

@@ -2,7 +2,7 @@
 
 Such a data set has no events. Images and videos become cameras; vectors of numbers become poses and
 forces where the names of their components have their units, and otherwise a scalar stream for each
-component, without a unit. One that SlipLab published has its raw trials beside the rows, and those
+component, without a unit. One that SlipLab published has its raw trials next to the rows, and those
 are read instead (format `croissant`).
 """
 

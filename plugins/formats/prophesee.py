@@ -1,10 +1,10 @@
 """Reader of Prophesee's `.raw` files (EVT 2.0, 2.1 and 3.0) and `.dat` files (versions 1 and 2).
 
-A file is a header of lines that begin with `% `, and words. The header ends at `% end`, or where a
-line is none of text; the words are decoded in `evt`. Where this deviates from faery, which tests
-compare it with, it follows the maker's documentation and decoders: events before the first time
-are dropped; times that no event used change no later one; vectors stand at their own base, and one
-that reaches beyond the camera is damage; the clock begins again at 0 after a gap, too, and not
+A file is a header of lines that begin with `% `, and words. The header ends at `% end`, or at the
+first line that is not text; the words are decoded in `evt`. Where this deviates from faery, which
+tests compare it with, it follows the maker's documentation and decoders: events before the first
+time are dropped; times that no event used change no later one; vectors start at their own base, and
+one that reaches beyond the camera is damage; the clock begins again at 0 after a gap, too, and not
 where it only fell; what follows `% end` is no header. Times are microseconds, with the header's
 `T0` added, which faery writes.
 """
@@ -79,11 +79,11 @@ _BLOCK = 1 << 18
 
 @dataclass(frozen=True)
 class Header:
-    """What the beginning of a file says.
+    """Header of a file.
 
     Attributes:
         begin: byte of the first word; end: byte behind the last whole one.
-        size: columns and rows; None where it does not say.
+        size: columns and rows; None if not stated.
         t0_us: what times count from.
         bits: of a column and a row, in DAT.
         swapped: EVT 2.1 with the upper half of each word first.
@@ -118,7 +118,7 @@ def read_prophesee(path: Path, name: str) -> ForeignTrial:
 
 
 def salvage_prophesee(path: Path, name: str) -> ForeignTrial:
-    """Read the events of a damaged file that stand before the damage.
+    """Read the events of a damaged file before the damage.
 
     Raises:
         FormatError: the file's header is damaged, or says no format.
@@ -262,7 +262,7 @@ def _rest(path: Path, header: Header) -> Lost | None:
 
 
 def _trial(path: Path, name: str, header: Header) -> ForeignTrial:
-    """Return a trial of the words that a header tells of."""
+    """Return a trial of the words that a header describes."""
     with as_damage():
         triggers, left_out = _triggers(path, header)
 
@@ -324,7 +324,7 @@ def _decoded(
     left out; times may run back where a high part fell.
 
     Raises:
-        DamagedWord: after what stands before it was yielded.
+        DamagedWord: after everything before it was yielded.
     """
     most = header.encoding.most_px
     width, height = header.size or (most, most)

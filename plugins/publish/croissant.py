@@ -17,7 +17,7 @@ from sliplab.storage.files import sha256
 from sliplab.storage.streams import Json
 
 VERSION = "1.0.0"
-"""Version of a publication; a corrected one is published anew."""
+"""Version of a publication; a corrected one is published again."""
 _CONTEXT: Json = {
     "@language": "en",
     "@vocab": "https://schema.org/",

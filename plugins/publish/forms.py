@@ -1,7 +1,7 @@
 """Publication of trials in one folder: the store's own files, MCAP, or a LeRobot data set.
 
-Beside the trials there are tables, a data card, checksums, and descriptions as Croissant and as
-RO-Crate. The folder of the store's own files reads as a store as well.
+In addition to the trials there are tables, a data card, checksums, and descriptions as Croissant
+and as RO-Crate. The folder of the store's own files reads as a store as well.
 """
 
 from __future__ import annotations

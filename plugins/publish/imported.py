@@ -1,4 +1,4 @@
-"""Reader of publications that hold the store's own files: Croissant, and LeRobot beside its rows.
+"""Reader of publications with the store's own files: Croissant, and LeRobot next to its rows.
 
 Files keep their bytes, so what was derived from a trial stays fresh. Each trial is copied, the copy
 is checked as `sliplab verify` checks one, and only then becomes visible.
@@ -119,7 +119,7 @@ def _texts(where: Campaign) -> CampaignTexts:
 
 
 def _plain(file: Path) -> Path:
-    """Return a file. Raises DamagedFile where it is none; links may lead anywhere."""
+    """Return a file. Raises DamagedFile if it is not a regular file; links may lead anywhere."""
     try:
         plain = S_ISREG(file.lstat().st_mode)
     except OSError:

@@ -1,9 +1,9 @@
-"""Trials as episodes of a LeRobot v3 data set: rows on a fixed grid of time, beside the raw trials.
+"""Trials as episodes of a LeRobot v3 data set: rows on a fixed time grid, with the raw trials.
 
 Layout: ``meta/info.json``, ``meta/stats.json``, ``meta/tasks.parquet``, ``meta/episodes/`` and
-``data/``, all Parquet of chunk-NNN/file-NNN. A row stands for 1/100 s of the trial's time line and
-has what was known at its end. Frames and counts of events are PNG inside of Parquet: LeRobot's
-videos are lossy. A feature is there if every trial has it.
+``data/``, all Parquet of chunk-NNN/file-NNN. A row covers 1/100 s of the trial's time line and has
+the values known at its end. Frames and counts of events are PNG inside of Parquet: LeRobot's videos
+are lossy. A feature is there if every trial has it.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class _Stats:
 
 @dataclass
 class _Levels:
-    """How often each level was in each channel of a feature's images."""
+    """Histogram of the levels in each channel of a feature's images."""
 
     histogram: I64
     images: int = 0
@@ -193,7 +193,7 @@ def _pictures(size: tuple[int, int], channels: int) -> Json:
 
 
 def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording) -> None:
-    """Write one trial's rows as a file of its own."""
+    """Write one trial's rows as a separate file."""
     start, count = _grid(recording)
     ends = start + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
     number = len(made.episodes)
@@ -307,7 +307,7 @@ def _at(ends: I64, times: I64, values: Array) -> Array:
 
 
 def _turned(ends: I64, times: I64, rotvec_deg: Array) -> Array:
-    """Interpolate rotations on the shortest way between two of them."""
+    """Interpolate rotations along the shortest path between two of them."""
     from scipy.spatial.transform import Rotation, Slerp
 
     times, first = np.unique(times, return_index=True)

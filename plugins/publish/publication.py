@@ -1,7 +1,7 @@
-"""What is published: trials of a store with their splits, and the folder they are written into.
+"""Content of a publication: trials of a store with their splits, and the output folder.
 
-A publication is written aside, in a folder beside its own, and appears by one rename: it is
-complete, or it is not there. The store is only read.
+A publication is written into a temporary sibling folder and appears by one rename: it is complete,
+or it does not exist. The store is only read.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ SPLITS = {
 
 @dataclass(frozen=True)
 class About:
-    """What the publisher says of a publication.
+    """Metadata of a publication, from the publisher.
 
     Attributes:
         licence: an SPDX id; None if none was given.
@@ -96,7 +96,7 @@ class Publication:
     """Trials to be published.
 
     Attributes:
-        splits: part of the split of each trial, by campaign and id; of imported ones there is none.
+        splits: part of the split of each trial, by campaign and id; imported ones have none.
     """
 
     store: Store
@@ -210,7 +210,7 @@ def _damaged(campaign: Campaign, trial: str, cause: str) -> InputError:
 
 @contextmanager
 def staged(output: Path) -> Iterator[Path]:
-    """Make a folder beside `output` that becomes `output` when the block ends without an error.
+    """Make a sibling folder that is renamed to `output` when the block ends without an error.
 
     Raises:
         InputError: `output` exists.

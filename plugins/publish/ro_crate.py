@@ -1,4 +1,4 @@
-"""RO-Crate 1.1 metadata of a publication: files with checksums, and what made them."""
+"""RO-Crate 1.1 metadata of a publication: files with checksums, and their origin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study of reflexes: every trial's outcome, and what they come to."""
+"""The study of reflexes: every trial's outcome, and their summary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of a study of reflexes: plates held, ways fallen, reaction times, plates over time."""
+"""Figures of a study of reflexes: plates held, distances fallen, reaction times, time courses."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def reactions(rows: Sequence[ReflexRow], *, simulated: bool) -> str:
 
 
 def fallen(rows: Sequence[ReflexRow], trials: Sequence[ReflexTrial], *, simulated: bool) -> str:
-    """Draw the way that every plate fell before the sensor left."""
+    """Draw the distance that every plate fell before the sensor left."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(WIDTH, 1.0 + 0.3 * len(rows)))
         for i, row in enumerate(rows):

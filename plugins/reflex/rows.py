@@ -1,7 +1,7 @@
-"""What the trials of a study of reflexes come to: drops prevented, way fallen, force, reaction.
+"""Results of a study of reflexes: drops prevented, distance fallen, force, reaction.
 
 A drop is prevented where the plate falls without a reflex, and is held by one that was triggered
-after the first tip had slipped: a detector that cries always prevents nothing.
+after the first tip had slipped: a detector that always triggers prevents nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sliplab.plugins.reflex.document import ReactionParts, ReflexRow, ReflexTria
 
 PARTS = ("window", "sensor", "network", "command", "actuator")
 SLIDING_MM_S = 0.1
-"""Speed above which a plate that has not come to its stop still slides."""
+"""Speed above which a plate that has not stopped still slides."""
 STOP_MM = 0.1
 """Distance from its stop at which a plate counts as dropped."""
 _LAST_S = 0.05

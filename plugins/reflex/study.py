@@ -1,8 +1,9 @@
 """`sliplab reflex`: how many drops a reflex prevents on a simulated rig, and how fast it is.
 
 The plate of gravity trials hangs on the sensor, which retracts. Every trial is run without a
-reflex, and with each detector and reflex. Results are kept in `OUT/reflex.json`, each as soon as
-its trial is over, so a stop resumes. Nothing is recorded, and no safe state is gone to.
+reflex, and with each detector and reflex. Results are stored in `OUT/reflex.json`, each as soon as
+its trial is over, so a stopped study resumes. Nothing is recorded, and the rig does not go to its
+safe state.
 """
 
 from __future__ import annotations
@@ -40,11 +41,11 @@ from sliplab.storage.streams import Json
 
 NAME = "reflex"
 VERSION = 1
-"""Of the way a trial is measured: kept results of another one are measured again."""
+"""Version of the measurement; stored results of another version are measured again."""
 HOLD_S = 1.0
 """Time for which the arm stays after a reflex; a plate that slides at its end has dropped."""
 STEP_MS = 20
-"""Step of the heights that are kept."""
+"""Step of the stored heights."""
 
 
 def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
@@ -52,7 +53,7 @@ def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
 
 
 _NEVER: Counting = _no_slip
-"""Sees no slip: for trials without a reflex, where nothing is to be detected."""
+"""No-slip outputs for trials without a reflex, in which nothing is detected."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for, checked.
+    """Request of a study, checked.
 
     Attributes:
         requests: one of each detector, without a reflex.
@@ -99,7 +100,7 @@ def request(
     count: int = 1,
     detectors: Sequence[str] = (),
 ) -> Request:
-    """Check what is asked for.
+    """Check a request.
 
     Args:
         reflexes: left out, all that the rig can do. detectors: left out, all of a store.
@@ -138,7 +139,7 @@ def request(
         for name, asked in requests.items():
             rule = _numbers(asked.detection)
             for reflex in reflexes:
-                make_reflex(reflex, file, plan, trial, HOLD_S)  # said before anything moves
+                make_reflex(reflex, file, plan, trial, HOLD_S)  # raises before anything moves
                 key = hash_data([made, trial.id, asked.model_sha256, rule, reflex])
                 cases.append(Case(trial, name, reflex, key))
     return Request(next(iter(requests.values())).rig, plan, requests, cases, out)
@@ -153,11 +154,11 @@ def _numbers(detection: Detection | Tuned) -> Json:
 
 
 def measure_reflexes(asked: Request) -> ReflexStudy:
-    """Run what is not kept yet, and write the page; return all results.
+    """Run what is not stored yet, and write the page; return all results.
 
     Raises:
-        RigError: a device failed; what was done is kept.
-        KeyboardInterrupt: somebody stopped it; the arm is stopped, and what was done is kept.
+        RigError: a device failed; finished results are stored.
+        KeyboardInterrupt: the user stopped it; the arm is stopped, finished results are stored.
     """
     head: Json = {
         "simulated": True,
@@ -187,7 +188,7 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
 
 @contextmanager
 def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
-    """Yield what builds the rig of a trial; a loopback rig's fakes run for all of them."""
+    """Yield a function that builds the rig of a trial; a loopback rig's fakes run for all."""
     if file.in_virtual_time:
         yield build_rig
         return
@@ -210,7 +211,7 @@ class Seen:
     course: PlateCourse | None = None
 
     def by(self, build: Callable[[RigFile], Rig]) -> Callable[[RigFile], Rig]:
-        """Return what builds the same rig, observed."""
+        """Return a function that builds the same rig, observed."""
 
         def observed(file: RigFile) -> Rig:
             rig = build(file)

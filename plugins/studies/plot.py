@@ -256,7 +256,7 @@ _SERIES = (
     (ORANGE, "s", (0, 6), "center"),
     (GREEN, "^", (0, -11), "center"),
 )
-"""Colour, mark, and where the label stands."""
+"""Colour, mark, and offset and alignment of the label."""
 
 
 def _cost_points(

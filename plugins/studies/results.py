@@ -1,4 +1,4 @@
-"""Where a store has the results of trade-offs."""
+"""Places of the results of trade-offs in a store."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ TRACKERS = {
     "components_": "OpenCV's connected components, weighted by intensity",
     "blob_detector_": "OpenCV's blob detector as it stands",
 }
-"""Beginnings of figures of the benchmark `labels`, a way to find markers each."""
+"""Prefixes of figures of the benchmark `labels`, one a method to find markers."""
 
 SETS = {"": "slides", "falls_": "falling plates", "stressed_": "slides with nuisances"}
 """Beginnings of figures of the benchmark `labels_truth`, a set of trials each."""
@@ -143,7 +143,7 @@ TRUTHS = {
 
 
 def label_speed(figures: Json) -> Table:
-    """List time a frame and error of each way to find markers.
+    """List the time per frame and the error of each method to find markers.
 
     Raises:
         KeyError: SlipLab's own are not among the figures.
@@ -164,7 +164,7 @@ def label_speed(figures: Json) -> Table:
 
 
 def label_truth(figures: Json) -> Table:
-    """List how far labels are off what is true in the simulation, by set of trials.
+    """List the errors of labels against the simulation's truth, by set of trials.
 
     Raises:
         KeyError: no set of trials is among the figures.

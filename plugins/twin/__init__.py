@@ -1,4 +1,4 @@
-"""A simulated rig's scene fitted to a pilot: what its trials say of the scene's parameters."""
+"""Calibration of a simulated rig: its scene's parameters fitted to a pilot's trials."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How frames and forces lie in space and time against the arm: scale, turn, distortion, delays.
+"""Alignment of frames and forces with the arm: scale, rotation, distortion, delays.
 
-A tip that slides steadily moves as its base does. What differs between both is the camera's: its
+A tip that slides steadily moves as its base does. The difference between both is the camera's: its
 scale, its turn about its axis, pixels that are not square, a tilt, a lens. What a tip lags behind
 its base grows with speed by a delay alone. Forces have a direction and a delay in the same way.
 """
@@ -27,7 +27,7 @@ LEAST_WAY_MM = 1.0
 """A tip's motion counts from a base's way of this length on, between the means of its two halves.
 """
 NOISE_MM = 0.01
-"""Supposed of a tip's way, for weights only: the arm's tremor."""
+"""Assumed error of a tip's travel, for weights only: the arm's tremor."""
 FEWEST_FRAMES = 20
 RELAX_S = 1.5
 """Time with which lags are taken to grow after a slip."""
@@ -37,7 +37,7 @@ ROUNDS, OUTLIER = 6, 2.5
 
 @dataclass(frozen=True)
 class View:
-    """How frames show motions of the arm; all numbers are 0 for a camera that is aligned with it.
+    """Alignment of frames with the arm's motion; all numbers are 0 for an aligned camera.
 
     Attributes:
         scale: of displacements in frames over those of the arm, less 1.
@@ -55,7 +55,7 @@ class View:
 
 
 def view_of(slips: Slips) -> View:
-    """Return how the frames of some slides show the arm's motion; NaN where they do not tell."""
+    """Return the alignment of some slides' frames with the arm; NaN where not observable."""
     ways = [row for i in range(len(slips.trials)) for row in _ways(slips, i)]
     if len(ways) < 12:
         return View()
@@ -214,7 +214,7 @@ def _near(
 def force_delay_ms(slips: Slips, growth: Growth) -> float:
     """Return how late forces are against the arm's poses, ms; NaN without a force sensor.
 
-    While all tips stick, the force along the slide follows the base's way, and what relaxes of it.
+    While all tips stick, the force along the slide follows the base's travel and its relaxation.
     """
     late, weight = [], []
     for i, trial in enumerate(slips.trials):
@@ -247,7 +247,7 @@ def force_delay_ms(slips: Slips, growth: Growth) -> float:
 
 
 def force_turn_deg(slips: Slips) -> float:
-    """Return the turn of the forces against the way in a slide's second half, degrees, else NaN."""
+    """Return the angle from the path to the forces in a slide's second half, degrees, else NaN."""
     found = []
     for (ahead, across), trial in zip(slips.direction, slips.trials, strict=True):
         if trial.forces is None:

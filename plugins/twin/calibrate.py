@@ -70,7 +70,7 @@ PREDICTED = 12
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a fit is asked for.
+    """Request of a fit, checked.
 
     Attributes:
         prior: worlds around the simulated rig to start from. rig_path: the rig's file.
@@ -100,7 +100,7 @@ def request(
     seed: int,
     gain_error: float = GAIN_ERROR,
 ) -> Calibration:
-    """Check what is asked for before anything is simulated.
+    """Check a request before anything is simulated.
 
     Raises:
         InputError: the rig is not a simulated one in virtual time, or the new file cannot be made.
@@ -136,12 +136,12 @@ def fitted_rig(rig_path: Path) -> RigFile:
 
 @dataclass(frozen=True)
 class SceneFit:
-    """A pilot, the worlds that it was compared with, and what follows for the scene.
+    """A pilot, the worlds that it was compared with, and the fitted scene.
 
     Attributes:
         observed: what the pilot shows. seen: what each world shows. bank: of these worlds.
         found: posterior of the prior's parameters.
-        skin: settings of the twin's skin, beside those among the parameters.
+        skin: settings of the twin's skin, in addition to those among the parameters.
     """
 
     prior: Prior
@@ -327,7 +327,7 @@ def judging_worlds(scene: SceneFit) -> list[World]:
 
 @dataclass(frozen=True)
 class Predicted:
-    """The test trials in a world: what is compared of them, and their numbers for scores."""
+    """The test trials in a world: their compared quantities, and their numbers for scores."""
 
     shown: list[Shown]
     marks: list[Marks]
@@ -348,7 +348,7 @@ def predict(worlds: Sequence[World]) -> tuple[list[Predicted], list[Predicted]]:
 def parameter_fits(
     scene: SceneFit, rig: RigFile, gain_error: float, checks: Sequence[MisfitCheck]
 ) -> tuple[ParameterFit, ...]:
-    """Return what is kept of the parameters' posterior; no interval where a misfit touches one.
+    """Return the stored results of the parameters' posterior; no interval under a misfit.
 
     Args:
         rig: with the assumed values. gain_error: largest error of the force sensor's gain.
@@ -383,7 +383,7 @@ def parameter_fits(
 
 
 def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
-    """Return what was read of the pilot, beside the middle 95 % of the worlds."""
+    """Return the pilot's statistics with the middle 95 % of the worlds."""
     bank, observed = scene.bank, scene.observed.fitted
     found = {}
     for k, name in enumerate(bank.statistics):
@@ -403,7 +403,7 @@ def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
 def compared(
     pilot: Sequence[Shown], twin: Sequence[Sequence[Shown]], before: Sequence[Sequence[Shown]]
 ) -> tuple[QuantityCompared, ...]:
-    """Return the test trials' quantities beside those of simulated worlds."""
+    """Return the test trials' quantities with those of simulated worlds."""
     if not pilot:
         return ()
     return tuple(

@@ -4,8 +4,8 @@ Each is near to one parameter of the camera, or to what of several can be seen t
 computed from events alone where that can be done. They need not be without bias: what simulated
 worlds give is computed in the same way, and compared.
 
-Log intensity has no scale of its own: contrast and threshold, and the threshold's mismatch, are
-seen as ratios only. What a force does to the image is seen as a product with that force.
+Log intensity has no absolute scale: contrast and threshold, and the threshold's mismatch, are
+observed as ratios only. What a force does to the image is seen as a product with that force.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ NAMES = (
 )
 """Of the estimates, with their units; all are positive, for their logarithms."""
 FIRST_MM = 0.3
-"""Way of the sensor in which discs are looked for: less than most need to slip."""
+"""Travel of the sensor in which discs are searched: less than most need to slip."""
 PHASE_MM = 1.0
 SHORT_S = 0.1
 """Forces and tips before and after a motion are means over so long."""
@@ -91,7 +91,7 @@ way."""
 FALSE_HOT = 0.01
 """Pixels that are called hot and are not, on average."""
 SCANNED, SCANNED_EVENTS = 3, 20_000
-"""Trials that scans are looked for in, and how many events of each."""
+"""Trials in which scans are searched, and the number of events of each."""
 SHAPED = 6
 """Trials that the edge and the contrast are taken from."""
 SWEPT = 3.0
@@ -107,11 +107,11 @@ CONTRAST_TREND, NOISE_TREND, SHIFT_TREND, PICTURE_TURN, EVENT_DELAY = CHECKED = 
     "picture_turn_deg",
     "event_delay_ms",
 )
-"""What events show of effects that no parameter of the camera makes."""
+"""Statistics of effects that no parameter of the camera causes."""
 
 
 def camera_estimates(trials: Sequence[PilotTrial]) -> dict[str, float]:
-    """Return estimates by name, see `NAMES`; NaN for those that cannot be had.
+    """Return estimates by name, see `NAMES`; NaN for those that are not identifiable.
 
     Trials without an event camera, or of another camera or skin than the first, are left out.
     """
@@ -166,7 +166,7 @@ def _events(trial: PilotTrial, begin_s: float, end_s: float) -> EventChunk:
 
 
 def _moved_s(trial: PilotTrial, way_mm: float) -> float:
-    """Time at which the sensor has gone a way; the end of the slide if it never does."""
+    """Return when the sensor has travelled a distance; the end of the slide if it never does."""
     return min(way_mm / trial.slide.speed_mm_s, trial.slide_s)
 
 
@@ -301,7 +301,7 @@ def _clear(rests: F64 | None, size_px: tuple[int, int]) -> Mask:
 def _times(
     trials: Sequence[PilotTrial], noise: _Noise, size_px: tuple[int, int]
 ) -> dict[str, float]:
-    """Return what the times of events say: read-out, dead time, rate of hot pixels."""
+    """Return estimates from the times of events: read-out, dead time, rate of hot pixels."""
     found: dict[str, float] = {}
     width, height = size_px
     scans: list[Scans] = []
@@ -352,7 +352,7 @@ def _rates(trials: Sequence[PilotTrial]) -> dict[str, float]:
 def _discs(
     trials: Sequence[PilotTrial], rests: F64, noise: _Noise, size_px: tuple[int, int]
 ) -> dict[str, float]:
-    """Return what discs before and after each slide say."""
+    """Return estimates from discs before and after each slide."""
     images = [_counts(trial, noise, size_px) for trial in trials]
     # what noise adds to a pixel's count: a mean, of leakage, and a variance
     seen_s = np.array([trial.slide_s - min(trial.hold_s, 0.0) for trial in trials])
@@ -480,7 +480,7 @@ def _contrast(fits: Sequence[RimFit], variances: F64, fitted: float) -> dict[str
 
 
 def _geometry(trials: Sequence[PilotTrial], discs: F64, complete: bool) -> dict[str, float]:
-    """Scale, radius, and what forces do to the image.
+    """Return scale, radius, and the effects of forces on the image.
 
     Args:
         discs: of each trial, (n, m, 8), see `rims`; displaced also where the rest is unknown.
@@ -549,7 +549,7 @@ def _growth(discs: F64, normal_n: F64, px_per_mm: float) -> dict[str, float]:
 
 
 def _papillae(trials: Sequence[PilotTrial], discs: F64) -> dict[str, float]:
-    """How discs differ in the deepest slides: between rings, and inside them.
+    """Return differences of discs in the deepest slides: between rings, and inside them.
 
     Radii grow with normal forces and displacements with tangential ones, so these say how loads
     differ between papillae, which one force of all cannot.

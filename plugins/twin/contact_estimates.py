@@ -67,7 +67,7 @@ class Contact:
 
 
 def read_contact(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Contact | None:
-    """Return what slides show of the contact; None without markers.
+    """Return the contact in slides; None without markers.
 
     Args:
         guess: design of the skin, and where the fit of its springs begins.
@@ -85,7 +85,7 @@ def read_contact(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Co
 
 
 def contact_estimates(contact: Contact) -> dict[str, float]:
-    """Return the estimates by name, NaN where these slides do not tell."""
+    """Return the estimates by name, NaN where these slides do not determine them."""
     growth = contact.growth if contact.fitted else Growth(*[float("nan")] * 4)
     return {
         "position_scatter_mm": place_scatter(contact.ring, contact.place_mm),
@@ -129,7 +129,7 @@ def lags_of(slips: Slips, ring: I64, table: SteadyLags, growth: Growth) -> Lags:
 
 
 def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:
-    """Return what the fitted springs say of the common parameters and of the scatters."""
+    """Return the fitted springs' estimates of the common parameters and of the scatters."""
     names = (
         "kinetic",
         "normal_compliance_per_mm",
@@ -233,7 +233,7 @@ class Papillae:
 
 
 def papillae(contact: Contact) -> Papillae | None:
-    """Return what a pilot tells of each papilla; None where it tells nothing."""
+    """Return a pilot's estimates of each papilla; None without a fit."""
     fit, ring, place = contact.springs, contact.ring, contact.place_mm
     if fit is None:
         return None

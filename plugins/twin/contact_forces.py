@@ -62,11 +62,11 @@ def gross_forces(slips: Slips) -> F64:
 
 
 def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
-    """Force over lag of each ring's tips at each depth, N/mm, (levels, rings); NaN where not known.
+    """Return force over lag of each ring's tips by depth, N/mm, (levels, rings); NaN if unknown.
 
     Stuck or sliding, a tip pulls with its spring, and its lag is seen: the measured force along
-    the slide is a sum of the rings' lags, with their stiffnesses as factors. What relaxes is
-    counted in as a lag of its own, q' = -q / tau + m lag'.
+    the slide is a sum of the rings' lags, with their stiffnesses as factors. Relaxation is modelled
+    as a separate lag, q' = -q / tau + m lag'.
     """
     levels, which = slips.depths
     rings = np.arange(ring.max(initial=0) + 1)
@@ -102,7 +102,7 @@ def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
 
 
 def relaxing(lag_mm: F64, t_s: F64, growth: Growth) -> F64:
-    """Return lags with what still relaxes of them, which a tip pulls in proportion to, (n, m)."""
+    """Return lags with their remaining relaxation; a tip's pull is proportional to them, (n, m)."""
     step = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
     decay = np.exp(-step / growth.relaxation_s)
     gain = growth.maxwell * growth.relaxation_s / step * (1.0 - decay)
@@ -112,7 +112,7 @@ def relaxing(lag_mm: F64, t_s: F64, growth: Growth) -> F64:
 
 
 def _filled(t_s: F64, values: F64) -> F64:
-    """Values with lines through what is missing; zeros where there are none."""
+    """Return values with gaps interpolated linearly; zeros without any value."""
     seen = np.isfinite(values)
     return np.interp(t_s, t_s[seen], values[seen]) if seen.any() else np.zeros(len(t_s))
 
@@ -140,7 +140,7 @@ def _slope(x: F64, y: F64) -> float:
 
 
 def hold_relaxation(slips: Slips) -> tuple[float, float]:
-    """Return share and time of what relaxes of the normal force in the hold; NaN without forces.
+    """Return share and time of the normal force's relaxation in the hold; NaN without forces.
 
     One time for all slides, a final force and a relaxing one for each: least squares with these
     two projected out. The share is that at the start of the hold over what remains.

@@ -1,4 +1,4 @@
-"""Lags of sliding tips: how they grow while springs relax, and what they are in steady slip.
+"""Lags of sliding tips: their growth while springs relax, and their values in steady slip.
 
 A tip that let go follows its base at the distance at which its spring pulls with friction.
 """
@@ -22,12 +22,12 @@ from sliplab.storage.streams import F64
 VARIATION, CORRELATION_MM, TREMOR_MM = 0.05, 0.5, 0.007
 """Supposed for weights only: friction's variation along a path, its length, the arm's tremor."""
 LEAST_STRETCH_MM = 0.15
-"""Slips of springs that were stretched less tell more of the tremor than of friction."""
+"""Slips of springs that were stretched less depend more on the tremor than on friction."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """How a lag grows after a slip while the stretched spring relaxes.
+    """Growth of a lag after a slip while the stretched spring relaxes.
 
     Attributes:
         maxwell: stiffness of the relaxing branch over the other. relaxation_s: its time.

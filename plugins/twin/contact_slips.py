@@ -1,4 +1,4 @@
-"""Slips of the papillae in a pilot's slides, from the markers' tracks: what every estimate needs.
+"""Slips of the papillae in a pilot's slides, from the markers' tracks: the input of all estimates.
 
 A tip sticks to the plate until its spring reaches friction, then follows its base at a distance:
 its lag. Both are seen directly: base motion as the arm reported it less the marker's displacement.

@@ -3,7 +3,8 @@
 A tip in steady slip pulls with T = mu N. Its papilla is a bent column: with the bend b,
 N = k_n (d - 0.6 b^2 / h) and T = b (k_b - 1.2 N / h), and the lag is b + c T, c the compliance of
 shear and base (the potential of `rigs.scene.slip`; a beam's shortening and softening). Lags have
-no scale of force: they tell friction, and the base's compliances over the skin's. Forces add it.
+no scale of force: they determine friction, and the ratio of the base's compliances to the skin's.
+Forces add the scale.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _NEWTON = 20
 
 @dataclass(frozen=True)
 class Guess:
-    """What is known or supposed of the skin before the pilot.
+    """Prior knowledge and assumptions of the skin before the pilot.
 
     Attributes:
         height_mm: of the centre papilla. radius_mm: of a papilla. spacing_mm: between rings.
@@ -60,7 +61,7 @@ class Lags:
         depth_mm: (l,). ring: (m,), -1 for a papilla that is not there.
         lag_mm: NaN where not known, 0 where a papilla does not touch, (l, m). error_mm: (l, m).
         normal_n: normal force at rest, (l,); NaN without. ratio: of the forces in gross slip.
-        kept: normal force in gross slip over that at rest, (l,).
+        kept: ratio of normal force in gross slip to that at rest, (l,).
         stiffness_n_per_mm: of all tips together while they stick, (l,).
         pull_n_per_mm: force over lag of each ring's tips, (l, rings).
     """

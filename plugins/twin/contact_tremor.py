@@ -1,4 +1,4 @@
-"""The arm's tremor, from what all sliding tips do together."""
+"""The arm's tremor, from the common motion of all sliding tips."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sliplab.storage.streams import F64
 C128 = npt.NDArray[np.complex128]
 
 BAND_HZ = (2.2, 10.0)
-"""Where an arm's tremor is looked for: friction along a path varies more slowly."""
+"""Band in which an arm's tremor is searched: friction along a path varies more slowly."""
 TONES = 4
 STRENGTHENING, WEAK_MM_S = 0.01, 0.1
 """Friction at the speed w is taken to grow by 0.01 ln(1 + w / 0.1 mm/s)."""

@@ -1,4 +1,4 @@
-"""Numbers of a fit of a simulated rig to a pilot, beside the rig file that it wrote."""
+"""Numbers of a fit of a simulated rig to a pilot, stored next to the rig file that it wrote."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rigs drawn from the posterior of a twin, whose samples are kept beside it (`twin.npz`).
+"""Rigs drawn from the posterior of a twin, whose samples are stored next to it (`twin.npz`).
 
 A sample is one world that the pilot leaves likely. All parameters are drawn, those too that are not
 identified and that the twin keeps as they were assumed; what is only known of them together, such
@@ -28,7 +28,7 @@ SEED = 1
 
 
 def samples_file(twin: Path) -> Path:
-    """Return the file beside a twin's rig file that holds samples of its posterior."""
+    """Return the path of a twin's posterior samples, next to its rig file."""
     return twin.with_suffix(".npz")
 
 

@@ -23,7 +23,7 @@ class Effect:
     Attributes:
         key: short name. title: for people.
         without: settings of the section `mock:` that leave it out, as mappings in each other.
-        beside: settings under which it is compared with and without.
+        beside: base settings of the comparison with and without it.
         only_with: keys of effects that are left out with it.
     """
 

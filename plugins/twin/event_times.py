@@ -1,4 +1,4 @@
-"""What the times of events say of a read-out that scans, and of a pixel's dead time.
+"""Estimates of a scanning read-out and of a pixel's dead time from the times of events.
 
 A read-out that scans gives all events of a column times that differ by whole periods, and those of
 other columns the same times later by what a scan takes to get there. A pixel that is dead for a
@@ -122,13 +122,13 @@ def _thinned(t_us: I64, x: Any) -> tuple[I64, Any]:
 
 
 def _agreement(intervals_us: F64, per_us: F64) -> F64:
-    """How well intervals are whole multiples of periods, -1 to 1, for some frequencies."""
+    """Return how well intervals match whole multiples of periods, -1 to 1, by frequency."""
     result: F64 = np.cos(2.0 * np.pi * np.outer(per_us, intervals_us)).mean(axis=1)
     return result
 
 
 def _top(x: F64, y: F64) -> float:
-    """Where y is largest, by a parabola through the highest point and those beside it."""
+    """Return the position of y's maximum, by a parabola through the highest three points."""
     k = int(np.clip(y.argmax(), 1, len(x) - 2))
     bend = y[k - 1] - 2.0 * y[k] + y[k + 1]
     shift = 0.5 * (y[k - 1] - y[k + 1]) / bend if bend < 0.0 else 0.0

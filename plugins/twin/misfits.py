@@ -1,4 +1,4 @@
-"""Checks that say where a pilot shows an effect that the simulated scene lacks.
+"""Checks for effects in a pilot that the simulated scene lacks.
 
 Each is a number that one kind of effect makes large. The same number of simulated worlds says how
 large it becomes without the effect, and a number beyond that is a misfit. Further checks compare
@@ -40,7 +40,7 @@ Stream = Literal["frames", "events", "poses", "force"]
 LEVEL = 0.05
 """Share of pilots without any such effect that show a misfit, of all checks together."""
 SETUP_LEVEL = 0.01
-"""Part of it that those checks have which tell of places, times and trends."""
+"""Its share for the checks of places, times and trends."""
 TAIL = 0.2
 """Share of the worlds that the tail of a number is taken from."""
 FEWEST = 20
@@ -66,13 +66,13 @@ SCALE, TURN, STRETCH, BENT, PERSPECTIVE, FRAME_DELAY, FORCE_DELAY, FORCE_TURN = 
 )
 
 VIEWS = frozenset((SCALE, TURN, STRETCH, BENT, PERSPECTIVE))
-"""Of the frames: a picture that is wrong makes delays and trends that are none."""
+"""Of the frames: a wrong image causes spurious delays and trends."""
 
 CONTACT_KEYS = frozenset(it.key for it in CONTACT)
 CAMERA_KEYS = frozenset(it.key for it in CAMERA)
 FORCE_KEYS = frozenset(it.key for it in PARAMETERS if "force" in it.streams)
 IN_MM = CONTACT_KEYS | {f"event_camera.{name}" for name in ("px_per_mm", "radius_mm")} | FORCE_KEYS
-"""What frames give a length to."""
+"""Parameters whose lengths are measured by frames."""
 NOISE_KEYS = frozenset(
     f"event_camera.{name}" for name in ("noise_hz", "leak_share", "hot_pixels", "hot_hz")
 )
@@ -88,8 +88,8 @@ class Check:
         floor: values that differ by less than this are alike.
         touches: parameters whose intervals do not hold with the effect.
         signed: the number is the distance from its median in worlds, either way.
-        setup: tells of places, times or trends that are wrong. These show in others, too, so that
-            it comes first; and its number is near to normal, see `Tail`.
+        setup: whether it shows places, times or trends that are wrong. These show in others, too,
+            so that it comes first; and its number is near to normal, see `Tail`.
     """
 
     key: str
@@ -177,7 +177,7 @@ SHOWN_BY: Mapping[Stream, frozenset[str]] = {
 def misfit_numbers(
     trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], contact: Contact | None
 ) -> dict[str, float]:
-    """Return the number of every check by key, NaN where the slides do not tell it.
+    """Return the number of every check by key, NaN where the slides do not determine it.
 
     Those of the event camera come from `read_camera`.
 
@@ -232,7 +232,7 @@ def gap_slope(place_mm: F64, raised_mm: F64, ring: I64) -> float:
 
 LEAST_SCATTER = 0.3
 """Estimates of papillae's friction are taken to scatter by at least so much of what is expected:
-where all are alike, the smallest difference would stand out."""
+where all are alike, the smallest difference would be significant."""
 
 
 def odd_friction(fit: Fit, ring: I64) -> float:
@@ -285,7 +285,7 @@ LEAST_IN_CELL_MM = 0.5
 """A tip's path in a cell counts from this length on."""
 FEWEST_IN_CELL = 3
 LEAST_LAG_MM = 0.3
-"""Lags that are smaller tell more of heights and of the arm's tremor than of friction."""
+"""Lags that are smaller depend more on heights and on the arm's tremor than on friction."""
 _CELLS = 10_000
 """More than there are along an axis of the plate."""
 
@@ -540,8 +540,8 @@ def misfits(
 
     A check for one kind of effect comes before those of all statistics: it says more. Those of
     the frames' picture come first, and then those of times and trends, since all others show them,
-    too. Left out is
-    what the pilot does not tell, or fewer than `FEWEST` worlds.
+    too. Checks that the pilot does not determine, or that fewer than `FEWEST` worlds do, are left
+    out.
 
     Args:
         numbers: of the pilot, see `misfit_numbers`. worlds: those of k simulated worlds.

@@ -1,4 +1,4 @@
-"""The page of a twin: what was fitted to a pilot, how well, and what the scene cannot show."""
+"""The page of a twin: fitted parameters, their accuracy, and effects that the scene lacks."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The parameters of a simulated rig that a pilot may tell something about.
+"""The parameters of a simulated rig that a pilot may determine.
 
 None of them was measured when a rig file was written: they are assumed (`sliplab guesses`). Each is
 a number of the rig file's section `mock:`, positive, and is estimated as a logarithm, so that an
-interval is a factor either way. The threshold of events is none of them: contrast, threshold and
+interval is a factor either way. The threshold of events is not among them: contrast, threshold and
 its mismatch scale together without changing an event, so the threshold keeps the rig's value.
 """
 
@@ -39,7 +39,7 @@ class Parameter:
 
 
 LAYER_STEP = "scene.skin.layer_step_mm"
-"""Stands for `scene.skin.heights_mm`: all steps are changed by one factor, the centre stays."""
+"""Scale of `scene.skin.heights_mm`: one factor changes all steps, the centre is fixed."""
 
 CONTACT = (
     Parameter("scene.friction.kinetic", "kinetic friction", "", ("frames", "force")),

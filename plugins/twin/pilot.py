@@ -51,7 +51,7 @@ class Forces:
 
 @dataclass(frozen=True)
 class Camera:
-    """What the event camera recorded of a slide.
+    """Recording of a slide by the event camera.
 
     Attributes:
         events: times in microseconds after the start of the slide, negative in the hold.

@@ -1,4 +1,4 @@
-"""Figures of a twin: its intervals, and a pilot's test trials beside simulated ones."""
+"""Figures of a twin: its intervals, and a pilot's test trials next to simulated ones."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def trends(panels: Sequence[Trend], *, simulated: bool) -> str:
             )
             along = np.linspace(it.places[0], it.places[-1], 50)
             ax.plot(along, (1.0 + it.percent / 100.0) ** ((along - along[0]) / 100.0), color=RED)
-            # a parameter that is known to a thousandth stands still
+            # a parameter that is known to a thousandth does not move
             least, most = min(low.min(), 0.98), max(high.max(), 1.02)
             ax.set_ylim(least - 0.05 * (most - least), most + 0.05 * (most - least))
             ax.set_title(it.title, fontsize=8)

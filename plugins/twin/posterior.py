@@ -1,11 +1,11 @@
-"""What a pilot says of a simulated rig's parameters: a posterior by regression on simulated worlds.
+"""Posterior of a simulated rig's parameters given a pilot, by regression on simulated worlds.
 
 A bank holds worlds drawn from a uniform prior and the statistics that each would have shown. The
 parameters are regressed on the statistics (semi-automatic approximate Bayesian computation,
 Fearnhead and Prangle 2012; regression adjustment, Beaumont et al. 2002, with a spread that changes
 over the prior, Blum and François 2010). What the regression missed in worlds that it was not
 fitted to, near to what is predicted from the pilot, is the posterior's shape. So an interval holds
-95 % of the worlds of the bank whatever the regression is worth (split conformal prediction, Vovk et
+95 % of the worlds of the bank however good the regression is (split conformal prediction, Vovk et
 al. 2005; Lei et al. 2018): a poor one only makes it wide.
 """
 
@@ -33,7 +33,7 @@ _NEAR = 0.5
 _NOTHING = 0.02
 """Share of variance explained in worlds not fitted to, below which the prediction is dropped."""
 _SEEN = 0.8
-"""Share of the worlds in which a statistic must be had to be used."""
+"""Share of the worlds in which a statistic must be defined to be used."""
 _FAR = 5.0
 """Standard deviations at which a statistic is cut off: one wild value must not outweigh all."""
 _LEVELS = (0.025, 0.5, 0.975)
@@ -46,7 +46,7 @@ class Bank:
     Attributes:
         parameters: names, p of them. statistics: names, q of them.
         theta: parameters of k worlds, (k, p), usually logarithms.
-        s: their statistics, (k, q), NaN where one could not be had.
+        s: their statistics, (k, q), NaN where undefined.
         lower, upper: bounds of the prior, (p,).
 
     Raises:
@@ -126,7 +126,7 @@ class Posterior:
 
 @dataclass(frozen=True)
 class _Spread:
-    """How the size of a regression's errors changes with what it predicts.
+    """Size of a regression's errors as a function of its predictions.
 
     Attributes:
         weights, constant: of the logarithm of the errors' size on predictions and squares.
@@ -290,7 +290,7 @@ def posterior(bank: Bank, observed: F64) -> Posterior:
 
 
 def widened(found: Posterior, slopes: F64, error: float) -> tuple[Estimate, ...]:
-    """Return estimates whose intervals allow for one more unknown that no statistic tells of.
+    """Return estimates whose intervals allow for one more unknown that no statistic depends on.
 
     Args:
         slopes: of the parameters over the unknown, (p,). error: largest size of it, of which all

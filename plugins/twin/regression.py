@@ -1,6 +1,6 @@
 """Regression of parameters on many statistics, of which most may say nothing.
 
-Sparse Bayesian regression in which every statistic has a prior variance of its own, found by
+Sparse Bayesian regression in which every statistic has its own prior variance, found by
 maximising the evidence (MacKay 1994, "automatic relevance determination"; Tipping 2001). Where a
 parameter depends on the statistics in a curved way, products of the linear predictions are added
 and treated the same. Statistics that are not correlated with any parameter are left out first.
@@ -19,7 +19,7 @@ MOST = 120
 ROUNDS = 12
 """Of the re-estimation of variances: more change predictions by less than they err."""
 _LEAST_NOISE = 1e-6
-"""Smallest share of a parameter's variance that is taken for noise, so that copies of an exact
+"""Smallest share of a parameter's variance that is treated as noise, so that copies of an exact
 statistic leave a matrix that can be inverted."""
 _SKILLED = 0.1
 """Share of variance explained from which on a prediction is used for others' curvature."""

@@ -1,6 +1,6 @@
-"""What a person compares of a pilot and its twin: slips, event rates, maps of events, by trial.
+"""Plots that compare a pilot with its twin: slips, event rates, maps of events, by trial.
 
-Nothing is fitted by these; the test trials' own are shown beside those of simulated worlds.
+They are not used for fitting; those of the test trials are shown next to those of simulated worlds.
 """
 
 from __future__ import annotations

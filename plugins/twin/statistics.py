@@ -25,12 +25,12 @@ def events_of(slides: Sequence[PilotTrial], with_events: Collection[str]) -> lis
 
 
 VERSION = 5
-"""Raised with every change of a statistic or of the scene's physics: worlds are simulated anew."""
+"""Raised with every change of a statistic or of the scene's physics: worlds are simulated again."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What slides show, by name.
+    """Statistics of slides, by name.
 
     Attributes:
         fitted: of contact and event camera; parameters are estimated by them.

@@ -1,6 +1,6 @@
-"""What changes from the first slide of a pilot to the last, which worlds do not know.
+"""Trends from the first slide of a pilot to the last, which worlds do not model.
 
-Each number is a change over the whole pilot in units of its own standard error, by regression on
+Each number is a change over the whole pilot in units of its standard error, by regression on
 the slides' order. Slides of one depth are compared, and those since one measurement of depth zero:
 an error of it changes forces and lags as wear does.
 """

@@ -96,7 +96,7 @@ def other_rig(
     """Return a simulated rig with other parameters and another skin.
 
     Args:
-        values: by the keys of `PARAMETERS`. skin: settings of it, beside those among `values`.
+        values: by the keys of `PARAMETERS`. skin: settings of it, in addition to those in `values`.
         zero_mm: error of depth zero.
     """
     settings = settings_of(rig.scene, values)
@@ -108,7 +108,7 @@ def other_rig(
 
 
 def other_specimen(rig: RigFile, values: Mapping[str, float], seed: int, zero_mm: float) -> RigFile:
-    """Return another specimen of a simulated rig: its skin, its pixels, its tremor are drawn anew.
+    """Return another specimen of a simulated rig: its skin, pixels and tremor are drawn again.
 
     Args:
         values, zero_mm: as for `other_rig`.
@@ -231,8 +231,8 @@ def simulated(
 ) -> list[Statistics]:
     """Return what the prior's first worlds show of the slides.
 
-    What was simulated is kept: a run that was stopped goes on, and other trials of the same
-    conditions on the same rig are compared with the same worlds.
+    Simulated worlds are stored: a stopped run resumes, and other trials of the same conditions on
+    the same rig are compared with the same worlds.
 
     Args:
         title: of the progress bar.

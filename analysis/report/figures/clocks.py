@@ -33,7 +33,7 @@ COLOURS = {"events": BLUE, "frames": ORANGE, "arm": GREEN}
 MARKS = {"events": "o", "frames": "s", "arm": "^"}
 
 FURTHER = (PURPLE, "#56B4E9", "#882255", GREY, "#8C564B")
-"""Colours of further devices, which are told apart by their labels as well."""
+"""Colours of further devices, which have labels as well."""
 
 
 def colour_of(device: str) -> str:

@@ -27,7 +27,7 @@ class Panel:
         label: of the axis, with its unit.
         values: by row, one a trial; a row without an entry stays empty.
         colour: of its dots.
-        zero: what stands at zero, as text; empty where zero is nothing.
+        zero: the meaning of zero, as text; empty where zero has none.
         published: a line for what the paper has, and how it is called.
         least: the smallest value that there can be.
         notes: by row, what to write at its right end, such as how many have no value.
@@ -49,7 +49,7 @@ def by_condition(
 
     Args:
         rows: names, from top to bottom.
-        breaks: a thin line goes above each of these rows, which begin a new group.
+        breaks: rows that begin a new group; a thin line is drawn above each.
     """
     height = 0.26 * max(len(rows), 3) + 1.25
     with plt.rc_context(STYLE):
@@ -208,7 +208,7 @@ def differences(
 
 @dataclass(frozen=True)
 class Changed:
-    """A figure at one setting: 0 is where it stands unchanged.
+    """Change of a figure at one setting; 0 is unchanged.
 
     Attributes:
         change: None where the figure cannot be computed.

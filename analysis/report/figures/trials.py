@@ -44,7 +44,7 @@ def trial_overview(
             there are only events.
         event_s: (k,) seconds of positive events; event_cell: (k,) their cell rows.
         onsets_s: incipient and gross onset, seconds; None if there is none.
-        motion_s: when the slide or retraction begins; None where nobody knows.
+        motion_s: when the slide or retraction begins; None if unknown.
         cells: rows of cells.
     """
     with plt.rc_context(STYLE):

@@ -42,10 +42,10 @@ _PIPE = 1 << 16
 
 
 class Program(Detector):
-    """A process that speaks as the module says.
+    """A process that speaks the protocol of the module's docstring.
 
     Args:
-        command: as a shell reads words; no shell runs it.
+        command: in shell syntax; no shell runs it.
         answer_s: longest wait for an answer. end_s: for its end.
 
     Raises:
@@ -126,7 +126,7 @@ class Program(Detector):
                     else:
                         try:
                             left = left[os.write(self._input, left[:_PIPE]) :]
-                        except BrokenPipeError:  # its end is said by what is read
+                        except BrokenPipeError:  # the reader reports the end
                             left = left[:0]
                         if not left:
                             waiting.unregister(self._input)

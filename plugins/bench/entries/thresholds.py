@@ -26,7 +26,7 @@ PATCHES = 5
 
 
 class Fall(WindowDetector):
-    """How far below its largest value of the last half second a mean over 80 ms has fallen."""
+    """Drop of a mean over 80 ms below its largest value of the last half second."""
 
     def __init__(self) -> None:
         super().__init__(Windows(polarity="both"), STRIDE_MS)
@@ -44,7 +44,7 @@ class Fall(WindowDetector):
 
     @abstractmethod
     def measured(self, x: SparseWindows) -> npt.NDArray[np.float64]:
-        """Return what falls, (n,)."""
+        """Return the quantity that falls, (n,)."""
 
 
 class Rate(Fall):

@@ -1,4 +1,4 @@
-"""Detectors that know no slip: a fair table has them at its bottom.
+"""Detectors that ignore slip: a fair table ranks them last.
 
 The hash is that of splitmix64 (Steele, Lea and Flood 2014).
 """
@@ -18,7 +18,7 @@ STRIDE_US = 10_000
 
 
 class Blind(Detector):
-    """A detector that knows the time and nothing else."""
+    """A detector that knows only the time."""
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`."""
@@ -41,7 +41,7 @@ class Blind(Detector):
 
 
 class Always(Blind):
-    """Cries always."""
+    """Always triggers."""
 
     def value(self, t_us: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """See `Blind`."""
@@ -49,7 +49,7 @@ class Always(Blind):
 
 
 class Never(Blind):
-    """Never cries."""
+    """Never triggers."""
 
     def value(self, t_us: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """See `Blind`."""
@@ -57,7 +57,7 @@ class Never(Blind):
 
 
 class Random(Blind):
-    """Cries at random: a hash of the time and of how many events there were, which is noise."""
+    """Triggers at random: a hash of the time and the number of events, which is noise."""
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`."""
@@ -81,7 +81,7 @@ class Random(Blind):
 
 
 class ByTheClock(Blind):
-    """Cries when most training scenes slip, by the time since the scene began."""
+    """Triggers when most training scenes slip, by the time since the scene began."""
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
         """See `Detector`."""

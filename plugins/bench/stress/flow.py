@@ -48,7 +48,7 @@ NAME = "stress"
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for, checked before anything moves.
+    """Request of a stress test, checked before anything moves.
 
     Attributes:
         store, campaigns: that trained the networks. taken: request of the trials with nuisances.
@@ -64,7 +64,7 @@ class Request:
 def request(
     store: Store, campaigns: list[Collected], protocol: Path, rig: Path | None, out: Path | None
 ) -> Request:
-    """Check what is asked for.
+    """Check a request.
 
     Args:
         rig: left out, that of the store's slides, if it is simulated.

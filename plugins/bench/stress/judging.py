@@ -1,7 +1,7 @@
 """Detectors under nuisances: false alarms in holds, and slips that are detected in time.
 
-A detector gives an alarm when its evidence exceeds its level. It then rests for the second that an
-alarm lasts in the bench, too, and begins anew, as it would after a reflex. An alarm earlier than
+A detector gives an alarm when its evidence exceeds its level. It then rests for one second, as long
+as an alarm lasts in the bench, and starts again, as it would after a reflex. An alarm earlier than
 the label's onset by more than the tolerance is false. The first one after that is the detection; a
 slip is missed if none comes before it is gross. The order is by the share of trials with neither a
 false alarm nor a missed slip: so a detector that always or never gives an alarm has no clean trial,
@@ -47,7 +47,7 @@ class StressTrial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a detector did in a trial: false alarms, and when it detected the slip in time."""
+    """A detector's result in a trial: false alarms, and the time of a detection in time."""
 
     false_alarms: int
     detected_ns: int | None

@@ -1,1 +1,1 @@
-"""How many trials the claims of a protocol need, by campaigns that are drawn from a pilot."""
+"""Power analysis: the trials that a protocol's claims need, by campaigns drawn from a pilot."""

@@ -1,4 +1,4 @@
-"""Trials that the claims of a protocol need, as a pilot lets expect: `power.json`."""
+"""Trials that the claims of a protocol need, predicted from a pilot: `power.json`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""After how many trials the claims of a plan are called, over campaigns drawn from a pilot."""
+"""Numbers of trials after which a plan's claims are called, over campaigns drawn from a pilot."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from sliplab.protocols.claims import FIGURES, Claim
 
 SHARES = (0.1, 0.5, 0.9)
 LINES = 10
-"""Campaigns of which widths are kept."""
+"""Number of campaigns whose widths are stored."""
 POINTS = 8
 """Looks at which they are, at most."""
 MOST_OPEN = 0.5
-"""A claim that is open at the end of more campaigns than this share cannot be had by the plan."""
+"""A claim that is open at the end of more campaigns than this share is out of the plan's reach."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Drawn:
         called: of each claim, trials after which it was called; None: never.
         states: of each claim, then or at the end. trials: taken, and known at the last look.
         ended: trials where the claims ended the campaign; None: they did not.
-        widths: of each claim; empty where they are not kept.
+        widths: of each claim; empty where they are not stored.
     """
 
     called: tuple[int | None, ...]
@@ -94,7 +94,7 @@ def spread(trials: Sequence[int | None]) -> Spread:
 
 
 def claim_powers(drawing: Drawing, campaigns: Sequence[Drawn]) -> tuple[ClaimPower, ...]:
-    """Return what drawn campaigns say of each claim."""
+    """Return the statistics of each claim over drawn campaigns."""
     found = []
     for k, claim in enumerate(claims_of(drawing.plan).claims):
         ends = [it.states[k] for it in campaigns]

@@ -1,8 +1,8 @@
 """`sliplab power`: how many trials the claims of a protocol need, by a pilot's labelled trials.
 
 Campaigns of the protocol are drawn from the pilot's figures, and each is looked at as a campaign is
-while it is collected. Figures and trained classifiers are kept among the store's derived results,
-so a stop resumes, and a second run with other claims takes only the drawing.
+while it is collected. Figures and trained classifiers are stored among the store's derived results,
+so a stopped run resumes, and a second run with other claims repeats only the drawing.
 """
 
 from __future__ import annotations
@@ -79,13 +79,13 @@ PilotTrial = tuple[Collected, Trial, Recording]
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """Request of a power analysis, checked.
 
     Attributes:
         plan: with the claims. pilot: trials whose figures are used.
         campaigns: of the store that they are from, with trials that train.
         judge: makes the figures. drawn: number of campaigns. sessions: of each of them.
-        classifier: of the learning curve; None: none is asked for.
+        classifier: of the learning curve; None: no curve.
     """
 
     store: Store
@@ -185,7 +185,7 @@ def request(
     classifier: Classifier | None = LOGISTIC,
     sessions: Sessions = ONE_SESSION,
 ) -> Request:
-    """Check what is asked for.
+    """Check a request.
 
     Raises:
         InputError: the store has no trials of the protocol's experiment, or sessions are wrong.
@@ -224,7 +224,7 @@ def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
     """Draw campaigns of a plan by a pilot's trials, without a learning curve.
 
     Raises:
-        InputError: the plan has no claims, or the pilot cannot tell.
+        InputError: the plan has no claims, or the pilot is not sufficient.
     """
     if plan.protocol.collection.stopping is None:
         raise InputError(
@@ -251,7 +251,7 @@ def measure_power(asked: Request, out: Path) -> PowerRecord:
 
 
 def foretell(asked: Request) -> PowerRecord:
-    """Draw campaigns, and return what they say of each claim.
+    """Draw campaigns, and return their statistics of each claim.
 
     Raises:
         InputError: the pilot has too few figures, or lacks levels of the protocol.
@@ -290,7 +290,7 @@ def foretell(asked: Request) -> PowerRecord:
 
 
 def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
-    """Return the figures of the pilot's trials, and what it does not tell.
+    """Return the figures of the pilot's trials, and what it does not determine.
 
     Raises:
         InputError: they are too few, or the pilot lacks levels of the protocol.

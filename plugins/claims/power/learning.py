@@ -1,4 +1,4 @@
-"""Accuracy over the number of training trials, and what more of them let expect.
+"""Accuracy over the number of training trials, and its extrapolation to more.
 
 The error of a classifier falls like a power of the number of training trials towards a floor that
 more trials do not lower: ``floor + scale * n ** -exponent`` (Cortes et al. 1994, Learning curves:
@@ -90,10 +90,10 @@ def by_trial(hits: F64, trial: I64) -> F64:
 
 
 def learning_of(classifier: str, trials: F64, accuracy: F64, planned: int) -> Learning:
-    """Return the curve, and what all planned training trials are expected to give.
+    """Return the curve, and the expected accuracy with all planned training trials.
 
     Its uncertainty is that of the test trials and of which training trials came first: both are
-    drawn anew (a bootstrap), and the curve is fitted again.
+    resampled (a bootstrap), and the curve is fitted again.
 
     Args:
         trials: (s,) training trials. accuracy: (orders, s, test trials).

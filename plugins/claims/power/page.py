@@ -55,7 +55,7 @@ def _repetitions(it: ClaimPower, record: PowerRecord) -> str:
 
 
 def sentence(record: PowerRecord) -> Iterator[str]:
-    """Yield what a person is to read: what cannot be had, hours, and the learning curve."""
+    """Yield the findings: claims out of reach, hours, and the learning curve."""
     for it in record.claims:
         if it.never > MOST_OPEN:
             yield f"cannot be had by this plan: {it.claim}: {impossible(it, record)}"
@@ -74,7 +74,7 @@ def hours(number: float) -> str:
 
 
 def impossible(it: ClaimPower, record: PowerRecord) -> str:
-    """Return why a claim cannot be had, and how many repetitions would call it."""
+    """Return why a claim is out of reach, and how many repetitions would call it."""
     said = f"it is open at the end in {percent(it.never, 0)} of the drawn campaigns; "
     if it.repetitions is None:
         return f"{said}no number of repetitions is foreseen that calls it"
@@ -86,7 +86,7 @@ def impossible(it: ClaimPower, record: PowerRecord) -> str:
 
 
 def expected(curve: Learning, *, simulated: bool) -> str:
-    """Return what the learning curve lets expect of the whole plan."""
+    """Return what the learning curve predicts for the whole plan."""
     last = curve.points[-1]
     return (
         f"{curve.classifier}: {percent(last.accuracy)} ({_span(last.low, last.high)}) by "

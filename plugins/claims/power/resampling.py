@@ -1,14 +1,14 @@
-"""Campaigns as a pilot lets expect them: figures of trials that nobody has taken.
+"""Campaigns drawn from a pilot: figures of trials that were not taken.
 
 A trial's figure is that of one of the pilot's trials of the same condition, or of the nearest
 ones, moved by what the factors' effects differ between the two conditions. So undetected and
 missing ones come as often as the pilot has them there, and all figures of a trial belong together.
 Blocks differ as much as the pilot's do, sessions as much as is stated or as the pilot's do; a
 drift is drawn where one is stated. The pilot is itself one of many that might have been: it is
-drawn anew in the same way before each campaign (a hierarchical bootstrap: Davison and Hinkley 1997,
+resampled in the same way before each campaign (a hierarchical bootstrap: Davison and Hinkley 1997,
 Bootstrap Methods and their Application, section 3.8). Few values, drawn again and again, would give
-percentiles in steps, so each is moved by a little more chance, and their spread is kept (Silverman
-and Young 1987, The bootstrap: to smooth or not to smooth?).
+percentiles in steps, so each is moved by a little more chance, and their spread is preserved
+(Silverman and Young 1987, The bootstrap: to smooth or not to smooth?).
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Pilot:
 
     @cached_property
     def _off(self) -> dict[str, F64]:
-        """What each trial is off its condition's expected figure, (n,) by figure."""
+        """Residual of each trial from its condition's expected figure, (n,) by figure."""
         own = [tuple(condition[axis.name] for axis in self.axes) for condition in self.conditions]
         code, _ = self._coded(own, np.random.default_rng(0))
         return {
@@ -165,7 +165,7 @@ class Pilot:
             return ASSUMED
         off, of, scatter = self._off[figure], self.sessions, self.scatter(figure)
         first, block = np.unique(self.blocks, return_index=True, return_inverse=True)[1:]
-        if len(first) >= 2 * self.session_count:  # else sessions and blocks cannot be told apart
+        if len(first) >= 2 * self.session_count:  # else sessions and blocks cannot be distinguished
             there = np.isfinite(off)
             count = np.bincount(block[there], minlength=len(first))
             total = np.bincount(block[there], off[there], minlength=len(first))
@@ -187,9 +187,9 @@ class Pilot:
     def over_time(
         self, plan: Plan, grid: Grid, sessions: Sessions, rng: np.random.Generator
     ) -> dict[str, F64]:
-        """Draw what time adds to a campaign's trials, (N,) by figure, in the order taken.
+        """Draw the effects of time on a campaign's trials, (N,) by figure, in the order taken.
 
-        That is of sessions, of a drift, and of the batches of an adaptive campaign, which are its
+        These are of sessions, of a drift, and of the batches of an adaptive campaign, which are its
         blocks.
         """
         choice, stopping = plan.protocol.collection.adaptive, plan.protocol.collection.stopping
@@ -223,7 +223,7 @@ class Pilot:
         return self._again(rng)._drawn(conditions, blocks if in_blocks else None, rng)
 
     def _again(self, rng: np.random.Generator) -> Pilot:
-        """Draw the pilot anew."""
+        """Resample the pilot."""
         return replace(self, values=self._drawn(self.conditions, self.blocks, rng))
 
     def _drawn(
@@ -281,7 +281,7 @@ class Pilot:
 
 
 def sessions_text(pilot: Pilot, sessions: Sessions) -> Iterator[str]:
-    """Yield which sessions and drift are drawn, and what the pilot does not show of them."""
+    """Yield which sessions and drift are drawn, and the limits of the pilot for them."""
     there, only = pilot.session_count, "a pilot of one session cannot show how sessions differ"
     sizes = ", ".join(f"{pilot.between(name, sessions):.2f} ({name})" for name in pilot.values)
     sizes += " of the scatter between trials"
@@ -318,7 +318,7 @@ def _smoothing(off: F64) -> tuple[float, float]:
 
 
 def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis, ...], list[str]]:
-    """Return the factors that a pilot and a plan share, and what the pilot does not tell of others.
+    """Return the factors that a pilot and a plan share, and the limits of the pilot for others.
 
     Args:
         conditions: of the pilot's trials.
@@ -357,7 +357,7 @@ def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis
 
 
 def _unknown(axis: Axis, factor: Factor, levels: Sequence[Level], compared: bool) -> Iterator[str]:
-    """Yield what to say of levels that the pilot lacks.
+    """Yield notes on levels that the pilot lacks.
 
     Raises:
         KeyedError: nothing is known of one of them.

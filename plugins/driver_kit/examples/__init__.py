@@ -1,1 +1,1 @@
-"""Example drivers, one folder a kind of device: what `sliplab new driver` starts from."""
+"""Example drivers, one folder a kind of device: the templates of `sliplab new driver`."""

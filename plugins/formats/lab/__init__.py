@@ -1,1 +1,1 @@
-"""The lab's recordings of before: pickles of events, videos and forces in a run's folder."""
+"""The lab's older recordings: pickles of events, videos and forces in a run's folder."""

@@ -1,4 +1,4 @@
-"""The lab's recordings in their folders: two pickles or an HDF5 file each, and what lies beside."""
+"""The lab's recordings in their folders: two pickles or an HDF5 file each, and further files."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _read(pair: Pair, name: str, salvage: bool) -> ForeignTrial:
 
 
 def _complete(trial: ForeignTrial, files: Files, path: Path) -> ForeignTrial:
-    """Add what the folder of a run holds of a recording, and check the polarity in its name."""
+    """Add a recording's files in the folder of a run, and check the polarity in its name."""
     if files.kind != LAB_PICKLES and len(files.files) == 1:
         trial = check_polarity(trial, files.stem)
     return with_run(trial, files.stem, run_folder(path))

@@ -58,7 +58,7 @@ def parse_pickle(data: bytes, path: str | Path, before: int = 0) -> Any:
 
     Args:
         path: where it came from, for messages.
-        before: bytes that stand before it there.
+        before: bytes that precede it there.
     """
     answer = in_child(data, _SECONDS + len(data) // _BYTES_PER_SECOND)
     kind, *found = _Answer(io.BytesIO(answer)).load()

@@ -1,4 +1,4 @@
-"""What the lab's scripts leave beside the events of a recording: a second copy, video and forces.
+"""Further files of the lab's scripts for a recording: a second copy, video and forces.
 
 A run's folder has `meta.json`, the events below `events`, videos below `videos`, and the times of
 the videos' frames in one pickle a camera, `timestamps_CAMERA.pkl`, written when the run ends. All
@@ -48,7 +48,7 @@ _FEW_FRAMES = 3
 
 
 def run_folder(path: Path) -> Path | None:
-    """Return the folder of the run whose events a folder or file holds; None where it is none."""
+    """Return the folder of the run whose events a folder or file holds; None without a run."""
     folder = path if path.is_dir() else path.parent
     for each in (folder, folder.parent):
         if each != folder and folder.name != EVENTS_FOLDER:
@@ -143,7 +143,7 @@ def _differing(pair: Pair, counts: Counter[int]) -> Iterator[str]:
 
 
 def with_run(trial: ForeignTrial, stem: str, run: Path | None) -> ForeignTrial:
-    """Return a trial with what its run's folder holds of it.
+    """Return a trial with its files in its run's folder.
 
     Args:
         stem: the recording's name.

@@ -42,7 +42,7 @@ _LEAST_ROW = 8
 """Bytes of a row of a database, at least."""
 _ENDING = re.compile(r"\.(db3|mcap)(\.zstd)?$")
 _FAULTS = (Exception,)
-"""What rosbags raises where a file is damaged: errors of its own, of Python and of assertions."""
+"""Exceptions of rosbags for a damaged file: its own, Python's and failed assertions."""
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -64,7 +64,7 @@ def read_bag(path: Path, name: str) -> ForeignTrial:
 
 
 def salvage_bag(path: Path, name: str) -> ForeignTrial:
-    """Read what stands whole in a `.db3` that is cut short, and any other recording as it is.
+    """Read the intact part of a truncated `.db3`, and any other recording as it is.
 
     Raises:
         FormatError: as `read_bag`.
@@ -130,7 +130,7 @@ def _folder(path: Path) -> Source:
 
 
 def _order(file: Path) -> tuple[int, str]:
-    """Return what sorts the parts of a recording, which are numbered."""
+    """Return the sort key of the numbered parts of a recording."""
     number = re.search(r"_(\d{1,9})\.", file.name)
     return int(number[1]) if number else 0, file.name
 
@@ -231,7 +231,7 @@ def _rows(database: sqlite3.Connection, topic: str, path: Path, whole: bool) -> 
 
 
 def _cut(path: Path) -> Lost | None:
-    """Return what a database lacks by the number of pages in its header; None if nothing."""
+    """Return the missing part of a database by its header's page count; None if complete."""
     size = path.stat().st_size
     page, pages = struct.unpack(">16xH10xI", read_head(path)[:32].ljust(32, b"\0"))
     whole = (page if page > 1 else 1 << 16) * pages
@@ -247,8 +247,8 @@ def _size(path: Path) -> int:
 
 @contextmanager
 def _opened_sqlite(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database that is not written to. Raises Damage for what sqlite finds inside."""
-    # nothing is written beside a file that may be on a read-only disk
+    """Open a database read-only. Raises Damage for faults that sqlite finds."""
+    # no files are written next to the database: the disk may be read-only
     address = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(address, uri=True)) as database:
@@ -324,7 +324,7 @@ def _text(error: Exception) -> str:
 
 
 def _bounded(unpack: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """Return what unpacks a chunk as `unpack` does, up to a bound."""
+    """Return a function that unpacks a chunk as `unpack` does, up to a bound."""
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1.reader import decompressors
 

@@ -1,4 +1,4 @@
-"""What the data card of a publication says of its MCAP files."""
+"""Text on MCAP files in the data card of a publication."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ _ROS2_EVENT = np.dtype(
         "itemsize": 16,
     }
 )
-"""An event but the first, whose column and row stand two bytes later: CDR aligns each field."""
+"""An event but the first, whose column and row are two bytes later: CDR aligns each field."""
 _TIME_HIGH, _TIME_LOW, _ADDR_X, _ADDR_Y, _BASE_Y, _VECT_8 = range(6)
 _LOWS, _HIGHS, _DRIVER_HIGHS = 1 << 12, 1 << 12, 1 << 4
 

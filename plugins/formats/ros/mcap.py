@@ -69,7 +69,7 @@ _FAULTS = (
     OSError,
     EOFError,
 )
-"""What the `mcap` library raises, besides its own errors, where a file is damaged."""
+"""Exceptions of the `mcap` library for a damaged file, besides its own errors."""
 _MOST_MESSAGES = 1 << 62
 _SCHEMAS = ("ros2msg", "ros2idl", "ros1msg")
 """Encodings of the definitions of ROS messages."""
@@ -78,7 +78,7 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 
 @dataclass
 class _Found:
-    """What a file holds, but its events and frames."""
+    """Contents of a file, except events and frames."""
 
     topics: dict[str, str] = field(default_factory=dict)
     """Message type by topic, in the order of the file."""
@@ -149,7 +149,7 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
             f"{reason}; a published trial is imported whole or not at all, for its record, which "
             "says whether it is simulated, is at its end: publish it again"
         )
-    # topics behind the damage are not the file's any more
+    # topics after the damage are no longer readable
     found = _Found()
     frames = Counter(topic for _, topic, _ in _messages(path, found, FRAMES, part=_Part(part.at)))
     trial = recording(path, name, _source(path, found, part.at))
@@ -188,7 +188,7 @@ def _messages_said(path: Path, topic: str | None) -> int | None:
 
 
 class _Within:
-    """A file of which no more is asked than it has: memory is allocated for what is asked."""
+    """A file whose reads are limited to its size, since memory is allocated for the request."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._size = file, size

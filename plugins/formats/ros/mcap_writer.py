@@ -1,9 +1,9 @@
 """A trial as one MCAP file of ROS 2 messages, on the trial's time line.
 
-What a person looks at (events, frames, poses, forces, pulses, phases, onsets) has messages of its
-own, with the time line as log time and stamp. Events keep their camera's clock inside of their
-packets. All other columns go along as the devices gave them, and record, label and campaign as
-attachments, so that `mcap.read_mcap` makes the same trial of the file again.
+Data for viewers (events, frames, poses, forces, pulses, phases, onsets) have separate messages,
+with the time line as log time and stamp. Events keep their camera's clock inside of their packets.
+All other columns go along as the devices gave them, and record, label and campaign as attachments,
+so that `mcap.read_mcap` makes the same trial of the file again.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class _Trial:
         self.schemas: dict[str, int] = {}
         self.sequences: dict[int, int] = {}
         self.shift_ns = 0
-        """What log times, which cannot be negative, are ahead of the time line."""
+        """Offset of log times, which cannot be negative, from the time line."""
         self.label = self._label()
         self.counts = {"events": 0, "frames": 0, "messages": 0}
 

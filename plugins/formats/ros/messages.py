@@ -2,7 +2,7 @@
 
 Definitions are those of ROS 2 and of event_camera_msgs, with the messages that they contain, in the
 form that MCAP calls ``ros2msg``. Bytes are CDR as ROS 2 has it: four bytes that say little endian,
-then every field at a multiple of its own size. Those of `sliplab_msgs` are ours.
+then every field at a multiple of its size. Those of `sliplab_msgs` are ours.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""A trial of a store inside an MCAP file, complete, and its way back into a store.
+"""A complete trial of a store inside an MCAP file, and its re-import into a store.
 
 Such a trial is written by the store's own writer, checked as `sliplab verify` checks one, and
-keeps its record: clocks, condition and gates are what they were. Its files are made anew, so their
-bytes, and with them the keys of what was derived from them, may differ although nothing in them
-does: steps then compute again.
+retains its record: clocks, condition and gates are unchanged. Its files are written again, so their
+bytes, and with them the keys of derived results, may differ although the contents are equal: steps
+then compute again.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Original:
             return None
         first = next(self.frames[FRAMES_KIND](), None) if FRAMES_KIND in self.frames else None
         if first is None:
-            return self.record.geometry.frame_px or (1, 1)  # tracks, whose frames nobody has
+            return self.record.geometry.frame_px or (1, 1)  # tracks without frames
         return first.shape[1], first.shape[0]
 
     @uninterrupted
@@ -212,7 +212,7 @@ class Original:
             raise FormatError(f"holds more frames than times of frames, {len(t_ns)}")
 
     def keep_label(self, store: Store, campaign: str, trial: str) -> None:
-        """Write the trial's label, before the trial: nobody asks for it until that is there."""
+        """Write the trial's label, before the trial: no one reads it until the trial exists."""
         if self.label is None:
             return
         kept = Derived.of(store, LABELS, campaign)

@@ -1,4 +1,4 @@
-"""Trial of a recording of ROS 1 or ROS 2: the topics that are read, and what is left out.
+"""Trial of a recording of ROS 1 or ROS 2: the topics that are read, and those left out.
 
 The first topic of events and the first one of frames that can be read are taken. A message that
 cannot be right is left out and counted; other topics are named in the record.
@@ -54,7 +54,7 @@ class _Decoder(Protocol[T_co]):
     """Decoder of the messages of one topic, in their order."""
 
     def read(self, fields: Fields) -> T_co:
-        """Return what a message holds. Raises FormatError where it cannot be right."""
+        """Return the content of a message. Raises FormatError if it is invalid."""
 
     def warnings(self) -> list[str]:
         """Return lines about what was left out or changed so far."""
@@ -65,7 +65,7 @@ D = TypeVar("D", bound=_Decoder[Any])
 
 @dataclass
 class _Topic(Generic[D]):
-    """A topic, and what was left out of it when it was read last."""
+    """A topic, and its messages that the last read left out."""
 
     name: str
     source: Source
@@ -78,7 +78,7 @@ class _Topic(Generic[D]):
         self.decoder = self.make()
 
     def messages(self) -> Generator[Any, None, None]:
-        """Yield what each message holds, and None for one that cannot be right."""
+        """Yield the content of each message, and None for an invalid one."""
         self.total, self.bad, self.decoder = 0, 0, self.make()
         for data in self.source.read(self.name):
             self.total += 1

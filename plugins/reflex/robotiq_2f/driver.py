@@ -5,9 +5,9 @@ reports the state of its last move until it has taken up the new one; it is take
 echoes the requested position. The gripper is never activated from here: that moves its fingers
 over their whole stroke.
 
-Every answer has one time limit, and at most `MOST_BYTES`. After one that is missing or wrong
-nothing more is asked over this connection, where a late answer would be taken for the next one's.
-A stop is still sent, without waiting for an answer that another thread waits for.
+Every answer has one time limit, and at most `MOST_BYTES`. After one that is missing or wrong the
+connection is no longer used: a late answer would be taken for the next one's. A stop is still sent,
+without waiting for an answer that another thread waits for.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Robotiq2f:
         self.range = protocol.range_of(settings.model)
         self._link: BoundedSocket | None = None
         self._broken: str | None = None
-        """Why nothing more is asked over this connection."""
+        """Reason that this connection is no longer used."""
         self._asking = threading.Lock()
         """Held from a request to its answer; a stop does not wait for it."""
         self._sending = threading.Lock()
@@ -122,7 +122,7 @@ class Robotiq2f:
         self._received, self._asked, self._broken = b"", None, None
 
     def health(self) -> DeviceHealth:
-        """Return what the gripper reports. Raises RigError."""
+        """Return the gripper's report. Raises RigError."""
         opening = self.state().opening_mm
         return DeviceHealth(
             device=DEVICE,

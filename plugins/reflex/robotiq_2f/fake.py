@@ -108,7 +108,7 @@ class FakeRobotiq:
         self._server.cut()
 
     def send(self, data: bytes) -> None:
-        """Send bytes to every client, which none has asked for."""
+        """Send unsolicited bytes to every client."""
         for handler in list(self._server.open):
             handler.wfile.write(data)
 

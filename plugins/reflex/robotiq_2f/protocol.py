@@ -57,7 +57,7 @@ def register(name: str, line: bytes) -> int:
 
 
 def range_of(model: Model) -> GripperRange:
-    """Return what a model's commands may be."""
+    """Return the range of a model's commands."""
     return RANGES[model]
 
 

@@ -134,7 +134,7 @@ def make_grid(axes: Axes, windows: Windows, network: Network, full: bool = False
 
 
 def _requirement(name: str, value: Any, windows: Windows, network: Network) -> str | None:
-    """Return what would be right, where no network can have this value."""
+    """Return the requirement that a value violates, as text; None for a valid one."""
     if name == "width":
         wide = {key: round(getattr(network, key) * value) for key in CHANNELS}
         limits = {"conv1_channels": 256, "conv2_channels": 256, "hidden": 1024}

@@ -6,8 +6,8 @@ only judge. The front is over figures of test trials; which rows would be on it 
 trials is also given, because a front chosen on test trials is biased in its favour.
 
 Factors are compared one at a time with the paper's value: which differences are more than seed
-noise. Differences are taken seed by seed; the intervals are each by itself, so of twenty one would
-leave zero out by chance.
+noise. Differences are taken seed by seed; the intervals are not corrected for multiple comparisons:
+one in twenty would exclude zero by chance.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def _true_onsets(part: Sequence[LabelledTrial]) -> Trials:
 def make_rows(
     search: DetectorSearch, advance: Callable[[], None] = lambda: None
 ) -> tuple[list[Row], dict[str, str]]:
-    """Return the rows of all kept runs, and what is left out, with the reason.
+    """Return the rows of all stored runs, and those left out, with the reason.
 
     Args:
         advance: called after each setting.
@@ -288,7 +288,7 @@ def _work(measured: Sequence[Json], per_s: float) -> BySeed:
 
 
 def _costs(rows: Sequence[Row], part: str) -> npt.NDArray[np.float64]:
-    """Return the objectives, all to be low; what is not there is infinitely bad."""
+    """Return the objectives, all to be minimised; missing ones are infinite."""
     values = [
         [
             None if (v := row.objective(name, part)) is None else sign * v
@@ -347,7 +347,7 @@ def comparisons(rows: Sequence[Row]) -> list[Json]:
     """Return each line through the paper's setting, the paper's own value among them.
 
     Networks are compared with the pair that validation trials chose for each, at a stride of a
-    window's length: the paper's own pair is of its own windows and says little of others.
+    window's length: the paper's pair belongs to its windows and says little of others.
 
     Returns:
         one for each value: ``factor``, ``value``, ``paper``, ``row`` (the place among `rows`), and
@@ -460,7 +460,7 @@ _UNITS = {
 def search_result(
     search: DetectorSearch, full: bool, simulated: bool, advance: Callable[[], None] = lambda: None
 ) -> Json:
-    """Return all numbers of the runs that are kept, as plain data.
+    """Return all numbers of the stored runs, as plain data.
 
     Args:
         full: every value of the factors was tried with every other.
@@ -488,7 +488,7 @@ def search_result(
 
 
 def plan(search: DetectorSearch, simulated: bool) -> Json:
-    """Return what there is to do."""
+    """Return the pending work."""
     pending = len(search.sweep.pending)
     return {
         "step": "tradeoff",

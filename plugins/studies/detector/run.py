@@ -1,6 +1,6 @@
-"""`sliplab tradeoff --detector`: what a detector's speed costs in errors, over a store's trials.
+"""`sliplab tradeoff --detector`: speed of a detector against its errors, over a store's trials.
 
-A search is kept run by run, so it may be stopped and gone on with, and made larger later.
+A search is stored run by run, so it may be stopped, resumed, and made larger later.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def tradeoff_detector(
     Args:
         full: every value of the factors with every other.
         reviewed: people's decisions are applied to the labels.
-        minutes: no run is started after so many; the page is of the kept ones then.
-        dry_run: only say what there is to do, and how long it would take.
+        minutes: no run is started after so many; the page then shows the finished ones.
+        dry_run: only report the pending work and its estimated time.
 
     Returns:
         the numbers and how many runs were ``made`` for them, or what there is to do and

@@ -2,9 +2,9 @@
 
 A run is a setting and a seed. Window length, step, pooling and width need a training each; stride,
 precision, smoothing and margin are read off the same network, so spikes are counted once over whole
-trials. A network is kept as soon as it is trained, and after each epoch all that the next one
-needs, so a search may be stopped anywhere. Names hold the key: a search with other samples or other
-trials displaces nothing of this one.
+trials. A network is stored as soon as it is trained, and each epoch stores a checkpoint, so a
+search may be stopped anywhere. Names hold the key: a search with other samples or other trials
+displaces nothing of this one.
 
 Windows of every length cover the same stretches of a trial: as many milliseconds a class as the
 protocol's own windows do. Otherwise short windows would all lie next to the onsets, and accuracies
@@ -126,7 +126,7 @@ class SearchTrials:
 
     @property
     def judged(self) -> list[LabelledTrial]:
-        """All whose windows are counted, in the order in which their counts are kept."""
+        """All whose windows are counted, in the order of their stored counts."""
         return [*self.validation, *self.test, *self.falling]
 
     def samples(self, setting: Setting, part: list[LabelledTrial], most: int) -> SampleSet:
@@ -265,7 +265,7 @@ class DetectorSearch:
         self._samples: dict[str, SampleSet] = {}
 
     def read(self, run: Run) -> tuple[Json, Arrays]:
-        """Return a kept run's figures and its spike counts."""
+        """Return a stored run's figures and its spike counts."""
         return self.derived.read(run.name), self.derived.arrays(run.name)
 
     def model_path(self, run: Run) -> Path:
@@ -274,7 +274,7 @@ class DetectorSearch:
         return self.derived.folder / name
 
     def warnings(self) -> dict[str, list[str]]:
-        """Return the warnings of kept networks, by run."""
+        """Return the warnings of stored networks, by run."""
         there = [run for run in self.runs if self.sweep.done(run)]
         found = {run.title: self.derived.read(run.name)["warnings"] for run in there}
         return {title: warnings for title, warnings in found.items() if warnings}
@@ -282,7 +282,7 @@ class DetectorSearch:
     def estimate(self, run: Run) -> dict[str, float]:
         """Return the seconds of a run by part, ``train`` and ``count``.
 
-        As long as a kept run of the same setting took; without one, estimated from a few windows.
+        As long as a stored run of the same setting took; without one, estimated from a few windows.
         Fresh weights fire less or more than trained ones, so the second is right within a factor
         of two or so.
         """
@@ -323,7 +323,7 @@ class DetectorSearch:
         return train, len(PRECISIONS) * (len(spans) * cut + each * (windows + 2 * samples))
 
     def fitted(self, run: Run, advance: Callable[[float, str], None]) -> Fitted:
-        """Return a run's network: the kept one, or trained now, from where it was stopped."""
+        """Return a run's network: the stored one, or trained now, from its last checkpoint."""
         path = self.model_path(run)
         if path.exists():
             advance(1.0, "")

@@ -1,7 +1,7 @@
 """Generalisation: networks trained without a level of a factor, and tested on it alone.
 
-15 % of the other trials choose the epoch. Results of other skins are in the same table. Each
-result is kept as soon as it is there; a stopped training resumes at its last epoch.
+15 % of the other trials choose the epoch. Results of other skins are in the same table. Each result
+is stored as soon as it is complete; a stopped training resumes at its last epoch.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def train_without(
     """Train without a level and test on it, or say why that cannot be.
 
     Args:
-        state: file that keeps the training after each epoch; goes when the training is over.
+        state: checkpoint file, written after each epoch and deleted when the training is over.
     """
     rows = trials.without(factor, level)
     lacking = sorted(part for part, of in rows.items() if not len(of))
@@ -177,7 +177,7 @@ class _Results(ResultFile[GeneralisationResults]):
 
 
 class Generalisation:
-    """A store's samples, what can be left out of them, and the results that are kept.
+    """A store's samples, what can be left out of them, and the stored results.
 
     Args:
         store: labelled, with a trained network.
@@ -284,7 +284,7 @@ def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, li
 
 
 def _same_level(given: str, texts: Sequence[str]) -> list[str]:
-    """Return the levels, as text, that one stands for: with their unit, another one, or none."""
+    """Return the levels, as text, that one matches: with their unit, another one, or none."""
     found = []
     for text in texts:
         number, _, unit = text.partition(" ")

@@ -110,7 +110,7 @@ def skin_task(work: Generalisation, model: Model, seed: int, trials: int) -> Tas
 
 
 def _touch(work: Generalisation, model: Model, seed: int, trials: int) -> UnseenScores:
-    """Take some of the same trials on another skin, judge them, and let them go."""
+    """Take some of the same trials on another skin, score them, and delete them."""
     item, folder = work.campaigns[0], work.folder / f"skin{seed}"
     taken = Store.create(folder / "store").campaign(item.name).committed()
     change = {"mock": {"scene": {"skin": {"seed": seed}}}}

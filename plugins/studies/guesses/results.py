@@ -48,7 +48,7 @@ Figures = dict[str, float | None]
 
 
 class StudySensitivity:
-    """The test trials of a study that are repeated at each setting, and what is kept of them.
+    """The test trials of a study that are repeated at each setting, and their stored results.
 
     Args:
         trials: of each campaign, test trials spread over its conditions.
@@ -89,7 +89,7 @@ class StudySensitivity:
     def score(
         self, setting: Setting, value: float | None, store: Store, campaigns: list[Collected]
     ) -> SettingScores:
-        """Judge the trials that were repeated at a setting.
+        """Score the trials that were repeated at a setting.
 
         Args:
             value: of the changed parameter.

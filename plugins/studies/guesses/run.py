@@ -2,7 +2,7 @@
 
 Some of a study's test trials are repeated on the same simulated rig with one parameter 20 %
 lower, then 20 % higher. They are relabelled and evaluated by the study's own network and detection
-settings. Each setting is a small store, deleted once its figures are kept; so the sweep may be
+settings. Each setting is a small store, deleted once its figures are stored; so the sweep may be
 stopped anywhere, and resumes.
 """
 
@@ -107,7 +107,7 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
 def measure_setting(
     work: StudySensitivity, setting: Setting, scenes: Mapping[str, MockSettings]
 ) -> SettingScores:
-    """Take, label and judge the trials at one setting, and let them go.
+    """Take, label and score the trials at one setting, and delete them.
 
     Args:
         scenes: settings of the simulated rig of each campaign.

@@ -139,7 +139,7 @@ def _value(key: str, value: float | None, *, unit: bool = True) -> str:
 
 
 def _data(names: Sequence[str], lower: Side, higher: Side) -> dict[str, list[object]]:
-    """Return what is drawn, a row a parameter and side."""
+    """Return the plotted data, a row a parameter and side."""
     data: dict[str, list[object]] = {"guess": [], "factor": []}
     for side, word in ((lower, "less"), (higher, "more")):
         for name in names:

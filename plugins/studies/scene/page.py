@@ -62,7 +62,7 @@ Error = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class SceneCost:
-    """Cost and error of a scene's variants; `cost.html` has the words.
+    """Cost and error of a scene's variants; `cost.html` has the text.
 
     Attributes:
         trials: ids of the trials that were simulated.
@@ -165,7 +165,7 @@ def short_table(result: Result) -> tuple[list[str], list[list[str]]]:
 
 
 def choice_pairs(result: Result) -> dict[str, str]:
-    """Return both choices of a level, each with its reason, and what a twin's pilot asked for."""
+    """Return both choices of a level, each with its reason, and effects that a pilot requires."""
     names = {"by measured windows": "measured", "by closed forms": "closed_form"}
     choice = result["choice"]
     pairs = {

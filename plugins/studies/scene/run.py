@@ -1,4 +1,4 @@
-"""`sliplab tradeoff --scene`: cost and error of each way to simulate a trial.
+"""`sliplab tradeoff --scene`: cost and error of each method to simulate a trial.
 
 Every variant runs the same trials with the same seeds. It is timed as the rig file has it, on this
 otherwise idle machine, and compared with the dearest variant without noise and

@@ -25,7 +25,7 @@ HIGHEST = 3
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to simulate a trial; level 0 is closed forms, without any run."""
+    """One method to simulate a trial; level 0 is closed forms, without any run."""
 
     level: int
     step_ms: int

@@ -1,11 +1,11 @@
 """Change of a parameter along a campaign: a line through fits of its reference trials.
 
-Each fit has an uncertainty of its own, and references differ by more than that: by what varies
-from trial to trial, and by the scene's own errors. So the line is a random-effects regression:
-weights 1 / (v + tau^2), v being a fit's variance and tau^2 the scatter beyond it (method of
-moments, DerSimonian and Laird 1986; with a covariate, Thompson and Sharp 1999). The interval of its
-slope is that of Knapp and Hartung (2003), which holds for few references; it is never narrower
-than the fits' own variances make it (Röver et al. 2015).
+Each fit has its own uncertainty, and references differ by more than that: by the variation from
+trial to trial, and by the scene's errors. So the line is a random-effects regression, weighted by
+1 / (v + tau^2), v being a fit's variance and tau^2 the scatter beyond it (method of moments,
+DerSimonian and Laird 1986; with a covariate, Thompson and Sharp 1999). The interval of its slope is
+that of Knapp and Hartung (2003), which holds for few references; it is never narrower than the
+fits' own variances make it (Röver et al. 2015).
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ MADE = frozenset(
         "arm.vibration_hz",
     }
 )
-"""What was drawn when skin, pixels and arm were made: it does not change in a campaign."""
+"""Properties of the specimen's skin, pixels and arm: they do not change in a campaign."""
 STIFFNESSES = frozenset(
     {
         "scene.skin.youngs_modulus_mpa",
@@ -70,7 +70,7 @@ class OneSpecimen(Prior):
 
     Attributes:
         with_forces: stiffnesses may change too. Without forces friction and stiffness cannot be
-            distinguished: then the stiffnesses are the rig file's, and friction stands for both.
+            distinguished: then the stiffnesses are the rig file's, and friction represents both.
     """
 
     with_forces: bool
@@ -218,7 +218,7 @@ def calibrate_drift(
 def parameter_drift(
     it: Parameter, found: Drift, trials: Sequence[Trial], together: int
 ) -> ParameterDrift:
-    """Return what is kept of a parameter's drift.
+    """Return the stored result of a parameter's drift.
 
     Args:
         together: parameters that are looked at; one that is called changed must be so improbable
@@ -261,7 +261,7 @@ def beyond(it: ParameterDrift, limit_percent: float) -> bool:
 
 
 def verdict(fit: DriftFit) -> str:
-    """Return what a person reads of the limit."""
+    """Return the verdict on the drift as text."""
     friction = next(it for it in fit.parameters if it.key == FRICTION)
     simulated = "simulated " if fit.simulated else ""
     found = (

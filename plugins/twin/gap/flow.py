@@ -2,7 +2,7 @@
 
 The training trials of a protocol are simulated on the twin, on the rig file as it was before it was
 fitted, and on rigs drawn from the twin's posterior, among which the trials are divided. A network
-is trained on each, and tested on the real test trials beside the store's own.
+is trained on each, and tested on the real test trials along with the store's own.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TrainedOn = Literal["own", "twin", "drawn", "assumed"]
 
 @dataclass(frozen=True)
 class Gap:
-    """What is asked for.
+    """Request of a comparison, checked.
 
     Attributes:
         tested: campaigns of the store whose test trials judge.
@@ -77,7 +77,7 @@ class Trained:
 def request(
     store: Store, tested: list[Collected], rig: Path, protocol: Path, out: Path, drawn: int
 ) -> Gap:
-    """Check what is asked for before anything is simulated.
+    """Check a request before anything is simulated.
 
     Raises:
         InputError: the rig is no twin, its samples are missing, or the protocol trains no network
@@ -217,7 +217,7 @@ def rules(wanted: Gap, model: Model) -> dict[str, Detection]:
 
 
 def scores(wanted: Gap, network: Trained, judged: Judged, less: Behind | None) -> GapNetwork:
-    """Return what is kept of a network.
+    """Return the stored result of a network.
 
     Args:
         less: how far it is behind the first one.

@@ -28,7 +28,7 @@ COLUMNS = (
     "disturbance: lead (ms)",
 )
 LATENCIES = 8
-"""Column of the first latency; on a page the others would not fit beside them."""
+"""First column of the second table, of latencies; one table would be too wide for a page."""
 
 
 def render(found: TwinGap) -> str:

@@ -1,4 +1,4 @@
-"""How far a network is behind another on the same test trials."""
+"""Deficit of a network against another on the same test trials."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a scene needs: effects that a pilot shows, and the cheapest scene that has them."""
+"""Needs of a scene: effects that a pilot shows, and the cheapest scene that has them."""

@@ -1,4 +1,4 @@
-"""Which effects of a twin its pilot asks for, and the cheapest scene that predicts it as well.
+"""Effects of a twin that its pilot requires, and the cheapest scene that predicts it as well.
 
 The test trials are taken in worlds of the twin with all effects and with each left out, by the same
 chance; the pilot's own say which predict better (`analysis.twin.needs`).
@@ -43,7 +43,7 @@ SAVES = 0.95
 
 @dataclass(frozen=True)
 class Needs:
-    """What a pilot asks for.
+    """Effects that a pilot requires.
 
     Attributes:
         effects: of the scene, those that it lacks, and those that no slide shows.
@@ -203,12 +203,12 @@ def _whole(effects: Sequence[Effect]) -> list[Effect]:
 
 
 def cheapest_path(twin: Path) -> Path:
-    """Return the file of the cheapest scene beside a twin's."""
+    """Return the path of the cheapest scene's file, next to the twin's."""
     return twin.with_name(f"{twin.stem}-cheapest.yaml")
 
 
 def write_cheapest(twin: Path, needs: Needs) -> None:
-    """Write the cheapest scene as a rig file that extends the twin's; none if there is none."""
+    """Write the cheapest scene, if there is one, as a rig file that extends the twin's."""
     path = cheapest_path(twin)
     it = needs.cheapest
     if it is None:

@@ -1,4 +1,4 @@
-"""Which effects of a scene a pilot asks for: how well test trials are predicted with and without.
+"""Ablation of a scene's effects: predictions of a pilot's test trials with and without each.
 
 A trial is reduced to numbers in a few groups. Worlds of the twin predict each of them; the score of
 a prediction is its continuous ranked probability score (CRPS: Gneiting and Raftery 2007), in units
@@ -32,9 +32,9 @@ SOON_US = 1_000
 APART_S = 0.05
 """Speeds are differences of places so far apart in time."""
 STILL = 1e-5
-"""Less motion than this is none: mm, or mm/s."""
+"""Motion below this counts as rest: mm, or mm/s."""
 NEGLIGIBLE = 0.02
-"""A loss of so many scatters is none: no twin is exact."""
+"""Losses below so many scatters are negligible: no twin is exact."""
 FEWEST_TRIALS = FEWEST_WORLDS = 3
 
 
@@ -165,7 +165,7 @@ def crps(ensemble: F64, truth: F64) -> F64:
 
 @dataclass(frozen=True)
 class Need:
-    """What leaving an effect out does to the prediction of test trials.
+    """Ablation of an effect: the change in the prediction of test trials.
 
     Attributes:
         loss: mean of the score without less that with it. low, high: its 90 % interval over trials,
@@ -184,7 +184,7 @@ class Need:
 
     @property
     def verdict(self) -> Verdict:
-        """An effect is asked for where its loss is beyond chance, over trials and over worlds."""
+        """The verdict: an effect is required if its loss exceeds chance, over trials and worlds."""
         if self.low > 0.0 and self.loss > self.limit:
             return "asked for"
         return "not asked for" if self.expected > self.limit else "not shown"

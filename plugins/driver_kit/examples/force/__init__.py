@@ -31,7 +31,7 @@ class ExampleForceSettings(DriverSettings):
 
 
 def build(settings: ExampleForceSettings, arm: Arm) -> ForceSensor:
-    """Make the sensor, not connected yet; it is none of the arm's."""
+    """Make the sensor, not connected yet; it does not belong to the arm."""
     from sliplab.plugins.driver_kit.examples.force.driver import ExampleForce
 
     return ExampleForce(settings)

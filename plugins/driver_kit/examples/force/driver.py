@@ -45,7 +45,7 @@ class ExampleForce:
         self._buffer = StreamBuffer(DEVICE, settings.stall_s)
 
     def connect(self) -> None:
-        """Open the connection, anew after a fault; at most `ANSWER_S`. Raises RigError."""
+        """Open the connection, again after a fault; at most `ANSWER_S`. Raises RigError."""
         self.close()
         address = self._settings.host, self._settings.port
         try:

@@ -43,7 +43,7 @@ class FakeExampleFrames(FakeStream):
 
 
 class FakedExampleFrames(ExampleFrames):
-    """The driver on a fake of its own, which ends with it."""
+    """The driver with its own fake, which ends with it."""
 
     def __init__(
         self,

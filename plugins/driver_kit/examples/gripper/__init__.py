@@ -19,7 +19,7 @@ from sliplab.rigs.core.network import answers
 RANGE = GripperRange(
     opening_mm=(0.0, 80.0), speed_mm_s=(20.0, 100.0), force_n=(5.0, 60.0), step_mm=0.1
 )
-"""What its maker states."""
+"""The manufacturer's ratings."""
 
 
 class ExampleGripperSettings(GripperSettings):

@@ -102,7 +102,7 @@ class ExampleGripper:
 
         Raises:
             OSError: no answer in time.
-            ValueError: a line that is none, or the end of the connection.
+            ValueError: an invalid line, or the end of the connection.
         """
         with self._asking:
             self._number += 1

@@ -45,7 +45,7 @@ class ExampleSync:
         self._buffer = StreamBuffer(DEVICE, settings.stall_s)
 
     def connect(self) -> None:
-        """Open the connection, anew after a fault, and see the box answer. Raises RigError."""
+        """Connect, again after a fault, and check that the box answers. Raises RigError."""
         self.close()
         address = self._settings.host, self._settings.port
         try:

@@ -31,7 +31,7 @@ class FakeExampleSync(FakeStream):
         super().__init__("fake sync box")
 
     def reset(self) -> None:
-        """Restart as after a brown-out: no train, and a clock that begins anew."""
+        """Restart as after a brown-out: no train, and a clock that starts again at zero."""
         self._thread.call(self._end)
         self._zero_ns = self._now_ns()
         self.write(b"BOOT\n")
