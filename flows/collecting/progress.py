@@ -194,7 +194,7 @@ class _Page:
         with (
             suppress(Exception),
             temporary_settings(updates={PREFECT_CLIENT_MAX_RETRIES: 0}),
-            # with settings of its own it is not the client of the flow run
+            # with separate settings it is not the client of the flow run
             get_client(httpx_settings={"timeout": ANSWER_S}, sync_client=True) as client,
         ):
             self._answered(self._rig, client, True)

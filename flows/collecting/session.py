@@ -85,7 +85,7 @@ class CollectionSession:
     rounds: Rounds | None = None
 
     def more(self) -> list[Trial]:
-        """Return what is to be taken after all that was: asked for again, or the next round."""
+        """Return the trials to take after all others: requested retakes, or the next round."""
         return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
 

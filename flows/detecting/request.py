@@ -33,9 +33,9 @@ class DetectRequest:
 
     Attributes:
         detection: the paper's rule by its settings, or another detector with its levels.
-        safe: reaction when slip cannot be detected any more, where a reflex is asked for.
+        safe: reaction when slip can no longer be detected, where a reflex is requested.
         plan, trial: the motion that is made; None where the rig is only listened to.
-        seconds: how long to listen; None until somebody ends it.
+        seconds: how long to listen; None until the user ends it.
     """
 
     rig: RigFile
@@ -200,7 +200,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
     if not 0 < deeper_mm < float("inf"):
         right = "must be 'stop', 'press:MM' or 'grip:MM', such as press:0.4"
         raise InputError("--reflex", "", text, right)
-    # a retraction gets shallower throughout, and what goes on is cut off at the limit
+    # a retraction gets shallower throughout, and motion beyond the limit is cut off
     depth = _shallowest_mm(program)
     if depth + deeper_mm > deepest + 1e-9:
         limits = plan.protocol.collection.limits

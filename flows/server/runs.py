@@ -156,7 +156,7 @@ def _carry_out_here(flow: Any, run: Any) -> None:
 
     try:
         run_flow(flow, flow_run=run, return_type="state")
-    except BaseException as error:  # a thread has nobody to raise to
+    except BaseException as error:  # a thread has no caller to raise to
         console.say(f"{run.name}: {error or type(error).__name__}")
 
 
@@ -179,7 +179,7 @@ def _carry_out(run_id: str, flow_name: str) -> None:
         try:
             run_flow(flow, flow_run=run, return_type="state")
         except (Abort, Pause):
-            pass  # the server said so
+            pass  # the server requested it
         except Exception as error:
             link.mark_lost(error)
             if (kept := run_records.end_of(here.folder, run_id)) is not None:

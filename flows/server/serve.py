@@ -46,7 +46,7 @@ def serve(
         folders: below which a run may name its protocol; a relative name is of the first. Those
             that ship, and those that a schedule names, it may name as well.
         port: of the embedded server's page.
-        poll_s: how often the server is asked for new runs, s.
+        poll_s: how often the server is polled for new runs, s.
 
     Raises:
         Locked: another program serves this store.

@@ -53,9 +53,9 @@ window.addEventListener("pointermove", (event) => {
 }, true);
 window.addEventListener("pointerup", () => { held = null; }, true);
 """
-"""Bokeh's own editable lines are caught within 2 pixels only, and beside where they are drawn."""
+"""Bokeh's own editable lines are caught within 2 pixels only, with an offset from their drawing."""
 _RESOLUTION_NS = 100_000
-"""Onsets set by hand are kept to a tenth of a millisecond."""
+"""Onsets set by hand are rounded to a tenth of a millisecond."""
 
 
 class TimePlots:

@@ -91,7 +91,7 @@ class _OwnPage(AuthProvider):
 
     @property
     def login_url(self) -> str:
-        """Nobody logs in; Bokeh asks for one."""
+        """A login URL, which Bokeh requires; there is no login."""
         return "/"
 
 
