@@ -125,9 +125,9 @@ def masked(text: str) -> str:
 
     Secrets are the passwords of addresses (``scheme://user:password@host``), wherever they come
     from, and the values of environment variables that are named as one. Errors of other libraries
-    quote addresses with their credentials, and command lines are kept with locks: such text goes
-    through here before it is kept or said. Data do not: a condition must not change because it
-    looks like somebody's key.
+    quote addresses with their credentials, and locks record command lines: such text is masked
+    before it is stored or printed. Data are not masked: a condition must not change because it
+    looks like a key.
     """
     for secret in _secrets():
         if secret in text:

@@ -58,7 +58,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file that somebody else wrote to the disk."""
+    """Flush a file that other code wrote."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -127,7 +127,7 @@ def read_blocks(path: Path) -> Iterator[bytes]:
 
 
 def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
-    """Return the bytes of a file that somebody names: of a device or a pipe there is no end.
+    """Return the bytes of a regular file; devices and pipes, which have no end, are refused.
 
     Args:
         most: bytes; a larger file is refused before it is read.
@@ -319,7 +319,7 @@ def write_json(path: Path, data: Any) -> None:
 def write_json_aside(path: Path, data: Any) -> None:
     """Write JSON, flushed but not atomic, in a folder that is not visible yet.
 
-    Whoever makes the folder visible flushes its entries before.
+    The caller that makes the folder visible flushes its entries first.
 
     Raises:
         ValueError: as `write_json`.

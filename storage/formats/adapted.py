@@ -108,7 +108,7 @@ def _opened(
 
 
 def _salvaged(salvage: Callable[[], ForeignTrial], made: ForeignTrial) -> ForeignTrial:
-    """Return what stands whole of the events' file, with the frames of another file."""
+    """Return the intact part of the events' file, with the frames of another file."""
     return replace(salvage(), frames=made.frames, frame_px=made.frame_px)
 
 

@@ -175,7 +175,7 @@ def read_events(
 
     Args:
         names: its files; paths: them on the disk, for formats that need it.
-        salvage: of a file that is damaged where it begins to be read, take what stands whole.
+        salvage: read the intact part of a file that is damaged where it begins to be read.
 
     Raises:
         FormatError: a file cannot be right.

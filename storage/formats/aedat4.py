@@ -203,9 +203,9 @@ class Aedat4File:
     def events(self, number: int) -> Iterator[EventChunk]:
         """Yield the events of a stream, packets together up to `_PACKET_EVENTS` events.
 
-        Events that cannot be right are left out; a packet with some is a chunk of its own.
+        Invalid events are left out; a packet with some is a separate chunk.
 
-        A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
+        A camera's packet has a few hundred events: the overhead per chunk would exceed their cost.
         """
         room = _empty(_PACKET_EVENTS)
         filled = 0

@@ -324,7 +324,7 @@ def _resolution(
 
 
 def _same_length(columns: Mapping[str, Sized]) -> None:
-    """Refuse columns of which one is truncated: nobody knows which events it has lost."""
+    """Refuse columns of which one is truncated: the events that it has lost are unknown."""
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
         stated = ", ".join(f"{key} {count}" for key, count in lengths.items())

@@ -4,9 +4,9 @@ A trial is committed by the store's own rename after all of it was read and chec
 cannot be imported does not stop the others. Rows that cannot be right, or whose times run back, are
 left out and counted (`time_order`); where they are many, the trial is not imported. Unknown
 properties (relations of clocks, poses, conditions) are marked as unknown and never invented:
-the time line is the event camera's own clock, or that of the frames where there are no events. Of a
-damaged file what stands whole before the damage may be salvaged; the trial's record counts what is
-lost.
+the time line is the event camera's own clock, or that of the frames where there are no events. The
+intact part of a damaged file, before the damage, may be salvaged; the trial's record counts the
+lost rest.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def import_trials(
         kind: the format's name.
         on_trial: called with each trial's id before it is read; what it raises ends the import
             between two trials.
-        salvage: of a damaged file, import what stands whole before the damage.
+        salvage: import the intact part of a damaged file, before the damage.
 
     Returns:
         ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
@@ -374,7 +374,7 @@ class _RunsBack(Exception):
 def _take_whole(
     store: Store, campaign: Campaign, trial: ForeignTrial, kind: str, salvage: bool
 ) -> tuple[ForeignTrial, _Content]:
-    """Commit one trial, or what stands whole of it; return it with what was read."""
+    """Commit one trial, or its intact part; return it with what was read."""
     try:
         return trial, _take(store, campaign, trial, kind)
     except NoEvents:

@@ -148,7 +148,7 @@ def pull(
     remote.check()
     listed = remote.campaigns()
     store = Store.create(folder)
-    # or an earlier pull was killed before it said where from
+    # or an earlier pull was killed before it stored its origin
     fresh = origin_of(folder) is None and not any((folder / "campaigns").glob("*"))
     done = PullResult()
     with (

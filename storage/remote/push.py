@@ -71,9 +71,9 @@ class PushOptions:
 
     Attributes:
         quarantine: push quarantine, too.
-        replace: also trials of which another take is there that this store knows nothing of.
+        replace: also trials of which the target has another take, unknown to this store.
         read_back: read every object that was sent; without it, only its size is compared.
-        check: read back what was there before, too, and send anew what is damaged.
+        check: read back existing objects, too, and upload damaged ones again.
     """
 
     quarantine: bool = False

@@ -498,7 +498,7 @@ class Rows:
             self._fine.add(at)
 
     def _kept_chunk(self, at: tuple[int, ...]) -> tuple[int, bytes] | None:
-        """Return the filters that a chunk went past, and its bytes; None where nothing is kept."""
+        """Return the filters that a chunk skipped, and its bytes; None where nothing is stored."""
         try:
             mask, data = self._data.read_direct_chunk(at)
         except _HDF5_ERRORS:

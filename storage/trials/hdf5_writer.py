@@ -2,7 +2,7 @@
 
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
 index reaches as far as their 32-bit times (71.6 min), later events are found by bisection. The
-other streams are beside them. Columns are chunked and compressed with bitshuffle, events in
+other streams are in the same file. Columns are chunked and compressed with bitshuffle, events in
 LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
 same data are the same bytes.
 
@@ -10,7 +10,7 @@ A trial has more columns than most of them have chunks, so that making, opening 
 costs more than their data. So every file begins as a copy of one that has all columns and no rows,
 and rows wait in memory until they are whole chunks.
 
-Format 2 differs from 1 in how events are kept: LZ4 instead of zstd, and times after the offset in
+Format 2 differs from 1 in the storage of events: LZ4 instead of zstd, and times after the offset in
 32 bits (docs/decisions/0020). A reader need not know which it has. Format 3 is format 2 with an
 index that ends before the last event (docs/decisions/0067).
 """

@@ -189,12 +189,12 @@ class Recording:
         return self._refitted
 
     def use_clocks(self, refitted: SyncResult | None) -> None:
-        """Use the clocks that `clocks_elsewhere` was in another process, whatever is kept here."""
+        """Use `clocks_elsewhere` of another process, whatever is stored here."""
         self.__dict__.pop("clocks", None)
         self.__dict__["_refitted"] = refitted
 
     def forget_clocks(self) -> None:
-        """Look for refitted clocks anew: they have just been written."""
+        """Forget refitted clocks, so that those just written are read."""
         for name in ("_refitted", "clocks"):
             self.__dict__.pop(name, None)
 

@@ -3,7 +3,7 @@
     campaigns/NAME/registrations/0001.json        what was registered, and when
     campaigns/NAME/registrations/0001.json.tsr    time stamp by RFC 3161; .ots by OpenTimestamps
 
-Each file has a checksum of its own content and the SHA-256 of the file before it. These show
+Each file has a checksum of its content and the SHA-256 of the file before it. These show
 damage; only a stamp or a signature of a third party shows when the file was made.
 """
 
@@ -153,7 +153,7 @@ def _is_stamp(data: bytes, ending: str) -> bool:
         return data.startswith(_PROOF)
     if len(data) < 2 or data[0] != _SEQUENCE:
         return False
-    head = 2 + (data[1] & 0x7F if data[1] & 0x80 else 0)  # DER: a long length has bytes of its own
+    head = 2 + (data[1] & 0x7F if data[1] & 0x80 else 0)  # DER: a long length has further bytes
     return data[head : head + 1] == bytes([_SEQUENCE])  # a request begins with its version
 
 

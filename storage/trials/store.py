@@ -65,8 +65,8 @@ IMPORTED: Final = "imported"
 ADAPTER = "adapter"
 """Key of that part, and format, of a campaign that came by an adapter, which it keeps."""
 AGAIN, FORGIVEN = "again", "forgiven"
-"""Cause of a committed trial that a person wants anew; mark of a failed attempt that counts no
-longer."""
+"""Cause of a committed trial that is to be retaken; mark of a failed attempt that is no longer
+counted."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
 
 
@@ -115,7 +115,7 @@ class QuarantineEntry(TypedDict):
         cause: ``interrupted``, or what is wrong with it.
         folder: its name in the quarantine.
         attempt: number of the attempt at the trial, of a complete one.
-        forgiven: who made the attempt count no longer; asked: who wanted the trial anew.
+        forgiven: who reset the attempt; asked: who requested the retake.
     """
 
     cause: str
@@ -330,7 +330,7 @@ class Campaign:
         )
 
     def attempts(self) -> dict[str, int]:
-        """Count the complete attempts at each trial that were not kept: each has its own seed."""
+        """Count the complete attempts at each trial that were rejected: each has its own seed."""
         return self._count(lambda item: str(item["cause"]).startswith(("gate", AGAIN)))
 
     def _count(self, wanted: Callable[[QuarantineEntry], bool]) -> dict[str, int]:

@@ -3,9 +3,9 @@
 Matroska files carry random identifiers and dates unless the muxer is configured not to; with the
 bit-exact flag two identical videos are two identical files, so checksums mean something.
 Encoding runs in separate threads behind bounded queues: a full queue is back-pressure that the
-caller sees as time, never as a lost frame. Frames know nothing of each other, so every thread has
-an encoder for itself and takes every so manieth frame: that costs a quarter less processor time
-than letting one encoder share the slices of each frame among threads.
+caller sees as time, never as a lost frame. Frames are coded independently, so every thread has its
+own encoder and takes every n-th frame: that costs a quarter less processor time than letting one
+encoder share the slices of each frame among threads.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class VideoWriter:
 
         Raises:
             ValueError: another shape or type than the file's.
-            RuntimeError: an encoder failed or stands still.
+            RuntimeError: an encoder failed or hangs.
         """
         if images.dtype != np.uint8 or images.shape[1:] != (self.height, self.width):
             raise ValueError(

@@ -1,7 +1,7 @@
 """Writing of a trial: in `incoming` until every file is complete, then visible by one rename.
 
 The first event camera, the first frame camera, arm, sync box and small sensors share one HDF5 file.
-Each further camera has files of its own, made with its first chunk, in the same layout.
+Each further camera has its own files, made with its first chunk, in the same layout.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class TrialWriter:
             self._frames.add(chunk)
 
     def add_stream(self, name: str, chunk: StreamChunk | CameraChunk) -> None:
-        """Append to a named stream; that of a further camera has files of its own.
+        """Append to a named stream; that of a further camera has its own files.
 
         Raises:
             ValueError: the name is not a small identifier, or the stream is of another kind.
