@@ -33,7 +33,7 @@ class RigSource:
     text: str
     """The file's own text if it extends nothing, else the merged content as YAML."""
     parts: tuple[tuple[Path, Document], ...]
-    """Each file with its own keys, the one that was asked for first."""
+    """Each file with its own keys, the requested one first."""
 
     def blame(self, key: str) -> Path:
         """Return the file that sets `key`, the first one where none does."""

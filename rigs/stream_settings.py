@@ -309,7 +309,7 @@ def check_distinct(devices: DeviceSettings | None, streams: Mapping[str, Stream]
 
 
 def _place(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Return what tells one device from another of its driver, by its key."""
+    """Return the settings that distinguish devices of one driver, by key."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, dict):

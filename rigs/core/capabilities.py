@@ -173,10 +173,10 @@ class Arm(Protocol):
 
 @runtime_checkable
 class StoppingArm(Protocol):
-    """An arm that goes on for a while after a stop; any other is taken to stop at once."""
+    """An arm with a stopping distance; any other is taken to stop at once."""
 
     def stopping_s(self, speed_mm_s: float) -> float:
-        """Time for which it goes on at full speed, or as far: reaction, and half of braking."""
+        """Stopping distance as time at full speed: reaction, and half of braking."""
 
 
 @runtime_checkable
@@ -265,7 +265,7 @@ class Mounting:
 
     axes: Literal["plate", "base"] = "plate"
     """The frame that `rotvec_deg` turns to: the plate's axes (x right, y up, z into the plate),
-    along which the tool stands, or the arm's base."""
+    with which the tool is aligned, or those of the arm's base."""
     rotvec_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rotation vector from the sensor's axes to that frame."""
     feels: Literal["plate", "arm"] = "plate"
@@ -274,7 +274,7 @@ class Mounting:
 
 @runtime_checkable
 class ForceSensor(Protocol):
-    """A sensor of force and torque with a clock of its own, or that of the arm."""
+    """A sensor of force and torque with its own clock, or that of the arm."""
 
     mounting: Mounting
     grade: ForceGrade

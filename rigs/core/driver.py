@@ -180,7 +180,7 @@ class FakeBox(Protocol):
         """Address for the driver, used by `SyncBoxDriver.reach`; it can be pickled."""
 
     def reset(self) -> None:
-        """Restart as after a brown-out: no train, and a clock that begins anew."""
+        """Restart as after a brown-out: no train, and a restarted clock."""
 
     def silence(self) -> None:
         """Hang: send and answer nothing from now on."""
@@ -236,7 +236,7 @@ class ForceSensorDriver(Driver[SettingsT]):
 
     kind = "force sensor"
     build: Callable[[SettingsT, Arm], ForceSensor] = field(kw_only=True)
-    """Make the device, not connected yet; beside the arm, whose controller may measure forces.
+    """Make the device, not connected yet; the arm is given as its controller may measure forces.
 
     Raises RigError where that arm has none.
     """

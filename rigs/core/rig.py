@@ -331,7 +331,7 @@ class Rig:
                 times = self.take_step(index, step, began, sink if recording else None)
                 steps.append((times, step.recorded))
                 course.taken(step, self.position)
-                # a nuisance is over before it has a speed, and is no path that was asked for
+                # a nuisance is over before it has a speed, and is not part of the planned path
                 if step.recorded and step.phase != "nuisance":
                     speed = step.speed_mm_s if isinstance(step, Move) else 0.0
                     path.append(self._segment(times, began, course.at, speed))
@@ -1025,7 +1025,7 @@ class Rig:
             if at.distance_mm(out) == 0:
                 return None
             pose, speed_mm_s = self.plate_frame.pose(out), self.at_most(RETRACT_SPEED_MM_S)
-            if self._twisted:  # straight out as it stands; it turns back where it is clear
+            if self._twisted:  # straight out with its present rotation; it turns back once clear
                 pose = replace(pose, rotvec_deg=begin.rotvec_deg)
             blind = _of_sensor(error) and not isinstance(error, ForceLimitError)
             if self.force is not None and self._often and not blind:

@@ -57,7 +57,7 @@ class StreamBuffer:
         """Add a part with its times, shape (n,), and its size; in the receiving thread.
 
         Raises:
-            ValueError: times fall back or stop, or nobody reads.
+            ValueError: times fall back or stop, or the buffer is not read.
         """
         with self._lock:
             if not self._running or not len(times):
@@ -81,7 +81,7 @@ class StreamBuffer:
             self._last[stream] = int(times[-1])
 
     def fail(self, why: str) -> None:
-        """Note why nothing more comes; the first reason is kept, those after it follow from it."""
+        """Record why the stream ended; the first reason is stored, later ones follow from it."""
         with self._lock:
             self._fault = self._fault or why
 

@@ -17,7 +17,7 @@ from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
 KEPT_S = 2.0
-"""Loads kept behind the newest one."""
+"""Length of the history of loads before the newest one, s."""
 
 
 class ToolLoad:

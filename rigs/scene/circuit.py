@@ -43,7 +43,7 @@ _WHITE, _OFFSET = 255.0, 20.0  # v2e: a share (I + 20) / 275 of the cutoff at in
 
 
 class Circuit(NamedTuple):
-    """State of all pixels; (height, width) each, if nothing else is said."""
+    """State of all pixels; shapes are (height, width) unless stated otherwise."""
 
     cells: F64
     """(height, width, 6)."""

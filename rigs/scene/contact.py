@@ -73,7 +73,7 @@ BLOCK = np.dtype(
             "place_x place_y base_x base_y branch_x branch_y force_x force_y normal normal_branch",
             "indentation bent path slipped mode speed slid_s earlier",
             "layout_x layout_y gap along bending compliance across shorter",
-            # where the base moves to, and the depth; where the tip stands, and its stretch at first
+            # target of the base's motion, and the depth; the tip's place, and its initial stretch
             "to_x to_y deep foot_x foot_y old_x old_y",
             # force along the papilla and the gain of its relaxing branch; soft part across it
             "pressed gain soft",
@@ -82,7 +82,7 @@ BLOCK = np.dtype(
             # how the step ends: mode, place, force, bend; slip, and share of the step at which the
             # tip lets go (negative: it does not)
             "end_mode end_x end_y end_force_x end_force_y end_normal end_bent slip share",
-            # the search for the bend: bracket, whether it goes on (negative: failed), stretch
+            # the search for the bend: bracket, whether it continues (negative: failed), stretch
             "low high seeks stretch",
             # the force when the slip begins, the cone's radii at both ends; the slip's direction
             "from_x from_y before after unit_x unit_y top bottom arc",
@@ -156,13 +156,13 @@ def _take_knot(w, field, i, j, knot):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def feel_spots(blocks, n, clean, field, spots, factors):  # type: ignore[no-untyped-def]
-    """Let every tip feel the friction of the spots on which it stands when a step begins.
+    """Apply the friction of the spots under the tips at the beginning of a step.
 
-    It keeps that friction for the step, so that it feels a spot's border a step late: a few
+    It is constant during the step, so a tip feels a spot's border a step late: a few
     micrometres on the way.
 
     Args:
-        clean: friction beside all spots, as `Springs.friction`.
+        clean: friction outside all spots, as `Springs.friction`.
         field: friction as it is felt; rows of the tips that came to another place are written.
         spots: of `Springs`, (k, 4).
         factors: by which each row of `field` differs from `clean`, (n,), written.
@@ -767,7 +767,7 @@ def _needs_speed(law, cone, slides_s):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _speed_at_end(w, field, law, i, j):  # type: ignore[no-untyped-def]
-    """Take the speed of a tip that let go anew, which is soon as it is where its slip ends.
+    """Recompute the speed of a tip that let go: it soon equals that at the end of its slip.
 
     Returns:
         1 if there is a new speed, and the slip is sought again; else 0.

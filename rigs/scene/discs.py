@@ -106,7 +106,7 @@ def _ground(image, low_x, low_y, high_x, high_y, dark, down, along):  # type: ig
 
 @njit(cache=True, nogil=True)
 def _sharp(image, cx, cy, radius, ground, level, dark, bright, down, along):  # type: ignore[no-untyped-def]
-    """One disc that stands still; row + down, column + along are its places in the noise tiles."""
+    """One static disc; row + down, column + along are its places in the noise tiles."""
     height, width = image.shape
     outer, inner = radius + HALF_DIAGONAL, radius - HALF_DIAGONAL
     for y in range(max(int(np.ceil(cy - outer)), 0), min(int(cy + outer) + 1, height)):

@@ -333,7 +333,7 @@ class MarkerSensor:
         first, last = begin_ns // BIN_NS, max((end_ns - 1) // BIN_NS, begin_ns // BIN_NS)
         if first == last and first in self._bins:
             return self._bins[first]
-        # what was drawn before is dropped, what is needed again is kept
+        # bins drawn before are dropped, those needed again are retained
         self._bins = {
             index: self._bins.get(index) or candidates(self._noise, self._trial, index)
             for index in range(first, last + 1)

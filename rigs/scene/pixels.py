@@ -1,8 +1,8 @@
 """Events of many pixels at once: which meet thresholds on a segment of a marker's path, and when.
 
-One pixel's events wait for each other; those of many do not, and where their numbers lie side
-by side a compiler does four or eight of them at a time. So all that a pixel needs stands in a
-tile, one field after the other with a lane for each pixel, and is worked on in loops without
+One pixel's events depend on each other; those of many do not, and where their numbers are adjacent
+in memory a compiler processes four or eight of them at a time. So all data of a pixel are in a
+tile, one field after the other with a lane for each pixel, and are processed in loops without
 branches. Fields are constant distances apart, which is how the compiler knows that lanes do not
 touch each other.
 
@@ -239,7 +239,7 @@ def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine(roots, n):  # type: ignore[no-untyped-def]
-    """One step of Chebyshev's method; where SINCE was, the packed event stands then."""
+    """One step of Chebyshev's method; the packed event replaces SINCE."""
     for j in range(n):
         t, target = roots[R_TIME + j], roots[R_TARGET + j]
         inverse = roots[R_INVERSE + j]

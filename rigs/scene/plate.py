@@ -7,7 +7,7 @@ that its own swing is faster than the steps takes speed and force of the end alo
 but without ringing. Forces fall monotonically with the plate's speed, so one scalar equation with a
 bracket round its root decides the step, however many tips change between stick and slip in it.
 Where static friction exceeds kinetic, a tip that lets go makes the plate faster at once, so a step
-ends where the first one does, were all held, and what is left of it is a step of its own.
+ends where the first one does, were all held, and the rest of it is a separate step.
 Regularised friction would let a held plate creep.
 """
 

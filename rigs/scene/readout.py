@@ -88,7 +88,7 @@ def read_each(  # type: ignore[no-untyped-def]
         events: packed (see above), their times ns after `base_ns`, at most `span_ns`; overwritten.
         other: scratch, as long.
         fired: time (ns) at which each pixel last fired, (height, width), written.
-        t_ns, xs, ys, ps: written from `kept` on.
+        t_ns, xs, ys, ps: output, written from index `kept` on.
 
     Returns:
         how many they hold now.
@@ -153,7 +153,7 @@ def read_scans(  # type: ignore[no-untyped-def]
         where = (scan << x_bits | (event >> 13) & 4095) << y_bits | (event >> 1) & 4095
         other[inside] = where << low | (event >> 25) << 1 | event & 1
         inside += 1
-    # what is sorted stands behind what is left over
+    # the sorted events are behind the left-over ones
     keys = events[left:]
     for k in range(inside):
         keys[k] = other[k]

@@ -51,7 +51,7 @@ def no_lists(markers: int, slots: int) -> RimLists:
 def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[no-untyped-def]
     """Pixels within `band` px of a disc's rim, into `pixels`; how many there are.
 
-    Where there are more than `pixels` has room for, the rest is counted and not kept.
+    Where there are more than `pixels` has room for, the rest is counted and dropped.
     """
     n, room = 0, pixels.shape[0]
     outer, inner = radius + band, max(radius - band, 0.0)
@@ -89,7 +89,7 @@ def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place):  # type: ignore[no-untyped-def]
-    """Make marker i's list anew, where it is now; False where it cannot have one.
+    """Rebuild marker i's list at its present place; False where it cannot have one.
 
     There is none where the list has too few slots, or the disc is so small that the rim's
     curvature matters.

@@ -29,7 +29,7 @@ _MARCH_MM = KNOT_MM / 8.0
 """Distance between the places at which the balance of a tip is looked at one by one."""
 _MOST_PLACES = 4096.0
 _STEADY = 1.25
-"""Speed over the next one up to which a line or a parabola through both tells of the one after."""
+"""Ratio of successive speeds up to which a line or a parabola through both predicts the next."""
 _CLOSE_SPEED = 1e-3
 """A change of the speed, over that at which friction begins to rise, like `CLOSE`."""
 

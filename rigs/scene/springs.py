@@ -158,7 +158,7 @@ class Tips:
         return self.state[:, MODE]
 
     def copy(self) -> Tips:
-        """The same state in memory of its own."""
+        """Return a copy of the state."""
         return Tips(self.state.copy())
 
 

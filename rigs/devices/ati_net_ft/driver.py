@@ -36,7 +36,7 @@ LOOK_S = 0.05
 """The listening thread looks this often whether it shall end."""
 JOIN_S = 1.0
 BACKLOG = 1 << 20
-"""Records kept for a reader, two minutes at most; older ones are dropped, and counted."""
+"""Records buffered for a reader, two minutes at most; older ones are dropped, and counted."""
 MISSING = 1 << 12
 """Numbers of missing records that are remembered, for those that come late."""
 RECEIVE_BYTES = 1 << 20
@@ -57,7 +57,7 @@ class Counts:
     """Sample counter farther ahead than the time that has passed allows; dropped."""
     malformed: int = 0
     dropped: int = 0
-    """Nobody read them in time."""
+    """Not read in time."""
 
 
 class AtiNetFt:

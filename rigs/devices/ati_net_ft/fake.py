@@ -43,7 +43,7 @@ class Kind(Enum):
     SATURATED = "saturated status"
     """The next `count` records say that force or torque is out of range."""
     RESTART = "restart"
-    """The sample counter begins anew."""
+    """The sample counter restarts."""
     MALFORMED = "malformed records"
     """The next `count` datagrams are cut short."""
 
@@ -52,11 +52,11 @@ class FakeNetFt:
     """A sensor to read at `host`; a context manager: its threads end with it.
 
     Args:
-        host: loopback address of its own.
+        host: a loopback address that nothing else uses.
         load: what it feels; nothing if left out.
         rate_hz: records a second, as set on its page.
         now_ns: the clock that its counter runs by.
-        ticks: where the 32-bit sample counter stands first.
+        ticks: initial value of the 32-bit sample counter.
         units: of force and torque, as its page names them.
         fed: it sends what `send` is given instead, when it is given.
 

@@ -1,7 +1,7 @@
 """OpenCV's `VideoCapture` in a child process: a thread grabs, the process answers calls.
 
 A grab may wait for seconds, or for ever where a driver hangs, and cannot be interrupted. In a
-process of its own it can be killed.
+separate process it can be killed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Taken:
         fault: why no more frames come; None while they may.
         silent_s: since the last frame, or since the start, as far as this process could look.
         received: a frame has come since the start.
-        grabbed, overflowed: since the start, the second ones dropped since nobody read.
+        grabbed, overflowed: since the start; overflowed frames were not read in time.
     """
 
     images: U8
@@ -104,7 +104,7 @@ class Capture:
             self._stall.waited_s(self._seen)
 
     def stop(self) -> None:
-        """Keep no more frames; those that are kept can still be taken."""
+        """Store no more frames; stored ones can still be taken."""
         with self._lock:
             self._region = None
 

@@ -80,7 +80,7 @@ class UvcCamera:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Frames of this run, or of the last one: taken over, and dropped since nobody read."""
+        """Frames of this run, or of the last one: grabbed, and dropped as not read in time."""
         if self._last is None:
             return {"grabbed": 0, "overflowed": 0}
         return {"grabbed": self._last.grabbed, "overflowed": self._last.overflowed}
