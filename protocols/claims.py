@@ -150,7 +150,7 @@ class Claim(StrictModel):
 
     @property
     def kind(self) -> Kind:
-        """Which of the three is said; a difference of at least a size is `apart`."""
+        """Which of the three bounds is given; a difference of at least a size is `apart`."""
         if self.within is not None:
             return "within"
         if self.between is not None and self.at_least is not None:

@@ -130,9 +130,9 @@ def build_program(collection: Collection, condition: Condition) -> Program:
 def _disturbed_hold(
     seconds: float, at: Position, nuisances: tuple[AnyNuisance, ...]
 ) -> Iterator[Step]:
-    """The recorded hold, in which the arm makes the motions of nuisances and comes back each time.
+    """The recorded hold, in which the arm makes the motions of nuisances and returns each time.
 
-    It stands still for as long as without them; the last `QUIET_S` seconds are undisturbed.
+    It rests as long as without nuisances; the last `QUIET_S` seconds are undisturbed.
     """
     due = sorted(
         (number * float(each.every), order)

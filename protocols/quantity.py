@@ -2,7 +2,7 @@
 
 A protocol's numbers become trial ids, so they must be the same on every machine and for every
 way of writing them: ``2.4 mm``, ``2.40 mm`` and ``0.24 cm`` are one level. They are therefore
-kept as `decimal.Decimal` in the canonical unit of their kind, and never pass through a float.
+stored as `decimal.Decimal` in the canonical unit of their kind, and never pass through a float.
 """
 
 from __future__ import annotations

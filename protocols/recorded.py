@@ -1,6 +1,6 @@
 """Plan of a campaign that was recorded elsewhere: its trials, conditions and split.
 
-It stands where the plan of a protocol does. Its trials are those that were imported; nothing is
+It takes the place of the plan of a protocol. Its trials are those that were imported; nothing is
 planned beyond them. The split is a function of the adapter and the trials' own names and fields.
 """
 
@@ -28,7 +28,7 @@ class RecordedTrial:
 
     Attributes:
         condition: levels by factor as text with unit: ``{"speed": "0.6 mm/s"}``.
-        fields: everything that file names and tables said of it, by name.
+        fields: everything that file names and tables state about it, by name.
         label: the class by which it is spread over the split; None for a trial of slip.
         seconds: length of its recording.
         classes: all classes that it shows.

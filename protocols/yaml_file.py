@@ -329,7 +329,7 @@ class _Builder:
 
 
 _SECRET = "cannot be read as text; quote it"
-"""All that is said of a secret: the parser's own words could hold it."""
+"""Message about a secret; the parser's own message could contain it."""
 
 
 def _unread(tag: str) -> str:
@@ -393,7 +393,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def _at_once(path: str, flags: int) -> int:
-    """Open without waiting for whoever writes into a pipe."""
+    """Open a file without blocking, even if it is a pipe without a writer."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
@@ -614,8 +614,8 @@ def _close(model: type[BaseModel], item: Any) -> str | None:
 def _fault(model: type[BaseModel], item: Any) -> KeyedError:
     """Return one fault of pydantic's, with those that were found with it.
 
-    A model that is chosen by what is in it (a device by its driver) is validated by itself, and
-    its faults continue from the key where it stands: `KeyedError` with a ``.`` before the key.
+    A model that is chosen by its content (a device by its driver) is validated separately, and
+    its faults continue from its key: `KeyedError` with a ``.`` before the key.
     """
     value: object | None = item.get("input")
     loc, kind, context = item["loc"], item["type"], item.get("ctx", {})
