@@ -128,7 +128,7 @@ def detect(
     Raises:
         InputError: there is no folder for `out`.
         RigError: a device failed; the arm is stopped.
-        SafeState: slip could not be detected any more; the arm stays in contact.
+        SafeState: slip could no longer be detected; the arm stays in contact.
         StopRequested, KeyboardInterrupt: the user stopped a motion.
     """
     training.limit_threads(1)

@@ -88,7 +88,7 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]
 
 
 def refuse_paused(store: Store) -> None:
-    """Refuse to begin a collection whose store is paused; it would stand still at once.
+    """Refuse to begin a collection whose store is paused; it would pause at once.
 
     Raises:
         CampaignStopped: the store is paused.

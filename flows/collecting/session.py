@@ -103,7 +103,7 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         campaign = _recover(store, run_request)
         supervisor = CollectionSupervisor(run_request, store, campaign)
         supervisor.begin()
-        # the rig is closed before anybody waits for figures
+        # the rig is closed before results are computed
         with (
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,

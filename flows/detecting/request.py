@@ -53,7 +53,7 @@ class DetectRequest:
 
     @property
     def timeouts(self) -> Timeouts | None:
-        """When slip counts as not detectable; None without a reflex that depends on it.
+        """Timeouts after which slip counts as undetectable; None without a reflex that needs them.
 
         Without a safe state decisions may be late, as they may be computed in this process.
         """
@@ -145,7 +145,7 @@ def make_detect_request(
 
 
 def load_model(path: Path) -> Fitted:
-    """Load a model file. Raises InputError if it is none."""
+    """Load a model file. Raises InputError if it is not one."""
     try:
         return model_file.load(path)
     except OSError as error:
@@ -219,7 +219,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
 
 
 def make_safe_state(file: RigFile, plan: Plan) -> Reflex | None:
-    """Return the reaction when slip cannot be detected any more, if the rig file names one."""
+    """Return the reaction when slip can no longer be detected, if the rig file names one."""
     wanted = file.reflex
     if wanted is None:
         return None

@@ -102,7 +102,7 @@ class RunRequest:
 
     @property
     def has_claims(self) -> bool:
-        """Whether claims are looked at."""
+        """Return True if claims are evaluated."""
         return self.plan.protocol.collection.stopping is not None and self.claims != "ignore"
 
     def _begun(self, campaign: Campaign) -> set[str] | None:

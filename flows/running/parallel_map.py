@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
 
 CHUNK = 64
-"""Most pieces in a task: what a lost worker loses, and what a stop on a cluster waits for."""
+"""Largest number of jobs in a task, which a lost worker loses and a stop on a cluster waits for."""
 SHARES = 4
-"""So many chunks a core of a cluster, so that none waits long for the last one."""
+"""Chunks per core of a cluster, so that no core waits long for the last one."""
 
 Piece = Callable[[Any], Any]
 Done = Callable[[int, Any], None]
@@ -57,7 +57,7 @@ def parallel_map(
     """Call `piece` on every job. Must run in a flow; with a cluster, in one that runs on it.
 
     Args:
-        name: what people call it.
+        name: display name.
         done: called in this thread with a job's number and what came of it, in any order.
 
     Raises:
@@ -216,7 +216,7 @@ def run_trials(
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
 def _trials_flow(argument: Opaque[_Step]) -> int:
-    """All that is stale."""
+    """Compute the results of the stale trials."""
     step = argument.content
     with timed(step.store, step.title):
         keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)

@@ -99,7 +99,7 @@ def delivered(store: Path, run: str) -> None:
 
 
 def suspended(store: Path, run: str) -> None:
-    """A flow run left its process to be resumed in another one: it has not begun any more."""
+    """A flow run left its process to be resumed in another one: it counts as not begun."""
     (_folder(store) / f"{run}.json").unlink(missing_ok=True)
 
 

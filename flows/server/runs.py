@@ -1,4 +1,4 @@
-"""The runs that Prefect's page asks for: one at a time on the rig, a word to the arm at once.
+"""Runs started from Prefect's page: one at a time on the rig, stop requests at once.
 
 The service looks for runs that are due. One that moves the arm, or needs all cores, is carried out
 in a separate process (`python -m sliplab.flows.server.runs ID FLOW`) that ends with the service.
@@ -72,7 +72,7 @@ class ServedRuns:
                         await asyncio.wait({ending}, timeout=poll_s)
                 await self._stop()
             finally:
-                stopping.request()  # words that wait for a trial's end do not hold the end up
+                stopping.request()  # requests that wait for a trial's end do not delay the end
 
     async def _look(self, client: Any, threads: ThreadPoolExecutor) -> None:
         """See how the run on the rig is, and begin what is due."""

@@ -186,7 +186,7 @@ async def _delete_older(name: str, flows: list[str], store: Path) -> None:
 
 
 async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
-    """Close runs that a service before this one had taken and that no process has any more.
+    """Close runs that an earlier service had taken and that no process carries out.
 
     A run whose process died has been closed by its record; this is about those that were killed
     before they could write one, and would be pending for ever.

@@ -1,6 +1,6 @@
 """Settings of `sliplab serve`, passed to the processes of its flow runs.
 
-They are passed by the environment and not by the runs' parameters, which anybody who sees
+They are passed by the environment and not by the runs' parameters, which anyone who sees
 Prefect's page could change.
 """
 

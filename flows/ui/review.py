@@ -69,7 +69,7 @@ class Row:
 
     @property
     def status(self) -> str:
-        """The decision in a word, or why there can be none."""
+        """The decision as one word, or the reason why none is possible."""
         if self.problem:
             return "damaged"
         if self.label != "fresh":

@@ -252,7 +252,7 @@ class TimePlots:
             self._quiet = False
 
     def put(self, kind: Kind, time_s: float | None) -> None:
-        """Put one line somewhere, or take it away, for a person."""
+        """Place or remove one line, as a user would."""
         now = self.onsets()
         time = None if time_s is None else _rounded(time_s)
         values = {f"{other}_ns": getattr(now, f"{other}_ns") for other in KINDS}
