@@ -27,7 +27,7 @@ MAX_DRIFT = DRIFT_UNITS // 4
 
 _LEAST, _MOST = -(2**63), 2**63 - 1
 _FEW = 8
-"""So many times are quicker mapped one by one."""
+"""Number of times up to which mapping them one by one is faster."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ _FAULTS = {
 _OWN_FAULTS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
 _IN_WORDS = re.compile(r"errno = (\d+)")
 _SHORTEST = 8
-"""A shorter value is a switch, or is in many a word."""
+"""A shorter value is a switch, or part of many words."""
 
 
 class StoreError(RuntimeError):

@@ -44,7 +44,7 @@ class FoundLabel:
     """The label of a trial as the data set states it.
 
     Attributes:
-        source: where it stood.
+        source: file or field that it was read from.
         whole: class of the whole recording.
         clock: of its times: ``events``, ``frames`` or ``start``.
     """

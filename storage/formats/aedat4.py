@@ -90,7 +90,7 @@ class Aedat4File:
         at: byte of the packet that was read last.
 
     Raises:
-        FormatError: it is none, or damaged.
+        FormatError: it is not an AEDAT4 file, or damaged.
         OSError: it cannot be read.
     """
 
@@ -141,7 +141,7 @@ class Aedat4File:
         return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
 
     def whole(self) -> Lost | None:
-        """Find the first packet that cannot be read; nothing from there on is read any more.
+        """Find the first packet that cannot be read; nothing is read from there on.
 
         Returns:
             What is lost by that; None where all is whole.
@@ -340,7 +340,7 @@ def _event_words(data: memoryview) -> Any:
 
 
 def _split(words: Any, chunk: EventChunk) -> EventChunk:
-    """Fill a chunk from the words of its events; return it without those that cannot be right."""
+    """Fill a chunk from the words of its events; return it without the invalid ones."""
     if _split_events(words, chunk.x, chunk.y, chunk.p, chunk.t_us):
         return chunk
     return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)

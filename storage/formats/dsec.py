@@ -233,7 +233,7 @@ def _lab_trial(
 
 
 def _piece(columns: Mapping[str, Rows]) -> int:
-    """Return the rows that stand or fall together: a piece of the column of times."""
+    """Return the rows that are read or lost together: a chunk of the column of times."""
     *_, times = columns.values()
     starts = (low for low, *_ in times.stored())
     with suppress(*_FAULTS):

@@ -170,7 +170,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Whole:
-    """What is known of a trial once all of it was read, on the time line.
+    """Properties of a trial that are known once all of it was read, on the time line.
 
     Attributes:
         span_ns: begin and end of the recording.
@@ -365,7 +365,7 @@ def some_rows(chunk: ChunkT, good: Any) -> ChunkT:
 
 
 def resolution_us(times: Any, per_unit: float, whole_us: float = 0.0) -> float:
-    """Return the step from the latest time to the next one that its type can tell, us.
+    """Return the resolution of the times' type at the latest time, us.
 
     Args:
         per_unit: microseconds of one unit of the times.

@@ -78,7 +78,7 @@ class Files:
 
 @dataclass(frozen=True)
 class Layout:
-    """How files and folders of recordings belong together; plug-ins declare it as a hook.
+    """Layout of the files and folders of recordings; plug-ins declare it as a hook.
 
     Attributes:
         enter: returns the folder to be imported in place of a path; the path itself for any other

@@ -223,7 +223,7 @@ def _counted(count: int, reason: str) -> str:
 
 @dataclass
 class _Content:
-    """What was read of a trial.
+    """Content read of a trial.
 
     Attributes:
         orders: rows that stay of streams whose times run back.

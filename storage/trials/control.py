@@ -3,7 +3,7 @@
     STORE/control/000001.json        a request: who, when, why
     STORE/control/000001.done.json   its answer: when and by whom it was carried out, and the result
     campaigns/NAME/skipped.json      trials that a person skipped: who, when, why
-    campaigns/NAME/quarantine/ID.N/cause.json   who took a committed trial away again
+    campaigns/NAME/quarantine/ID.N/cause.json   who withdrew a committed trial
 
 Any program may submit one. The holder of the store's lock carries it out: a collection between two
 trials, or, while none runs, the program that submits it. Nothing is deleted.

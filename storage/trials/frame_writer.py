@@ -119,7 +119,7 @@ class Spool:
         """Append frames, which must not change afterwards; waits only where the queue is full.
 
         Raises:
-            OSError: the disk refused these or earlier ones, or has stood still for `WAIT_S`.
+            OSError: the disk refused these or earlier ones, or made no progress for `WAIT_S`.
         """
         if not images.size:
             return

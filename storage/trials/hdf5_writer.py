@@ -105,7 +105,7 @@ WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
 INDEX, OFFSET = "ms_to_idx", "t_offset"
 _LAST_32 = 2**32 - 1
 INDEXED_MS = 2**32 // 1000 + 1
-"""Milliseconds that the index reaches to: those that DSEC's 32-bit times can tell."""
+"""Length of the index, ms: the range of DSEC's 32-bit times."""
 # one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
 _SMALL = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
 _EVENTS = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="lz4")

@@ -60,7 +60,7 @@ def exclusive(
     Args:
         what: name of the locked thing, for the message.
         brief: the block is over at once; others may wait for that.
-        mode: of the file, if it is made. In a folder for all users (0666) anybody may have put
+        mode: of the file, if it is made. In a folder for all users (0666) any user may have put
             something else there: then it must be a plain file with no other name.
         about: further keys of the holder, such as its store.
 

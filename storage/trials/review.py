@@ -66,7 +66,7 @@ class Decision(Entry):
 
     Attributes:
         verdict: ``accept`` (the label holds), ``adjust`` (the onsets are these), ``reject`` (the
-            trial is not to be used) or ``reopen`` (nothing is decided any more).
+            trial is not to be used) or ``reopen`` (the label is undecided again).
         label: key of the label that it was made on.
         old: the label's onsets; new: those that hold by this decision.
     """

@@ -4,8 +4,8 @@
     STORE/campaigns/NAME/campaign.json protocol.yaml rig.yaml checksums.json
     STORE/campaigns/NAME/trials/ID/      committed trials
     STORE/campaigns/NAME/incoming/ID/    the trial being written
-    STORE/campaigns/NAME/quarantine/     attempts that are no trials, each with its cause
-    STORE/campaigns/NAME/bench/          who stood at the rig, one file a session
+    STORE/campaigns/NAME/quarantine/     rejected attempts, each with its cause
+    STORE/campaigns/NAME/bench/          operator and equipment, one file a session
     STORE/campaigns/NAME/registrations/  what was registered before the first trial, one file a time
     STORE/campaigns/NAME/skipped.json    trials that a person skipped (`storage.trials.control`)
     STORE/control/                       requests of people (`storage.trials.control`)
@@ -341,7 +341,7 @@ class Campaign:
         return counts
 
     def add_bench_record(self, data: SessionRecord) -> None:
-        """Keep who stood at the rig, with what, for one session."""
+        """Store the operator and equipment of one session."""
         folder = self.folder / "bench"
         make_folder(self.inside(folder))
         there = [int(path.stem) for path in folder.glob("*.json") if path.stem.isdecimal()]

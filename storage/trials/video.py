@@ -202,7 +202,7 @@ def count_frames(path: Path) -> int:
 
 
 def frame_rate(path: Path) -> int:
-    """Frames a second of a video's time base; the frames have times of their own."""
+    """Frames a second of a video's time base; the frames have separate times."""
     with av.open(video_url(path)) as container:
         rate: int = round(container.streams.video[0].average_rate)
     return rate
