@@ -62,7 +62,7 @@ RESERVED = frozenset(
 )
 """Names of the first devices, in files, records and columns."""
 _PLACES = frozenset({"serial", "host", "port", "events_port", "triggers_port", "index", "path"})
-"""Keys by which drivers tell their devices apart."""
+"""Keys by which drivers distinguish their devices."""
 MOST = 16
 """Further devices of a rig: a limit for people's typing errors, not of the store."""
 

@@ -278,7 +278,7 @@ class ForceSensor(Protocol):
 
     mounting: Mounting
     grade: ForceGrade
-    """How its samples come onto the time line."""
+    """Method by which its samples are placed on the time line."""
     zeroing: Literal["trial", "session", "never"]
     """When the rig, or the sensor itself, takes the present load for zero: before each trial while
     the arm is clear of the plate, once when it connects, or never."""
@@ -335,10 +335,10 @@ class ScalarSensor(Protocol):
 
 @dataclass(frozen=True)
 class GripperState:
-    """What a gripper reports.
+    """State of a gripper.
 
     Attributes:
-        moving: fingers have not come to the end of the last move.
+        moving: fingers have not finished the last move.
         stalled: they ended it at an object, or at the force limit.
     """
 

@@ -155,7 +155,7 @@ class FrameCameraDriver(Driver[SettingsT]):
     unplug: Callable[[FrameCamera], None] | None = None
     """Unplug a camera that `fake` has opened, for tests."""
     grade: FrameGrade = "hardware trigger"
-    """How frames are timed on a loopback rig: `host arrival` where the camera runs by itself."""
+    """Timing of frames on a loopback rig: `host arrival` where the camera is free-running."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class FakeForceSensor(Protocol):
 
     @property
     def address(self) -> Any:
-        """Where the driver finds it, for `ForceSensorDriver.reach`; it can be pickled."""
+        """Address for the driver, used by `ForceSensorDriver.reach`; it can be pickled."""
 
     def send(self, chunk: WrenchChunk) -> None:
         """Send samples of the plate's load, in the sensor's axes and clock."""

@@ -184,7 +184,7 @@ class Rig:
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _twisted: bool = field(default=False, init=False)
-    """The sensor does not stand as the plate's axes do."""
+    """The sensor is rotated with respect to the plate's axes."""
     _plate_uncaught: bool = field(default=False, init=False)
     """True while the plate is released and not caught: it hangs on the sensor, or falls."""
 
@@ -345,7 +345,7 @@ class Rig:
 
     @property
     def _often(self) -> bool:
-        """Whether forces and poses are looked at every `force_watch.POLL_S`.
+        """Return True if forces and poses are checked every `force_watch.POLL_S`.
 
         Not on a simulated rig without a limit of force, where an overload breaks nothing.
         """
@@ -353,7 +353,7 @@ class Rig:
 
     @property
     def _closed_mm(self) -> float:
-        """What the fingers add to the arm's depth."""
+        """Depth that the fingers add to the arm's."""
         return 0.0 if self._fingers_mm is None else max(self.grip_opening_mm - self._fingers_mm, 0)
 
     def _watch_forces(self, turns: bool = False, leaving: bool = False) -> ForceWatch:
@@ -382,7 +382,7 @@ class Rig:
         return self._forces
 
     def _end_watch(self) -> None:
-        """Read no forces any more."""
+        """Stop reading forces."""
         if self._forces is not None and self.force is not None:
             self._forces = None
             self.force.stop()
@@ -574,7 +574,7 @@ class Rig:
         """Read the events; return their number around the centre papilla.
 
         Raises:
-            RigError: no event came any more, not even noise.
+            RigError: no more events came, not even noise.
         """
         chunk = self.events.read()
         if self._noise is not None:
@@ -944,7 +944,7 @@ class Rig:
         return self.plate_frame.position(self.pose().xyz_mm)
 
     def pose(self) -> Pose:
-        """Return the arm's current pose. Raises ArmFault if it is none."""
+        """Return the arm's current pose. Raises ArmFault if it is invalid."""
         return check_pose(self.arm.pose())
 
     @contextmanager
@@ -1063,7 +1063,7 @@ class Rig:
 
 
 def _seconds(way: float, speed: float) -> float:
-    """Return the time that a way takes; infinite at a speed that is none, which is never sent."""
+    """Return the time that a path takes; infinite at an invalid speed, which is never sent."""
     if way == 0.0:
         return 0.0
     return way / speed if 0.0 < speed < math.inf else math.inf

@@ -68,7 +68,7 @@ class ToolLoad:
             t_s: time of the controller's clock.
 
         Returns:
-            None if the scene has not come to that time.
+            None if the scene has not reached that time.
         """
         times, loads = self._known
         if not len(times) or t_s > times[-1]:

@@ -100,7 +100,7 @@ once if they lie next to each other and if it is known beforehand how many there
 _ROWS, _STATES, _CONSTANTS = len(BLOCK.names or ()), 18, 8
 _AWAY_MM = 1e6
 _LETS_GO, _SLOWS = 1.0, 2.0
-"""Kinds of rare slips: a tip that lets go, and one whose earlier speeds predict nothing."""
+"""Kinds of rare slips: a tip that lets go, and one without a usable speed history."""
 ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
 
@@ -140,7 +140,7 @@ def make_blocks(table, field, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def store_state(blocks, state):  # type: ignore[no-untyped-def]
-    """Write the state of the tips in `blocks` back into rows of their own, (n, 18)."""
+    """Write the state of the tips in `blocks` back into one row each, (n, 18)."""
     flat = blocks.view(np.float64)
     for i in range(state.shape[0]):
         for c in range(_STATES):
@@ -272,7 +272,7 @@ def _touches_at(was, deep):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _touch(w, law, j, step):  # type: ignore[no-untyped-def]
-    """Let a tip that meets the plate in this step stand under its base where it does so."""
+    """Place a tip that meets the plate in this step under its base at that moment."""
     was, gain = w.indentation[j], step.gain
     w.foot_x[j], w.foot_y[j] = w.to_x[j], w.to_y[j]
     if was < 0.0:

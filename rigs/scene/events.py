@@ -218,7 +218,7 @@ class MarkerSensor:
         self._bins: dict[int, Candidates] = {}
 
     def _new_circuit(self, seed: int) -> Circuit:
-        """Pixels with OFF thresholds and leak rates of their own."""
+        """Pixels with individual OFF thresholds and leak rates."""
         optics, shape, off = self.optics, self.threshold.shape, self.threshold
         mean, sigma = optics.threshold_off, optics.threshold_off_sigma
         if mean is not None or sigma is not None:

@@ -1,4 +1,4 @@
-"""From places in the plate's plane to pixels: a pinhole that may stand askew, a lens that bends.
+"""Projection of the plate's plane to pixels: a pinhole that may be tilted, and lens distortion.
 
 Straight on, this is one scale. A tilt makes it a homography and a radial term bends it; both are
 modelled exactly, because labels are read to a tenth of a pixel.

@@ -38,7 +38,7 @@ _NEVER = 1e9
 def _pull(blocks, n, field, law, sensor, plate_y, step, new):  # type: ignore[no-untyped-def]
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N.
 
-    It is what must stand for the end of the step, so that its mean with the beginning (`new`) is
+    It is the effective force at the end of the step, so that its mean with the beginning (`new`) is
     that over the step: the force of a tip that lets go falls in no time.
     """
     total = 0.0

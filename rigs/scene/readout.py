@@ -131,7 +131,7 @@ def read_scans(  # type: ignore[no-untyped-def]
         period_ns, phase_ns, column_ns: see `Scans`.
 
     Returns:
-        how many events are delivered in all, and how many of later scans are left: these stand
+        how many events are delivered in all, and how many of later scans are left: these are
         at the front of `events`, their times unchanged.
     """
     height, width = fired.shape
@@ -197,8 +197,8 @@ def larger(array, capacity):  # type: ignore[no-untyped-def]
 def sort_packed(keys, n, other, low, high):  # type: ignore[no-untyped-def]
     """Sort the first `n` of `keys` (int64, not negative) in place.
 
-    Bits `low` to `high` (without) are sorted by counting, 9 at a time; what is equal in them is
-    put in order by insertion, so they should tell nearly all keys apart.
+    Bits `low` to `high` (without) are sorted by counting, 9 at a time; keys that are equal in them
+    are sorted by insertion, so these bits should distinguish nearly all keys.
 
     Args:
         other: scratch, as long as `keys`.

@@ -33,7 +33,7 @@ class Kind(Enum):
     """A kind of fault."""
 
     SILENCE = "silence"
-    """Nothing is sent any more; the page still answers."""
+    """No more records are sent; the page still answers."""
     LOSS = "packet loss"
     """The next `count` records do not arrive."""
     REORDER = "reordering"

@@ -4,7 +4,7 @@ Pylon fills a fixed number of buffers and drops frames that find none free, so a
 empties them into a bounded queue. If the queue is not read, it fills up, then pylon's buffers do,
 and only then are frames lost, which shows as a gap in the camera's frame ids. Where the time of a
 frame comes separately, as an event, the thread waits for it. Silence is the time without a frame
-that is delivered: incomplete frames, repeated ones and those without a time are none.
+that is delivered: incomplete frames, repeated ones and those without a time do not count.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class UrWrench:
         self._arm.zero_force()
 
     def stop(self) -> None:
-        """Keep no more samples; those that came can still be read."""
+        """Store no more samples; those received can still be read."""
         self._streaming = False
 
     def close(self) -> None:
