@@ -1,4 +1,4 @@
-"""Nuisances: what looks like slip and is none, as named elements of a protocol.
+"""Nuisances: disturbances that look like slip, as named elements of a protocol.
 
     collection:
       factors:
@@ -52,7 +52,7 @@ class _Nuisance(StrictModel):
 
     @property
     def request(self) -> str:
-        """What a person is asked to do at a real rig; empty if the arm does it."""
+        """Instruction for the operator of a real rig; empty if the arm does it."""
         return ""
 
     def scaled(self, share: Decimal) -> Any:

@@ -16,7 +16,7 @@ def shipped_files(folder: Path) -> dict[str, Path]:
 
 
 def find_shipped(given: Path, known: dict[str, Path]) -> Path | None:
-    """The file that a person means: a path, or a bare name among `known`; None for neither.
+    """Return the file named by the user: a path, or a bare name among `known`; None for neither.
 
     A hyphen in the name is an underscore in the file's.
     """
@@ -32,7 +32,7 @@ def shipped_protocols() -> dict[str, Path]:
 
 
 def protocol_path(given: Path) -> Path:
-    """The file that a person means: a path, or the name of a shipped protocol.
+    """Return the file named by the user: a path, or the name of a shipped protocol.
 
     Raises:
         InputError: a bare name that is neither.

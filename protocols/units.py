@@ -135,7 +135,7 @@ def forget_packages() -> None:
 
 
 class UnitError(ValueError):
-    """A unit of a package that is none."""
+    """An invalid unit of a package."""
 
 
 def _take(found: Any) -> None:

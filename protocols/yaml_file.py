@@ -147,7 +147,7 @@ def _kind_faults(model: type[BaseModel], data: Mapping[Any, Any]) -> Iterator[Ke
 
 
 _NOTHING: frozenset[Any] = frozenset()
-_NUMBERS: frozenset[Any] = frozenset({int, float})  # decimals have readers of their own
+_NUMBERS: frozenset[Any] = frozenset({int, float})  # decimals are read separately
 
 
 @cache
@@ -566,7 +566,7 @@ class ChosenModel(ABC):
 
 
 def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
-    """Return the faults of `error` as a person needs them: key, value and what is right.
+    """Return the faults of `error` for the user: key, value and what is right.
 
     Unknown keys come first: one that is misspelt is the cause of a missing one, which is left out.
     """
@@ -620,7 +620,7 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
     value: object | None = item.get("input")
     loc, kind, context = item["loc"], item["type"], item.get("ctx", {})
     key = f".{_key(loc)}" if loc else ""
-    if loc and loc[-1] == "[key]":  # pydantic's word for the name of an entry itself
+    if loc and loc[-1] == "[key]":  # pydantic's placeholder for the name of an entry
         said = re.sub("^Value error, |^[A-Z].* should", "", item["msg"]).strip()
         return KeyedError(f".{_key(loc[:-1])}", None, f"is no right name: {said}")
     if kind == "value_error" and isinstance(context.get("error"), KeyedError):
@@ -714,7 +714,7 @@ class KeyedError(ValueError):
 
     @property
     def faults(self) -> tuple[KeyedError, ...]:
-        """This fault by itself, then each of the others."""
+        """Return this fault without the others, then each of the others."""
         return KeyedError(self.key, self.value, str(self)), *self.more
 
     @property
