@@ -33,7 +33,7 @@ def main() -> None:
         try:
             with guarded():
                 code = _run()
-        except OutputLost as error:  # of what was left to be written
+        except OutputLost as error:  # of output still to be written
             code = _fail(str(error), 1)
     except KeyboardInterrupt:
         code = _fail("interrupted", 130)
@@ -108,7 +108,7 @@ def _ignore_signals() -> None:
 
 
 def _explain(error: Exception) -> int:
-    """Say what ended the command; returns the exit code."""
+    """Report the error that ended the command; return the exit code."""
     from sliplab.flows.cli import errors
     from sliplab.flows.running import stopping
     from sliplab.protocols.errors import InputError
@@ -120,7 +120,7 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    """Say in one line what ended the program before, or after, it could say more."""
+    """Report in one line an error before or after normal error reporting is available."""
     said = message if code == 130 else f"error: {message}"
     with suppress(OSError):
         os.write(2, f"{said}\n".encode(errors="backslashreplace"))

@@ -34,7 +34,7 @@ class CollectResult(CampaignCounts):
 
     Attributes:
         taken: attempts; retaken: those of a trial that an attempt failed of before.
-        left_out: trials that the request did not want yet.
+        left_out: trials that the request does not include yet.
         ended: why the collection ended.
     """
 

@@ -74,7 +74,7 @@ def measure_holdout(
     work, current = Holdout(store, campaigns, trials, seeds), version("sliplab")
 
     def measure() -> HoldoutResult:
-        """Take what is missing of the trials, label and judge them."""
+        """Take the missing trials, label and judge them."""
         return work.score(*retake([holdout_request(work)]))
 
     sweep = task_sweep([Task(NAME, work.key, measure)], work.results)

@@ -107,7 +107,7 @@ def say_faults(result: Mapping[str, Any]) -> None:
 
 @contextmanager
 def new_store(place: Path) -> Iterator[Store]:
-    """Yield the store at `place`; one that is made here is taken away again if it stays empty."""
+    """Yield the store at `place`; one that is made here is removed again if it stays empty."""
     there = place.is_dir() and any(place.iterdir())
     existed = place.exists()
     from sliplab.storage.trials.store import Store

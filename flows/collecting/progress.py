@@ -33,7 +33,7 @@ STOP_LIMIT_S = 0.5
 ANSWER_S = 5.0
 """Longest wait for one answer of the server, s."""
 LOST_AFTER = 3
-"""After so many reports without an answer the server counts as lost."""
+"""Number of unanswered reports after which the server counts as lost."""
 MOST_POINTS = 300
 
 

@@ -173,7 +173,7 @@ def _stretches(found: Plan) -> str:
 
 
 def _claims(found: Plan) -> Iterator[str]:
-    """Yield lines about the claims of a plan, and what they do to it."""
+    """Yield lines about the claims of a plan, and their effect on it."""
     collection = found.protocol.collection
     if collection.stopping is None:
         return

@@ -35,7 +35,7 @@ from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
-"""`overrule`: they are looked at and do not end the campaign."""
+"""`overrule`: claims are evaluated and do not end the campaign."""
 
 
 @dataclass(frozen=True)

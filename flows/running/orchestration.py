@@ -289,7 +289,7 @@ def is_unreachable() -> bool:
 
 
 def report_unreachable(reason: str) -> None:
-    """Say that the server of the flow that runs now does not answer."""
+    """Report that the server of the current flow does not answer."""
     if _link is not None:
         _link.mark_lost(reason)
 

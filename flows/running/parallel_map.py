@@ -58,7 +58,7 @@ def parallel_map(
 
     Args:
         name: display name.
-        done: called in this thread with a job's number and what came of it, in any order.
+        done: called in this thread with a job's number and its result, in any order.
 
     Raises:
         KeyboardInterrupt: a stop was requested; jobs that had not begun are not started.
@@ -153,7 +153,7 @@ short is done by then, and what is long takes two starts at the most."""
 
 @dataclass(frozen=True)
 class _Step:
-    """A step with what it has to do.
+    """A step with its pending work.
 
     Attributes:
         name: where its results are stored; title: its display name.

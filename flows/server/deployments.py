@@ -52,7 +52,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     """Do the work of one served flow run.
 
     Args:
-        work: gets the service and Prefect's flow run; returns as text what it did.
+        work: gets the service and Prefect's flow run; returns a text about its result.
 
     Returns:
         The state in which the run ends.

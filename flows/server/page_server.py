@@ -1,4 +1,4 @@
-"""The Prefect server of a service: its page, its password, and what is done when it is lost.
+"""The Prefect server of a service: its page, its password, and the handling of its loss.
 
 A service outlives its server. A server of our own that ended, or does not answer, is restarted
 at its port; once a server answers again, the runs that ended in the meantime are reported to it.

@@ -75,7 +75,7 @@ class ServedRuns:
                 stopping.request()  # requests that wait for a trial's end do not delay the end
 
     async def _look(self, client: Any, threads: ThreadPoolExecutor) -> None:
-        """See how the run on the rig is, and begin what is due."""
+        """Check the run on the rig, and start due runs."""
         if self._process is not None:
             await self._supervise(client)
         self._words = {run: word for run, word in self._words.items() if not word.done()}

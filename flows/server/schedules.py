@@ -364,7 +364,7 @@ def upcoming_runs(
 
     Args:
         path: the schedules' file, for messages.
-        count: so many runs of each. after: now by default.
+        count: number of runs of each. after: now by default.
 
     Returns:
         In each schedule's time zone.

@@ -189,7 +189,7 @@ async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
     """Close runs that an earlier service had taken and that no process carries out.
 
     A run whose process died has been closed by its record; this is about those that were killed
-    before they could write one, and would be pending for ever.
+    before they could write one, and would stay pending.
     """
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import (

@@ -343,7 +343,7 @@ class ShownTrial:
 
 
 def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
-    """Read what is shown of a trial; frames are read later, one at a time.
+    """Read the displayed data of a trial; frames are read later, one at a time.
 
     Raises:
         StoreError: the trial is damaged.

@@ -98,7 +98,7 @@ def rerun() -> ModuleType:
 
 
 def save(subject: Subject, path: Path) -> dict[str, int]:
-    """Write a trial as an .rrd file, complete or not at all.
+    """Write a trial as an .rrd file, atomically.
 
     Returns:
         numbers of events, frames and so on, and the file's bytes.
