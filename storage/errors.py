@@ -43,8 +43,8 @@ class NoStore(InputError, StoreError):
     """The path or URL of a store was given, and no store can be there: wrong input.
 
     Args:
-        place: as it was given.
-        why: what is there instead, and what to do.
+        place: as given by the user.
+        why: the fault, and the remedy.
     """
 
     def __init__(self, place: Path | str, why: str) -> None:

@@ -67,7 +67,7 @@ def sync_file(path: Path) -> None:
 
 
 def protect(path: Path) -> None:
-    """Take away the right to write a file, which its user can still move and delete.
+    """Remove the write permission of a file, which its user can still move and delete.
 
     Nothing happens on a file system without such rights.
     """
@@ -76,7 +76,7 @@ def protect(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and what is missing above it, and flush each one's entry to the disk."""
+    """Make a folder and its missing parents, and flush each one's entry to the disk."""
     missing = [folder]
     while not missing[-1].parent.is_dir():
         missing.append(missing[-1].parent)
@@ -262,7 +262,7 @@ def sweep_temporary(folder: Path) -> int:
 
 
 def sweep_marked(folder: Path) -> None:
-    """Delete what killed programs left in any folder: only what is marked as this project's."""
+    """Delete leftovers of killed programs in any folder, if they are marked as this project's."""
     with suppress(OSError):
         for path, runs in temporary_files(folder):
             marked = _TEMPORARY.fullmatch(path.name)

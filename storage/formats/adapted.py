@@ -184,7 +184,7 @@ class _Opening:
     """A trial while it is opened.
 
     Attributes:
-        stack: closes what was unpacked, once the trial is imported.
+        stack: closes unpacked files, once the trial is imported.
         clocks: of devices and streams on the time line, which is the events' clock.
     """
 

@@ -74,7 +74,7 @@ class FoundLabel:
 
 @dataclass(frozen=True)
 class FoundLabels:
-    """Labels by the ids of their trials, and what is noteworthy about them."""
+    """Labels by the ids of their trials, and notes about them."""
 
     by_trial: dict[str, FoundLabel]
     warnings: list[str]

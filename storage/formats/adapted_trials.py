@@ -35,7 +35,7 @@ class AdaptedTrial:
 
     Attributes:
         source: its file, or the table with its row.
-        fields: what names and tables say of it.
+        fields: its fields from names and tables.
         condition: levels by factor as text with unit.
         files: paths of each stream's files, by the stream's key.
         missing: streams that it has no files of.
@@ -103,7 +103,7 @@ class _Draft:
 
 
 def find_trials(adapter: Adapter, file: Path, folder: DataFolder) -> AdaptedSet:
-    """Find the trials of a data set with all that names and tables say of them.
+    """Find the trials of a data set with their fields from names and tables.
 
     Raises:
         InputError: a pattern fits nothing, two trials have one id, a field is missing, or a table

@@ -144,7 +144,7 @@ class Aedat4File:
         """Find the first packet that cannot be read; nothing is read from there on.
 
         Returns:
-            What is lost by that; None where all is whole.
+            The loss; None if the file is intact.
         """
         reason = self._short
         for kind, read in (

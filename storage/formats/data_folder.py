@@ -31,7 +31,7 @@ class DataFolder:
     Attributes:
         path: the folder, ``.zip`` or single file.
         names: paths of the files.
-        skipped: what is left out: links, hidden files, and what is no file.
+        skipped: links, hidden files, and entries that are no files.
     """
 
     def __init__(self, path: Path) -> None:

@@ -382,7 +382,7 @@ class _opened:
     """An open file and its columns of plain numbers; its faults become `FormatError`.
 
     Args:
-        torn: open a file that is cut short too, with zeros in place of what is missing.
+        torn: open truncated files, too, with zeros in place of missing data.
     """
 
     def __init__(self, path: Path, *, torn: bool = False) -> None:
@@ -446,7 +446,7 @@ def _open_note(path: Path) -> Callable[[], tuple[str, ...]]:
 
 
 def _stated_end(path: Path) -> int:
-    """Return the number of bytes that a file says it has; 0 where it says none."""
+    """Return the number of bytes that a file's header states; 0 if it states none."""
     with path.open("rb") as file:
         head = file.read(_SUPERBLOCK)
     at = {0: 40, 1: 44, 2: 28, 3: 28}.get(head[8] if len(head) == _SUPERBLOCK else -1)

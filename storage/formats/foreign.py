@@ -31,7 +31,7 @@ from sliplab.storage.trials.store import Campaign, Store
 OUTSIDE = "events outside of the sensor"
 UNKNOWN_POLARITY = "events with an unknown polarity"
 NO_TIME = "{} without a valid time"
-"""Reasons why rows are left out, by what they are."""
+"""Reasons why rows are left out, by their kind."""
 NO_TIME_NS = -(1 << 63)
 """In place of a time that is not a number or is out of range."""
 ChunkT = TypeVar("ChunkT", bound=EventChunk | FrameChunk | PoseChunk | WrenchChunk | ScalarChunk)
@@ -42,7 +42,7 @@ EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14
 LATEST_US = 1 << 53
-"""285 years; what comes later is not a time, and would not fit 64 bits of nanoseconds."""
+"""285 years; a larger value is not a time, and would not fit 64 bits of nanoseconds."""
 
 
 class FormatError(ValueError):
@@ -157,7 +157,7 @@ class Restorable(Protocol):
 
 @dataclass(frozen=True)
 class Seen:
-    """First and last time of what was read of a trial, each on its own clock; None without any.
+    """First and last time of a trial's data, each on its own clock; None without any.
 
     Attributes:
         further_ns: of poses and streams by name.

@@ -1,4 +1,4 @@
-"""Import of foreign trials into a campaign: each one complete or not at all.
+"""Import of foreign trials into a campaign, each one atomically.
 
 A trial is committed by the store's own rename after all of it was read and checked. A trial that
 cannot be imported does not stop the others. Rows that cannot be right, or whose times run back, are
@@ -118,7 +118,7 @@ def import_trials(
 
     Returns:
         ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
-        and where there are any, ``warnings``, ``salvaged`` (what is lost of each trial),
+        and where there are any, ``warnings``, ``salvaged`` (the loss of each trial),
         ``left_out`` (rows left out of each trial, by reason) and ``failed``: trials that could not
         be imported, of which nothing is left.
 

@@ -69,7 +69,7 @@ class PullResult:
             been before; withdrawn: pulled before, marked as withdrawn at the URL, and quarantined
             here.
         set_aside: of quarantine; files and bytes: fetched.
-        problems: what was not downloaded, and why.
+        problems: failed downloads, with reasons.
     """
 
     trials: int = 0

@@ -45,7 +45,7 @@ _NAME, _ROW, _INODE, _CHANGED, _SYNC = (
 )
 _META = b"sliplab"
 UNREAD = "unread_bytes"
-"""Column of a catalogue with trials that are not whole: what was not read of their files."""
+"""Column of a catalogue with salvaged trials: the number of unread bytes of their files."""
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:

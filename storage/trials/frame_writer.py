@@ -93,7 +93,7 @@ class FrameWriter:
         spool.unlink()
 
     def abandon(self) -> None:
-        """Close what is open, as far as the disk takes it."""
+        """Close open files, as far as the disk permits."""
         if self._spool is not None:
             with suppress(OSError):
                 self._spool.close()

@@ -689,7 +689,7 @@ class StreamReader:
         """Return the kind of every named stream, by name; ``""`` for one that is unknown.
 
         Raises:
-            NotOurs: what is there is no stream of ours.
+            NotOurs: the group is not a stream written by SlipLab.
         """
         return self._file.streams()
 

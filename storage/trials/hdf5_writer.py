@@ -46,7 +46,7 @@ FORMAT, INDEX_CUT_FORMAT = 2, 3
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
-"""Rows of small columns that are held back; each write costs more than what is in it."""
+"""Rows of small columns that are buffered; the overhead of each write exceeds its data."""
 
 COLUMNS: dict[str, Kind] = {
     "events/x": ("uint16", (), "px"),
@@ -333,7 +333,7 @@ class StreamFile:
         self._columns[name] = Column(self._file, name)
 
     def finish(self) -> None:
-        """Write what is held back and the index, and close the file, whatever happens."""
+        """Write buffered rows and the index, and close the file in any case."""
         try:
             if self._next_ms > INDEXED_MS:
                 self._file.attrs["format"] = INDEX_CUT_FORMAT

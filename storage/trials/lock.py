@@ -125,7 +125,7 @@ def _open(path: Path, mode: int) -> int:
 
 
 def _check_plain(handle: int, path: Path) -> None:
-    """Refuse what is not made to be a lock: its content would be overwritten."""
+    """Refuse a file that is not a lock: its content would be overwritten."""
     found = os.fstat(handle)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
         raise OSError(errno.EINVAL, "is not a regular lock file", str(path))

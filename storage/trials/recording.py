@@ -52,7 +52,7 @@ class Tracks:
 class Recording:
     """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns.
 
-    A committed trial is never rewritten, and never read where it is not what was committed: each
+    A committed trial is never rewritten, and never read if it differs from the committed one: each
     of its files is checked against its checksum before this object first reads it. Where its clocks
     were fitted again and came out otherwise, the new ones are among the derived results, and are
     used in the record's place.
@@ -72,7 +72,7 @@ class Recording:
         self._checked: set[str] = set()
 
     def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None, Fetch | None]]:
-        """Send another process the trial's paths, not what was read of it."""
+        """Send another process the trial's paths, not its loaded data."""
         return Recording, (self.folder, self.sync_file, self._fetch)
 
     @cached_property

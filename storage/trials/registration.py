@@ -158,7 +158,7 @@ def _is_stamp(data: bytes, ending: str) -> bool:
 
 
 def _stamp_problem(data: bytes, path: Path) -> str | None:
-    """Return what is wrong with a stamp; both kinds contain the digest of the stamped file."""
+    """Return the fault of a stamp; both kinds contain the digest of the stamped file."""
     if bytes.fromhex(sha256(path)) in data:
         return None
     return f"is not of {path}: it does not contain the SHA-256 of that file"
@@ -206,7 +206,7 @@ def _registration_of(session: Path) -> str | None:
 
 
 def _problem(campaign: Campaign, place: int, path: Path, before: str | None) -> str | None:
-    """Return what is wrong with a registration's file; None where it is as it was written."""
+    """Return the fault of a registration's file; None if it is unchanged."""
     found = Registration.load(path)
     data = found.to_json()
     if json_text(data).encode() != path.read_bytes():

@@ -35,7 +35,7 @@ class Onsets:
     gross_ns: int | None = None
 
     def problem(self) -> str | None:
-        """Say why these cannot be the onsets of a trial; None if they can."""
+        """Return why these cannot be the onsets of a trial; None if they can."""
         if self.gross_ns is None:
             return None
         if self.incipient_ns is None:

@@ -50,7 +50,7 @@ __all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError"]
 FORMAT = 2
 """Format that this version writes; `storage.trials.migrate` brings older ones forward."""
 SYNC = "sync"
-"""Step whose results hold clocks that were fitted again; recordings read them there."""
+"""Step whose results hold refitted clocks; recordings read them there."""
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json",
     "protocol.yaml",
@@ -112,7 +112,7 @@ class QuarantineEntry(TypedDict):
     """An attempt in quarantine.
 
     Attributes:
-        cause: ``interrupted``, or what is wrong with it.
+        cause: ``interrupted``, or its fault.
         folder: its name in the quarantine.
         attempt: number of the attempt at the trial, of a complete one.
         forgiven: who reset the attempt; asked: who requested the retake.

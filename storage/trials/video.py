@@ -92,7 +92,7 @@ class VideoWriter:
             self.frames += 1
 
     def close(self) -> None:
-        """Encode what is queued, close the file, and raise what an encoder raised."""
+        """Encode queued frames, close the file, and re-raise an encoder's error."""
         if self._closed:
             return
         self._closed = True
@@ -108,7 +108,7 @@ class VideoWriter:
             raise RuntimeError(f"the video encoder failed: {self._error}") from self._error
 
     def _encode(self, encoder: Any, waiting: queue.Queue[tuple[int, U8] | None]) -> None:
-        """One thread: encode what is waiting, and write each frame when its turn has come."""
+        """Encode queued frames in one thread, and write each frame in its turn."""
         while (item := waiting.get()) is not None:
             if self._error is not None:
                 continue  # drain, so that the writer is never blocked by a dead encoder

@@ -223,7 +223,7 @@ class TrialWriter:
         finish_folder(self.folder, cause)
 
     def abandon(self) -> None:
-        """Close what is open and leave the folder as it is, for quarantine."""
+        """Close open files and leave the folder unchanged, for quarantine."""
         if not self._sealed:
             self._sealed = True
             try:
@@ -236,7 +236,7 @@ class TrialWriter:
                         camera.abandon()
 
     def discard(self) -> None:
-        """Close what is open and delete it; for motions that are no trial."""
+        """Close open files and delete the folder; for motions that are no trial."""
         self.abandon()
         shutil.rmtree(self.folder)
 
