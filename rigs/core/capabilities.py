@@ -375,7 +375,7 @@ class Gripper(Protocol):
         """Stop the fingers where they are; safe to call at any time and more than once."""
 
     def close(self) -> None:
-        """Close the connection; the fingers stay, and hold what they hold."""
+        """Close the connection; the fingers stay, and keep their grip."""
 
 
 @runtime_checkable
@@ -437,7 +437,7 @@ class Truth(TrueOnsets):
         simulated: true.
         level: of physics.
         threshold_mm: displacement of a marker that counts as slip.
-        from_hold: the same from the start of the hold, where that was wanted.
+        from_hold: the same from the start of the hold, if requested.
         clocks: pairs of a device's clock and the sync box's, ns, by device; absent from
             a simulation server.
     """

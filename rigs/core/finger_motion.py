@@ -132,7 +132,7 @@ class FingerMotion:
         return None
 
     def restart(self, now_ns: int) -> None:
-        """Count times from `now_ns` on; the fingers go on with what they do."""
+        """Count times from `now_ns` on; the fingers continue their motion."""
         with self._lock:
             last = self._legs[-1]
             self._legs = [

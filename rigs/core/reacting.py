@@ -135,7 +135,7 @@ class SafeState(StaysInContact):
 
     Attributes:
         cause: why slip could not be detected.
-        reaction: what was done.
+        reaction: the reaction carried out.
     """
 
     def __init__(self, cause: str, kind: str, reaction: Reaction) -> None:

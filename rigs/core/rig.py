@@ -357,7 +357,7 @@ class Rig:
         return 0.0 if self._fingers_mm is None else max(self.grip_opening_mm - self._fingers_mm, 0)
 
     def _watch_forces(self, turns: bool = False, leaving: bool = False) -> ForceWatch:
-        """Read forces from now on, and hold them against the limit.
+        """Read forces from now on, and compare them with the limit.
 
         Args:
             turns: the tool turns, so that its weight changes the readings of a sensor whose load
@@ -736,7 +736,7 @@ class Rig:
                 raise StopRequested
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
-        """Let time pass; forces and the arm's pose are looked at after it, and meanwhile."""
+        """Let time pass; forces and the arm's pose are checked meanwhile and at its end."""
         resting = self._resting if self._often else None
         if self._forces is None and self._motion is None and resting is None:
             self.clock.wait(seconds)

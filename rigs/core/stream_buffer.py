@@ -49,7 +49,7 @@ class StreamBuffer:
             self._running = True
 
     def end(self) -> None:
-        """End a run: what came can still be read, what comes is dropped."""
+        """End a run: received parts can still be read, new ones are dropped."""
         with self._lock:
             self._running = False
 
@@ -76,7 +76,7 @@ class StreamBuffer:
             if stream in self._last and int(times[-1]) == last:
                 if self._stall.waited_s(self._count) > self._stall_s:
                     raise ValueError(f"its clock has stopped at {last}")
-            else:  # data whose times stay the same are no life
+            else:  # data with constant times do not count as activity
                 self._count += 1
             self._last[stream] = int(times[-1])
 

@@ -144,7 +144,7 @@ class MockForceSensor:
             self._world.drop_wrench(self._name)
 
     def stop(self) -> None:
-        """Stop streaming; what was sampled up to the last whole step can still be read."""
+        """Stop streaming; samples up to the last whole step can still be read."""
         if self._loads is not None and self._until_ns is None:
             self._world.advance()
             self._world.drop_wrench(self._name)

@@ -89,7 +89,7 @@ BLOCK = np.dtype(
             # the search for the slip (`rigs.scene.slip.slip_step`)
             "bend ahead aside rest_x rest_y soft_x soft_y quick lag grip grip_slope far",
             # for lanes that are prepared one by one: kind, share of the drive until the tip lets
-            # go, how long it slides then (s), what it takes from the plate by letting go
+            # go, how long it slides then (s), the force that the plate loses by its letting go
             "rare held slides_s kick",
         )
         for name in names.split()
@@ -381,7 +381,7 @@ def settle(w, law, start_s, h, decay):  # type: ignore[no-untyped-def]
         w.slipped[j] = start_s + share * h if share >= 0.0 else w.slipped[j]
         part = h * (1.0 - max(share, 0.0))
         speed, earlier = slip / part if slip > 0.0 else 0.0, w.speed[j]
-        # a tip that just let go, or slows down fast, is not as it was a step ago
+        # a tip that just let go, or slows down fast, differs from its state a step ago
         steady = slip > 0.0 and share < 0.0 and is_steady(earlier, speed)
         w.earlier[j] = earlier if steady and w.slid_s[j] == h else -1.0
         w.slid_s[j], w.speed[j] = h if steady else 0.0, speed
@@ -393,7 +393,7 @@ def settle(w, law, start_s, h, decay):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _slide(w, field, law, first, count, step, rare):  # type: ignore[no-untyped-def]
-    """Let the tips slide whose `end_mode` says so; `rare`: how many are prepared one by one."""
+    """Slide the tips with `end_mode` sliding; `rare`: how many are prepared one by one."""
     rough = field.shape[1] > 1
     if rare > 0:
         for j in range(count):
@@ -410,7 +410,7 @@ def _slide(w, field, law, first, count, step, rare):  # type: ignore[no-untyped-
         again = 0
         for j in range(count):
             if w.seeks[j] > 0.0:
-                w.seeks[j] = -1.0  # no more passes for what is not found by now
+                w.seeks[j] = -1.0  # no more passes for slips not found by now
             elif w.rare[j] == _LETS_GO and w.seeks[j] == 0.0:
                 again += _speed_at_end(w, field, law, first + j, j)
         if again > 0:

@@ -11,7 +11,7 @@ import numpy as np
 from sliplab.storage.kernels import njit
 
 SHIFTS = 128
-"""A noise tile is this much wider than anything drawn from it: there are so many shifts."""
+"""Margin of a noise tile over anything drawn from it: the number of possible shifts."""
 MARGIN_PX = 6.0
 """Margin of the noise beyond a disc's rim."""
 HALF_DIAGONAL = 0.7072

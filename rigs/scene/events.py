@@ -81,7 +81,7 @@ Events = tuple[I64, U16, U16, U8]
 
 @dataclass(frozen=True)
 class EventOptics:
-    """The camera and what it sees; fields as in `rigs.mock.settings.EventCamera`."""
+    """The camera and its scene; fields as in `rigs.mock.settings.EventCamera`."""
 
     width: int = 640
     height: int = 480

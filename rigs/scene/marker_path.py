@@ -362,7 +362,7 @@ def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: igno
 def cut_block(first, last, block, zero, reach, since, until, curve, spread, segments, n):  # type: ignore[no-untyped-def]
     """Cut a block into segments on which the marker does not move far.
 
-    What is done follows from the block's own rows alone.
+    The result depends on the block's own rows alone.
 
     Args:
         first, last: the block's first and last row.

@@ -13,7 +13,7 @@ which is Newton's with the curvature, is nearly always enough. What is not good 
 a second tile for more of them. What is not monotone, and what never gets good, is left to
 `crossings`, one pixel at a time.
 
-What is done on a segment follows from the rows of its block alone, to the bit, and pixels do not
+The result on a segment depends on the rows of its block alone, to the bit, and pixels do not
 wait for each other, so neither the cut of a trial into calls nor the order of pixels matters.
 """
 
@@ -150,7 +150,7 @@ _TICK = float(1 << 25)  # a nanosecond in a packed event
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def begin_segment(fire, n, segment):  # type: ignore[no-untyped-def]
-    """Set up what is the same for all thresholds: limits, and slopes at both ends."""
+    """Set up the values common to all thresholds: limits, and slopes at both ends."""
     a, b = segment.begin, segment.end
     for j in range(n):
         fire[R_LOW + j], fire[R_HIGH + j], fire[R_FINE + j] = a, b, segment.fine
@@ -225,7 +225,7 @@ def pack_steps(n, since, inverse, curve, steps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
-    """Find the step in which each time lies, and fetch what is known of it."""
+    """Find the step in which each time lies, and fetch its coefficients."""
     for j in range(n):
         k, t = np.uint64(roots[R_STEP + j]), roots[R_TIME + j]
         while t > until[k]:

@@ -217,7 +217,7 @@ def advance_free(  # type: ignore[no-untyped-def]
             height = motion[0] + h * share * (before + 0.5 * share * (held - before))
             if ns < 1 or ns == step_ns or height <= stop:
                 break
-            # the step ends where the first tip lets go, and what is left of it is another
+            # the step ends where the first tip lets go, and its rest is another
             at = _between(blocks[0], motion[0], sensor[k], share)
             part = ns * 1e-9
             decay, gain = relaxing(part, law.relaxation_s)

@@ -26,7 +26,7 @@ from sliplab.storage.kernels import njit
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""
 _MARCH_MM = KNOT_MM / 8.0
-"""Distance between the places at which the balance of a tip is looked at one by one."""
+"""Distance between the places at which the balance of a tip is evaluated one by one."""
 _MOST_PLACES = 4096.0
 _STEADY = 1.25
 """Ratio of successive speeds up to which a line or a parabola through both predicts the next."""
@@ -322,7 +322,7 @@ def is_steady(earlier, speed):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # type: ignore[no-untyped-def]
-    """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds predict nothing, mm/s.
+    """Speed of a tip that slid for `slid_s` seconds and without a usable speed history, mm/s.
 
     With x = (|f| / cone - 1) / strengthening the speed is weak (e^x - 1), and x' = a - b (e^x - 1)
     while rates are constant: a linear equation for e^-x, solved exactly, because a tip that lets go

@@ -36,7 +36,7 @@ NO_ID = (1 << 64) - 1
 GIGE_IDS = 65_535
 """Block ids of a GigE camera: 1 to 65,535, then 1 again; more than that, where it extends them."""
 FASTER, SPARE = 1.5, 100
-"""Largest gap in the ids: so many times the frames that fit into the time, and so many more."""
+"""Largest gap in the ids: a factor of the frames that fit into the time, and an offset."""
 MOST_EXPOSURES = 1000
 """Exposure ends that wait for their frame."""
 
