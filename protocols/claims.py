@@ -159,7 +159,7 @@ class Claim(StrictModel):
 
     @property
     def value(self) -> float:
-        """What is claimed, in the figure's own unit: percent or ms."""
+        """Claimed value, in the figure's own unit: percent or ms."""
         said = next(v for v in (self.within, self.at_least, self.at_most) if v is not None)
         return float(said) * FIGURES[self.figure].scale
 

@@ -61,7 +61,7 @@ class FilePattern:
     """A pattern of file names below a folder.
 
     Attributes:
-        text: as it was written.
+        text: as written.
         fields: names of what it catches.
     """
 

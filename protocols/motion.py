@@ -369,7 +369,7 @@ def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> I
 
 
 def _check_nuisances(nuisances: Nuisances, levels: Levels, limits: Any) -> Iterator[KeyedError]:
-    """Hold names and the arm's speeds against what is known, and the limits; see `path_fault`."""
+    """Check names and the arm's speeds against known names and the limits; see `path_fault`."""
     base, known = "collection.nuisances", nuisances.known
     for name, where in levels(nuisances.apply, f"{base}.apply"):
         nuisances.check_name(name, where)

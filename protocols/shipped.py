@@ -45,7 +45,7 @@ def protocol_path(given: Path) -> Path:
 
 
 def neighbours(given: Path, most: int = 1000) -> list[str]:
-    """Return the names in a path's folder, at most so many, for the nearest to a missing one."""
+    """Return up to `most` names in a path's folder, to suggest the nearest to a missing one."""
     try:
         with os.scandir(given.parent) as entries:
             return sorted(each.name for each in islice(entries, most))
