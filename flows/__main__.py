@@ -33,7 +33,7 @@ def main() -> None:
         try:
             with guarded():
                 code = _run()
-        except OutputLost as error:  # of what was left to be written
+        except OutputLost as error:  # of output still to be written
             code = _fail(str(error), 1)
     except KeyboardInterrupt:
         code = _fail("interrupted", 130)
@@ -41,7 +41,7 @@ def main() -> None:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
     if own:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: _end(code))  # all has been said
+            signal.signal(number, lambda *_: _end(code))  # all messages are printed
     orchestration = sys.modules.get("sliplab.flows.running.orchestration")
     if orchestration is not None and not orchestration.close():
         _end(code)
@@ -64,7 +64,7 @@ def _end(code: int) -> None:
 
 
 def _end_on_signals() -> None:
-    """End the program at once on a signal while it has not begun, or has said all it had to say."""
+    """End the program at once on a signal before it has begun or after its last message."""
 
     def end(*_: object) -> None:
         stopping = sys.modules.get("sliplab.flows.running.stopping")
@@ -99,7 +99,7 @@ def _run() -> int:
 
 
 def _ignore_signals() -> None:
-    """Ignore signals until `stopping.signals` ends: that the user stopped it is being said."""
+    """Ignore signals until `stopping.signals` ends, while the message about the stop is printed."""
     from sliplab.flows.running import stopping
 
     if threading.current_thread() is threading.main_thread():
@@ -108,7 +108,7 @@ def _ignore_signals() -> None:
 
 
 def _explain(error: Exception) -> int:
-    """Say what ended the command; returns the exit code."""
+    """Report the error that ended the command; return the exit code."""
     from sliplab.flows.cli import errors
     from sliplab.flows.running import stopping
     from sliplab.protocols.errors import InputError
@@ -120,7 +120,7 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    """Say in one line what ended the program before, or after, it could say more."""
+    """Report in one line an error before or after normal error reporting is available."""
     said = message if code == 130 else f"error: {message}"
     with suppress(OSError):
         os.write(2, f"{said}\n".encode(errors="backslashreplace"))

@@ -87,7 +87,7 @@ def evaluate_classes_flow(argument: Opaque[tuple[ClassJob, Cluster | None]]) -> 
 
 @task(name="scores of classes", cache_policy=NO_CACHE, persist_result=False)
 def score_classes(argument: Opaque[tuple[ClassJob, dict[str, SampleSet]]]) -> None:
-    """Windows, recordings and classes, kept as one result."""
+    """Windows, recordings and classes, stored as one result."""
     evaluate_classes(*argument.content)
 
 

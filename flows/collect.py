@@ -34,7 +34,7 @@ class CollectResult(CampaignCounts):
 
     Attributes:
         taken: attempts; retaken: those of a trial that an attempt failed of before.
-        left_out: trials that the request did not want yet.
+        left_out: trials that the request does not include yet.
         ended: why the collection ended.
     """
 
@@ -101,7 +101,7 @@ def collect(run_request: RunRequest) -> CollectResult:
     """
     store = Store.create(run_request.store)
     refuse_paused(store)
-    if control.open_requests(store):  # whoever asked was killed before it was done
+    if control.open_requests(store):  # the requester was killed before it carried them out
         with store_lock(store):
             carry_out(store)
     if run_request.due_trials(store.campaign(run_request.campaign)):

@@ -93,9 +93,9 @@ class DetectSummary(DetectNumbers):
     """Summary of a detection.
 
     Attributes:
-        trial, protocol: of the motion; None where the arm stood.
+        trial, protocol: of the motion; None where the arm did not move.
         virtual_time: the rig's clock is not the real one.
-        interrupted: somebody ended it.
+        interrupted: the user ended it.
     """
 
     simulated: bool
@@ -116,20 +116,20 @@ def detect(
     build: Callable[[RigFile], Rig] = build_rig,
     show: bool = True,
 ) -> DetectSummary:
-    """Run a detection to its end; return a summary, with ``interrupted`` if somebody ended it.
+    """Run a detection to its end; return a summary, with ``interrupted`` if the user ended it.
 
     Args:
         out: a file of JSON lines, one a decision, that is written while it runs.
-        counting: the network, instead of the model's by the event-driven kernels in one thread:
-            in a process of its own where the request has a safe state.
+        counting: the network; by default the model's with the event-driven kernels in one thread,
+            in a separate process where the request has a safe state.
         build: makes the rig.
         show: show decisions on the terminal.
 
     Raises:
         InputError: there is no folder for `out`.
         RigError: a device failed; the arm is stopped.
-        SafeState: slip could not be detected any more; the arm stays in contact.
-        StopRequested, KeyboardInterrupt: somebody stopped a motion.
+        SafeState: slip could no longer be detected; the arm stays in contact.
+        StopRequested, KeyboardInterrupt: the user stopped a motion.
     """
     training.limit_threads(1)
     with ExitStack() as done:
@@ -186,7 +186,7 @@ def _detector(request: DetectRequest, rig: Rig, counting: Counting) -> LiveDetec
 
 
 def _listen(request: DetectRequest, rig: Rig, sink: DetectSink) -> bool:
-    """Listen without moving; return True if somebody ended it."""
+    """Listen without moving; return True if the user ended it."""
     try:
         rig.listen(FOREVER_S if request.seconds is None else request.seconds, sink, RATE_HZ)
     except (StopRequested, KeyboardInterrupt):
@@ -241,7 +241,7 @@ def _short_turns() -> Iterator[None]:
 
 @contextmanager
 def _counting(request: DetectRequest) -> Iterator[Counting]:
-    """Yield the model's network; in a process of its own where there is a safe state to go to."""
+    """Yield the model's network, in a separate process if the request has a safe state."""
     limit_ns = None if request.timeouts is None else request.timeouts.decision_ns
     if limit_ns is None:
         yield counting_of(request.fitted)

@@ -100,5 +100,5 @@ def evaluate_flow(argument: Opaque[tuple[Job, Cluster | None]]) -> None:
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
 def score(argument: Opaque[tuple[Job, SampleSet, SampleSet]]) -> None:
-    """Windows, detections and label errors, kept as one result."""
+    """Windows, detections and label errors, stored as one result."""
     score_store(*argument.content)

@@ -1,10 +1,10 @@
 """`sliplab holdout`: figures of a campaign that is used for no selection, once per release.
 
 Every change of the program is evaluated on a study's test trials, so the design slowly overfits to
-them. The trials here have a seed
-and a skin of the simulated rig that stand nowhere else. The study's own network and detection
-settings are evaluated on them, as they are, once with each version of the program; each time is in
-the ledger next to the figures, so that a reader sees how often somebody looked.
+them. The trials here have a seed and a skin of the simulated rig that are used nowhere else. The
+study's own network and detection settings are evaluated on them unchanged, once with each version
+of the program. The ledger next to the figures lists each evaluation, so that a reader sees their
+number.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class HoldoutDone(StepDone):
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The figures of the campaign, and where they are kept.
+    """The figures of the campaign, and the file that stores them.
 
     Attributes:
         done: 1 where it was evaluated now, else 0.
@@ -74,7 +74,7 @@ def measure_holdout(
     work, current = Holdout(store, campaigns, trials, seeds), version("sliplab")
 
     def measure() -> HoldoutResult:
-        """Take what is missing of the trials, label and judge them."""
+        """Take the missing trials, label and judge them."""
         return work.score(*retake([holdout_request(work)]))
 
     sweep = task_sweep([Task(NAME, work.key, measure)], work.results)

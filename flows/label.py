@@ -111,7 +111,7 @@ def check_required(run_request: RunRequest) -> bool:
 
 
 def check_labels(run_request: RunRequest, trials: int = CHECKED_TRIALS) -> StepResult:
-    """Take, label and compare what is missing; the figures are kept in the study's store."""
+    """Take, label and compare missing trials; save the figures in the study's store."""
     from sliplab.flows.collect import collect  # a command that only labels needs no rig
 
     video = video_request(run_request, trials)

@@ -29,7 +29,7 @@ from sliplab.storage.trials.store import Store
 def train_on_markers(
     store: Store, campaigns: list[Collected], reviewed: bool = False
 ) -> StepResult:
-    """Train what is missing or stale; see `train.train`. It takes seconds on this machine.
+    """Train missing or stale networks; see `train.train`. It takes seconds on this machine.
 
     Raises:
         StoreError: labels or samples are missing.

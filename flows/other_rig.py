@@ -64,7 +64,7 @@ def _merge(data: dict[str, Any], other: Mapping[str, Any]) -> None:
 
 
 def retake(run_requests: Sequence[RunRequest]) -> tuple[Store, list[Collected]]:
-    """Take what is missing of the trials and label them; return the store and its campaigns."""
+    """Take the missing trials and label them; return the store and its campaigns."""
     store = Store.create(run_requests[0].store)
     for run_request in run_requests:
         collect(run_request)

@@ -96,7 +96,7 @@ def _evaluated(
     """Write the page, and return the numbers, of campaigns with a spiking network.
 
     Args:
-        without_frames: what is said besides where there are no frames.
+        without_frames: summary of a study without frames; adds its sections to the page.
     """
     folder = report_folder(store)
     sources = read_sources(store, campaigns, planned, step_seconds(store))

@@ -74,7 +74,7 @@ def _changed(model: Any, values: Mapping[str, Any]) -> Any:
 
 
 def with_true_times(rig: RigFile, with_faults: bool = False) -> RigFile:
-    """Return the rig with perfect clocks and, if not said otherwise, no faults."""
+    """Return the rig with perfect clocks and, by default, no faults."""
     return changed(rig, {"clocks": PERFECT, "faults": rig.scene.faults if with_faults else ()})
 
 
@@ -165,7 +165,7 @@ def _ready(rig: RigFile, plan: Plan, trial: Trial) -> Rig:
     """Return the rig with what the trial needs mounted, as a session does it."""
     built = build_rig(rig)
     built.connect()
-    built.frames.set_region(_SMALL_PX, _SMALL_PX)  # it is asked for frames and takes none
+    built.frames.set_region(_SMALL_PX, _SMALL_PX)  # frames are requested and none is taken
     for task in plan.changeovers(None, trial):
         built.operator.ask(task.request, task.prompt, task.expected)
     return built

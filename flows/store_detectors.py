@@ -99,7 +99,7 @@ def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
     """Return detectors by their names: a model with the rule, or all that a store has.
 
     Args:
-        names: of those that are wanted; left out, all.
+        names: of the requested detectors; by default all.
 
     Raises:
         InputError: there is none.

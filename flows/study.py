@@ -53,7 +53,7 @@ class Outcome:
 def study(
     run_requests: list[RunRequest], check: int = 0, more: Sequence[Search] = (), holdout: int = 0
 ) -> Outcome:
-    """Run what is missing or stale, step by step; a step with nothing to do says so.
+    """Run missing or stale steps in order; a step with nothing to do reports that.
 
     Args:
         check: trials whose labels are checked with video, where the rig draws none.

@@ -51,7 +51,7 @@ class SyncDone(StepResult):
     """Numbers of what `sync` did, and each campaign's clocks.
 
     Attributes:
-        changed: trials whose clocks are others than those of the record.
+        changed: trials whose clocks differ from those of the record.
         page: path of the page.
     """
 
@@ -62,7 +62,7 @@ class SyncDone(StepResult):
 
 
 def sync(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> SyncDone:
-    """Fit what is stale, and write the page if anything on it has changed.
+    """Fit stale clocks, and write the page if anything on it has changed.
 
     Raises:
         StoreError: nothing but imported recordings, which have no sync pulses.

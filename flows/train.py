@@ -133,7 +133,7 @@ def train(
     cluster: Cluster | None = None,
     reviewed: bool = False,
 ) -> StepResult:
-    """Train what is missing or stale.
+    """Train missing or stale networks.
 
     Args:
         cluster: what makes the samples; this machine trains.

@@ -1,7 +1,7 @@
 """Adapter: what a foreign data set consists of, as data.
 
 An adapter says which files are the streams of a trial, which names and columns are factors, where
-the labels stand, and how trials are split. `sliplab import --adapter` reads by it; its text stays
+the labels are, and how trials are split. `sliplab import --adapter` reads by it; its text stays
 with the campaign in place of a protocol, and the analysis takes split and settings from it.
 """
 

@@ -150,7 +150,7 @@ class Claim(StrictModel):
 
     @property
     def kind(self) -> Kind:
-        """Which of the three is said; a difference of at least a size is `apart`."""
+        """Which of the three bounds is given; a difference of at least a size is `apart`."""
         if self.within is not None:
             return "within"
         if self.between is not None and self.at_least is not None:
@@ -159,7 +159,7 @@ class Claim(StrictModel):
 
     @property
     def value(self) -> float:
-        """What is claimed, in the figure's own unit: percent or ms."""
+        """Claimed value, in the figure's own unit: percent or ms."""
         said = next(v for v in (self.within, self.at_least, self.at_most) if v is not None)
         return float(said) * FIGURES[self.figure].scale
 

@@ -25,7 +25,7 @@ FULL_TURN = 360
 
 
 def check_consistency(protocol: Protocol) -> None:
-    """Hold a protocol that a person gives against the rules over several keys.
+    """Check a protocol against the rules that concern several keys.
 
     Raises:
         KeyedError: the rules that are broken.

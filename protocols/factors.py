@@ -158,7 +158,7 @@ def in_canonical_unit(level: Any, symbol: object) -> Any:
         symbol: the factor's unit, as a file gives it.
 
     Returns:
-        the number; a level that is none, or has no unit to be read in, as it is.
+        the number; a level that is no number, or has no unit, unchanged.
 
     Raises:
         ValueError: the unit is of another dimension.
@@ -309,7 +309,7 @@ class Context(Factor):
 
 
 def unknown_factor(name: str, factors: Iterable[str]) -> str:
-    """The message for a `name` that is none of the defined `factors`."""
+    """Return the message for a `name` that is not one of the defined `factors`."""
     foreign = foreign_character(name)
     hint = f" (holds {foreign})" if foreign else ""
     names = list(factors)

@@ -1,10 +1,10 @@
 """Patterns of file names that catch pieces of them, and texts that are put together from these.
 
 A pattern is a path with ``/``: ``**/{part:train|test}/*_{object:number}.npy``. In a folder or file
-name ``*`` stands for any characters and ``?`` for one; a folder ``**`` stands for any folders, or
-none. ``{name}`` catches any characters, ``{name:number}`` a whole number, which has no digit beside
-it, and ``{name:one|two}`` one of these words. Where several matches are possible, whatever stands
-first takes the most it can: in ``*{object:number}*`` the object is the last number.
+name ``*`` matches any characters and ``?`` one; a folder ``**`` matches any folders, or none.
+``{name}`` catches any characters, ``{name:number}`` a whole number without adjacent digits, and
+``{name:one|two}`` one of these words. Where several matches are possible, earlier parts are greedy:
+in ``*{object:number}*`` the object is the last number.
 
 Names are matched here and not by regular expressions: those of a file from elsewhere could take
 for ever. The time taken is bounded by the lengths of pattern and name.
@@ -61,7 +61,7 @@ class FilePattern:
     """A pattern of file names below a folder.
 
     Attributes:
-        text: as it was written.
+        text: as written.
         fields: names of what it catches.
     """
 

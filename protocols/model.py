@@ -60,7 +60,7 @@ COLUMNS = (
     "split",
     "motion_s",
 )
-"""Columns that tables of trials have beside the conditions."""
+"""Columns of tables of trials in addition to the conditions."""
 
 
 def _check_names(factors: Iterable[str], section: str) -> None:

@@ -130,9 +130,9 @@ def build_program(collection: Collection, condition: Condition) -> Program:
 def _disturbed_hold(
     seconds: float, at: Position, nuisances: tuple[AnyNuisance, ...]
 ) -> Iterator[Step]:
-    """The recorded hold, in which the arm makes the motions of nuisances and comes back each time.
+    """The recorded hold, in which the arm makes the motions of nuisances and returns each time.
 
-    It stands still for as long as without them; the last `QUIET_S` seconds are undisturbed.
+    It rests as long as without nuisances; the last `QUIET_S` seconds are undisturbed.
     """
     due = sorted(
         (number * float(each.every), order)
@@ -369,7 +369,7 @@ def _check_twist(phase: TwistPhase, base: str, levels: Levels, limits: Any) -> I
 
 
 def _check_nuisances(nuisances: Nuisances, levels: Levels, limits: Any) -> Iterator[KeyedError]:
-    """Hold names and the arm's speeds against what is known, and the limits; see `path_fault`."""
+    """Check names and the arm's speeds against known names and the limits; see `path_fault`."""
     base, known = "collection.nuisances", nuisances.known
     for name, where in levels(nuisances.apply, f"{base}.apply"):
         nuisances.check_name(name, where)

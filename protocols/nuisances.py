@@ -1,4 +1,4 @@
-"""Nuisances: what looks like slip and is none, as named elements of a protocol.
+"""Nuisances: disturbances that look like slip, as named elements of a protocol.
 
     collection:
       factors:
@@ -7,7 +7,7 @@
       nuisances: {apply: $nuisance, strength: $strength}
 
 A simulated rig produces each by physics (`sliplab.rigs.mock.nuisances`). On a real rig the arm
-makes its own motions, which lie in the hold, and a person is asked for the rest.
+makes its own motions, which are in the hold, and the operator is asked to make the rest.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
 NONE, MIX = "none", "mix"
 """Levels that apply no nuisance, and all of them at once."""
 QUIET_S = 2.0
-"""End of the hold in which the arm stands still: labels count from there."""
+"""End of the hold in which the arm is at rest: labels count from there."""
 
 
 class _Nuisance(StrictModel):
@@ -52,7 +52,7 @@ class _Nuisance(StrictModel):
 
     @property
     def request(self) -> str:
-        """What a person is asked to do at a real rig; empty if the arm does it."""
+        """Instruction for the operator of a real rig; empty if the arm does it."""
         return ""
 
     def scaled(self, share: Decimal) -> Any:
@@ -326,7 +326,7 @@ class TrialNuisances:
 
 
 def requests(elements: tuple[AnyNuisance, ...]) -> str:
-    """What a person is asked for; empty if the arm does it all."""
+    """Instruction for the operator; empty if the arm does it all."""
     return "; ".join(each.request for each in elements if each.request)
 
 

@@ -278,7 +278,7 @@ class Plan:
 
     @cached_property
     def collection_hash(self) -> str:
-        """Hash of all that decides what is collected, the levels taken left out.
+        """Hash of all settings that determine the trials, except the levels taken.
 
         Levels, repetitions and reference trials only add trials; the ids say which.
         """

@@ -59,16 +59,16 @@ PAPER = (
     Value("detection.choose", "protocol", "published", "source of sliding mean and lead"),
     Value("detection.stride_ms", None, "published", "stride of the windows (ms)"),
 )
-"""Overlapping windows would have been said; mirroring, layers' sizes, loss and rate are not."""
+"""The paper mentions no overlapping windows; it gives no mirroring, layer sizes, loss or rate."""
 
 COMPARED = ("network", "training", "detection")
 """Sections that an additional network takes from a preset; it shares the others."""
 
 
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
-    """`analysis:` with the values of its preset for the keys that it does not say itself.
+    """Return `analysis:` with the preset's values for the keys that it does not set itself.
 
-    A section that is not a mapping stays unchanged, for whoever checks it.
+    A section that is not a mapping stays unchanged, for the later check.
     """
     found = dict(data)
     for each in PAPER if data.get("preset") == "paper" else ():

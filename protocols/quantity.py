@@ -2,7 +2,7 @@
 
 A protocol's numbers become trial ids, so they must be the same on every machine and for every
 way of writing them: ``2.4 mm``, ``2.40 mm`` and ``0.24 cm`` are one level. They are therefore
-kept as `decimal.Decimal` in the canonical unit of their kind, and never pass through a float.
+stored as `decimal.Decimal` in the canonical unit of their kind, and never pass through a float.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PATTERN = re.compile(rf"\s*{_DIGITS}\s*([A-Za-z%/][A-Za-z0-9%/]*)\s*")
 _DASHES = "\u2010\u2011\u2012\u2013\u2014\u2212\ufe63"
 _PLAIN = str.maketrans(dict.fromkeys(_DASHES, "-") | {"\u03bc": "u"})
 _LARGEST = Decimal("1e9")
-# by canonical unit, far beyond any rig: what is larger was meant in another unit, or not at all
+# by canonical unit, far beyond any rig: a larger value is a mistake of unit, or a typing error
 _SIZES = {
     unit: Decimal(size)
     for unit, size in {

@@ -1,6 +1,6 @@
 """Plan of a campaign that was recorded elsewhere: its trials, conditions and split.
 
-It stands where the plan of a protocol does. Its trials are those that were imported; nothing is
+It takes the place of the plan of a protocol. Its trials are those that were imported; nothing is
 planned beyond them. The split is a function of the adapter and the trials' own names and fields.
 """
 
@@ -24,11 +24,11 @@ _SCALE = float(1 << 63)
 
 @dataclass(frozen=True)
 class RecordedTrial:
-    """What the split needs to know of a trial.
+    """Properties of a trial that the split needs.
 
     Attributes:
         condition: levels by factor as text with unit: ``{"speed": "0.6 mm/s"}``.
-        fields: everything that file names and tables said of it, by name.
+        fields: everything that file names and tables state about it, by name.
         label: the class by which it is spread over the split; None for a trial of slip.
         seconds: length of its recording.
         classes: all classes that it shows.
@@ -142,9 +142,9 @@ class RecordedPlan:
 def split_recorded(adapter: Adapter, trials: Sequence[RecordedTrial], file: str) -> dict[str, str]:
     """Return the part of each trial by id: ``train``, ``validation`` or ``test``.
 
-    Trials that stand together are ranked by a hash inside their stratum: the class, or the
-    condition; of trials that stay together by a field there is one stratum. The place of rank r of
-    n is (r + u) / n, with u a hash of the stratum, so that shares come out as stated.
+    Trials are ranked by a hash inside their stratum: the class, or the condition. Trials that
+    stay together by a field form one stratum. The place of rank r of n is (r + u) / n, with u a
+    hash of the stratum, so that shares come out as stated.
 
     Raises:
         InputError: a field is missing, or its value is no part.

@@ -84,7 +84,7 @@ class Windows(StrictModel):
 
     @property
     def polarities(self) -> int:
-        """1, or 2 when both polarities are kept apart."""
+        """1, or 2 when both polarities are separate."""
         return 2 if self.polarity == "both" else 1
 
     @property
@@ -309,7 +309,7 @@ class AnalysisSettings(StrictModel):
         for name, part, wanted in changes:
             left = {key: wanted[key] for key in wanted.keys() - part.model_fields_set}
             found = part.model_copy(update=left)
-            found.model_fields_set.difference_update(left)  # nobody said them: see `rule_for`
+            found.model_fields_set.difference_update(left)  # the user did not set them: `rule_for`
             object.__setattr__(self, name, found)  # frozen for all others
         return self
 
@@ -357,14 +357,14 @@ class AnalysisSettings(StrictModel):
         return AnalysisSettings.model_validate({**data, "preset": self.also, "also": None})
 
     def rule_for(self, outputs_per_class: float, margin: float) -> Detection:
-        """The rule of detection here, in the spikes that another network gives.
+        """Return the rule of detection in units of the spikes that another network gives.
 
-        Gravity trials are evaluated by the network of the kinematic campaign. A margin that is said
+        Gravity trials are evaluated by the network of the kinematic campaign. A margin that is set
         here is a lead by so many spikes of as many neurons as are here.
 
         Args:
             outputs_per_class: of the network; it may have fewer of one class than of another.
-            margin: the lead in its spikes where none is said here.
+            margin: the lead in its spikes where none is set here.
         """
         factor = outputs_per_class / self.network.outputs_per_class
         said = "margin" in self.detection.model_fields_set

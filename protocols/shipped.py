@@ -16,7 +16,7 @@ def shipped_files(folder: Path) -> dict[str, Path]:
 
 
 def find_shipped(given: Path, known: dict[str, Path]) -> Path | None:
-    """The file that a person means: a path, or a bare name among `known`; None for neither.
+    """Return the file named by the user: a path, or a bare name among `known`; None for neither.
 
     A hyphen in the name is an underscore in the file's.
     """
@@ -33,7 +33,7 @@ def shipped_protocols() -> dict[str, Path]:
 
 
 def protocol_path(given: Path) -> Path:
-    """The file that a person means: a path, or the name of a shipped protocol.
+    """Return the file named by the user: a path, or the name of a shipped protocol.
 
     Raises:
         InputError: a bare name that is neither.
@@ -46,7 +46,7 @@ def protocol_path(given: Path) -> Path:
 
 
 def neighbours(given: Path, most: int = 1000) -> list[str]:
-    """Return the names in a path's folder, at most so many, for the nearest to a missing one."""
+    """Return up to `most` names in a path's folder, to suggest the nearest to a missing one."""
     try:
         with os.scandir(given.parent) as entries:
             return sorted(each.name for each in islice(entries, most))

@@ -48,7 +48,7 @@ def is_secret(name: str) -> bool:
 def holds_secret(key: str) -> bool:
     """Return whether a part of a key's path (``devices.arm.password``) is a secret's name.
 
-    A section that is called ``key`` is none: a user's own name, such as of a factor.
+    A section that is called ``key`` is not a secret: a user's own name, such as of a factor.
     """
     *sections, last = re.findall(r"[^.\[\]]+", key) or [""]
     return is_secret(last) or any(is_secret(name) for name in sections if name != "key")

@@ -1,12 +1,12 @@
 """Motion templates: motions written as data, with parameters in the place of numbers.
 
-A template is a YAML file in `templates/`: the phases of a motion, in which ``$name`` stands for a
+A template is a YAML file in `templates/`: the phases of a motion, with ``$name`` in place of a
 parameter. A protocol names it and gives the parameters, each a quantity, a word or a factor:
 
     motion: {template: gravity, depth: 4 mm, distance: 4.2 mm, speed: $speed}
 
-What it stands for is the motion with its phases written out, and no more: ids, hashes and programs
-are those of that motion, and a campaign keeps it written out, so that no later template changes
+It expands to the motion with its phases written out, and nothing else: ids, hashes and programs are
+those of that motion, and a campaign stores the expanded motion, so that no later template changes
 what was collected.
 """
 
@@ -86,7 +86,7 @@ def expand(motion: Any) -> Any:
 
 
 def in_terms_of_template(error: InputError, document: Mapping[str, Any]) -> InputError:
-    """Return an error about a phase of a template as one about the parameter that stands there."""
+    """Return an error about a phase of a template as one about the parameter used there."""
     collection = document.get("collection")
     motion = collection.get("motion") if isinstance(collection, dict) else None
     if not isinstance(motion, dict) or motion.get("template") not in templates():

@@ -84,7 +84,7 @@ _known = _Known()
 
 
 def find_unit(symbol: str) -> Unit | None:
-    """Return the unit of a symbol; packages are asked for one that the table does not have."""
+    """Return the unit of a symbol; packages are searched for one that the table does not have."""
     if symbol not in _known.units:
         load_packages()
     return _known.units.get(symbol)
@@ -129,13 +129,13 @@ def load_packages() -> None:
 
 
 def forget_packages() -> None:
-    """Forget what packages brought, so that they are looked for anew."""
+    """Forget the units of packages, so that they are loaded again."""
     _known.units = {each.symbol: each for each in TABLE}
     _known.faults = None
 
 
 class UnitError(ValueError):
-    """A unit of a package that is none."""
+    """An invalid unit of a package."""
 
 
 def _take(found: Any) -> None:

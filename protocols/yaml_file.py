@@ -147,7 +147,7 @@ def _kind_faults(model: type[BaseModel], data: Mapping[Any, Any]) -> Iterator[Ke
 
 
 _NOTHING: frozenset[Any] = frozenset()
-_NUMBERS: frozenset[Any] = frozenset({int, float})  # decimals have readers of their own
+_NUMBERS: frozenset[Any] = frozenset({int, float})  # decimals are read separately
 
 
 @cache
@@ -329,7 +329,7 @@ class _Builder:
 
 
 _SECRET = "cannot be read as text; quote it"
-"""All that is said of a secret: the parser's own words could hold it."""
+"""Message about a secret; the parser's own message could contain it."""
 
 
 def _unread(tag: str) -> str:
@@ -393,7 +393,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def _at_once(path: str, flags: int) -> int:
-    """Open without waiting for whoever writes into a pipe."""
+    """Open a file without blocking, even if it is a pipe without a writer."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
@@ -566,7 +566,7 @@ class ChosenModel(ABC):
 
 
 def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
-    """Return the faults of `error` as a person needs them: key, value and what is right.
+    """Return the faults of `error` for the user: key, value and what is right.
 
     Unknown keys come first: one that is misspelt is the cause of a missing one, which is left out.
     """
@@ -614,13 +614,13 @@ def _close(model: type[BaseModel], item: Any) -> str | None:
 def _fault(model: type[BaseModel], item: Any) -> KeyedError:
     """Return one fault of pydantic's, with those that were found with it.
 
-    A model that is chosen by what is in it (a device by its driver) is validated by itself, and
-    its faults continue from the key where it stands: `KeyedError` with a ``.`` before the key.
+    A model that is chosen by its content (a device by its driver) is validated separately, and
+    its faults continue from its key: `KeyedError` with a ``.`` before the key.
     """
     value: object | None = item.get("input")
     loc, kind, context = item["loc"], item["type"], item.get("ctx", {})
     key = f".{_key(loc)}" if loc else ""
-    if loc and loc[-1] == "[key]":  # pydantic's word for the name of an entry itself
+    if loc and loc[-1] == "[key]":  # pydantic's placeholder for the name of an entry
         said = re.sub("^Value error, |^[A-Z].* should", "", item["msg"]).strip()
         return KeyedError(f".{_key(loc[:-1])}", None, f"is no right name: {said}")
     if kind == "value_error" and isinstance(context.get("error"), KeyedError):
@@ -714,7 +714,7 @@ class KeyedError(ValueError):
 
     @property
     def faults(self) -> tuple[KeyedError, ...]:
-        """This fault by itself, then each of the others."""
+        """Return this fault without the others, then each of the others."""
         return KeyedError(self.key, self.value, str(self)), *self.more
 
     @property

@@ -263,7 +263,7 @@ def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None
 def _driven_stream(
     name: str, stream: Stream, shown: Loopback | None, arm: Arm, plate: PlateFrame
 ) -> FurtherStream:
-    """Build a further device by its driver; beside the arm, whose controller may measure forces.
+    """Build a further device by its driver; the arm's controller may measure its forces.
 
     Raises:
         RigError: it is missing, or delivers other time stamps than the rig file says.

@@ -1,4 +1,4 @@
-"""Writes measurements into a rig file: comments are preserved, and a copy of the old file is kept.
+"""Writes measurements into a rig file: comments are preserved, and the old file is backed up.
 
 The new text is validated as a rig file before it replaces the old one atomically.
 """

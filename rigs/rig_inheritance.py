@@ -34,7 +34,7 @@ class RigSource:
     text: str
     """The file's own text if it extends nothing, else the merged content as YAML."""
     parts: tuple[tuple[Path, Document], ...]
-    """Each file with its own keys, the one that was asked for first."""
+    """Each file with its own keys, the requested one first."""
 
     def blame(self, key: str) -> Path:
         """Return the file that sets `key`, the first one where none does."""
@@ -98,7 +98,7 @@ def read_rig(path: Path) -> RigSource:
     for _, data in reversed(parts):
         merged = _merge(merged, data)
     faults = [fault for _, data in parts for fault in data.faults]
-    if len(parts) > 1 and not faults:  # what is left out in a list has no form
+    if len(parts) > 1 and not faults:  # items left out in a list have no form
         names = " on ".join(file.name for file, _ in parts)
         text = f"# Merged: {names}\n" + rig_yaml(merged)
     written = {key: each for _, data in reversed(parts) for key, each in data.written.items()}

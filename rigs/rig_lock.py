@@ -1,9 +1,9 @@
 """One program at a time at a real rig: an OS lock for each device that must not be shared.
 
 The locks apply to the whole machine, across users and sessions, because two programs that drive one
-arm are dangerous whoever runs them. The lock files are therefore in one shared folder. A lock ends
-with its holder's process. It does not exclude another machine that can reach the same arm; the
-arm's controller must do that.
+arm are dangerous even if different users run them. The lock files are therefore in one shared
+folder. A lock ends with its holder's process. It does not exclude another machine that can reach
+the same arm; the arm's controller must do that.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ RESERVED = frozenset(
 )
 """Names of the first devices, in files, records and columns."""
 _PLACES = frozenset({"serial", "host", "port", "events_port", "triggers_port", "index", "path"})
-"""Keys by which drivers tell their devices apart."""
+"""Keys by which drivers distinguish their devices."""
 MOST = 16
 """Further devices of a rig: a limit for people's typing errors, not of the store."""
 
@@ -309,7 +309,7 @@ def check_distinct(devices: DeviceSettings | None, streams: Mapping[str, Stream]
 
 
 def _place(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Return what tells one device from another of its driver, by its key."""
+    """Return the settings that distinguish devices of one driver, by key."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, dict):

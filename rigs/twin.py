@@ -59,7 +59,7 @@ class TwinRecord(StrictModel):
 
 
 def warnings(twin: TwinRecord, plan: Plan) -> Iterator[str]:
-    """Say where a plan leaves the conditions that a twin was fitted on, and what the twin lacks.
+    """Report where a plan leaves the conditions that a twin was fitted on, and the twin's gaps.
 
     A slide that is pressed deeper or driven faster than any of the pilot's is simulated by numbers
     that no trial has tested.

@@ -1,9 +1,9 @@
 """A device's clock to the sync box's, as straight lines that join, in exact integers.
 
 A trial's streams are stamped by clocks that count from different days and run at slightly
-different speeds. The raw stamps are never rewritten; a `ClockMap` stored beside them says what they
-mean. Absolute times near 2**62 ns do not fit a float64 (its step there is 1024 ns), so nothing here
-turns a time into a float.
+different speeds. The raw stamps are never rewritten; a `ClockMap` stored with them gives their
+meaning. Absolute times near 2**62 ns do not fit a float64 (its step there is 1024 ns), so nothing
+here turns a time into a float.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MAX_DRIFT = DRIFT_UNITS // 4
 
 _LEAST, _MOST = -(2**63), 2**63 - 1
 _FEW = 8
-"""So many times are quicker mapped one by one."""
+"""Number of times up to which mapping them one by one is faster."""
 
 
 @dataclass(frozen=True)

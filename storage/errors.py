@@ -28,7 +28,7 @@ _FAULTS = {
 _OWN_FAULTS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
 _IN_WORDS = re.compile(r"errno = (\d+)")
 _SHORTEST = 8
-"""A shorter value is a switch, or is in many a word."""
+"""A shorter value is a switch, or part of many words."""
 
 
 class StoreError(RuntimeError):
@@ -43,8 +43,8 @@ class NoStore(InputError, StoreError):
     """The path or URL of a store was given, and no store can be there: wrong input.
 
     Args:
-        place: as it was given.
-        why: what is there instead, and what to do.
+        place: as given by the user.
+        why: the fault, and the remedy.
     """
 
     def __init__(self, place: Path | str, why: str) -> None:
@@ -125,9 +125,9 @@ def masked(text: str) -> str:
 
     Secrets are the passwords of addresses (``scheme://user:password@host``), wherever they come
     from, and the values of environment variables that are named as one. Errors of other libraries
-    quote addresses with their credentials, and command lines are kept with locks: such text goes
-    through here before it is kept or said. Data do not: a condition must not change because it
-    looks like somebody's key.
+    quote addresses with their credentials, and locks record command lines: such text is masked
+    before it is stored or printed. Data are not masked: a condition must not change because it
+    looks like a key.
     """
     for secret in _secrets():
         if secret in text:

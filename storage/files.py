@@ -58,7 +58,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file that somebody else wrote to the disk."""
+    """Flush a file that other code wrote."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -67,7 +67,7 @@ def sync_file(path: Path) -> None:
 
 
 def protect(path: Path) -> None:
-    """Take away the right to write a file, which its user can still move and delete.
+    """Remove the write permission of a file, which its user can still move and delete.
 
     Nothing happens on a file system without such rights.
     """
@@ -76,7 +76,7 @@ def protect(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and what is missing above it, and flush each one's entry to the disk."""
+    """Make a folder and its missing parents, and flush each one's entry to the disk."""
     missing = [folder]
     while not missing[-1].parent.is_dir():
         missing.append(missing[-1].parent)
@@ -127,7 +127,7 @@ def read_blocks(path: Path) -> Iterator[bytes]:
 
 
 def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
-    """Return the bytes of a file that somebody names: of a device or a pipe there is no end.
+    """Return the bytes of a regular file; devices and pipes, which have no end, are refused.
 
     Args:
         most: bytes; a larger file is refused before it is read.
@@ -262,7 +262,7 @@ def sweep_temporary(folder: Path) -> int:
 
 
 def sweep_marked(folder: Path) -> None:
-    """Delete what killed programs left in any folder: only what is marked as this project's."""
+    """Delete leftovers of killed programs in any folder, if they are marked as this project's."""
     with suppress(OSError):
         for path, runs in temporary_files(folder):
             marked = _TEMPORARY.fullmatch(path.name)
@@ -319,7 +319,7 @@ def write_json(path: Path, data: Any) -> None:
 def write_json_aside(path: Path, data: Any) -> None:
     """Write JSON, flushed but not atomic, in a folder that is not visible yet.
 
-    Whoever makes the folder visible flushes its entries before.
+    The caller that makes the folder visible flushes its entries first.
 
     Raises:
         ValueError: as `write_json`.

@@ -2,8 +2,8 @@
 
 numba keeps a kernel's machine code for as long as the file that defines it stays the same. Kernels
 and constants of other files are part of that code, and numba does not see when those change: after
-an upgrade, or a change to a callee alone, old code would run. So the kernels of a file are kept in
-a folder that is named by a hash of every source that they can depend on.
+an upgrade, or a change to a callee alone, old code would run. So the kernels of a file are cached
+in a folder that is named by a hash of every source that they can depend on.
 """
 
 from __future__ import annotations

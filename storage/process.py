@@ -83,7 +83,7 @@ def send(who: Json, number: signal.Signals) -> bool:
     """Send a signal to the process that `this_process` described, and to no other.
 
     Returns:
-        False if it does not run on this machine any more, or belongs to somebody else.
+        False if it does not run on this machine any more, or belongs to another user.
     """
     if not isinstance(who.get("pid"), int) or not hasattr(os, "pidfd_open"):
         return False
@@ -167,7 +167,7 @@ def _end_with(parent: BaseProcess) -> None:
 
 
 def start_tethered(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a foreign program in a session of its own, out of reach of the terminal's signals.
+    """Start a foreign program in a new session, out of reach of the terminal's signals.
 
     The kernel kills it and its process group when this process ends, however it ends: it does so
     when the last writer of a pipe is gone that the program inherits.

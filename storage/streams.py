@@ -1,7 +1,7 @@
 """Chunks of device streams: plain arrays with raw device times.
 
 A chunk is the unit that flows from a device through the rig into the recording being written.
-Nothing here converts a time: raw device times are kept as they came, and clock maps are added
+Nothing here converts a time: raw device times are stored unchanged, and clock maps are added
 later (docs/decisions/0002). All times are int64.
 """
 
@@ -106,8 +106,8 @@ class FrameChunk:
     number: I64
     """The camera's own frame counter, shape (n,); a gap is a lost frame."""
     t_ns: I64
-    """Middle of exposure on the camera's clock, nanoseconds, shape (n,); `host_ns` again from a
-    camera that has no clock to be read."""
+    """Middle of exposure on the camera's clock, nanoseconds, shape (n,); equals `host_ns` for a
+    camera without a readable clock."""
     host_ns: I64
     """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
     sync: U8
@@ -116,7 +116,7 @@ class FrameChunk:
     """Instead of images: column and row of every papilla's marker in the order of the skin's
     layout, shape (n, m, 2), NaN where it was not seen whole."""
     plate_px: F32 | None = None
-    """Beside `markers_px`: the centre of the plate's marker, shape (n, 2); None without one."""
+    """Centre of the plate's marker, with `markers_px`, shape (n, 2); None without one."""
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -176,7 +176,7 @@ StreamChunk = WrenchChunk | ScalarChunk
 """Chunks that a named stream in the trial's own file may be made of;
 `storage.trials.hdf5_writer.STREAMS` has the columns of each."""
 CameraChunk = EventChunk | FrameChunk | PulseChunk | ClockReads
-"""Chunks of a further camera, whose stream has a file of its own: its events or frames, the sync
+"""Chunks of a further camera, whose stream has its own file: its events or frames, the sync
 pulses that it saw, and reads of its clock."""
 EVENTS_KIND, FRAMES_KIND = "events", "frames"
 """Kinds of the named streams of further cameras."""

@@ -34,7 +34,7 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
     """Take pictures of a board that a person holds before the outside camera.
 
     Raises:
-        StopRequested: the person said stop.
+        StopRequested: the user requested a stop.
         RigError: the camera provides tracks, or no frame arrived.
     """
     rig, camera = session.rig, session.file.frame_camera

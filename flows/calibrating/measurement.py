@@ -120,7 +120,7 @@ class Measurement:
 
         Raises:
             InputError: there is no terminal to ask on.
-            KeyboardInterrupt: the person said stop.
+            KeyboardInterrupt: the user requested a stop.
             RigError: the measurement failed; nothing was written.
         """
         if dry_run:

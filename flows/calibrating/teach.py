@@ -107,7 +107,7 @@ def teach_plane_by_hand(session: CalibrationSession) -> Finding:
     """Find the contact plane from four points to which a person jogs the arm.
 
     Raises:
-        StopRequested: the person said stop.
+        StopRequested: the user requested a stop.
         RigError: as `teach_plane`.
     """
     where = {
@@ -241,7 +241,7 @@ def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> Finding:
         tool: from the flange to the point that the controller reports now.
 
     Raises:
-        StopRequested: the person said stop.
+        StopRequested: the user requested a stop.
         RigError: orientations too much alike, or the tip was off the point by more than 0.3 mm.
     """
     from scipy.spatial.transform import Rotation

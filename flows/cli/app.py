@@ -54,7 +54,7 @@ def options(
     """Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report."""
 
 
-# panels of the help stand in the order of their first commands
+# panels of the help are in the order of their first commands
 for part in (
     collect.app,
     register.app,

@@ -107,7 +107,7 @@ def say_faults(result: Mapping[str, Any]) -> None:
 
 @contextmanager
 def new_store(place: Path) -> Iterator[Store]:
-    """Yield the store at `place`; one that is made here is taken away again if it stays empty."""
+    """Yield the store at `place`; one that is made here is removed again if it stays empty."""
     there = place.is_dir() and any(place.iterdir())
     existed = place.exists()
     from sliplab.storage.trials.store import Store
@@ -130,6 +130,6 @@ def opened_campaigns(folder: Path, names: list[str] | None) -> tuple[Store, list
 
     store = open_store(folder)
     prepare_store(folder)
-    # what is made anew from a protocol leaves imported campaigns out, unless somebody names them
+    # commands that recompute from a protocol skip imported campaigns unless they are named
     found = collected(store, names)
     return store, [item for item in found if names or item.recorded is None] or found

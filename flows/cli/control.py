@@ -1,7 +1,7 @@
 """`sliplab pause`, `resume`, `stop`, `skip`, `again`, `serve`: control from another process.
 
-Those before `serve` are for another terminal: each keeps in STORE/control/ who asked for what,
-when and why. `serve` offers one rig's deployments on Prefect's page, with schedules.
+Those before `serve` are for another terminal: each request is stored in STORE/control/ with its
+user, time and reason. `serve` offers one rig's deployments on Prefect's page, with schedules.
 """
 
 from __future__ import annotations

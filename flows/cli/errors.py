@@ -98,7 +98,7 @@ class Failure:
             {"file": f.file, "key": f.key or None, "value": f.value, "message": f.message}
             for f in self.faults
         ]
-        with suppress(OutputLost):  # it was said on standard error
+        with suppress(OutputLost):  # the error is already on standard error
             console.print_error({**named, "message": self.message}, self.exit_code, faults)
         return self.exit_code
 

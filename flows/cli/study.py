@@ -185,7 +185,7 @@ def holdout(
 
 
 def _note_seeds(run_requests: Sequence[RunRequest]) -> None:
-    """Say that fewer networks are trained than show by how much seeds differ."""
+    """Warn that too few networks are trained to show the spread over seeds."""
     from sliplab.flows.study import study_plan
 
     slides = study_plan(run_requests).slides

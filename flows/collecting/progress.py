@@ -33,7 +33,7 @@ STOP_LIMIT_S = 0.5
 ANSWER_S = 5.0
 """Longest wait for one answer of the server, s."""
 LOST_AFTER = 3
-"""After so many reports without an answer the server counts as lost."""
+"""Number of unanswered reports after which the server counts as lost."""
 MOST_POINTS = 300
 
 
@@ -194,7 +194,7 @@ class _Page:
         with (
             suppress(Exception),
             temporary_settings(updates={PREFECT_CLIENT_MAX_RETRIES: 0}),
-            # with settings of its own it is not the client of the flow run
+            # with separate settings it is not the client of the flow run
             get_client(httpx_settings={"timeout": ANSWER_S}, sync_client=True) as client,
         ):
             self._answered(self._rig, client, True)

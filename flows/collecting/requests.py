@@ -45,7 +45,7 @@ def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iter
         collects: the campaign that trials are taken for; `sliplab stop` stops nothing else.
 
     Raises:
-        Locked: somebody else holds it.
+        Locked: another process holds it.
         StoreError: its disk is full, read-only or failing.
     """
     about = {"collects": collects} if collects else None
@@ -88,7 +88,7 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]
 
 
 def refuse_paused(store: Store) -> None:
-    """Refuse to begin a collection whose store is paused; it would stand still at once.
+    """Refuse to begin a collection whose store is paused; it would pause at once.
 
     Raises:
         CampaignStopped: the store is paused.
@@ -101,7 +101,7 @@ def refuse_paused(store: Store) -> None:
 
 
 def holder_of(folder: Path) -> Json | None:
-    """Return who holds the lock of the store in `folder`, None if nobody does."""
+    """Return the holder of the lock of the store in `folder`, None if it is not locked."""
     try:
         with exclusive(folder / STORE_LOCK, "the store", brief=True):
             return None
@@ -113,8 +113,8 @@ def halt(folder: Path) -> tuple[Json | None, bool]:
     """Signal the collection that runs on the store in `folder` to stop.
 
     Returns:
-        Who holds the store, None if nobody does; and whether the signal reached a collection. It
-        does not reach another host or another user, and is never sent to what does not collect.
+        Holder of the store's lock, None if it is not locked; and whether the signal reached a
+        collection. It does not reach another host or user, and is only sent to a collection.
     """
     holder = holder_of(folder)
     if holder is None or not holder.get("collects"):
@@ -222,7 +222,7 @@ def known_trials(
         InputError: a trial is in no campaign's plan, or in several.
         StoreError: the store holds no campaign.
     """
-    # what was imported is neither skipped nor taken again, unless somebody names it
+    # imported trials are neither skipped nor taken again unless they are named
     plans = {
         item.name: {trial.id for trial in item.plan}
         for item in collected(store, names)
@@ -246,7 +246,7 @@ def known_trials(
 
 
 def _carry_out_if_free(store: Store) -> Json | None:
-    """Carry out open requests if nobody holds the store; else return who does."""
+    """Carry out open requests if the store is not locked; else return the holder of its lock."""
     with ExitStack() as lock:
         try:
             lock.enter_context(store_lock(store, brief=True))
@@ -257,10 +257,10 @@ def _carry_out_if_free(store: Store) -> Json | None:
 
 
 def _wait(store: Store, title: str, limit_s: float, made: Request | None) -> None:
-    """Wait until the request is answered, or nobody holds the store; `limit_s` at most.
+    """Wait until the request is answered or the store's lock is free; `limit_s` at most.
 
     Raises:
-        KeyboardInterrupt: the user does not want to wait any longer; the request stands.
+        KeyboardInterrupt: the user stopped waiting; the request remains open.
     """
     begin = time.monotonic()
     with console.bar(title, round(limit_s)) as bar:

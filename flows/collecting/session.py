@@ -73,7 +73,7 @@ class CollectionSession:
     """An open session at the rig: the objects that run it and the trials to take.
 
     Attributes:
-        rounds: of a protocol with claims, if they are looked at.
+        rounds: of a protocol with claims, if they are evaluated.
         trials: pending trials that the run request asks for; with rounds, those of the first.
         left_out: number of pending trials that it does not ask for.
     """
@@ -85,7 +85,7 @@ class CollectionSession:
     rounds: Rounds | None = None
 
     def more(self) -> list[Trial]:
-        """Return what is to be taken after all that was: asked for again, or the next round."""
+        """Return the trials to take after all others: requested retakes, or the next round."""
         return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
 
@@ -103,7 +103,7 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         campaign = _recover(store, run_request)
         supervisor = CollectionSupervisor(run_request, store, campaign)
         supervisor.begin()
-        # the rig is closed before anybody waits for figures
+        # the rig is closed before results are computed
         with (
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,
@@ -141,7 +141,7 @@ def _opened_rounds(
 def refresh(run_request: RunRequest) -> Campaign:
     """Recover the store and describe the campaign, where there is nothing to take.
 
-    Claims are looked at, too: a collection may have ended right after its last trial.
+    Claims are evaluated, too: a collection may have ended right after its last trial.
     """
     store = Store.create(run_request.store)
     with store_lock(store):
@@ -227,7 +227,7 @@ class TrialCollector:
         """Take `trials`, and do before each what the protocol asks for.
 
         Raises:
-            RigError: a device failed, or a person did not do what was asked.
+            RigError: a device failed, or the operator did not carry out a request.
             StoreError: the store's disk is full, read-only or failing.
             CampaignStopped: the supervisor ended the campaign.
             KeyboardInterrupt: a stop was requested.
@@ -241,7 +241,7 @@ class TrialCollector:
             self._previous = trial
 
     def fresh_start(self) -> None:
-        """Forget what was prepared: after a pause, plate, skin and depth zero may have changed."""
+        """Forget all preparations: after a pause, plate, skin and depth zero may have changed."""
         self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:

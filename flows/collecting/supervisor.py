@@ -127,7 +127,7 @@ class CollectionSupervisor:
             console.say(f"{request.kind} {trial}: {did}")
 
     def _check_window(self, trial: Trial) -> None:
-        """Check that the trial's planned time fits: the arm rests when people come."""
+        """Check that the trial's planned time fits: the arm must rest while people are present."""
         until = self._run_request.until
         if until is None:
             return

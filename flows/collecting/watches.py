@@ -92,7 +92,7 @@ class ReferenceWatch:
         """Check the last reference trial of earlier sessions.
 
         Raises:
-            CampaignStopped: it had drifted, and nobody asked for it again.
+            CampaignStopped: it had drifted, and no retake was requested.
         """
         if self._gate is None:
             return

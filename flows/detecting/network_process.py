@@ -1,4 +1,4 @@
-"""A network in a process of its own, so that one that hangs or dies cannot keep the arm moving."""
+"""A network in a separate process, so that the arm stops if the network hangs or crashes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class NetworkLost(LibraryError):
 
 
 class NetworkProcess:
-    """A network's spike counts, as `analysis.detectors.live.Counting`, from a process of its own.
+    """A network in a separate process that counts spikes (`analysis.detectors.live.Counting`).
 
     Args:
         model: its file.

@@ -33,9 +33,9 @@ class DetectRequest:
 
     Attributes:
         detection: the paper's rule by its settings, or another detector with its levels.
-        safe: reaction when slip cannot be detected any more, where a reflex is asked for.
+        safe: reaction when slip can no longer be detected, where a reflex is requested.
         plan, trial: the motion that is made; None where the rig is only listened to.
-        seconds: how long to listen; None until somebody ends it.
+        seconds: how long to listen; None until the user ends it.
     """
 
     rig: RigFile
@@ -53,7 +53,7 @@ class DetectRequest:
 
     @property
     def timeouts(self) -> Timeouts | None:
-        """When slip counts as not detectable; None without a reflex that depends on it.
+        """Timeouts after which slip counts as undetectable; None without a reflex that needs them.
 
         Without a safe state decisions may be late, as they may be computed in this process.
         """
@@ -145,7 +145,7 @@ def make_detect_request(
 
 
 def load_model(path: Path) -> Fitted:
-    """Load a model file. Raises InputError if it is none."""
+    """Load a model file. Raises InputError if it is not one."""
     try:
         return model_file.load(path)
     except OSError as error:
@@ -200,7 +200,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
     if not 0 < deeper_mm < float("inf"):
         right = "must be 'stop', 'press:MM' or 'grip:MM', such as press:0.4"
         raise InputError("--reflex", "", text, right)
-    # a retraction gets shallower throughout, and what goes on is cut off at the limit
+    # a retraction gets shallower throughout, and motion beyond the limit is cut off
     depth = _shallowest_mm(program)
     if depth + deeper_mm > deepest + 1e-9:
         limits = plan.protocol.collection.limits
@@ -219,7 +219,7 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
 
 
 def make_safe_state(file: RigFile, plan: Plan) -> Reflex | None:
-    """Return the reaction when slip cannot be detected any more, if the rig file names one."""
+    """Return the reaction when slip can no longer be detected, if the rig file names one."""
     wanted = file.reflex
     if wanted is None:
         return None

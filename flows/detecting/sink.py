@@ -34,7 +34,7 @@ PATIENCE_US = 200_000
 """Wait before evaluating a window that no event follows, us on the camera's clock as estimated
 here: events that were sent earlier must have arrived by then."""
 KEPT = 100_000
-"""Latencies that are kept for the summary: the last 55 minutes of 30 ms windows."""
+"""Latencies stored for the summary: the last 55 minutes of 30 ms windows."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class DetectSink(NullSink):
         clock: the rig's, by which arrivals are dated.
         on_decision: called with each decision as soon as it is made.
         every_poll: called each time that the streams were read.
-        timeouts: beyond which slip cannot be detected in time; None: it is never said.
+        timeouts: beyond which slip cannot be detected in time; None: never reported.
     """
 
     def __init__(

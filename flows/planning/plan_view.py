@@ -55,7 +55,7 @@ class PlanJson(TypedDict):
     Attributes:
         bytes: None without a rig; scene: None but on a simulated rig.
         stretches: first and last trial of each stretch without a person.
-        claims: what a pilot foretells of them, as in power.json; None without one.
+        claims: predictions of a pilot about them, as in power.json; None without one.
     """
 
     protocol: str
@@ -71,7 +71,7 @@ class PlanJson(TypedDict):
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a pilot foretells of a plan's claims: a table with lines below it, and all as data."""
+    """A pilot's predictions about a plan's claims: a table with lines below it, and all as data."""
 
     title: str
     columns: Sequence[str]
@@ -132,7 +132,7 @@ def plan_json(
 
     Args:
         needed: its bytes; None without a rig.
-        claims: what a pilot foretells of them; None without one.
+        claims: predictions of a pilot about them; None without one.
     """
     rows: list[TrialRow] = [
         {
@@ -173,7 +173,7 @@ def _stretches(found: Plan) -> str:
 
 
 def _claims(found: Plan) -> Iterator[str]:
-    """Yield lines about the claims of a plan, and what they do to it."""
+    """Yield lines about the claims of a plan, and their effect on it."""
     collection = found.protocol.collection
     if collection.stopping is None:
         return

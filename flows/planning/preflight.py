@@ -86,7 +86,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
 
 
 def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
-    """Check that what was measured on the rig is there, recent, and consistent."""
+    """Check that the measurements of the rig exist, are recent, and are consistent."""
     plan, calibration = run_request.plan.protocol.collection, run_request.rig.calibration
     needed = {"contact_plane", "tool_centre_point", "event_crop"}
     if "frames" in plan.recording.streams:

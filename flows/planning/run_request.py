@@ -35,7 +35,7 @@ from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
-"""`overrule`: they are looked at and do not end the campaign."""
+"""`overrule`: claims are evaluated and do not end the campaign."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class RunRequest:
 
     @property
     def has_claims(self) -> bool:
-        """Whether claims are looked at."""
+        """Return True if claims are evaluated."""
         return self.plan.protocol.collection.stopping is not None and self.claims != "ignore"
 
     def _begun(self, campaign: Campaign) -> set[str] | None:

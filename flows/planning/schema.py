@@ -56,7 +56,7 @@ _PART = "Part"
 
 
 class _Described(GenerateJsonSchema):
-    """Without titles that repeat the keys; each key with the text that stands below its field."""
+    """Schemas without titles that repeat the keys; each key with the text below its field."""
 
     def model_schema(self, schema: Any) -> Schema:
         made = super().model_schema(schema)
@@ -133,7 +133,7 @@ def _plain(part: Any) -> Any:
         left.pop("default")
     if "prefixItems" in left:
         left |= {"items": left.pop("prefixItems"), "additionalItems": False}
-    if "$ref" in left and len(left) > 1:  # else what is beside it would not count
+    if "$ref" in left and len(left) > 1:  # else the keys next to it are ignored
         left["allOf"] = [{"$ref": left.pop("$ref")}]
     return left
 

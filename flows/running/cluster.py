@@ -149,7 +149,7 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
 
     Raises:
         InputError: no address, or the packages for it are missing.
-        ClusterError: nobody answers there, it has no worker, or one that cannot be used.
+        ClusterError: nothing answers there, it has no worker, or one that cannot be used.
     """
     if address is None:
         yield None

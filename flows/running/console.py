@@ -92,7 +92,7 @@ def print_error(
     exit_code: int,
     faults: Sequence[Mapping[str, str | None]] = (),
 ) -> None:
-    """The error as the one JSON object of a command that was asked for one and has none yet.
+    """Print the error as the one JSON object of a command, unless it has printed one already.
 
     Args:
         named: ``file``, ``key``, ``value`` and ``message``.

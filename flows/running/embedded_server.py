@@ -39,7 +39,7 @@ from sliplab.flows.running.same_origin import SameOrigin
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
 LEAN = {
-    # the feed of events, and what could be set off by them: runs, tasks and states are kept
+    # without the feed of events and automations; runs, tasks and states are stored
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
     # task runs are written many at once, and a second later at most
@@ -66,7 +66,7 @@ class EmbeddedServer:
     Args:
         port: where; 0 for a free one.
         page: whether it has Prefect's page, and all of its services with it.
-        password: that its clients must know (PREFECT_API_AUTH_STRING); one of its own by default.
+        password: that its clients must know (PREFECT_API_AUTH_STRING); by default a new one.
 
     Raises:
         ServerError: the port is taken, or it did not start.
@@ -202,7 +202,7 @@ class EmbeddedServer:
 
 
 def new_password() -> str:
-    """A password that nobody can guess, in the form that Prefect asks for (``user:password``)."""
+    """Return a random password in the form that Prefect expects (``user:password``)."""
     return f"sliplab:{secrets.token_urlsafe(32)}"
 
 

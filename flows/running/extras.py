@@ -32,7 +32,7 @@ _BRINGS = {module: extra for extra, modules in EXTRAS.items() for module in modu
 
 def lacking(error: BaseException, who: str) -> str | None:
     """Say in one line which extra `who` needs, if `error` is that its package is missing."""
-    # a package that is there without one of its own modules is damaged, and no extra mends it
+    # an installed package that lacks one of its modules is damaged, and no extra mends it
     module = error.name if isinstance(error, ModuleNotFoundError) else None
     extra = _BRINGS.get(module or "")
     if extra is None:

@@ -5,7 +5,7 @@ server that the user names with PREFECT_API_URL is used instead of the embedded 
 
 No campaign waits for its server (docs/decisions/0095). Prefect's engine calls it in the flow's own
 thread, when a run begins and when it ends; `ServerLink` gives each of these requests a limit. A run
-that cannot begin there is made without Prefect, and an end that was not delivered is kept in the
+that cannot begin there is made without Prefect. An end that was not delivered is saved in the
 store (`run_records`), from where the next command reports it. One line says so.
 """
 
@@ -50,8 +50,8 @@ _DEFAULTS = {
     "PREFECT_CLI_PROMPT": "false",
 }
 NO_RESULTS: Any = Path(os.devnull)
-"""A flow's `result_storage`. Without one, Prefect asks the server for it, by a client of its own
-that has no limit and stays open."""
+"""A flow's `result_storage`. Without one, Prefect queries the server for it, with a separate client
+that has no timeout and stays open."""
 _LOGGING = "PREFECT_LOGGING_SETTINGS_PATH"
 _CERTIFICATES = ("SSL_CERT_FILE", "PREFECT_API_SSL_CERT_FILE")
 _PROXY = re.compile("(all|https?|no)_proxy", re.IGNORECASE)
@@ -148,9 +148,9 @@ def _checked(names: str) -> Iterator[None]:
 
 
 def hide_what_a_lost_server_leaves() -> None:
-    """Keep Prefect's own words of a lost server off the terminal, in each process with a flow.
+    """Suppress Prefect's log messages about a lost server, in each process with a flow.
 
-    The flow says it in one line, and what could not be sent is kept in the store.
+    The flow reports it in one line, and saves what could not be sent in the store.
     """
     logging.getLogger("asyncio").addFilter(_is_fault)
     logging.getLogger("prefect._internal.concurrency").setLevel(logging.CRITICAL)
@@ -289,7 +289,7 @@ def is_unreachable() -> bool:
 
 
 def report_unreachable(reason: str) -> None:
-    """Say that the server of the flow that runs now does not answer."""
+    """Report that the server of the current flow does not answer."""
     if _link is not None:
         _link.mark_lost(reason)
 
@@ -324,7 +324,7 @@ def limited_settings() -> dict[Any, Any]:
 
 
 class _Work:
-    """The work of a flow run and its outcome, which is kept even if its report fails."""
+    """The work of a flow run and its outcome, which is available even if its report fails."""
 
     def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
         self._do, self._link = do, link
@@ -377,8 +377,8 @@ class WorkNotBegun(RuntimeError):
 def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
-    Inside a flow that is served it is part of that flow's run, which has an end of its own.
-    A server that is lost, or cannot be started, holds nothing up.
+    Inside a served flow it is part of that flow's run, which reports its own end.
+    A server that is lost or cannot be started delays nothing.
 
     Args:
         cluster: where its tasks go that are submitted, instead of threads.
@@ -449,7 +449,7 @@ def _reported(
             try:
                 _without_server(work, argument)
             except BaseException:
-                if not work.started:  # an error of the work is kept, and raised below
+                if not work.started:  # an error of the work is stored, and raised below
                     raise
         elif not (delivered := error is work.error):
             link.mark_lost(error)

@@ -1,9 +1,9 @@
 """Independent jobs on all cores of this machine or on a Dask cluster.
 
-`parallel_map` takes any jobs. `each_trial` makes something of every trial by itself, and
-`run_trials` keeps it among the derived results. Labels and clocks are made this way, samples and
-spike counts on a cluster. A stop is answered between two jobs; what was made until then is kept,
-and the next run makes the rest.
+`parallel_map` takes any jobs. `each_trial` computes a result for every trial, and `run_trials`
+stores it among the derived results. Labels and clocks are made this way, samples and spike counts
+on a cluster. A stop is answered between two jobs. Finished results are stored, and the next run
+makes the rest.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
 
 CHUNK = 64
-"""Most pieces in a task: what a lost worker loses, and what a stop on a cluster waits for."""
+"""Largest number of jobs in a task, which a lost worker loses and a stop on a cluster waits for."""
 SHARES = 4
-"""So many chunks a core of a cluster, so that none waits long for the last one."""
+"""Chunks per core of a cluster, so that no core waits long for the last one."""
 
 Piece = Callable[[Any], Any]
 Done = Callable[[int, Any], None]
 
 
 class WorkerKilled(RuntimeError):
-    """A worker process was killed; results that were returned before are kept."""
+    """A worker process was killed; results that were returned before are stored."""
 
 
 def parallel_map(
     name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluster: Cluster | None = None
 ) -> None:
-    """Make `piece` of every job. Stands in a flow; with a cluster, in one that runs on it.
+    """Call `piece` on every job. Must run in a flow; with a cluster, in one that runs on it.
 
     Args:
-        name: what people call it.
-        done: called in this thread with a job's number and what came of it, in any order.
+        name: display name.
+        done: called in this thread with a job's number and its result, in any order.
 
     Raises:
-        KeyboardInterrupt: a stop was requested; what nobody had begun is not begun.
+        KeyboardInterrupt: a stop was requested; jobs that had not begun are not started.
         WorkerKilled: a process of this machine that did the work was killed.
         MainModuleError: the work needs the script that runs.
     """
@@ -153,10 +153,10 @@ short is done by then, and what is long takes two starts at the most."""
 
 @dataclass(frozen=True)
 class _Step:
-    """A step with what it has to do.
+    """A step with its pending work.
 
     Attributes:
-        name: where its results are kept; title: what people call it.
+        name: where its results are stored; title: its display name.
     """
 
     store: Store
@@ -216,7 +216,7 @@ def run_trials(
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
 def _trials_flow(argument: Opaque[_Step]) -> int:
-    """All that is stale."""
+    """Compute the results of the stale trials."""
     step = argument.content
     with timed(step.store, step.title):
         keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)

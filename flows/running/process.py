@@ -141,9 +141,9 @@ _GO_ON = "then run the same command to resume; every committed trial is kept"
 
 
 def exhausted(error: BaseException | None) -> str | None:
-    """Return what the system has no more of, if that is behind `error`; else None.
+    """Return the exhausted system resource that caused `error`; else None.
 
-    Errors that were raised in place of the system's own are looked through.
+    The causes of chained errors are examined, too.
     """
     while error is not None:
         number = error.errno if isinstance(error, OSError) else None

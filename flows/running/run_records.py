@@ -1,12 +1,12 @@
-"""Ends of flow runs, kept in the store: they outlive the server, the process and the machine.
+"""Ends of flow runs, saved in the store: they outlive the server, the process and the machine.
 
     STORE/control/runs/ID.json       what began, when, and in which process on which machine
-    STORE/control/runs/ID.end.json   how it ended; the first word stands
+    STORE/control/runs/ID.end.json   how it ended; written once
     STORE/control/runs/ID.owed.json  how it ended, while Prefect's server does not know it yet
 
 A process that is killed writes no end. The next program that opens the store finds its begin, sees
-that the process is gone, writes the end, and tells Prefect, which would show the run as running
-for ever. The same program reports the ends that a server, which did not answer then, still lacks.
+that the process is gone, writes the end and reports it to Prefect, which would otherwise show the
+run as running for ever. It also reports the ends that a server which did not answer still lacks.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def delivered(store: Path, run: str) -> None:
 
 
 def suspended(store: Path, run: str) -> None:
-    """A flow run left its process to be resumed in another one: it has not begun any more."""
+    """A flow run left its process to be resumed in another one: it counts as not begun."""
     (_folder(store) / f"{run}.json").unlink(missing_ok=True)
 
 

@@ -3,7 +3,7 @@
 Python delivers a signal as an exception wherever it happens to be. Inside a destructor or a weak
 reference's callback that exception is dropped, and the program continues, which an arm must not. So
 the handler also raises a flag: the rig looks at it in every poll, progress bars at every step. The
-trace that Python prints of a dropped one is left out: the request is kept.
+traceback that Python prints of a dropped exception is suppressed, since the flag is set.
 
 While files are written that belong together, only the flag is raised, and the exception when they
 are complete (`sliplab.storage.interrupts`).
@@ -85,7 +85,7 @@ def signals() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in SIGNALS}
     if before[signal.SIGHUP] is signal.SIG_IGN:  # under nohup it is meant to outlive its terminal
         del before[signal.SIGHUP]
-    if before[signal.SIGINT] is not _handle:  # a request stands until the outermost block ends
+    if before[signal.SIGINT] is not _handle:  # a request holds until the outermost block ends
         _requested.clear()
     hook = sys.unraisablehook
 

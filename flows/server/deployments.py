@@ -52,7 +52,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     """Do the work of one served flow run.
 
     Args:
-        work: gets the service and Prefect's flow run; returns as text what it did.
+        work: gets the service and Prefect's flow run; returns a text about its result.
 
     Returns:
         The state in which the run ends.
@@ -78,7 +78,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     except KeyboardInterrupt:
         state = Cancelled(message="stopped, the arm first; every committed trial is kept")
     except Exception as error:
-        if stopping.requested():  # compiled code that a signal interrupts has errors of its own
+        if stopping.requested():  # compiled code interrupted by a signal raises other errors
             state = Cancelled(message="stopped, the arm first; every committed trial is kept")
         else:
             state = Failed(message=_words(error))

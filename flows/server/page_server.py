@@ -1,4 +1,4 @@
-"""The Prefect server of a service: its page, its password, and what is done when it is lost.
+"""The Prefect server of a service: its page, its password, and the handling of its loss.
 
 A service outlives its server. A server of our own that ended, or does not answer, is restarted
 at its port; once a server answers again, the runs that ended in the meantime are reported to it.
@@ -103,8 +103,8 @@ def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
 
     Raises:
         ServerError: ours did not start; its port may be taken.
-        InputError: the password cannot be kept where only this user can read it, or the server at
-            PREFECT_API_URL asks for none.
+        InputError: the password cannot be stored where only this user can read it, or the server
+            at PREFECT_API_URL requires none.
     """
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
@@ -130,11 +130,11 @@ def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
 
 
 def refuse_open(url: str) -> None:
-    """Check that a Prefect server asks for a password; where nobody listens, Prefect says so.
+    """Check that a Prefect server requires a password; if none listens, Prefect reports that.
 
     Raises:
-        InputError: it does not, and whoever reaches it can move the arm; or it does not answer in
-            time, so that nobody knows.
+        InputError: it does not, and anyone who reaches it can move the arm; or it does not answer
+            in time, so that this is unknown.
     """
     address = run_records.server_name(url)
     try:
@@ -162,10 +162,10 @@ def refuse_open(url: str) -> None:
 
 
 def page_password(home: Path) -> str:
-    """The password of a service's page, kept from one start to the next.
+    """The password of a service's page, stored from one start to the next.
 
     Raises:
-        InputError: it cannot be kept where only this user can read it.
+        InputError: it cannot be stored where only this user can read it.
     """
     path = home / PASSWORD
     with suppress(OSError, UnicodeDecodeError):

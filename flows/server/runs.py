@@ -1,4 +1,4 @@
-"""The runs that Prefect's page asks for: one at a time on the rig, a word to the arm at once.
+"""Runs started from Prefect's page: one at a time on the rig, stop requests at once.
 
 The service looks for runs that are due. One that moves the arm, or needs all cores, is carried out
 in a separate process (`python -m sliplab.flows.server.runs ID FLOW`) that ends with the service.
@@ -72,10 +72,10 @@ class ServedRuns:
                         await asyncio.wait({ending}, timeout=poll_s)
                 await self._stop()
             finally:
-                stopping.request()  # words that wait for a trial's end do not hold the end up
+                stopping.request()  # requests that wait for a trial's end do not delay the end
 
     async def _look(self, client: Any, threads: ThreadPoolExecutor) -> None:
-        """See how the run on the rig is, and begin what is due."""
+        """Check the run on the rig, and start due runs."""
         if self._process is not None:
             await self._supervise(client)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
@@ -156,7 +156,7 @@ def _carry_out_here(flow: Any, run: Any) -> None:
 
     try:
         run_flow(flow, flow_run=run, return_type="state")
-    except BaseException as error:  # a thread has nobody to raise to
+    except BaseException as error:  # a thread has no caller to raise to
         console.say(f"{run.name}: {error or type(error).__name__}")
 
 
@@ -179,7 +179,7 @@ def _carry_out(run_id: str, flow_name: str) -> None:
         try:
             run_flow(flow, flow_run=run, return_type="state")
         except (Abort, Pause):
-            pass  # the server said so
+            pass  # the server requested it
         except Exception as error:
             link.mark_lost(error)
             if (kept := run_records.end_of(here.folder, run_id)) is not None:

@@ -6,10 +6,10 @@ schedules:
      days: [mon, tue, wed, thu], from: "22:00", until: "06:00"}
   - {name: morning report, flow: report, cron: "30 7 * * mon-fri"}
 
-Store and rig are no parameters: they are what `sliplab serve` was started with, so that nobody
-can send an arm's data elsewhere from a page. A window is computed from when its run was due and not
-from when it began: a run that starts late, because the computer was off, must not take the rest of
-its night out of the next day.
+Store and rig are no parameters: they are those that `sliplab serve` was started with, so that an
+arm's data cannot be sent elsewhere from a page. A window is computed from when its run was due and
+not from when it began: a run that starts late, because the computer was off, must not take the rest
+of its night out of the next day.
 """
 
 from __future__ import annotations
@@ -364,7 +364,7 @@ def upcoming_runs(
 
     Args:
         path: the schedules' file, for messages.
-        count: so many runs of each. after: now by default.
+        count: number of runs of each. after: now by default.
 
     Returns:
         In each schedule's time zone.

@@ -46,7 +46,7 @@ def serve(
         folders: below which a run may name its protocol; a relative name is of the first. Those
             that ship, and those that a schedule names, it may name as well.
         port: of the embedded server's page.
-        poll_s: how often the server is asked for new runs, s.
+        poll_s: how often the server is polled for new runs, s.
 
     Raises:
         Locked: another program serves this store.
@@ -186,10 +186,10 @@ async def _delete_older(name: str, flows: list[str], store: Path) -> None:
 
 
 async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
-    """Close runs that a service before this one had taken and that no process has any more.
+    """Close runs that an earlier service had taken and that no process carries out.
 
     A run whose process died has been closed by its record; this is about those that were killed
-    before they could write one, and would be pending for ever.
+    before they could write one, and would stay pending.
     """
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import (

@@ -1,6 +1,6 @@
 """Settings of `sliplab serve`, passed to the processes of its flow runs.
 
-They are passed by the environment and not by the runs' parameters, which anybody who sees
+They are passed by the environment and not by the runs' parameters, which anyone who sees
 Prefect's page could change.
 """
 
@@ -48,10 +48,10 @@ class Service:
         os.environ[ENVIRONMENT] = json.dumps(asdict(self))
 
     def protocol(self, given: Path) -> Path:
-        """The protocol file that a run's parameter names.
+        """Return the protocol file that a run's parameter names.
 
-        Whoever names it may see less than the service does: a file that is not below the service's
-        folders is ignored, and nothing of one that is not a protocol is quoted.
+        The user who names it may have fewer rights than the service: a file that is not below the
+        service's folders is ignored, and no content of a file that is not a protocol is quoted.
 
         Raises:
             InputError: it is elsewhere, links followed, or is not a protocol.
@@ -79,7 +79,7 @@ def service() -> Service:
     """Return the settings of the service that started this process.
 
     Raises:
-        RuntimeError: nobody serves here.
+        RuntimeError: no service is running.
     """
     text = os.environ.get(ENVIRONMENT)
     if text is None:

@@ -69,7 +69,7 @@ class Row:
 
     @property
     def status(self) -> str:
-        """The decision in a word, or why there can be none."""
+        """The decision as one word, or the reason why none is possible."""
         if self.problem:
             return "damaged"
         if self.label != "fresh":
@@ -221,9 +221,9 @@ def filtered_rows(
     """Return the rows that pass the filters, in the order of work.
 
     Args:
-        campaign, state: only these; all where empty. The state ``doubtful`` means trials that
-            nobody has decided on and that have a reason for doubt.
-        text: only trials whose id holds it.
+        campaign, state: only these; all where empty. The state ``doubtful`` means trials without a
+            decision that have a reason for doubt.
+        text: only trials whose id contains it.
         doubtful_first: undecided trials come first, by their rank, then those with the gravest
             doubts before others.
     """
@@ -265,7 +265,7 @@ class ShownTrial:
     Attributes:
         label: its label, None where it has none; label_key: the label's own key.
         frame_ns: (n,) int64; displacement_px: (n, m), NaN where unknown; both empty without label.
-        xy_px: (n, m, 2) places of the markers, NaN where lost; None where they were not kept.
+        xy_px: (n, m, 2) places of the markers, NaN where lost; None where they were not stored.
         plate_px: (n, 2) the same of the plate's marker; None without.
         rate_s: (k,) middle of each bin of 10 ms; rate: (k,) events a second.
         span_s: start and end of the recording; motion_s: of the slide or retraction.
@@ -324,7 +324,7 @@ class ShownTrial:
         return int(np.argmin(np.abs(self.frame_ns - round(time_s * 1e9))))
 
     def picture(self, index: int) -> U8 | None:
-        """Return a frame of the video, uint8 (height, width); None if none was kept."""
+        """Return a frame of the video, uint8 (height, width); None if none was stored."""
         if not self.recording.has_video:
             return None
         if self._reader is None:
@@ -343,7 +343,7 @@ class ShownTrial:
 
 
 def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
-    """Read what is shown of a trial; frames are read later, one at a time.
+    """Read the displayed data of a trial; frames are read later, one at a time.
 
     Raises:
         StoreError: the trial is damaged.
@@ -412,7 +412,7 @@ def record_verdict(
 
     Raises:
         LabelChanged: the label on the disk is another one by now, or out of date.
-        Overtaken: somebody decided in the meantime.
+        Overtaken: another user decided in the meantime.
         ValueError: onsets that cannot be, or a rejection without a reason.
         OSError: it cannot be written.
     """

@@ -76,7 +76,7 @@ class Page:
         doc.add_next_tick_callback(lambda: self._step(1))
 
     def _connect(self) -> None:
-        """Connect each control to what it does."""
+        """Connect each control to its action."""
         see = self.see
         for item in (see.campaign, see.state, see.text):
             item.on_change("value", lambda attr, old, new: self._fill())

@@ -53,9 +53,9 @@ window.addEventListener("pointermove", (event) => {
 }, true);
 window.addEventListener("pointerup", () => { held = null; }, true);
 """
-"""Bokeh's own editable lines are caught within 2 pixels only, and beside where they are drawn."""
+"""Bokeh's own editable lines are caught within 2 pixels only, with an offset from their drawing."""
 _RESOLUTION_NS = 100_000
-"""Onsets set by hand are kept to a tenth of a millisecond."""
+"""Onsets set by hand are rounded to a tenth of a millisecond."""
 
 
 class TimePlots:
@@ -252,7 +252,7 @@ class TimePlots:
             self._quiet = False
 
     def put(self, kind: Kind, time_s: float | None) -> None:
-        """Put one line somewhere, or take it away, for a person."""
+        """Place or remove one line, as a user would."""
         now = self.onsets()
         time = None if time_s is None else _rounded(time_s)
         values = {f"{other}_ns": getattr(now, f"{other}_ns") for other in KINDS}

@@ -1,6 +1,6 @@
 """Serve the review page on this computer only, until it is stopped.
 
-Anybody who reaches the page can decide. So it listens on the loopback address, has a path that
+Anyone who reaches the page can decide. So it listens on the loopback address, has a path that
 cannot be guessed, is listed nowhere, and answers neither another page's scripts nor a foreign host
 name (`flows.running.same_origin`, for pages and for the connection that carries everything).
 """
@@ -91,7 +91,7 @@ class _OwnPage(AuthProvider):
 
     @property
     def login_url(self) -> str:
-        """Nobody logs in; Bokeh asks for one."""
+        """A login URL, which Bokeh requires; there is no login."""
         return "/"
 
 

@@ -56,8 +56,8 @@ window.addEventListener("keydown", (event) => {
   }
 }, true);
 """
-# the trial of the row that was pressed, as it stands there: by the time that the server hears of
-# it, its number in the list may be another trial's
+# the trial of the clicked row is sent by its id: when the server receives the click, its number in
+# the list may be another trial's
 CHOOSING = """
 if (window.sliplab_rows) return;
 window.sliplab_rows = true;
@@ -120,7 +120,7 @@ class Widgets:
             ],
             stylesheets=[_TABLE_STYLE],
         )
-        # a table draws itself anew only where its rows became more or fewer
+        # a table redraws itself only if its number of rows changed
         self.source.js_on_change("data", CustomJS(args={"table": self.table}, code=_REDRAW))
         self.heading, self.lines, self.flags, self.past = _div(), _div(), _div(), _div()
         self.said, self.caption = _div(), _div()

@@ -98,7 +98,7 @@ def rerun() -> ModuleType:
 
 
 def save(subject: Subject, path: Path) -> dict[str, int]:
-    """Write a trial as an .rrd file, complete or not at all.
+    """Write a trial as an .rrd file, atomically.
 
     Returns:
         numbers of events, frames and so on, and the file's bytes.
@@ -133,7 +133,7 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
 
 
 def show(subject: Subject) -> None:
-    """Open a trial in Rerun's viewer, and wait until somebody closes it.
+    """Open a trial in Rerun's viewer, and wait until the user closes it.
 
     Raises:
         StoreError: there is no display.
@@ -352,7 +352,7 @@ def _further(to: _Columns, recording: Recording) -> None:
 
 
 def _pictures(to: _Columns, recording: Recording, stream: str, path: str, count: str = "") -> None:
-    """Send the video of one frame camera, if it has one: every so manieth frame of a long one."""
+    """Send the video of one frame camera, if it has one: every n-th frame of a long one."""
     if recording.video(stream) is None:
         return
     import cv2

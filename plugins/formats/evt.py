@@ -198,7 +198,7 @@ def decode_evt3(
     t: I64,
     edges: I64,
 ) -> tuple[int, int]:
-    """Decode 16-bit words, each of which changes one part of the state: time, row, and columns alone or as vectors.
+    """Decode 16-bit words; each changes the state: time, row, and columns alone or as vectors.
 
     A vector starts at the last base and advances it; a single event does not change it.
 

@@ -173,10 +173,10 @@ class Arm(Protocol):
 
 @runtime_checkable
 class StoppingArm(Protocol):
-    """An arm that goes on for a while after a stop; any other is taken to stop at once."""
+    """An arm with a stopping distance; any other is taken to stop at once."""
 
     def stopping_s(self, speed_mm_s: float) -> float:
-        """Time for which it goes on at full speed, or as far: reaction, and half of braking."""
+        """Stopping distance as time at full speed: reaction, and half of braking."""
 
 
 @runtime_checkable
@@ -265,7 +265,7 @@ class Mounting:
 
     axes: Literal["plate", "base"] = "plate"
     """The frame that `rotvec_deg` turns to: the plate's axes (x right, y up, z into the plate),
-    along which the tool stands, or the arm's base."""
+    with which the tool is aligned, or those of the arm's base."""
     rotvec_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rotation vector from the sensor's axes to that frame."""
     feels: Literal["plate", "arm"] = "plate"
@@ -274,11 +274,11 @@ class Mounting:
 
 @runtime_checkable
 class ForceSensor(Protocol):
-    """A sensor of force and torque with a clock of its own, or that of the arm."""
+    """A sensor of force and torque with its own clock, or that of the arm."""
 
     mounting: Mounting
     grade: ForceGrade
-    """How its samples come onto the time line."""
+    """Method by which its samples are placed on the time line."""
     zeroing: Literal["trial", "session", "never"]
     """When the rig, or the sensor itself, takes the present load for zero: before each trial while
     the arm is clear of the plate, once when it connects, or never."""
@@ -335,10 +335,10 @@ class ScalarSensor(Protocol):
 
 @dataclass(frozen=True)
 class GripperState:
-    """What a gripper reports.
+    """State of a gripper.
 
     Attributes:
-        moving: fingers have not come to the end of the last move.
+        moving: fingers have not finished the last move.
         stalled: they ended it at an object, or at the force limit.
     """
 
@@ -375,7 +375,7 @@ class Gripper(Protocol):
         """Stop the fingers where they are; safe to call at any time and more than once."""
 
     def close(self) -> None:
-        """Close the connection; the fingers stay, and hold what they hold."""
+        """Close the connection; the fingers stay, and keep their grip."""
 
 
 @runtime_checkable
@@ -437,7 +437,7 @@ class Truth(TrueOnsets):
         simulated: true.
         level: of physics.
         threshold_mm: displacement of a marker that counts as slip.
-        from_hold: the same from the start of the hold, where that was wanted.
+        from_hold: the same from the start of the hold, if requested.
         clocks: pairs of a device's clock and the sync box's, ns, by device; absent from
             a simulation server.
     """

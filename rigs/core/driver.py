@@ -155,7 +155,7 @@ class FrameCameraDriver(Driver[SettingsT]):
     unplug: Callable[[FrameCamera], None] | None = None
     """Unplug a camera that `fake` has opened, for tests."""
     grade: FrameGrade = "hardware trigger"
-    """How frames are timed on a loopback rig: `host arrival` where the camera runs by itself."""
+    """Timing of frames on a loopback rig: `host arrival` where the camera is free-running."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class FakeBox(Protocol):
         """Address for the driver, used by `SyncBoxDriver.reach`; it can be pickled."""
 
     def reset(self) -> None:
-        """Restart as after a brown-out: no train, and a clock that begins anew."""
+        """Restart as after a brown-out: no train, and a restarted clock."""
 
     def silence(self) -> None:
         """Hang: send and answer nothing from now on."""
@@ -215,7 +215,7 @@ class FakeForceSensor(Protocol):
 
     @property
     def address(self) -> Any:
-        """Where the driver finds it, for `ForceSensorDriver.reach`; it can be pickled."""
+        """Address for the driver, used by `ForceSensorDriver.reach`; it can be pickled."""
 
     def send(self, chunk: WrenchChunk) -> None:
         """Send samples of the plate's load, in the sensor's axes and clock."""
@@ -236,7 +236,7 @@ class ForceSensorDriver(Driver[SettingsT]):
 
     kind = "force sensor"
     build: Callable[[SettingsT, Arm], ForceSensor] = field(kw_only=True)
-    """Make the device, not connected yet; beside the arm, whose controller may measure forces.
+    """Make the device, not connected yet; the arm is given as its controller may measure forces.
 
     Raises RigError where that arm has none.
     """

@@ -1,9 +1,9 @@
 """Motion of a gripper's fingers: reaction, finite speed and acceleration, stall at a force.
 
 Fingers that close stall where the force on them would pass the limit of their move, and stay there:
-the gear of a parallel gripper locks itself. A force is not known here; whoever simulates the
-contact reports where it is reached (`stall`). Simulated fingers and the fakes of grippers share
-this motion.
+the gear of a parallel gripper is self-locking. Forces are not known here; the contact simulation
+reports where the limit is reached (`stall`). Simulated fingers and the fakes of grippers share this
+motion.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class FingerMotion:
         return None
 
     def restart(self, now_ns: int) -> None:
-        """Count times from `now_ns` on; the fingers go on with what they do."""
+        """Count times from `now_ns` on; the fingers continue their motion."""
         with self._lock:
             last = self._legs[-1]
             self._legs = [

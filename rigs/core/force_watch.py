@@ -213,10 +213,10 @@ class ForceWatch:
             )
 
     def seconds_to(self, force_n: float, now_ns: int) -> float:
-        """Return the time until the normal force will be `force_n`, if it goes on as it does.
+        """Return the time until the normal force reaches `force_n` at its present rate.
 
-        The straight line of least squares through the last 10 ms is followed. A sample's age is
-        known by the one that came fastest among them: what came later waited on its way.
+        The rate is a least-squares line through the last 10 ms. A sample's age is measured against
+        the one with the least delay among them: later ones were delayed in transit.
 
         Args:
             now_ns: the host's clock.

@@ -1,4 +1,4 @@
-"""Devices beside a rig's first cameras and its force sensor: each gives one stream with a name.
+"""Devices besides a rig's first cameras and force sensor: each gives one stream with a name.
 
 They are started after the first cameras and before the pulses, read with them, and closed last.
 Whatever one of them raises names its stream, and ends a trial as a fault of a first camera does.

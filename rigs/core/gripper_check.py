@@ -16,7 +16,7 @@ def check_move(allowed: GripperRange, opening_mm: float, speed_mm_s: float, forc
     """Check a move.
 
     Raises:
-        RigError: the first value that is out of range, with its unit and what is allowed.
+        RigError: the first value that is out of range, with its unit and the allowed range.
     """
     for name, value, (low, high), unit in (
         ("opening", opening_mm, allowed.opening_mm, "mm"),

@@ -88,7 +88,7 @@ class _Place:
 
     @property
     def excess(self) -> float:
-        """Distance beyond the limits, mm; negative inside, NaN for a value that is none."""
+        """Distance beyond the limits, mm; negative inside, NaN for an invalid value."""
         return max(self.low - self.value, self.value - self.high)
 
     def fault(self, where: str) -> GuardError:

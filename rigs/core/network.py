@@ -41,14 +41,14 @@ class BoundedSocket(socket.socket):
         self._wait()
 
     def receive(self, most: int) -> bytes:
-        """Return what came, at least one byte and at most `most`. Raises OSError."""
+        """Return received bytes, at least one and at most `most`. Raises OSError."""
         data = self.recv(most)
         if not data:
             raise ConnectionError("it closed the connection")
         return data
 
     def recv(self, size: int, flags: int = 0) -> bytes:
-        """Return what came, at most `size` bytes; none at the end of the connection."""
+        """Return received bytes, at most `size`; none at the end of the connection."""
         self._wait()
         data = super().recv(size, flags)
         self._count(len(data))

@@ -59,7 +59,7 @@ class SlipDetected(Exception):
 
 
 class SenseLost(Exception):
-    """A watcher cannot detect slip any more; the text says why."""
+    """A watcher can no longer detect slip; the text gives the reason."""
 
 
 class Watcher(Sink, Protocol):
@@ -131,11 +131,11 @@ class Reaction:
 
 
 class SafeState(StaysInContact):
-    """Slip could not be detected any more, and the rig went to its safe state.
+    """Slip could no longer be detected, and the rig went to its safe state.
 
     Attributes:
         cause: why slip could not be detected.
-        reaction: what was done.
+        reaction: the reaction carried out.
     """
 
     def __init__(self, cause: str, kind: str, reaction: Reaction) -> None:
@@ -230,7 +230,7 @@ def _take(
         rig.take_step(index, step, at, watcher if streaming else None)
     except SlipDetected as slip:
         assert reflex is not None
-        watcher.guarded = safe is not None  # without one nothing depends on slip any more
+        watcher.guarded = safe is not None  # without one nothing depends on slip from here on
         made = _react(rig, step.phase, reflex, watcher, watcher, slip.evidence)
         rig.wait(reflex.hold_s, watcher)
         return made

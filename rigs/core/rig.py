@@ -184,7 +184,7 @@ class Rig:
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _twisted: bool = field(default=False, init=False)
-    """The sensor does not stand as the plate's axes do."""
+    """The sensor is rotated with respect to the plate's axes."""
     _plate_uncaught: bool = field(default=False, init=False)
     """True while the plate is released and not caught: it hangs on the sensor, or falls."""
 
@@ -331,7 +331,7 @@ class Rig:
                 times = self.take_step(index, step, began, sink if recording else None)
                 steps.append((times, step.recorded))
                 course.taken(step, self.position)
-                # a nuisance is over before it has a speed, and is no path that was asked for
+                # a nuisance is over before it has a speed, and is not part of the planned path
                 if step.recorded and step.phase != "nuisance":
                     speed = step.speed_mm_s if isinstance(step, Move) else 0.0
                     path.append(self._segment(times, began, course.at, speed))
@@ -345,7 +345,7 @@ class Rig:
 
     @property
     def _often(self) -> bool:
-        """Whether forces and poses are looked at every `force_watch.POLL_S`.
+        """Return True if forces and poses are checked every `force_watch.POLL_S`.
 
         Not on a simulated rig without a limit of force, where an overload breaks nothing.
         """
@@ -353,11 +353,11 @@ class Rig:
 
     @property
     def _closed_mm(self) -> float:
-        """What the fingers add to the arm's depth."""
+        """Depth that the fingers add to the arm's."""
         return 0.0 if self._fingers_mm is None else max(self.grip_opening_mm - self._fingers_mm, 0)
 
     def _watch_forces(self, turns: bool = False, leaving: bool = False) -> ForceWatch:
-        """Read forces from now on, and hold them against the limit.
+        """Read forces from now on, and compare them with the limit.
 
         Args:
             turns: the tool turns, so that its weight changes the readings of a sensor whose load
@@ -382,7 +382,7 @@ class Rig:
         return self._forces
 
     def _end_watch(self) -> None:
-        """Read no forces any more."""
+        """Stop reading forces."""
         if self._forces is not None and self.force is not None:
             self._forces = None
             self.force.stop()
@@ -574,7 +574,7 @@ class Rig:
         """Read the events; return their number around the centre papilla.
 
         Raises:
-            RigError: no event came any more, not even noise.
+            RigError: no more events came, not even noise.
         """
         chunk = self.events.read()
         if self._noise is not None:
@@ -736,7 +736,7 @@ class Rig:
                 raise StopRequested
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
-        """Let time pass; forces and the arm's pose are looked at after it, and meanwhile."""
+        """Let time pass; forces and the arm's pose are checked meanwhile and at its end."""
         resting = self._resting if self._often else None
         if self._forces is None and self._motion is None and resting is None:
             self.clock.wait(seconds)
@@ -944,7 +944,7 @@ class Rig:
         return self.plate_frame.position(self.pose().xyz_mm)
 
     def pose(self) -> Pose:
-        """Return the arm's current pose. Raises ArmFault if it is none."""
+        """Return the arm's current pose. Raises ArmFault if it is invalid."""
         return check_pose(self.arm.pose())
 
     @contextmanager
@@ -1025,7 +1025,7 @@ class Rig:
             if at.distance_mm(out) == 0:
                 return None
             pose, speed_mm_s = self.plate_frame.pose(out), self.at_most(RETRACT_SPEED_MM_S)
-            if self._twisted:  # straight out as it stands; it turns back where it is clear
+            if self._twisted:  # straight out with its present rotation; it turns back once clear
                 pose = replace(pose, rotvec_deg=begin.rotvec_deg)
             blind = _of_sensor(error) and not isinstance(error, ForceLimitError)
             if self.force is not None and self._often and not blind:
@@ -1063,7 +1063,7 @@ class Rig:
 
 
 def _seconds(way: float, speed: float) -> float:
-    """Return the time that a way takes; infinite at a speed that is none, which is never sent."""
+    """Return the time that a path takes; infinite at an invalid speed, which is never sent."""
     if way == 0.0:
         return 0.0
     return way / speed if 0.0 < speed < math.inf else math.inf

@@ -49,7 +49,7 @@ class StreamBuffer:
             self._running = True
 
     def end(self) -> None:
-        """End a run: what came can still be read, what comes is dropped."""
+        """End a run: received parts can still be read, new ones are dropped."""
         with self._lock:
             self._running = False
 
@@ -57,7 +57,7 @@ class StreamBuffer:
         """Add a part with its times, shape (n,), and its size; in the receiving thread.
 
         Raises:
-            ValueError: times fall back or stop, or nobody reads.
+            ValueError: times fall back or stop, or the buffer is not read.
         """
         with self._lock:
             if not self._running or not len(times):
@@ -76,12 +76,12 @@ class StreamBuffer:
             if stream in self._last and int(times[-1]) == last:
                 if self._stall.waited_s(self._count) > self._stall_s:
                     raise ValueError(f"its clock has stopped at {last}")
-            else:  # data whose times stay the same are no life
+            else:  # data with constant times do not count as activity
                 self._count += 1
             self._last[stream] = int(times[-1])
 
     def fail(self, why: str) -> None:
-        """Note why nothing more comes; the first reason is kept, those after it follow from it."""
+        """Record why the stream ended; the first reason is stored, later ones follow from it."""
         with self._lock:
             self._fault = self._fault or why
 

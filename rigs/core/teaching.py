@@ -274,7 +274,7 @@ def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
         prompts: the instruction, and the word that confirms it.
 
     Raises:
-        StopRequested: the operator said stop, or `rig.should_stop` became true.
+        StopRequested: the operator requested a stop, or `rig.should_stop` became true.
         RigError: the arm moves while it should be at rest, was stopped, or does not answer.
     """
     poses = []

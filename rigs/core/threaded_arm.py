@@ -59,7 +59,7 @@ class Run:
 
 
 class ThreadedArm(ABC):
-    """A base for drivers of arms that follow a path in a thread of their own.
+    """A base for drivers of arms that follow a path in a separate thread.
 
     A subclass implements `state`, `_follow_path` and `_abort`.
     """

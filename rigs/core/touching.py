@@ -105,7 +105,7 @@ class RateTouch:
     LONG_S: ClassVar[float] = 0.4
     """Time for which the rate must have risen before the rise, not the 50 ms, is the touch."""
     LEAST_S: ClassVar[float] = 0.5
-    """Time before a rise: what comes sooner is due to the motion, or to contact."""
+    """Time before a rise: an earlier one is due to the motion, or to contact."""
     RISE: ClassVar[float] = 1.7
     """Smallest rate after a rise, over that before it."""
     LOG_RATIO: ClassVar[float] = 32.0

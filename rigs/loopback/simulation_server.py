@@ -413,7 +413,7 @@ class SimulationServer:
         what()
 
     def restore(self, device: str) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """A person puts right whatever is wrong with a device.
+        """Recover a device from any fault, as an operator would.
 
         A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
 

@@ -17,7 +17,7 @@ from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
 KEPT_S = 2.0
-"""Loads kept behind the newest one."""
+"""Length of the history of loads before the newest one, s."""
 
 
 class ToolLoad:
@@ -68,7 +68,7 @@ class ToolLoad:
             t_s: time of the controller's clock.
 
         Returns:
-            None if the scene has not come to that time.
+            None if the scene has not reached that time.
         """
         times, loads = self._known
         if not len(times) or t_s > times[-1]:

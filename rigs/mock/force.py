@@ -25,7 +25,7 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 DEVICE = "force sensor"
 BEHIND_NS = 64_000_000
-"""Loads kept behind the last sample that was read."""
+"""Length of the history of loads before the last sample that was read, ns."""
 _HOUR_NS = 3_600_000_000_000
 _SEEDS = 2**63
 
@@ -144,7 +144,7 @@ class MockForceSensor:
             self._world.drop_wrench(self._name)
 
     def stop(self) -> None:
-        """Stop streaming; what was sampled up to the last whole step can still be read."""
+        """Stop streaming; samples up to the last whole step can still be read."""
         if self._loads is not None and self._until_ns is None:
             self._world.advance()
             self._world.drop_wrench(self._name)

@@ -257,7 +257,7 @@ def _optics(settings: MockSettings, camera: FrameCamera) -> FrameOptics:
 Mask = npt.NDArray[np.bool_]
 
 OUT_OF_SIGHT_MM = 500.0
-"""Distance beside or below the plate's centre at which hidden markers are placed."""
+"""Distance to the side of the plate's centre, or below it, at which hidden markers are placed."""
 
 
 class FrameFaults:

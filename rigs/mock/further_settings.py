@@ -1,4 +1,4 @@
-"""Settings of the simulated devices that a rig has beside its first cameras; cheap to import."""
+"""Settings of simulated devices besides a rig's first cameras; cheap to import."""
 
 from __future__ import annotations
 

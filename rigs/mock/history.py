@@ -27,7 +27,7 @@ class History:
 
     @property
     def begin_ns(self) -> int:
-        """Time of the first row kept."""
+        """Time of the first stored row."""
         return int(self._t_ns[0])
 
     @property

@@ -46,7 +46,7 @@ DAMPING = 0.05
 
 
 def faults_of(nuisances: TrialNuisances, camera: EventCamera, seed: int) -> list[AnyFault]:
-    """The faults that stand for a trial's nuisances; those of the arm have none.
+    """Return the faults that simulate a trial's nuisances; those of the arm have none.
 
     Args:
         camera: warmth multiplies its noise.

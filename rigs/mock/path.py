@@ -175,7 +175,7 @@ class Leg:
     turns: bool = False
     """A turn on the spot: orientations follow the shortest rotation, not a line."""
     ramp: Ramp | None = None
-    """How it speeds up and brakes; None: full speed from the start to the end."""
+    """Acceleration and braking; None: full speed from the start to the end."""
 
     def at(self, t_ns: I64, columns: slice = EVERY) -> F64:
         """Return states at times within the leg, shape (n, 12) or those columns."""

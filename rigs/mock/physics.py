@@ -30,7 +30,7 @@ I64 = npt.NDArray[np.int64]
 FINE_NS = 1_000_000
 """Step while the plate may fall, ns."""
 KEPT_NS = 300_000_000_000
-"""Minimum kept history, at most twice as much; a trial takes a few tens of seconds."""
+"""Minimum stored history, at most twice as much; a trial takes a few tens of seconds."""
 _CHUNK = 4096
 OUT_OF_REACH_MM = 1e6
 """Gap of a torn papilla, which never touches."""

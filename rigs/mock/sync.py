@@ -352,7 +352,7 @@ class _PulseFaults:
         """Return true times and time stamps of the reported pulses on `ticks`.
 
         Pulses are reported in order of time. Where some come late or twice, those after the true
-        time `until_ns` are kept for the next call.
+        time `until_ns` are held for the next call.
         """
         if self._whole:
             return true_ns, stamps

@@ -1,4 +1,4 @@
-"""The simulated thermometer: a sensor of one quantity without a clock of its own."""
+"""The simulated thermometer: a sensor of one quantity without its own clock."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def truth_of(
         are linear between rows; onsets of sliding are located within rows.
 
     Raises:
-        RigError: a reference is older than the kept history (minutes).
+        RigError: a reference is older than the stored history (minutes).
     """
     world.advance()
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm

@@ -123,8 +123,8 @@ class World:
     def at_begin(self, method: Callable[[], None]) -> None:
         """Call a device's method whenever a trial begins, after everything else is reset.
 
-        The device, which knows the world, is not kept alive by it: a rig that is used no more
-        returns its megabytes at once.
+        Only a weak reference to the device is held, since the device refers to the world: an unused
+        rig frees its memory at once.
         """
         self._at_begin.append(WeakMethod(method))
 
@@ -281,7 +281,7 @@ class World:
         """Record the forces of every row from the last one on, until `drop_loads`.
 
         Args:
-            camera: name of a further event camera, which has a record of its own.
+            camera: name of a further event camera, which has a separate record.
         """
         return self.physics.keep_loads(self.now_ns, camera)
 
@@ -289,7 +289,7 @@ class World:
         """Keep the sum of the forces of every row from the last one on, until the trial ends.
 
         Args:
-            sensor: name of a further force sensor, which has a record of its own.
+            sensor: name of a further force sensor, which has a separate record.
         """
         return self.physics.keep_wrench(self.now_ns, sensor)
 

@@ -1,4 +1,4 @@
-"""Exponential and logarithm without branches, for what is computed side by side: tips, pixels.
+"""Exponential and logarithm without branches, for parallel lanes of tips or pixels.
 
 A call of the mathematics library inside a loop keeps it from being computed several lanes at a
 time. These two are plain arithmetic, right to a few units in the last place, and give the same

@@ -1,4 +1,4 @@
-"""Pixels with a bandwidth, a reference that leaks, and ON and OFF thresholds of their own.
+"""Pixels with a bandwidth, a leaking reference, and individual ON and OFF thresholds.
 
 As in v2e (Hu, Liu and Delbruck, CVPRW 2021). The log intensity u(t) that a pixel sees goes through
 a low pass of first order whose cutoff is proportional to the intensity. The memorised level falls
@@ -43,7 +43,7 @@ _WHITE, _OFFSET = 255.0, 20.0  # v2e: a share (I + 20) / 275 of the cutoff at in
 
 
 class Circuit(NamedTuple):
-    """State of all pixels; (height, width) each, if nothing else is said."""
+    """State of all pixels; shapes are (height, width) unless stated otherwise."""
 
     cells: F64
     """(height, width, 6)."""

@@ -75,7 +75,7 @@ BLOCK = np.dtype(
             "place_x place_y base_x base_y branch_x branch_y force_x force_y normal normal_branch",
             "indentation bent path slipped mode speed slid_s earlier",
             "layout_x layout_y gap along bending compliance across shorter",
-            # where the base moves to, and the depth; where the tip stands, and its stretch at first
+            # target of the base's motion, and the depth; the tip's place, and its initial stretch
             "to_x to_y deep foot_x foot_y old_x old_y",
             # force along the papilla and the gain of its relaxing branch; soft part across it
             "pressed gain soft",
@@ -84,14 +84,14 @@ BLOCK = np.dtype(
             # how the step ends: mode, place, force, bend; slip, and share of the step at which the
             # tip lets go (negative: it does not)
             "end_mode end_x end_y end_force_x end_force_y end_normal end_bent slip share",
-            # the search for the bend: bracket, whether it goes on (negative: failed), stretch
+            # the search for the bend: bracket, whether it continues (negative: failed), stretch
             "low high seeks stretch",
             # the force when the slip begins, the cone's radii at both ends; the slip's direction
             "from_x from_y before after unit_x unit_y top bottom arc",
             # the search for the slip (`rigs.scene.slip.slip_step`)
             "bend ahead aside rest_x rest_y soft_x soft_y quick lag grip grip_slope far",
             # for lanes that are prepared one by one: kind, share of the drive until the tip lets
-            # go, how long it slides then (s), what it takes from the plate by letting go
+            # go, how long it slides then (s), the force that the plate loses by its letting go
             "rare held slides_s kick",
         )
         for name in names.split()
@@ -105,7 +105,7 @@ Blocks = npt.NDArray[np.record]
 _ROWS, _STATES, _CONSTANTS = len(BLOCK.names or ()), 18, 8
 _AWAY_MM = 1e6
 _LETS_GO, _SLOWS = 1.0, 2.0
-"""Kinds of rare slips: a tip that lets go, and one whose earlier speeds predict nothing."""
+"""Kinds of rare slips: a tip that lets go, and one without a usable speed history."""
 ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
 
@@ -145,7 +145,7 @@ def make_blocks(table: F64, field: F64, state: F64) -> Blocks:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def store_state(blocks: Blocks, state: F64) -> None:
-    """Write the state of the tips in `blocks` back into rows of their own, (n, 18)."""
+    """Write the state of the tips in `blocks` back into one row each, (n, 18)."""
     flat = blocks.view(np.float64)
     for i in range(state.shape[0]):
         for c in range(_STATES):
@@ -161,13 +161,13 @@ def _take_knot(w: Block, field: F64, i: int, j: int, knot: float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def feel_spots(blocks: Blocks, n: int, clean: F64, field: F64, spots: F64, factors: F64) -> None:
-    """Let every tip feel the friction of the spots on which it stands when a step begins.
+    """Apply the friction of the spots under the tips at the beginning of a step.
 
-    It keeps that friction for the step, so that it feels a spot's border a step late: a few
+    It is constant during the step, so a tip feels a spot's border a step late: a few
     micrometres on the way.
 
     Args:
-        clean: friction beside all spots, as `Springs.friction`.
+        clean: friction outside all spots, as `Springs.friction`.
         field: friction as it is felt; rows of the tips that came to another place are written.
         spots: of `Springs`, (k, 4).
         factors: by which each row of `field` differs from `clean`, (n,), written.
@@ -291,7 +291,7 @@ def _touches_at(was: float, deep: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _touch(w: Block, law: Law, j: int, step: Step) -> None:
-    """Let a tip that meets the plate in this step stand under its base where it does so."""
+    """Place a tip that meets the plate in this step under its base at that moment."""
     was, gain = w.indentation[j], step.gain
     w.foot_x[j], w.foot_y[j] = w.to_x[j], w.to_y[j]
     if was < 0.0:
@@ -400,7 +400,7 @@ def settle(w: Block, law: Law, start_s: float, h: float, decay: float) -> None:
         w.slipped[j] = start_s + share * h if share >= 0.0 else w.slipped[j]
         part = h * (1.0 - max(share, 0.0))
         speed, earlier = slip / part if slip > 0.0 else 0.0, w.speed[j]
-        # a tip that just let go, or slows down fast, is not as it was a step ago
+        # a tip that just let go, or slows down fast, differs from its state a step ago
         steady = slip > 0.0 and share < 0.0 and is_steady(earlier, speed)
         w.earlier[j] = earlier if steady and w.slid_s[j] == h else -1.0
         w.slid_s[j], w.speed[j] = h if steady else 0.0, speed
@@ -412,7 +412,7 @@ def settle(w: Block, law: Law, start_s: float, h: float, decay: float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _slide(w: Block, field: F64, law: Law, first: int, count: int, step: Step, rare: int) -> None:
-    """Let the tips slide whose `end_mode` says so; `rare`: how many are prepared one by one."""
+    """Slide the tips with `end_mode` sliding; `rare`: how many are prepared one by one."""
     rough = field.shape[1] > 1
     if rare > 0:
         for j in range(count):
@@ -429,7 +429,7 @@ def _slide(w: Block, field: F64, law: Law, first: int, count: int, step: Step, r
         again = 0
         for j in range(count):
             if w.seeks[j] > 0.0:
-                w.seeks[j] = -1.0  # no more passes for what is not found by now
+                w.seeks[j] = -1.0  # no more passes for slips not found by now
             elif w.rare[j] == _LETS_GO and w.seeks[j] == 0.0:
                 again += _speed_at_end(w, field, law, first + j, j)
         if again > 0:
@@ -796,7 +796,7 @@ def _needs_speed(law: Law, cone: float, slides_s: float) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _speed_at_end(w: Block, field: F64, law: Law, i: int, j: int) -> int:
-    """Take the speed of a tip that let go anew, which is soon as it is where its slip ends.
+    """Recompute the speed of a tip that let go: it soon equals that at the end of its slip.
 
     Returns:
         1 if there is a new speed, and the slip is sought again; else 0.

@@ -13,7 +13,7 @@ from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64, U8
 
 SHIFTS = 128
-"""A noise tile is this much wider than anything drawn from it: there are so many shifts."""
+"""Margin of a noise tile over anything drawn from it: the number of possible shifts."""
 MARGIN_PX = 6.0
 """Margin of the noise beyond a disc's rim."""
 HALF_DIAGONAL = 0.7072
@@ -123,7 +123,7 @@ def _sharp(
     down: int,
     along: int,
 ) -> None:
-    """One disc that stands still; row + down, column + along are its places in the noise tiles."""
+    """One static disc; row + down, column + along are its places in the noise tiles."""
     height, width = image.shape
     outer, inner = radius + HALF_DIAGONAL, radius - HALF_DIAGONAL
     for y in range(max(int(np.ceil(cy - outer)), 0), min(int(cy + outer) + 1, height)):

@@ -20,7 +20,7 @@ its last one, and its reference level of log intensity."""
 TAIL = 1.0 / (1.0 + np.exp(CUT))
 """Value of the logistic where the edge ends."""
 FAR = 1e6
-"""Stands for a rim distance that is never reached, px."""
+"""Rim distance that is never reached, px."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

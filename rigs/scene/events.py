@@ -82,7 +82,7 @@ Events = tuple[I64, U16, U16, U8]
 
 @dataclass(frozen=True)
 class EventOptics:
-    """The camera and what it sees; fields as in `rigs.mock.settings.EventCamera`."""
+    """The camera and its scene; fields as in `rigs.mock.settings.EventCamera`."""
 
     width: int = 640
     height: int = 480
@@ -219,7 +219,7 @@ class MarkerSensor:
         self._bins: dict[int, Candidates] = {}
 
     def _new_circuit(self, seed: int) -> Circuit:
-        """Pixels with OFF thresholds and leak rates of their own."""
+        """Pixels with individual OFF thresholds and leak rates."""
         optics, shape, off = self.optics, self.threshold.shape, self.threshold
         mean, sigma = optics.threshold_off, optics.threshold_off_sigma
         if mean is not None or sigma is not None:
@@ -334,7 +334,7 @@ class MarkerSensor:
         first, last = begin_ns // BIN_NS, max((end_ns - 1) // BIN_NS, begin_ns // BIN_NS)
         if first == last and first in self._bins:
             return self._bins[first]
-        # what was drawn before is dropped, what is needed again is kept
+        # bins drawn before are dropped, those needed again are retained
         self._bins = {
             index: self._bins.get(index) or candidates(self._noise, self._trial, index)
             for index in range(first, last + 1)

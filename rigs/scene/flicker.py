@@ -8,9 +8,9 @@ whose thresholds are both theta has P / theta - 1 of them in a half period on th
 least theta; else none: its reference level comes to rest.
 
 A pixel has a reference level for the light besides the one for the markers. That is exact where the
-image stands still. At a rim that moves, the events of both are a superposition, in which neither
+image is static. At a rim that moves, the events of both are a superposition, in which neither
 advances or delays the other. The levels are at random between two events when the light is first
-seen, as if it had long been so, and a leak does not move them.
+seen, as in a steady state, and a leak does not move them.
 """
 
 from __future__ import annotations

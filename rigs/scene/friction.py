@@ -1,7 +1,7 @@
 """Friction: the coefficient along the path of each tip, and the cone that it makes of the force.
 
-With one constant coefficient a sliding papilla pulls with a constant force and its marker stands
-still in the image, exactly as if it stuck. Real surfaces are not like that. The field is smooth
+With one constant coefficient a sliding papilla pulls with a constant force and its marker rests in
+the image, exactly as if it stuck. Real surfaces are not like that. The field is smooth
 (C1 between its knots), so that forces, marker paths and event times stay smooth too, and the
 contact solver's Newton steps have a true slope.
 
@@ -173,7 +173,7 @@ def keeps_sliding(
 def raised_cone(fx: float, fy: float, before: float, after: float) -> tuple[float, float]:
     """Radii of a cone at both ends of a step, made as large as the force is that lies on it.
 
-    The speed of sliding raises friction, and goes on as it does.
+    The speed of sliding raises friction, by the same ratio at both ends.
     """
     size = np.sqrt(fx * fx + fy * fy)
     return size, after * (size / before) if before > 0.0 else after

@@ -1,7 +1,7 @@
-"""From places in the plate's plane to pixels: a pinhole that may stand askew, a lens that bends.
+"""Projection of the plate's plane to pixels: a pinhole that may be tilted, and lens distortion.
 
 Straight on, this is one scale. A tilt makes it a homography and a radial term bends it; both are
-kept exact, because labels are read to a tenth of a pixel.
+modelled exactly, because labels are read to a tenth of a pixel.
 """
 
 from __future__ import annotations

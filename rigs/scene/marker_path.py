@@ -23,7 +23,7 @@ from sliplab.storage.streams import F64, I64
 COLUMN, ROW, RADIUS = 0, 1, 2
 """First index of the path's coordinates, all in px."""
 UNEVEN = 8.0
-"""Rows nearly coincide if the longest step beside them is longer by more than this factor."""
+"""Rows nearly coincide if the longest adjacent step is longer by more than this factor."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -87,12 +87,12 @@ def slope_weights(t: F64, first: int, last: int, shift: int, inverse: F64, weigh
     The slope is that of the cubic through the four nearest rows (Lagrange), at both ends of a
     block a one-sided one; through all of them where a block has fewer. Rows that nearly coincide
     with this one, or with a nearer one, are left out: a tip that comes free in a short step would
-    swing the curve far out in the long one beside it.
+    swing the curve far out in the long adjacent one.
 
     Args:
         t: times of rows, ns, (r,).
         first, last: the block's first and last row in `t`.
-        shift: those of row k stand in column k + shift, as a border's row has one of each block.
+        shift: those of row k are in column k + shift, as a border's row has one of each block.
         inverse: 1 over the length of each step, (r,), written.
         weights: (4, columns), 1/ns, of the rows from `nearest_row` on; written.
     """
@@ -163,7 +163,7 @@ def inner_weights(first: I64, blocks: int, weights: F64, inner: F64) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _slope(c: int, k: int, first: int, last: int, shift: int, weights: F64, curve: F64) -> float:
     """Slope of coordinate c at row k of a block."""
-    # differences: of what stands still, the slope is 0 to the bit
+    # differences: the slope of a coordinate at rest is 0 to the bit
     here, low, slope = curve[4 * c, k], nearest_row(k, first, last), 0.0
     for j in range(min(last - first + 1, 4)):
         slope += weights[j, k + shift] * (curve[4 * c, low + j] - here)
@@ -394,7 +394,7 @@ def cut_block(
 ) -> int:
     """Cut a block into segments on which the marker does not move far.
 
-    What is done follows from the block's own rows alone.
+    The result depends on the block's own rows alone.
 
     Args:
         first, last: the block's first and last row.

@@ -73,7 +73,7 @@ def hot_places(width: int, height: int, count: int, seed: int) -> I64:
 
 
 def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
-    """All that may become noise in second `index` of the trial with `seed`.
+    """Candidates for noise events in second `index` of the trial with `seed`.
 
     The sum of independent Poisson processes is one of the summed rate, whose events belong to each
     with its share; given their number, their times are sorted uniform ones, which the cumulative

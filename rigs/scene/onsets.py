@@ -97,7 +97,7 @@ def slide_onsets(
 
 
 def _bend(skin: Skin, shorter: F64, stretch: F64, pressed: F64) -> F64:
-    """Bend of columns whose tips stand `stretch` mm off, by Newton on a cubic that rises."""
+    """Bend of columns whose tips are `stretch` mm off, by Newton on a monotone cubic."""
     soft = 1.0 + skin.compliance_mm_per_n * (skin.bending_n_per_mm - 2.0 * shorter * pressed)
     cubic = skin.compliance_mm_per_n * 2.0 * shorter**2 * skin.normal_n_per_mm
     bend = stretch / np.maximum(soft, 0.1)

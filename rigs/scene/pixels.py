@@ -1,8 +1,8 @@
 """Events of many pixels at once: which meet thresholds on a segment of a marker's path, and when.
 
-One pixel's events wait for each other; those of many do not, and where their numbers lie side
-by side a compiler does four or eight of them at a time. So all that a pixel needs stands in a
-tile, one field after the other with a lane for each pixel, and is worked on in loops without
+One pixel's events depend on each other; those of many do not, and where their numbers are adjacent
+in memory a compiler processes four or eight of them at a time. So all data of a pixel are in a
+tile, one field after the other with a lane for each pixel, and are processed in loops without
 branches. Fields are constant distances apart, which is how the compiler knows that lanes do not
 touch each other.
 
@@ -13,7 +13,7 @@ which is Newton's with the curvature, is nearly always enough. What is not good 
 a second tile for more of them. What is not monotone, and what never gets good, is left to
 `crossings`, one pixel at a time.
 
-What is done on a segment follows from the rows of its block alone, to the bit, and pixels do not
+The result on a segment depends on the rows of its block alone, to the bit, and pixels do not
 wait for each other, so neither the cut of a trial into calls nor the order of pixels matters.
 """
 
@@ -153,7 +153,7 @@ _TICK = float(1 << 25)  # a nanosecond in a packed event
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def begin_segment(fire: F64, n: int, segment: Segment) -> None:
-    """Set up what is the same for all thresholds: limits, and slopes at both ends."""
+    """Set up the values common to all thresholds: limits, and slopes at both ends."""
     a, b = segment.begin, segment.end
     for j in range(n):
         fire[R_LOW + j], fire[R_HIGH + j], fire[R_FINE + j] = a, b, segment.fine
@@ -228,7 +228,7 @@ def pack_steps(n: int, since: F64, inverse: F64, curve: F64, steps: F64) -> None
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fetch(roots: F64, n: int, since: F64, until: F64, steps: F64) -> None:
-    """Find the step in which each time lies, and fetch what is known of it."""
+    """Find the step in which each time lies, and fetch its coefficients."""
     for j in range(n):
         k, t = np.uint64(roots[R_STEP + j]), roots[R_TIME + j]
         while t > until[k]:
@@ -242,7 +242,7 @@ def fetch(roots: F64, n: int, since: F64, until: F64, steps: F64) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine(roots: F64, n: int) -> None:
-    """One step of Chebyshev's method; where SINCE was, the packed event stands then."""
+    """One step of Chebyshev's method; the packed event replaces SINCE."""
     for j in range(n):
         t, target = roots[R_TIME + j], roots[R_TARGET + j]
         inverse = roots[R_INVERSE + j]

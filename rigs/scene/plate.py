@@ -7,7 +7,7 @@ that its own swing is faster than the steps takes speed and force of the end alo
 but without ringing. Forces fall monotonically with the plate's speed, so one scalar equation with a
 bracket round its root decides the step, however many tips change between stick and slip in it.
 Where static friction exceeds kinetic, a tip that lets go makes the plate faster at once, so a step
-ends where the first one does, were all held, and what is left of it is a step of its own.
+ends where the first one does, were all held, and the rest of it is a separate step.
 Regularised friction would let a held plate creep.
 """
 
@@ -50,7 +50,7 @@ def _pull(
 ) -> float:
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N.
 
-    It is what must stand for the end of the step, so that its mean with the beginning (`new`) is
+    It is the effective force at the end of the step, so that its mean with the beginning (`new`) is
     that over the step: the force of a tip that lets go falls in no time.
     """
     total = 0.0
@@ -240,7 +240,7 @@ def advance_free(
             height = motion[0] + h * share * (before + 0.5 * share * (held - before))
             if ns < 1 or ns == step_ns or height <= stop:
                 break
-            # the step ends where the first tip lets go, and what is left of it is another
+            # the step ends where the first tip lets go, and its rest is another
             at = _between(blocks[0], motion[0], sensor[k], share)
             part = ns * 1e-9
             decay, gain = relaxing(part, law.relaxation_s)

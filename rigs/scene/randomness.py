@@ -1,4 +1,4 @@
-"""Random numbers that depend on what they are for, and never on what was drawn before.
+"""Random numbers that depend on their purpose, and never on earlier draws.
 
 A trial must give the same bytes whether it is the first of a campaign or taken again after a
 crash, read in one chunk or in a thousand. So there is no global generator: each use names its

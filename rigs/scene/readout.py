@@ -100,7 +100,7 @@ def read_each(
         events: packed (see above), their times ns after `base_ns`, at most `span_ns`; overwritten.
         other: scratch, as long.
         fired: time (ns) at which each pixel last fired, (height, width), written.
-        t_ns, xs, ys, ps: written from `kept` on.
+        t_ns, xs, ys, ps: output, written from index `kept` on.
 
     Returns:
         how many they hold now.
@@ -143,7 +143,7 @@ def read_scans(
         period_ns, phase_ns, column_ns: see `Scans`.
 
     Returns:
-        how many events are delivered in all, and how many of later scans are left: these stand
+        how many events are delivered in all, and how many of later scans are left: these are
         at the front of `events`, their times unchanged.
     """
     height, width = fired.shape
@@ -165,7 +165,7 @@ def read_scans(
         where = (scan << x_bits | (event >> 13) & 4095) << y_bits | (event >> 1) & 4095
         other[inside] = where << low | (event >> 25) << 1 | event & 1
         inside += 1
-    # what is sorted stands behind what is left over
+    # the sorted events are behind the left-over ones
     keys = events[left:]
     for k in range(inside):
         keys[k] = other[k]
@@ -209,8 +209,8 @@ def larger(array: npt.NDArray[Any], capacity: int) -> npt.NDArray[Any]:
 def sort_packed(keys: I64, n: int, other: I64, low: int, high: int) -> None:
     """Sort the first `n` of `keys` (int64, not negative) in place.
 
-    Bits `low` to `high` (without) are sorted by counting, 9 at a time; what is equal in them is
-    put in order by insertion, so they should tell nearly all keys apart.
+    Bits `low` to `high` (without) are sorted by counting, 9 at a time; keys that are equal in them
+    are sorted by insertion, so these bits should distinguish nearly all keys.
 
     Args:
         other: scratch, as long as `keys`.

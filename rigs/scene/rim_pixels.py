@@ -54,7 +54,7 @@ def near_rim(
 ) -> int:
     """Pixels within `band` px of a disc's rim, into `pixels`; how many there are.
 
-    Where there are more than `pixels` has room for, the rest is counted and not kept.
+    Where there are more than `pixels` has room for, the rest is counted and dropped.
     """
     n, room = 0, pixels.shape[0]
     outer, inner = radius + band, max(radius - band, 0.0)
@@ -103,7 +103,7 @@ def make_list(
     aim: F32,
     place: npt.NDArray[np.int32],
 ) -> bool:
-    """Make marker i's list anew, where it is now; False where it cannot have one.
+    """Rebuild marker i's list at its present place; False where it cannot have one.
 
     There is none where the list has too few slots, or the disc is so small that the rim's
     curvature matters.

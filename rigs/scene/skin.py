@@ -75,7 +75,7 @@ class Skin:
 
 @dataclass(frozen=True)
 class Made:
-    """How n papillae came out, measured instead of drawn.
+    """Measured geometry of n papillae, instead of a drawn one.
 
     Attributes:
         height_mm: (n,). friction_factor: over the mean, (n,). offset_mm: from the design's places,

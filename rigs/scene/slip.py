@@ -28,10 +28,10 @@ from sliplab.storage.streams import F64
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""
 _MARCH_MM = KNOT_MM / 8.0
-"""Distance between the places at which the balance of a tip is looked at one by one."""
+"""Distance between the places at which the balance of a tip is evaluated one by one."""
 _MOST_PLACES = 4096.0
 _STEADY = 1.25
-"""Speed over the next one up to which a line or a parabola through both tells of the one after."""
+"""Ratio of successive speeds up to which a line or a parabola through both predicts the next."""
 _CLOSE_SPEED = 1e-3
 """A change of the speed, over that at which friction begins to rise, like `CLOSE`."""
 
@@ -357,7 +357,7 @@ def relaxed_speed(
     slid_s: float,
     law: Law,
 ) -> float:
-    """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds predict nothing, mm/s.
+    """Speed of a tip that slid for `slid_s` seconds and without a usable speed history, mm/s.
 
     With x = (|f| / cone - 1) / strengthening the speed is weak (e^x - 1), and x' = a - b (e^x - 1)
     while rates are constant: a linear equation for e^-x, solved exactly, because a tip that lets go

@@ -1,6 +1,6 @@
 """Constants and state of the papillae, and the levels of physics, for the contact solver.
 
-A scene should hold what it needs and nothing more, so the physics come in levels:
+A scene should hold only the physics that it needs, so the physics come in levels:
 
 L0  closed-form onsets, for labels and plans only (`rigs.scene.onsets`).
 L1  linear springs with Coulomb friction: return mapping.
@@ -158,7 +158,7 @@ class Tips:
         return self.state[:, MODE]
 
     def copy(self) -> Tips:
-        """The same state in memory of its own."""
+        """Return a copy of the state."""
         return Tips(self.state.copy())
 
 

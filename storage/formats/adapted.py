@@ -108,7 +108,7 @@ def _opened(
 
 
 def _salvaged(salvage: Callable[[], ForeignTrial], made: ForeignTrial) -> ForeignTrial:
-    """Return what stands whole of the events' file, with the frames of another file."""
+    """Return the intact part of the events' file, with the frames of another file."""
     return replace(salvage(), frames=made.frames, frame_px=made.frame_px)
 
 
@@ -184,7 +184,7 @@ class _Opening:
     """A trial while it is opened.
 
     Attributes:
-        stack: closes what was unpacked, once the trial is imported.
+        stack: closes unpacked files, once the trial is imported.
         clocks: of devices and streams on the time line, which is the events' clock.
     """
 

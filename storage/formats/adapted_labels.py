@@ -44,7 +44,7 @@ class FoundLabel:
     """The label of a trial as the data set states it.
 
     Attributes:
-        source: where it stood.
+        source: file or field that it was read from.
         whole: class of the whole recording.
         clock: of its times: ``events``, ``frames`` or ``start``.
     """
@@ -74,7 +74,7 @@ class FoundLabel:
 
 @dataclass(frozen=True)
 class FoundLabels:
-    """Labels by the ids of their trials, and what is noteworthy about them."""
+    """Labels by the ids of their trials, and notes about them."""
 
     by_trial: dict[str, FoundLabel]
     warnings: list[str]

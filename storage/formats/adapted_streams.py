@@ -87,7 +87,7 @@ def read_counts(array: Any, part: EventFiles) -> EventSource:
         array: counts, with the axes that `part` names.
 
     Raises:
-        FormatError: other axes, another size, or a count that is none.
+        FormatError: other axes, another size, or an invalid count.
     """
     axes: list[str] = list(part.axes)
     if array.ndim != len(axes):
@@ -132,7 +132,7 @@ def read_counts(array: Any, part: EventFiles) -> EventSource:
 
 
 def _whole(counts: Any, part: EventFiles) -> tuple[I64, int]:
-    """Return counts with 0 in place of what is none, and the number of such cells.
+    """Return counts with 0 in place of invalid cells, and the number of such cells.
 
     Raises:
         FormatError: there are as many of those as of counts above 0.
@@ -175,7 +175,7 @@ def read_events(
 
     Args:
         names: its files; paths: them on the disk, for formats that need it.
-        salvage: of a file that is damaged where it begins to be read, take what stands whole.
+        salvage: read the intact part of a file that is damaged where it begins to be read.
 
     Raises:
         FormatError: a file cannot be right.
@@ -249,7 +249,7 @@ def _check_polarities(values: Any) -> None:
 
 
 def _places(values: Any) -> Any:
-    """Return columns or rows of pixels, -1 for what is none."""
+    """Return columns or rows of pixels, -1 for invalid ones."""
     if values.dtype.kind != "f":
         return values
     with np.errstate(invalid="ignore"):
@@ -308,7 +308,7 @@ def read_frames(
 
 @dataclass
 class FrameNotes:
-    """What was found while frames were read: warnings, and the resolution of their times, us."""
+    """Findings of reading the frames: warnings, and the resolution of their times, us."""
 
     texts: list[str] = field(default_factory=list)
     resolution_us: float = 0.0

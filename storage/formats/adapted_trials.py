@@ -35,7 +35,7 @@ class AdaptedTrial:
 
     Attributes:
         source: its file, or the table with its row.
-        fields: what names and tables say of it.
+        fields: its fields from names and tables.
         condition: levels by factor as text with unit.
         files: paths of each stream's files, by the stream's key.
         missing: streams that it has no files of.
@@ -50,7 +50,7 @@ class AdaptedTrial:
     missing: tuple[str, ...] = ()
 
     def recorded(self) -> RecordedTrial:
-        """What the split needs to know of it; the recording's length is not known yet."""
+        """Properties that the split needs; the recording's length is not known yet."""
         names = () if self.label is None else self.label.classes
         first = names[0] if names else None
         return RecordedTrial(self.id, self.condition, self.fields, first, 0.0, names)
@@ -103,7 +103,7 @@ class _Draft:
 
 
 def find_trials(adapter: Adapter, file: Path, folder: DataFolder) -> AdaptedSet:
-    """Find the trials of a data set with all that names and tables say of them.
+    """Find the trials of a data set with their fields from names and tables.
 
     Raises:
         InputError: a pattern fits nothing, two trials have one id, a field is missing, or a table
@@ -260,7 +260,7 @@ class _Finding:
     ) -> list[tuple[str, ...]]:
         """Return the files that a pattern fits with the fields of each trial filled in.
 
-        Fields that no trial has stand for any characters.
+        Fields that no trial has match any characters.
         """
         known = [name for name in pattern.fields if any(name in each for each in fields)]
         if pattern.exact and len(known) == len(pattern.fields):

@@ -91,7 +91,7 @@ class Aedat4File:
         at: byte of the packet that was read last.
 
     Raises:
-        FormatError: it is none, or damaged.
+        FormatError: it is not an AEDAT4 file, or damaged.
         OSError: it cannot be read.
     """
 
@@ -142,10 +142,10 @@ class Aedat4File:
         return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
 
     def whole(self) -> Lost | None:
-        """Find the first packet that cannot be read; nothing from there on is read any more.
+        """Find the first packet that cannot be read; nothing is read from there on.
 
         Returns:
-            What is lost by that; None where all is whole.
+            The loss; None if the file is intact.
         """
         reason = self._short
         for kind, read in (
@@ -204,9 +204,9 @@ class Aedat4File:
     def events(self, number: int) -> Iterator[EventChunk]:
         """Yield the events of a stream, packets together up to `_PACKET_EVENTS` events.
 
-        Events that cannot be right are left out; a packet with some is a chunk of its own.
+        Invalid events are left out; a packet with some is a separate chunk.
 
-        A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
+        A camera's packet has a few hundred events: the overhead per chunk would exceed their cost.
         """
         room = _empty(_PACKET_EVENTS)
         filled = 0
@@ -341,7 +341,7 @@ def _event_words(data: memoryview) -> Any:
 
 
 def _split(words: Any, chunk: EventChunk) -> EventChunk:
-    """Fill a chunk from the words of its events; return it without those that cannot be right."""
+    """Fill a chunk from the words of its events; return it without the invalid ones."""
     if _split_events(words, chunk.x, chunk.y, chunk.p, chunk.t_us):
         return chunk
     return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)

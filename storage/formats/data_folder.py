@@ -31,7 +31,7 @@ class DataFolder:
     Attributes:
         path: the folder, ``.zip`` or single file.
         names: paths of the files.
-        skipped: what is left out: links, hidden files, and what is no file.
+        skipped: links, hidden files, and entries that are no files.
     """
 
     def __init__(self, path: Path) -> None:
@@ -153,7 +153,7 @@ class DataFolder:
                 return file.read(item.file_size)
         except (BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError) as error:
             raise InputError(where, "", None, f"cannot be unpacked: {error}") from None
-        except Exception as error:  # zlib and lzma have errors of their own
+        except Exception as error:  # zlib and lzma have their own errors
             raise InputError(where, "", None, f"cannot be unpacked: {error}") from None
 
     @contextmanager

@@ -233,7 +233,7 @@ def _lab_trial(
 
 
 def _piece(columns: Mapping[str, Rows]) -> int:
-    """Return the rows that stand or fall together: a piece of the column of times."""
+    """Return the rows that are read or lost together: a chunk of the column of times."""
     *_, times = columns.values()
     starts = (low for low, *_ in times.stored())
     with suppress(*_FAULTS):
@@ -324,7 +324,7 @@ def _resolution(
 
 
 def _same_length(columns: Mapping[str, Sized]) -> None:
-    """Refuse columns of which one is truncated: nobody knows which events it has lost."""
+    """Refuse columns of which one is truncated: the events that it has lost are unknown."""
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
         stated = ", ".join(f"{key} {count}" for key, count in lengths.items())
@@ -382,7 +382,7 @@ class _opened:
     """An open file and its columns of plain numbers; its faults become `FormatError`.
 
     Args:
-        torn: open a file that is cut short too, with zeros in place of what is missing.
+        torn: open truncated files, too, with zeros in place of missing data.
     """
 
     def __init__(self, path: Path, *, torn: bool = False) -> None:
@@ -446,7 +446,7 @@ def _open_note(path: Path) -> Callable[[], tuple[str, ...]]:
 
 
 def _stated_end(path: Path) -> int:
-    """Return the number of bytes that a file says it has; 0 where it says none."""
+    """Return the number of bytes that a file's header states; 0 if it states none."""
     with path.open("rb") as file:
         head = file.read(_SUPERBLOCK)
     at = {0: 40, 1: 44, 2: 28, 3: 28}.get(head[8] if len(head) == _SUPERBLOCK else -1)

@@ -27,7 +27,7 @@ def export_trials(
     on_trial: Callable[[str], None] = lambda name: None,
     stream: str = EVENTS_KIND,
 ) -> Json:
-    """Export trials to `folder`, each file complete or not at all, and a manifest last.
+    """Export trials to `folder`, each file atomically, and a manifest last.
 
     Args:
         stream: name of a further event camera's stream, whose events, pulses and clock are

@@ -2,7 +2,7 @@
 
 Each buffer has its length in front: `EVTS` is a vector of 16-byte structs, `TRIG` a vector of
 tables, `FRME` a table with pixels, `IOHE` a header with a description. Layouts were read off what
-dv-processing 2.0.4 writes (tests hold them against it); all numbers little-endian.
+dv-processing 2.0.4 writes (tests compare them with it); all numbers little-endian.
 
 A flatbuffer consists of offsets into itself. A table begins with the offset back to its vtable, the
 list of its fields' positions; a field that is not in the list has its default value. The reader

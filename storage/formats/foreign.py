@@ -31,18 +31,18 @@ from sliplab.storage.trials.store import Campaign, Store
 OUTSIDE = "events outside of the sensor"
 UNKNOWN_POLARITY = "events with an unknown polarity"
 NO_TIME = "{} without a valid time"
-"""Reasons why rows are left out, by what they are."""
+"""Reasons why rows are left out, by their kind."""
 NO_TIME_NS = -(1 << 63)
 """In place of a time that is not a number or is out of range."""
 ChunkT = TypeVar("ChunkT", bound=EventChunk | FrameChunk | PoseChunk | WrenchChunk | ScalarChunk)
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
 EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
-"""File beside exported trials, from which they are imported again as they were."""
+"""File next to exported trials, from which they are imported again unchanged."""
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14
 LATEST_US = 1 << 53
-"""285 years; what comes later is not a time, and would not fit 64 bits of nanoseconds."""
+"""285 years; a larger value is not a time, and would not fit 64 bits of nanoseconds."""
 
 
 class FormatError(ValueError):
@@ -157,7 +157,7 @@ class Restorable(Protocol):
 
 @dataclass(frozen=True)
 class Seen:
-    """First and last time of what was read of a trial, each on its own clock; None without any.
+    """First and last time of a trial's data, each on its own clock; None without any.
 
     Attributes:
         further_ns: of poses and streams by name.
@@ -170,7 +170,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Whole:
-    """What is known of a trial once all of it was read, on the time line.
+    """Properties of a trial that are known once all of it was read, on the time line.
 
     Attributes:
         span_ns: begin and end of the recording.
@@ -191,20 +191,20 @@ class ForeignTrial:
         events: its events, in order of time but for faults; read again by each call.
         event_px: columns and rows of its camera, None if unknown; called once `events` were read.
         epoch: what the times count from, as text.
-        about: further properties in the file, to be kept in the record.
-        unknown: names of what nobody knows of it any more.
+        about: further properties in the file, to be stored in the record.
+        unknown: names of missing metadata.
         kind: name of its format.
-        lost: what is damaged in its file, if this is what stands whole before the damage.
-        packets: packets that do; None where the format has none.
+        lost: the damage of its file, if this is the intact part before the damage.
+        packets: number of intact packets; None where the format has none.
         poses: of the arm, on its own clock; cameras: frames of further cameras by stream.
         streams: forces and scalars by stream.
         left_out: rows that were left out while it was opened, by reason.
         resolution_us: of the type of the times of frames and streams, us, by stream.
         notes: warnings about it, such as of files that contradict each other; called once all was
             read.
-        salvage: returns what stands whole in its file, if that turns out to be damaged; raises
-            FormatError where that is nothing.
-        campaign: the one that it is of; None for one of its own.
+        salvage: returns the intact part of its file, if that turns out to be damaged; raises
+            FormatError if there is none.
+        campaign: the campaign that it belongs to; None for a separate one.
         original: a trial of a store with all that belongs to it; it is committed as it was.
         clocks: those that are known, by device and stream. experiment: see the record.
         geometry: further keys of the record's geometry.
@@ -259,13 +259,13 @@ def refusal(file: Path, error: FormatError) -> InputError:
 def before_damage(
     read: Callable[[], ForeignTrial], error: FormatError, salvage: bool
 ) -> ForeignTrial:
-    """Return what stands whole in a file that could not be read.
+    """Return the intact part of a file that could not be read.
 
     Args:
         error: the fault that was found.
 
     Raises:
-        Damage: that is nothing, or it is not to be salvaged, and only offered.
+        Damage: there is no intact part, or it may not be salvaged, and is only offered.
         FormatError: the fault is no damage.
     """
     try:
@@ -365,7 +365,7 @@ def some_rows(chunk: ChunkT, good: Any) -> ChunkT:
 
 
 def resolution_us(times: Any, per_unit: float, whole_us: float = 0.0) -> float:
-    """Return the step from the latest time to the next one that its type can tell, us.
+    """Return the resolution of the times' type at the latest time, us.
 
     Args:
         per_unit: microseconds of one unit of the times.
@@ -379,7 +379,7 @@ def resolution_us(times: Any, per_unit: float, whole_us: float = 0.0) -> float:
 
 
 def grey(levels: U8) -> U8:
-    """Return a picture's grey levels (ITU-R BT.601), as an array of its own.
+    """Return a picture's grey levels (ITU-R BT.601), as a new array.
 
     Args:
         levels: shape (height, width), or with a last axis of grey, or of blue, green, red and

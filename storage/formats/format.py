@@ -30,7 +30,7 @@ class Format:
             recognises a file's content.
         sniff: recognises a file by its first bytes, or with none a folder that is one recording or
             one data set.
-        read: reads one file, or a folder that is one recording. salvage: reads what stands whole
+        read: reads one file, or a folder that is one recording. salvage: reads the intact part
             before the damage in a damaged one.
         read_files: reads the files of one recording that has several.
         read_all: reads the trials of a folder that is one data set.
@@ -63,8 +63,8 @@ class Files:
     Attributes:
         stem: what the trial is named after.
         kind: name of their format.
-        read: reads them as a trial of the given name; if the second argument is true, what stands
-            whole in a damaged file.
+        read: reads them as a trial of the given name; if the second argument is true, reads the
+            intact part of a damaged file.
     """
 
     stem: str
@@ -78,16 +78,16 @@ class Files:
 
 @dataclass(frozen=True)
 class Layout:
-    """How files and folders of recordings belong together; plug-ins declare it as a hook.
+    """Layout of the files and folders of recordings; plug-ins declare it as a hook.
 
     Attributes:
         enter: returns the folder to be imported in place of a path; the path itself for any other
             layout. It raises InputError where it cannot decide.
         folder: returns the folder of the recordings' files in a path; None for any other layout.
-        owns: tells whether an entry of such a path is read together with the recordings.
+        owns: returns True if an entry of such a path is read together with the recordings.
         join: returns recordings of several files, among files with their formats (None: unknown).
             Its second argument is the format that the user named, its third the path for messages.
-        complete: adds what lies beside a recording in the path that is imported.
+        complete: adds the files next to a recording in the path that is imported.
     """
 
     enter: Callable[[Path], Path] = lambda path: path

@@ -1,12 +1,12 @@
-"""Import of foreign trials into a campaign: each one complete or not at all.
+"""Import of foreign trials into a campaign, each one atomically.
 
 A trial is committed by the store's own rename after all of it was read and checked. A trial that
 cannot be imported does not stop the others. Rows that cannot be right, or whose times run back, are
 left out and counted (`time_order`); where they are many, the trial is not imported. Unknown
 properties (relations of clocks, poses, conditions) are marked as unknown and never invented:
-the time line is the event camera's own clock, or that of the frames where there are no events. Of a
-damaged file what stands whole before the damage may be salvaged; the trial's record counts what is
-lost.
+the time line is the event camera's own clock, or that of the frames where there are no events. The
+intact part of a damaged file, before the damage, may be salvaged; the trial's record counts the
+lost rest.
 """
 
 from __future__ import annotations
@@ -114,11 +114,11 @@ def import_trials(
         kind: the format's name.
         on_trial: called with each trial's id before it is read; what it raises ends the import
             between two trials.
-        salvage: of a damaged file, import what stands whole before the damage.
+        salvage: import the intact part of a damaged file, before the damage.
 
     Returns:
         ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
-        and where there are any, ``warnings``, ``salvaged`` (what is lost of each trial),
+        and where there are any, ``warnings``, ``salvaged`` (the loss of each trial),
         ``left_out`` (rows left out of each trial, by reason) and ``failed``: trials that could not
         be imported, of which nothing is left.
 
@@ -223,7 +223,7 @@ def _counted(count: int, reason: str) -> str:
 
 @dataclass
 class _Content:
-    """What was read of a trial.
+    """Content read of a trial.
 
     Attributes:
         orders: rows that stay of streams whose times run back.
@@ -378,7 +378,7 @@ class _RunsBack(Exception):
 def _take_whole(
     store: Store, campaign: Campaign, trial: ForeignTrial, kind: str, salvage: bool
 ) -> tuple[ForeignTrial, _Content]:
-    """Commit one trial, or what stands whole of it; return it with what was read."""
+    """Commit one trial, or its intact part; return it with what was read."""
     try:
         return trial, _take(store, campaign, trial, kind)
     except NoEvents:

@@ -68,7 +68,7 @@ def known_format(name: str) -> Format:
 def known_formats() -> Iterator[tuple[str, Format]]:
     """Yield formats with their names, those of the core first.
 
-    Those of plug-ins are loaded as they are asked for. One that cannot be loaded is left out.
+    Those of plug-ins are loaded on demand. One that cannot be loaded is left out.
     """
     yield from CORE.items()
     for name in format_names():

@@ -82,5 +82,5 @@ def arrays_of(data: Any, most_bytes: int) -> dict[str, Any]:
             return {item.filename[:-4]: array_of(packed.read(item)) for item in items}
     except FormatError:
         raise
-    except Exception as error:  # zlib and lzma have errors of their own
+    except Exception as error:  # zlib and lzma have their own errors
         raise FormatError(f"is a damaged .npz file ({error})") from None

@@ -99,8 +99,8 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
 
     Args:
         kind: the format, or `MIXED`: that of each file.
-        salvage: of a file that is damaged already where it begins to be read, yield what stands
-            whole.
+        salvage: yield the intact part of a file that is damaged already where it begins to be
+            read.
 
     Raises:
         InputError: it does not exist, a file is damaged, or faery is missing.
@@ -253,7 +253,7 @@ def name_of(stem: str) -> str:
     """Make the name of a trial from a file's name.
 
     Letters that are not Latin are transliterated, other characters become ``_``. Where that, or the
-    length, loses what tells names apart, the beginning of a hash of the file's name follows. Forms
+    length, makes names ambiguous, the beginning of a hash of the file's name follows. Forms
     of one text (Unicode's NFC and NFD) have one name.
     """
     text = unicodedata.normalize("NFC", stem)
@@ -300,7 +300,7 @@ def unique_names(stems: Sequence[str]) -> list[str]:
 
 
 def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
-    """Return the trial in a file, or what stands whole of it.
+    """Return the trial in a file, or its intact part.
 
     Raises:
         FormatError: it is damaged, or of another format.

@@ -1,4 +1,4 @@
-"""What every published trial has besides its streams: its campaign, and the arrays of its label."""
+"""Parts of a published trial besides its streams: its campaign, and the arrays of its label."""
 
 from __future__ import annotations
 

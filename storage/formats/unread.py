@@ -16,7 +16,7 @@ _MATLAB = re.compile(rb"MATLAB (\d+\.\d+) MAT-file")
 _COLUMNS = "write its events as the columns events/x, y, p and t (us) of an HDF5 file"
 _EVENT_BYTES = 5
 _LEAST = 20
-"""Events by which a file without a header is told from other bytes."""
+"""Events needed to distinguish a file without a header from other bytes."""
 
 
 def unread(file: Path) -> str | None:

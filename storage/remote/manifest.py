@@ -5,7 +5,7 @@
     URL/campaigns/NAME/about.json            manifest of campaign.json, protocol, rig file, bench,
                                              registrations
     URL/campaigns/NAME/trials/ID.json        manifest of a committed trial, written after its files
-    URL/campaigns/NAME/quarantine/ID.N.json  manifest of a quarantined folder, where asked for
+    URL/campaigns/NAME/quarantine/ID.N.json  manifest of a quarantined folder, if requested
     URL/campaigns/NAME/withdrawn/TAKE.json   mark: the recording TAKE of a trial is not wanted any
                                              more; without one, a missing manifest is a fault
 

@@ -125,5 +125,5 @@ def fetch(path: Path, known: Checksum) -> None:
 
 @lru_cache(maxsize=4)
 def remote_at(url: str) -> Remote:
-    """Return the storage at `url`, kept open: many files of one trial come from there."""
+    """Return the storage at `url`, cached: many files of one trial come from there."""
     return Remote(url)

@@ -185,7 +185,7 @@ class Remote:
         """Return the names of the pushed campaigns.
 
         Raises:
-            RemoteMissing: there is none: an empty or missing list is no news of any campaign.
+            RemoteMissing: there is none; an empty or missing list says nothing about campaigns.
         """
         found = self.folders("campaigns")
         if not found:

@@ -69,7 +69,7 @@ class PullResult:
             been before; withdrawn: pulled before, marked as withdrawn at the URL, and quarantined
             here.
         set_aside: of quarantine; files and bytes: fetched.
-        problems: what was not downloaded, and why.
+        problems: failed downloads, with reasons.
     """
 
     trials: int = 0
@@ -148,7 +148,7 @@ def pull(
     remote.check()
     listed = remote.campaigns()
     store = Store.create(folder)
-    # or an earlier pull was killed before it said where from
+    # or an earlier pull was killed before it stored its origin
     fresh = origin_of(folder) is None and not any((folder / "campaigns").glob("*"))
     done = PullResult()
     with (

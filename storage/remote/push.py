@@ -1,4 +1,4 @@
-"""Upload of committed trials to shared or object storage: each appears complete or not at all.
+"""Upload of committed trials to shared or object storage: each one atomically.
 
 Files are sent first, each read back and checked against its checksum, and the trial's manifest
 last. Only committed trials are read, so a campaign may run in the meantime. Files that exist at the
@@ -45,7 +45,7 @@ class PushResult:
             because they were retaken; there: they had been sent before.
         withdrawn: no longer visible, because a person wants them again; set_aside: sent of
             quarantine; files and bytes: sent.
-        problems: what was not sent, and why.
+        problems: failed uploads, with reasons.
     """
 
     trials: int = 0
@@ -71,9 +71,9 @@ class PushOptions:
 
     Attributes:
         quarantine: push quarantine, too.
-        replace: also trials of which another take is there that this store knows nothing of.
+        replace: also trials of which the target has another take, unknown to this store.
         read_back: read every object that was sent; without it, only its size is compared.
-        check: read back what was there before, too, and send anew what is damaged.
+        check: read back existing objects, too, and upload damaged ones again.
     """
 
     quarantine: bool = False
@@ -197,7 +197,7 @@ class _Push:
         return bool(marked) and was_pulled(trial) and take_of(trial) in marked
 
     def _mark_withdrawn(self, ours: Set[str], marked: Set[str]) -> None:
-        """Mark each take that a person wants again: other stores withdraw marked takes only.
+        """Mark each take that is to be retaken: other stores withdraw marked takes only.
 
         A take that is wanted after all loses its mark.
         """

@@ -260,7 +260,7 @@ class TrialLatency(Part):
     def uncounted(self) -> tuple[int, int, int, int]:
         """Numbers, 0 or 1, against a choice's bounds: false early, then missed or late, by onset.
 
-        Incipient slip stands before gross slip.
+        Incipient slip comes before gross slip.
         """
         return (
             int(self.false_early_incipient),

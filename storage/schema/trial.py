@@ -300,7 +300,7 @@ class StreamRecord(Part):
 
     @property
     def of_camera(self) -> bool:
-        """True for the stream of a further camera, which has files of its own."""
+        """True for the stream of a further camera, which has its own files."""
         return self.kind in {EVENTS_KIND, FRAMES_KIND}
 
 

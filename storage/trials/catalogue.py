@@ -45,7 +45,7 @@ _NAME, _ROW, _INODE, _CHANGED, _SYNC = (
 )
 _META = b"sliplab"
 UNREAD = "unread_bytes"
-"""Column of a catalogue with trials that are not whole: what was not read of their files."""
+"""Column of a catalogue with salvaged trials: the number of unread bytes of their files."""
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
@@ -53,7 +53,7 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
 
     Conditions become columns by factor; levels with a unit are numbers, the unit is in the
     column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since the
-    catalogue was last asked for are not read again.
+    catalogue was last read are not read again.
 
     Args:
         unreadable: gets a line for every trial that is damaged; without it, one is an error.
@@ -194,7 +194,7 @@ class _Part:
     """A campaign's part of the catalogue: rows of the index, and trials that have to be read.
 
     Attributes:
-        kept: numbers of the index's rows that are still right, by trial.
+        kept: numbers of the index's rows that are still valid, by trial.
         sync: stamp of each trial's refitted clocks, taken before they are read.
         fresh: rows that were read now, by trial.
     """

@@ -61,7 +61,7 @@ class Checksum(NamedTuple):
         return None
 
     def size_problem(self, path: str | Path) -> str | None:
-        """Say what is wrong with a file without reading it; None when it has all its bytes.
+        """Return the fault of a file without reading it; None if it has all its bytes.
 
         Raises:
             OSError: this program has no more memory or open files; nothing is known of the file.
@@ -79,7 +79,7 @@ class Checksum(NamedTuple):
         return None
 
     def problem(self, path: Path) -> str | None:
-        """Read a file and say what is wrong with it; None when it is as it was written.
+        """Read a file and return its fault; None if it is unchanged.
 
         An HDF5 file that a program left open, and that is otherwise as it was written, is closed.
 
@@ -156,7 +156,7 @@ def write_sums(folder: Path, names: Iterable[str]) -> None:
 
 
 def incomplete(folder: Path) -> str | None:
-    """Say why a trial's folder is incomplete, by the sizes of its files; None when it is complete.
+    """Return why a trial's folder is incomplete, by the sizes of its files; None if complete.
 
     Bytes that changed in place are found by `storage.trials.verify` only.
     """

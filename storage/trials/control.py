@@ -3,10 +3,10 @@
     STORE/control/000001.json        a request: who, when, why
     STORE/control/000001.done.json   its answer: when and by whom it was carried out, and the result
     campaigns/NAME/skipped.json      trials that a person skipped: who, when, why
-    campaigns/NAME/quarantine/ID.N/cause.json   who took a committed trial away again
+    campaigns/NAME/quarantine/ID.N/cause.json   who withdrew a committed trial
 
-Any program may ask. The holder of the store's lock carries out: a collection between two trials,
-or, while nobody collects, the program that asks. Nothing is deleted.
+Any program may submit one. The holder of the store's lock carries it out: a collection between two
+trials, or, while none runs, the program that submits it. Nothing is deleted.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Request(Entry):
 
     @property
     def by(self) -> Json:
-        """Person, time and reason of the request, to be kept with its consequences."""
+        """Person, time and reason of the request, to be stored with its consequences."""
         names = ("who", "when", "why", "host")
         return {**{name: getattr(self, name) for name in names}, "request": self.number}
 
@@ -101,7 +101,7 @@ def requests(store: Store) -> list[Request]:
 
 
 def answer(store: Store, request: Request, did: Json) -> Json:
-    """Keep the result of a request; an answer that exists stands."""
+    """Store the result of a request; an existing answer is not replaced."""
     write_new_json(_answer_path(store, request), {"when": now(), "by": user_name(), "did": did})
     return answered(store, request) or {"did": {}}
 
@@ -118,7 +118,7 @@ def answered(store: Store, request: Request) -> Json | None:
 
 
 def open_requests(store: Store) -> list[Request]:
-    """Return the requests that nobody has carried out yet, in order."""
+    """Return the requests that have not been carried out yet, in order."""
     return [item for item in requests(store) if answered(store, item) is None]
 
 

@@ -93,7 +93,7 @@ class FrameWriter:
         spool.unlink()
 
     def abandon(self) -> None:
-        """Close what is open, as far as the disk takes it."""
+        """Close open files, as far as the disk permits."""
         if self._spool is not None:
             with suppress(OSError):
                 self._spool.close()
@@ -119,7 +119,7 @@ class Spool:
         """Append frames, which must not change afterwards; waits only where the queue is full.
 
         Raises:
-            OSError: the disk refused these or earlier ones, or has stood still for `WAIT_S`.
+            OSError: the disk refused these or earlier ones, or made no progress for `WAIT_S`.
         """
         if not images.size:
             return

@@ -50,7 +50,7 @@ from sliplab.storage.trials.packed_chunks import Filter, unpacked_bytes
 from sliplab.storage.trials.superblock import HEAD_BYTES, closed
 
 MOST_STREAMS = 64
-"""Named streams that are read of one trial; a file with more is none of ours."""
+"""Named streams that are read of one trial; a file with more was not written by SlipLab."""
 _BLOCK = 1 << 15
 _FEW = 16
 _MOST_TEXT = 128
@@ -150,7 +150,7 @@ class RowFile:
         content: its bytes as an open binary file, read in place of what is at `path`.
 
     Raises:
-        OSError: it cannot be opened, or is none.
+        OSError: it cannot be opened, or is not an HDF5 file.
     """
 
     def __init__(self, path: Path, content: Any = None) -> None:
@@ -498,7 +498,7 @@ class Rows:
             self._fine.add(at)
 
     def _kept_chunk(self, at: tuple[int, ...]) -> tuple[int, bytes] | None:
-        """Return the filters that a chunk went past, and its bytes; None where nothing is kept."""
+        """Return the filters that a chunk skipped, and its bytes; None where nothing is stored."""
         try:
             mask, data = self._data.read_direct_chunk(at)
         except _HDF5_ERRORS:
@@ -689,7 +689,7 @@ class StreamReader:
         """Return the kind of every named stream, by name; ``""`` for one that is unknown.
 
         Raises:
-            NotOurs: what is there is no stream of ours.
+            NotOurs: the group is not a stream written by SlipLab.
         """
         return self._file.streams()
 

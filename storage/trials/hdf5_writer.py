@@ -2,7 +2,7 @@
 
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
 index reaches as far as their 32-bit times (71.6 min), later events are found by bisection. The
-other streams are beside them. Columns are chunked and compressed with bitshuffle, events in
+other streams are in the same file. Columns are chunked and compressed with bitshuffle, events in
 LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
 same data are the same bytes.
 
@@ -10,7 +10,7 @@ A trial has more columns than most of them have chunks, so that making, opening 
 costs more than their data. So every file begins as a copy of one that has all columns and no rows,
 and rows wait in memory until they are whole chunks.
 
-Format 2 differs from 1 in how events are kept: LZ4 instead of zstd, and times after the offset in
+Format 2 differs from 1 in the storage of events: LZ4 instead of zstd, and times after the offset in
 32 bits (docs/decisions/0020). A reader need not know which it has. Format 3 is format 2 with an
 index that ends before the last event (docs/decisions/0067).
 """
@@ -46,7 +46,7 @@ FORMAT, INDEX_CUT_FORMAT = 2, 3
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
-"""Rows of small columns that are held back; each write costs more than what is in it."""
+"""Rows of small columns that are buffered; the overhead of each write exceeds its data."""
 
 COLUMNS: dict[str, Kind] = {
     "events/x": ("uint16", (), "px"),
@@ -105,7 +105,7 @@ WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
 INDEX, OFFSET = "ms_to_idx", "t_offset"
 _LAST_32 = 2**32 - 1
 INDEXED_MS = 2**32 // 1000 + 1
-"""Milliseconds that the index reaches to: those that DSEC's 32-bit times can tell."""
+"""Length of the index, ms: the range of DSEC's 32-bit times."""
 # one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
 _SMALL = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
 _EVENTS = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="lz4")
@@ -333,7 +333,7 @@ class StreamFile:
         self._columns[name] = Column(self._file, name)
 
     def finish(self) -> None:
-        """Write what is held back and the index, and close the file, whatever happens."""
+        """Write buffered rows and the index, and close the file in any case."""
         try:
             if self._next_ms > INDEXED_MS:
                 self._file.attrs["format"] = INDEX_CUT_FORMAT

@@ -3,7 +3,7 @@
 The kernel releases the lock when the holder ends, however it ends. The file's content names
 the holder and is valid only while the lock is held. Where locks do not reach other machines,
 the note of another machine's holder is believed until a person deletes it. A file system without
-locks, or with locks that keep nobody out, is refused (docs/decisions/0070).
+locks, or with non-exclusive locks, is refused (docs/decisions/0070).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LOOK_S = 0.05
 _HOLDER_BYTES = 4000
 MOUNTS = Path("/proc/self/mountinfo")
 _ALONE = {"9p", "vboxsf", "prl_fs", "virtiofs", "fuse"}
-"""Types of file systems whose locks are kept by each machine for itself; also all of `fuse.*`."""
+"""Types of file systems with locks local to each machine; also all of `fuse.*`."""
 _ALONE_OPTIONS = {"nobrl", "nolock", "local_lock=flock", "local_lock=all"}
 """Options of NFS and SMB mounts by which locks are not sent to the server."""
 
@@ -60,7 +60,7 @@ def exclusive(
     Args:
         what: name of the locked thing, for the message.
         brief: the block is over at once; others may wait for that.
-        mode: of the file, if it is made. In a folder for all users (0666) anybody may have put
+        mode: of the file, if it is made. In a folder for all users (0666) any user may have put
             something else there: then it must be a plain file with no other name.
         about: further keys of the holder, such as its store.
 
@@ -74,7 +74,7 @@ def exclusive(
         if mode & 0o002:
             _check_plain(handle, path)
         _acquire(handle, path, what)
-        if os.fstat(handle).st_nlink == 0:  # somebody cleaned the folder up in between
+        if os.fstat(handle).st_nlink == 0:  # the folder was cleaned up in between
             raise Locked(f"{what}: the lock file {path} was deleted meanwhile; try again")
         _check(handle, path, what)
         holder = {**this_process(), "brief": brief, **(about or {})}
@@ -90,7 +90,7 @@ def exclusive(
 
 
 def current_holder(path: Path) -> Json | None:
-    """Return who holds the lock file at `path`; None if nobody does. Nothing is changed."""
+    """Return the holder of the lock file at `path`; None if it is free. Nothing is changed."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:
@@ -109,7 +109,7 @@ def current_holder(path: Path) -> Json | None:
 def _open(path: Path, mode: int) -> int:
     """Open a lock file, making it if it is missing.
 
-    In a folder that all may write to, the system refuses to *make* what somebody else made.
+    In a world-writable folder, the system refuses to *create* a file that another user created.
     """
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     try:
@@ -125,7 +125,7 @@ def _open(path: Path, mode: int) -> int:
 
 
 def _check_plain(handle: int, path: Path) -> None:
-    """Refuse what is not made to be a lock: its content would be overwritten."""
+    """Refuse a file that is not a lock: its content would be overwritten."""
     found = os.fstat(handle)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
         raise OSError(errno.EINVAL, "is not a regular lock file", str(path))
@@ -169,11 +169,11 @@ def _no_locks(path: Path, why: str) -> NoLocks:
 
 
 def _check(handle: int, path: Path, what: str) -> None:
-    """See that the lock that was just taken keeps others out, on this machine and elsewhere.
+    """Check that the lock that was just taken excludes others, on this machine and elsewhere.
 
     Raises:
-        NoLocks: a second open file is not kept out.
-        Locked: a program on another machine, which the lock does not reach, has not let go.
+        NoLocks: a second open file is not excluded.
+        Locked: a program on another machine, which the lock does not reach, still holds it.
     """
     second = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:

@@ -1,4 +1,4 @@
-"""Migration of a store to the newest format, with copies of what is changed.
+"""Migration of a store to the newest format, with copies of all changed files.
 
 | from | to | what changes |
 | --- | --- | --- |

@@ -52,7 +52,7 @@ class Tracks:
 class Recording:
     """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns.
 
-    A committed trial is never rewritten, and never read where it is not what was committed: each
+    A committed trial is never rewritten, and never read if it differs from the committed one: each
     of its files is checked against its checksum before this object first reads it. Where its clocks
     were fitted again and came out otherwise, the new ones are among the derived results, and are
     used in the record's place.
@@ -72,7 +72,7 @@ class Recording:
         self._checked: set[str] = set()
 
     def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None, Fetch | None]]:
-        """Send another process the trial's paths, not what was read of it."""
+        """Send another process the trial's paths, not its loaded data."""
         return Recording, (self.folder, self.sync_file, self._fetch)
 
     @cached_property
@@ -189,12 +189,12 @@ class Recording:
         return self._refitted
 
     def use_clocks(self, refitted: SyncResult | None) -> None:
-        """Use the clocks that `clocks_elsewhere` was in another process, whatever is kept here."""
+        """Use `clocks_elsewhere` of another process, whatever is stored here."""
         self.__dict__.pop("clocks", None)
         self.__dict__["_refitted"] = refitted
 
     def forget_clocks(self) -> None:
-        """Look for refitted clocks anew: they have just been written."""
+        """Forget refitted clocks, so that those just written are read."""
         for name in ("_refitted", "clocks"):
             self.__dict__.pop(name, None)
 

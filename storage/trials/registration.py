@@ -3,7 +3,7 @@
     campaigns/NAME/registrations/0001.json        what was registered, and when
     campaigns/NAME/registrations/0001.json.tsr    time stamp by RFC 3161; .ots by OpenTimestamps
 
-Each file has a checksum of its own content and the SHA-256 of the file before it. These show
+Each file has a checksum of its content and the SHA-256 of the file before it. These show
 damage; only a stamp or a signature of a third party shows when the file was made.
 """
 
@@ -153,12 +153,12 @@ def _is_stamp(data: bytes, ending: str) -> bool:
         return data.startswith(_PROOF)
     if len(data) < 2 or data[0] != _SEQUENCE:
         return False
-    head = 2 + (data[1] & 0x7F if data[1] & 0x80 else 0)  # DER: a long length has bytes of its own
+    head = 2 + (data[1] & 0x7F if data[1] & 0x80 else 0)  # DER: a long length has further bytes
     return data[head : head + 1] == bytes([_SEQUENCE])  # a request begins with its version
 
 
 def _stamp_problem(data: bytes, path: Path) -> str | None:
-    """Return what is wrong with a stamp; both kinds contain the digest of the stamped file."""
+    """Return the fault of a stamp; both kinds contain the digest of the stamped file."""
     if bytes.fromhex(sha256(path)) in data:
         return None
     return f"is not of {path}: it does not contain the SHA-256 of that file"
@@ -206,7 +206,7 @@ def _registration_of(session: Path) -> str | None:
 
 
 def _problem(campaign: Campaign, place: int, path: Path, before: str | None) -> str | None:
-    """Return what is wrong with a registration's file; None where it is as it was written."""
+    """Return the fault of a registration's file; None if it is unchanged."""
     found = Registration.load(path)
     data = found.to_json()
     if json_text(data).encode() != path.read_bytes():

@@ -2,9 +2,9 @@
 
     STORE/review/CAMPAIGN/TRIAL/000001.json   the first decision about a trial's label, and so on
 
-A decision names the label that it was made on by that label's key, so that it can be told when the
-label has changed since. The last decision counts; the ones before it stay. Of two people who decide
-on one trial at the same time, both keep their decisions, or the second one is warned.
+A decision names the label that it was made on by that label's key, which shows whether the label
+has changed since. The last decision counts; the earlier ones remain. Of two people who decide on
+one trial at the same time, both decisions are stored, or the second person is warned.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FORMAT = 1
 
 
 class Overtaken(StoreError):
-    """Somebody else decided about this trial first; the message says who, and what."""
+    """Another user decided about this trial first; the message gives the user and the decision."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Onsets:
     gross_ns: int | None = None
 
     def problem(self) -> str | None:
-        """Say why these cannot be the onsets of a trial; None if they can."""
+        """Return why these cannot be the onsets of a trial; None if they can."""
         if self.gross_ns is None:
             return None
         if self.incipient_ns is None:
@@ -65,8 +65,8 @@ class Decision(Entry):
     """One decision of a person about one label.
 
     Attributes:
-        verdict: ``accept`` (the label stands), ``adjust`` (the onsets are these), ``reject`` (the
-            trial is not to be used) or ``reopen`` (nothing is decided any more).
+        verdict: ``accept`` (the label holds), ``adjust`` (the onsets are these), ``reject`` (the
+            trial is not to be used) or ``reopen`` (the label is undecided again).
         label: key of the label that it was made on.
         old: the label's onsets; new: those that hold by this decision.
     """
@@ -138,7 +138,7 @@ def history(store: Store, campaign: str, trial: str) -> list[Decision]:
 
 
 def last(store: Store, campaign: str, trial: str) -> Decision | None:
-    """Return the decision that counts; None where nobody decided.
+    """Return the decision that counts; None if there is none.
 
     Raises:
         StoreError: it is damaged.

@@ -4,8 +4,8 @@
     STORE/campaigns/NAME/campaign.json protocol.yaml rig.yaml checksums.json
     STORE/campaigns/NAME/trials/ID/      committed trials
     STORE/campaigns/NAME/incoming/ID/    the trial being written
-    STORE/campaigns/NAME/quarantine/     attempts that are no trials, each with its cause
-    STORE/campaigns/NAME/bench/          who stood at the rig, one file a session
+    STORE/campaigns/NAME/quarantine/     rejected attempts, each with its cause
+    STORE/campaigns/NAME/bench/          operator and equipment, one file a session
     STORE/campaigns/NAME/registrations/  what was registered before the first trial, one file a time
     STORE/campaigns/NAME/skipped.json    trials that a person skipped (`storage.trials.control`)
     STORE/control/                       requests of people (`storage.trials.control`)
@@ -50,7 +50,7 @@ __all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError"]
 FORMAT = 2
 """Format that this version writes; `storage.trials.migrate` brings older ones forward."""
 SYNC = "sync"
-"""Step whose results hold clocks that were fitted again; recordings read them there."""
+"""Step whose results hold refitted clocks; recordings read them there."""
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json",
     "protocol.yaml",
@@ -65,8 +65,8 @@ IMPORTED: Final = "imported"
 ADAPTER = "adapter"
 """Key of that part, and format, of a campaign that came by an adapter, which it keeps."""
 AGAIN, FORGIVEN = "again", "forgiven"
-"""Cause of a committed trial that a person wants anew; mark of a failed attempt that counts no
-longer."""
+"""Cause of a committed trial that is to be retaken; mark of a failed attempt that is no longer
+counted."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
 
 
@@ -112,10 +112,10 @@ class QuarantineEntry(TypedDict):
     """An attempt in quarantine.
 
     Attributes:
-        cause: ``interrupted``, or what is wrong with it.
+        cause: ``interrupted``, or its fault.
         folder: its name in the quarantine.
         attempt: number of the attempt at the trial, of a complete one.
-        forgiven: who made the attempt count no longer; asked: who wanted the trial anew.
+        forgiven: who reset the attempt; asked: who requested the retake.
     """
 
     cause: str
@@ -330,7 +330,7 @@ class Campaign:
         )
 
     def attempts(self) -> dict[str, int]:
-        """Count the complete attempts at each trial that were not kept: each has its own seed."""
+        """Count the complete attempts at each trial that were rejected: each has its own seed."""
         return self._count(lambda item: str(item["cause"]).startswith(("gate", AGAIN)))
 
     def _count(self, wanted: Callable[[QuarantineEntry], bool]) -> dict[str, int]:
@@ -341,7 +341,7 @@ class Campaign:
         return counts
 
     def add_bench_record(self, data: SessionRecord) -> None:
-        """Keep who stood at the rig, with what, for one session."""
+        """Store the operator and equipment of one session."""
         folder = self.folder / "bench"
         make_folder(self.inside(folder))
         there = [int(path.stem) for path in folder.glob("*.json") if path.stem.isdecimal()]

@@ -65,7 +65,7 @@ class Problem:
 
     Attributes:
         path: the file or folder.
-        what: what is wrong with it.
+        what: its fault.
         kind: ``damaged``; ``unfinished`` for what a killed program left, which the next collection
             clears up; or ``recording`` for a trial that a running program writes. Only the first
             is a fault.
@@ -279,7 +279,7 @@ def _registered(campaign: Campaign) -> list[Problem]:
 
 
 def _temporary(folder: Path, campaign: str) -> list[Problem]:
-    """Find temporary files whose program is gone."""
+    """Find temporary files of ended programs."""
     what = "was left by a killed program; the next `sliplab collect` deletes it"
     return [
         Problem(str(path), what, UNFINISHED, campaign)
@@ -429,7 +429,7 @@ def _frame_problems(data: Path, video: Path, tracks: list[str], counts: dict[str
 
 
 def _leftovers(store: Store, campaign: Campaign) -> list[Problem]:
-    """Find unfinished trials, and what is in quarantine without a cause."""
+    """Find unfinished trials, and quarantined ones without a cause."""
     found = []
     folder = campaign.folder / "incoming"
     unfinished = sorted(folder.iterdir()) if folder.is_dir() else []

@@ -3,9 +3,9 @@
 Matroska files carry random identifiers and dates unless the muxer is configured not to; with the
 bit-exact flag two identical videos are two identical files, so checksums mean something.
 Encoding runs in separate threads behind bounded queues: a full queue is back-pressure that the
-caller sees as time, never as a lost frame. Frames know nothing of each other, so every thread has
-an encoder for itself and takes every so manieth frame: that costs a quarter less processor time
-than letting one encoder share the slices of each frame among threads.
+caller sees as time, never as a lost frame. Frames are coded independently, so every thread has its
+own encoder and takes every n-th frame: that costs a quarter less processor time than letting one
+encoder share the slices of each frame among threads.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class VideoWriter:
 
         Raises:
             ValueError: another shape or type than the file's.
-            RuntimeError: an encoder failed or stands still.
+            RuntimeError: an encoder failed or hangs.
         """
         if images.dtype != np.uint8 or images.shape[1:] != (self.height, self.width):
             raise ValueError(
@@ -92,7 +92,7 @@ class VideoWriter:
             self.frames += 1
 
     def close(self) -> None:
-        """Encode what is queued, close the file, and raise what an encoder raised."""
+        """Encode queued frames, close the file, and re-raise an encoder's error."""
         if self._closed:
             return
         self._closed = True
@@ -108,7 +108,7 @@ class VideoWriter:
             raise RuntimeError(f"the video encoder failed: {self._error}") from self._error
 
     def _encode(self, encoder: Any, waiting: queue.Queue[tuple[int, U8] | None]) -> None:
-        """One thread: encode what is waiting, and write each frame when its turn has come."""
+        """Encode queued frames in one thread, and write each frame in its turn."""
         while (item := waiting.get()) is not None:
             if self._error is not None:
                 continue  # drain, so that the writer is never blocked by a dead encoder
@@ -202,7 +202,7 @@ def count_frames(path: Path) -> int:
 
 
 def frame_rate(path: Path) -> int:
-    """Frames a second of a video's time base; the frames have times of their own."""
+    """Frames a second of a video's time base; the frames have separate times."""
     with av.open(video_url(path)) as container:
         rate: int = round(container.streams.video[0].average_rate)
     return rate

@@ -1,7 +1,7 @@
 """Writing of a trial: in `incoming` until every file is complete, then visible by one rename.
 
 The first event camera, the first frame camera, arm, sync box and small sensors share one HDF5 file.
-Each further camera has files of its own, made with its first chunk, in the same layout.
+Each further camera has its own files, made with its first chunk, in the same layout.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class TrialWriter:
             self._frames.add(chunk)
 
     def add_stream(self, name: str, chunk: StreamChunk | CameraChunk) -> None:
-        """Append to a named stream; that of a further camera has files of its own.
+        """Append to a named stream; that of a further camera has its own files.
 
         Raises:
             ValueError: the name is not a small identifier, or the stream is of another kind.
@@ -223,7 +223,7 @@ class TrialWriter:
         finish_folder(self.folder, cause)
 
     def abandon(self) -> None:
-        """Close what is open and leave the folder as it is, for quarantine."""
+        """Close open files and leave the folder unchanged, for quarantine."""
         if not self._sealed:
             self._sealed = True
             try:
@@ -236,7 +236,7 @@ class TrialWriter:
                         camera.abandon()
 
     def discard(self) -> None:
-        """Close what is open and delete it; for motions that are no trial."""
+        """Close open files and delete the folder; for motions that are no trial."""
         self.abandon()
         shutil.rmtree(self.folder)
 

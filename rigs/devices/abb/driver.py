@@ -95,8 +95,8 @@ class AbbArm(ThreadedArm):
     def connect(self) -> None:
         """Connect to the web services, start the pose stream, and check that their poses agree.
 
-        A connection that is open already is kept if the controller answers; if not, it is closed as
-        by `close` first. Takes at most (15 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` +
+        An open connection is reused if the controller answers; if not, it is closed as by `close`
+        first. Takes at most (15 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` +
         `STATUS_S` and the time of `close`.
 
         Raises:

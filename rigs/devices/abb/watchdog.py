@@ -44,7 +44,7 @@ class Watchdog:
     def begin(self, web: WebServices) -> None:
         """Start the heartbeat, and check that the controller's task is active.
 
-        Takes at most 5 requests and `ECHO_S`. An echo that was there before is none: signals
+        Takes at most 5 requests and `ECHO_S`. An echo from before does not count: signals
         keep their values when a task has ended.
 
         Args:

@@ -36,7 +36,7 @@ LOOK_S = 0.05
 """The listening thread looks this often whether it shall end."""
 JOIN_S = 1.0
 BACKLOG = 1 << 20
-"""Records kept for a reader, two minutes at most; older ones are dropped, and counted."""
+"""Records buffered for a reader, two minutes at most; older ones are dropped, and counted."""
 MISSING = 1 << 12
 """Numbers of missing records that are remembered, for those that come late."""
 RECEIVE_BYTES = 1 << 20
@@ -57,7 +57,7 @@ class Counts:
     """Sample counter farther ahead than the time that has passed allows; dropped."""
     malformed: int = 0
     dropped: int = 0
-    """Nobody read them in time."""
+    """Not read in time."""
 
 
 class AtiNetFt:
@@ -134,7 +134,7 @@ class AtiNetFt:
             self.zero()
 
     def start(self) -> None:
-        """Begin to stream; what came before is dropped.
+        """Begin to stream; earlier records are dropped.
 
         Raises:
             RigError: it is not connected, or cannot be sent to.
@@ -177,7 +177,7 @@ class AtiNetFt:
         self._send(rdt.SET_BIAS)
 
     def stop(self) -> None:
-        """Stop streaming; what has come can still be read."""
+        """Stop streaming; received records can still be read."""
         self._halt()
 
     def close(self) -> None:
@@ -222,7 +222,7 @@ class AtiNetFt:
     # -- the web page ----------------------------------------------------------------------
 
     def _configure(self) -> rdt.Page:
-        """Write rate and filter, and read the page, which must say what was written."""
+        """Write rate and filter, and read the page, which must show the written values."""
         settings = self._settings
         if settings.rate_hz is not None:
             self._get(f"{rdt.RATE_PAGE}{settings.rate_hz}")
@@ -289,7 +289,7 @@ class AtiNetFt:
         )
 
     def _greet(self) -> None:
-        """See that one record comes, whose status is no error."""
+        """Check that one record without an error arrives."""
         assert self._socket is not None
         self._send(rdt.STOP)
         for _ in range(TRIES):
@@ -308,7 +308,7 @@ class AtiNetFt:
         raise self._absent(f"none within {TRIES * self._settings.answer_s:g} s")
 
     def _drain(self) -> None:
-        """Forget what came before the stream; no more than the kernel's buffer can hold."""
+        """Discard records from before the stream, at most those in the kernel's buffer."""
         if self._socket is None:
             return
         self._socket.setblocking(False)

@@ -21,7 +21,7 @@ from sliplab.rigs.devices.ati_net_ft import rdt
 from sliplab.storage.streams import F64, WrenchChunk
 
 TURN_S = 0.0005
-"""Period at which the fake looks what is due."""
+"""Period at which the fake checks for due records."""
 JOIN_S = 2.0
 COUNTS_PER_N = COUNTS_PER_NM = 1_000_000
 OUT_OF_RANGE = rdt.ERROR | 1 << 30
@@ -33,7 +33,7 @@ class Kind(Enum):
     """A kind of fault."""
 
     SILENCE = "silence"
-    """Nothing is sent any more; the page still answers."""
+    """No more records are sent; the page still answers."""
     LOSS = "packet loss"
     """The next `count` records do not arrive."""
     REORDER = "reordering"
@@ -43,7 +43,7 @@ class Kind(Enum):
     SATURATED = "saturated status"
     """The next `count` records say that force or torque is out of range."""
     RESTART = "restart"
-    """The sample counter begins anew."""
+    """The sample counter restarts."""
     MALFORMED = "malformed records"
     """The next `count` datagrams are cut short."""
 
@@ -52,11 +52,11 @@ class FakeNetFt:
     """A sensor to read at `host`; a context manager: its threads end with it.
 
     Args:
-        host: loopback address of its own.
-        load: what it feels; nothing if left out.
+        host: a loopback address that nothing else uses.
+        load: the load that it measures; zero if left out.
         rate_hz: records a second, as set on its page.
         now_ns: the clock that its counter runs by.
-        ticks: where the 32-bit sample counter stands first.
+        ticks: initial value of the 32-bit sample counter.
         units: of force and torque, as its page names them.
         fed: it sends what `send` is given instead, when it is given.
 
@@ -142,7 +142,7 @@ class FakeNetFt:
                     self._send(*self._last)
 
     def overload(self) -> None:
-        """Say that the load is out of range from now on."""
+        """Report that the load is out of range from now on."""
         with self._lock:
             self._overloaded = True
             if self._to is not None:
@@ -294,6 +294,6 @@ def _page_of(sensor: FakeNetFt) -> type[http.server.BaseHTTPRequestHandler]:
             self.wfile.write(body)
 
         def log_message(self, format: str, *arguments: object) -> None:
-            """Say nothing."""
+            """Suppress log messages."""
 
     return Handler

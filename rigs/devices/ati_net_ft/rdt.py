@@ -3,7 +3,7 @@
 RDT is UDP, big-endian. A request is 8 bytes: `u16 0x1234, u16 command, u32 count`, a count of 0
 being without end. A record is 36 bytes: `u32 rdt_sequence, u32 ft_sequence, u32 status` and six
 `i32` counts, Fx Fy Fz Tx Ty Tz. `rdt_sequence` numbers the records of one request from 1;
-`ft_sequence` counts the sensor's own samples and goes on from request to request. The layout is
+`ft_sequence` counts the sensor's own samples and continues from request to request. The layout is
 that of the maker's manual 9620-05-NET FT; the status bits are those of 9610-05-Ethernet Axia, of
 which a Net Box shares the error bit and the latch of a monitor condition.
 """
@@ -32,7 +32,7 @@ RECORD = np.dtype(
     ]
 )
 ERROR, MONITOR = 1 << 31, 1 << 16
-"""Any error; and the latch of a condition that somebody set on the sensor, which is none."""
+"""Any error; and the latch of a monitor condition set by the user, which is not an error."""
 BITS = {
     0: "internal temperature out of range",
     1: "supply voltage out of range",
@@ -65,7 +65,7 @@ def request(command: int, count: int = 0) -> bytes:
 
 
 def status_problem(status: int) -> str | None:
-    """Return the errors that a status word tells of, in words; None where there is none."""
+    """Return the errors in a status word as text; None where there is none."""
     if not status & ERROR or status == ERROR | MONITOR:
         return None
     named = [text for bit, text in BITS.items() if status >> bit & 1]

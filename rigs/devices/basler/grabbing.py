@@ -4,7 +4,7 @@ Pylon fills a fixed number of buffers and drops frames that find none free, so a
 empties them into a bounded queue. If the queue is not read, it fills up, then pylon's buffers do,
 and only then are frames lost, which shows as a gap in the camera's frame ids. Where the time of a
 frame comes separately, as an event, the thread waits for it. Silence is the time without a frame
-that is delivered: incomplete frames, repeated ones and those without a time are none.
+that is delivered: incomplete frames, repeated ones and those without a time do not count.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NO_ID = (1 << 64) - 1
 GIGE_IDS = 65_535
 """Block ids of a GigE camera: 1 to 65,535, then 1 again; more than that, where it extends them."""
 FASTER, SPARE = 1.5, 100
-"""Largest gap in the ids: so many times the frames that fit into the time, and so many more."""
+"""Largest gap in the ids: a factor of the frames that fit into the time, and an offset."""
 MOST_EXPOSURES = 1000
 """Exposure ends that wait for their frame."""
 

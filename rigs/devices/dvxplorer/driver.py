@@ -43,7 +43,7 @@ class EventCounts:
     """Counts of the data received in one run.
 
     Attributes:
-        events: events kept, read or not.
+        events: events accepted, read or not.
         pulses: rising edges.
         gaps: intervals of more than `gap_s` between events, on the camera's clock.
         longest_gap_us: longest interval between two events.

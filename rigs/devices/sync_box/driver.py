@@ -120,7 +120,7 @@ class Train:
 
 
 MOST_WAITING = 100_000
-"""Buffered pulses or exposures: 17 minutes at 100 Hz. Further ones are counted, not kept."""
+"""Buffered pulses or exposures: 17 minutes at 100 Hz. Further ones are counted and dropped."""
 AHEAD_US = 1_000_000
 """Largest lead of an exposure over the host's clock, besides 2 %; a larger one is garbled."""
 TICK_AHEAD_US = 5_000_000
@@ -342,7 +342,7 @@ class SerialSyncBox:
                 self._early.append(body)
             return True
         passed_us = (self._now_ns() - self._asked_ns) // 1000
-        # by the host's clock, or by what the box's own clock last said
+        # by the host's clock, or by the last report of the box's own clock
         latest_us = max(passed_us + passed_us // 50, self._clock_us - train.first_us)
         if kind == "P":
             number, bit, us = numbers

@@ -99,7 +99,7 @@ class UrArm(ThreadedArm):
         """Host time at which the last move was sent; None once the arm is confirmed at rest."""
         self.on_wrench: Callable[[int, int, tuple[float, ...]], None] | None = None
         """Receives the wrench of every packet, with controller and host time, ns; set before the
-        arm is connected, otherwise the controller is not asked for it."""
+        arm is connected, otherwise the controller does not send it."""
         self._missing = 0
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
@@ -237,7 +237,7 @@ class UrArm(ThreadedArm):
         run.done = True
 
     def stopping_s(self, speed_mm_s: float) -> float:
-        """Time for which it goes on at full speed after a stop, or as far: see `StoppingArm`."""
+        """Stopping distance as time at full speed; see `StoppingArm`."""
         return REACTION_S + speed_mm_s / (2 * STOP_DECELERATION_MM_S2)
 
     def close(self) -> None:

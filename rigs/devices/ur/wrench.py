@@ -2,7 +2,7 @@
 
 `actual_TCP_force`: force and torque on the tool in the axes of the arm's base, the payload's
 weight taken off, stamped by the controller's clock. It comes with the arm's own stream: one more
-field of each packet, and no connection of its own.
+field of each packet, without a separate connection.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class UrWrench:
         self._arm.zero_force()
 
     def stop(self) -> None:
-        """Keep no more samples; those that came can still be read."""
+        """Store no more samples; those received can still be read."""
         self._streaming = False
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class UrWrench:
         self.stop()
 
     def describe(self) -> Json:
-        """Samples that nobody read in time."""
+        """Samples that were not read in time."""
         return {"dropped": self._dropped}
 
     def _check(self) -> None:

@@ -1,7 +1,7 @@
 """OpenCV's `VideoCapture` in a child process: a thread grabs, the process answers calls.
 
 A grab may wait for seconds, or for ever where a driver hangs, and cannot be interrupted. In a
-process of its own it can be killed.
+separate process it can be killed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Taken:
         fault: why no more frames come; None while they may.
         silent_s: since the last frame, or since the start, as far as this process could look.
         received: a frame has come since the start.
-        grabbed, overflowed: since the start, the second ones dropped since nobody read.
+        grabbed, overflowed: since the start; overflowed frames were not read in time.
     """
 
     images: U8
@@ -104,7 +104,7 @@ class Capture:
             self._stall.waited_s(self._seen)
 
     def stop(self) -> None:
-        """Keep no more frames; those that are kept can still be taken."""
+        """Store no more frames; stored ones can still be taken."""
         with self._lock:
             self._region = None
 
@@ -170,7 +170,7 @@ class Capture:
 
 
 def configure(device: Any, settings: UvcSettings) -> Json:
-    """Write every setting and read it back; return what the camera says it has.
+    """Write every setting and read it back; return the values that the camera reports.
 
     Args:
         device: a `cv2.VideoCapture` on V4L2.
@@ -199,14 +199,14 @@ def configure(device: Any, settings: UvcSettings) -> Json:
         wanted.append(("gain", cv2.CAP_PROP_GAIN, settings.gain, 0.5))
     if settings.focus is not None:
         wanted.append(("focus", cv2.CAP_PROP_FOCUS, settings.focus, 0.5))
-    # many cameras have neither; what is not there cannot be left on
+    # many cameras have neither; a missing control cannot be left on
     for switch in (cv2.CAP_PROP_AUTO_WB, cv2.CAP_PROP_AUTOFOCUS):
         device.set(switch, 0.0)
     found: Json = {}
     for name, code, value, tolerance in wanted:
         taken, back = device.set(code, value), device.get(code)
         said = getattr(settings, name, value)
-        if not taken and back < 0:  # OpenCV's answer for a control that is not there
+        if not taken and back < 0:  # OpenCV's answer for a missing control
             if name not in {"auto_exposure", "exposure_us"}:
                 raise ValueError(f"{name} = {said}: the camera has no such control")
             found[name] = None

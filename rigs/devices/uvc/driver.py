@@ -1,4 +1,4 @@
-"""A USB camera through OpenCV, which runs by itself; its frames are timed by their arrival.
+"""A free-running USB camera, read with OpenCV; its frames are timed by their arrival.
 
 Written for Linux (V4L2) and tried on streams only: no camera was at hand. OpenCV gives neither the
 number of a frame nor a time stamp that could be tied to the sync box, so a lost frame shows as too
@@ -80,7 +80,7 @@ class UvcCamera:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Frames of this run, or of the last one: taken over, and dropped since nobody read."""
+        """Frames of this run, or of the last one: grabbed, and dropped as not read in time."""
         if self._last is None:
             return {"grabbed": 0, "overflowed": 0}
         return {"grabbed": self._last.grabbed, "overflowed": self._last.overflowed}
@@ -176,7 +176,7 @@ class UvcCamera:
         raise RigError(DEVICE, "a USB camera has no clock that can be read")
 
     def stop(self) -> None:
-        """Keep no more frames; those that have come can still be read."""
+        """Store no more frames; those received can still be read."""
         if self._running:
             self._running = False
             self._call("stop")

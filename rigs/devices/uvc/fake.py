@@ -52,7 +52,7 @@ class VideoPipe:
         self._thread.start()
 
     def show(self, image: U8) -> None:
-        """Send a picture; a smaller one stands in the middle of a black one."""
+        """Send a picture; a smaller one is centred on a black one."""
         self._coming.put(image)
 
     def close(self) -> None:
@@ -62,7 +62,7 @@ class VideoPipe:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def write(self, data: bytes) -> int:
-        """Write to the pipe, which is full while nobody reads; called by the container."""
+        """Write to the pipe, which is full until it is read; called by the container."""
         rest = memoryview(data)
         while rest:
             if self._closing.is_set():
@@ -99,7 +99,7 @@ class VideoPipe:
             os.close(opened)
 
     def _open(self) -> int | None:
-        """Return the pipe's descriptor once somebody reads; None if it was closed before."""
+        """Return the pipe's descriptor once it has a reader; None if it was closed before."""
         while not self._closing.wait(POLL_S):
             try:
                 return os.open(self.path, os.O_WRONLY | os.O_NONBLOCK)
