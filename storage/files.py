@@ -393,12 +393,12 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
+        OSError: as `read_plain`.
         ValueError: not JSON, or not an object; the message names the file.
     """
     try:
-        data = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=_no_number, parse_float=_finite
-        )
+        text = read_plain(path).decode("utf-8")
+        data = json.loads(text, parse_constant=_no_number, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
     if not isinstance(data, dict):

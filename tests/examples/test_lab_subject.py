@@ -13,6 +13,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.page import Rendered
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
+from sliplab.flows.cli import app as cli
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome, searches
 from sliplab.plugins.bench.registry import known, make_detector
@@ -40,9 +41,12 @@ def subject(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     (info / "entry_points.txt").write_text("\n".join(lines))
     for folder in (info.parent, EXAMPLES / "lab-subject"):
         monkeypatch.syspath_prepend(str(folder))
+    groups, added = list(cli.app.registered_groups), set(cli._added)
     plugins.cache_clear()
     yield
     plugins.cache_clear()
+    cli.app.registered_groups[:] = groups  # the command line of this process is as it was
+    cli._added.intersection_update(added)
 
 
 @pytest.mark.usefixtures("subject")

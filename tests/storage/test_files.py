@@ -60,5 +60,6 @@ def test_only_a_regular_file_of_bounded_size_is_read_as_a_whole(tmp_path: Path) 
         read_plain(path, most=4)
     os.mkfifo(tmp_path / "pipe")
     for wrong in (Path("/dev/zero"), tmp_path / "pipe"):
-        with pytest.raises(OSError, match="not a regular file"):
-            read_plain(wrong)
+        for read in (read_plain, read_json):
+            with pytest.raises(OSError, match="not a regular file"):
+                read(wrong)

@@ -215,7 +215,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an event outside of the sensor": (
         _with("streams", "events", "size_px", to=[8, 12]),
-        r"events up to column 15 .* 8 x 12",
+        r"up to column 15 .* 8 x 12",
     ),
     "a motion outside": (_with("motion", "end", to=5), r"motion.start = 0.1: to 5: lies outside"),
 }
