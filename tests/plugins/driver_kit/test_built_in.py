@@ -11,7 +11,7 @@ from sliplab.plugins.driver_kit.rule import Bounds
 from sliplab.plugins.reflex import robotiq_2f
 from sliplab.plugins.reflex.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.core.driver import Driver
-from sliplab.rigs.core.registry import BUILT_IN, Listed, load_driver
+from sliplab.rigs.core.registry import listed, load_driver
 from sliplab.rigs.devices import abb, ati_net_ft, basler, dvxplorer, sync_box, ur, uvc
 from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
@@ -118,6 +118,7 @@ def test_a_driver_that_ships_keeps_every_rule(name: str) -> None:
 
 
 def test_no_driver_that_ships_is_left_out() -> None:
-    assert set(DEVICES) == set(BUILT_IN)
-    found: list[Driver] = [load_driver(Listed(*item, "sliplab")) for item in BUILT_IN.items()]
+    shipped = [item for item in listed().values() if item.package == "sliplab"]
+    assert set(DEVICES) == {item.name for item in shipped}
+    found: list[Driver] = [load_driver(item) for item in shipped]
     assert {make()[0].driver for make, _ in DEVICES.values()} == {driver.name for driver in found}
