@@ -34,6 +34,11 @@ class ReportData:
         """True if any of the campaigns was collected here rather than imported."""
         return any(item.recorded is None for item in self.campaigns)
 
+    @property
+    def collected(self) -> Summary | None:
+        """The figures where campaigns were collected here, by both cameras; else None."""
+        return self.summary if isinstance(self.summary, Summary) and self.collected_here else None
+
 
 @dataclass(frozen=True)
 class ReportSection:

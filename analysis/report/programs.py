@@ -27,7 +27,7 @@ class CommandResult:
 
     Attributes:
         file: in the store.
-        text: the command; ``{store}``, ``{folder}`` and ``{file}`` stand for paths.
+        text: the command; ``{store}``, ``{folder}`` and ``{file}`` are replaced by paths.
     """
 
     file: str
@@ -46,6 +46,11 @@ class CommandResult:
             return None
         except (OSError, ValueError) as error:
             raise StoreError(f"{error}; delete {path}, or make it again") from None
+
+    def key(self, store: Store, campaigns: object) -> list[Json]:
+        """Return the results for a report's key; empty where there are none. Raises StoreError."""
+        found = self.read(store)
+        return [] if found is None else [found]
 
     def command(self, store: Store) -> str:
         """Return the command for a store."""

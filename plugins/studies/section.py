@@ -17,7 +17,6 @@ from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.plugins.studies.plot import Panel, Point, cost_and_error
 from sliplab.plugins.studies.results import RESULTS
 from sliplab.plugins.studies.scene.page import SceneCost, scene_cost
-from sliplab.storage.schema.summary import Summary
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
@@ -271,7 +270,7 @@ def _found(store: Store) -> dict[str, Json]:
 
 
 def _make(data: ReportData) -> TradeoffSection | None:
-    if not isinstance(data.summary, Summary) or not data.collected_here:
+    if data.collected is None:
         return None
     return tradeoff_section(data.store, _found(data.store))
 

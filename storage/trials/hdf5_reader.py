@@ -489,15 +489,15 @@ class Rows:
         for at in product(range(low // step * step, high, step), *others):
             if at in self._fine:
                 continue
-            if (kept := self._kept_chunk(at)) is not None:
-                found = unpacked_bytes(self._filters, *kept, full)
+            if (chunk := self._stored_chunk(at)) is not None:
+                found = unpacked_bytes(self._filters, *chunk, full)
                 if found is not None and found < full:
                     raise NotOurs(
                         f"{self._name} has a chunk of {found} bytes, not {full}, at row {at[0]}"
                     )
             self._fine.add(at)
 
-    def _kept_chunk(self, at: tuple[int, ...]) -> tuple[int, bytes] | None:
+    def _stored_chunk(self, at: tuple[int, ...]) -> tuple[int, bytes] | None:
         """Return the filters that a chunk skipped, and its bytes; None where nothing is stored."""
         try:
             mask, data = self._data.read_direct_chunk(at)

@@ -10,10 +10,10 @@ from sliplab.flows.running import console
 app = typer.Typer()
 
 
-@app.command()
+@app.command(epilog="Example: sliplab rates my-store")
 def rates(store: StoreArgument, names: CampaignOption = None, as_json: JsonOption = False) -> None:
     """Measure event rates before and in the motion of each trial."""
-    from lab_rates.study import RESULT, measure
+    from lab_rates.study import COLUMNS, RESULT, measure, rows
     from sliplab.analysis.campaigns import collected
     from sliplab.storage.trials.store import Store
 
@@ -22,10 +22,6 @@ def rates(store: StoreArgument, names: CampaignOption = None, as_json: JsonOptio
     if as_json:
         console.print_json(result)
         return
-    rows = [
-        [name, f"{found['hold']:.0f}", f"{found['motion']:.0f}"]
-        for name, found in result["trials"].items()
-    ]
     simulated = " (simulated)" if result["simulated"] else ""
-    console.print_table(f"Event rates{simulated}", ["trial", "hold (1/s)", "motion (1/s)"], rows)
+    console.print_table(f"Event rates{simulated}", COLUMNS, rows(result))
     console.say(f"stored in {store / RESULT.file}; the next report shows them")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from lab_rates.study import RESULT
+from lab_rates.study import COLUMNS, RESULT, rows
 from sliplab.analysis.report.page import Content, Table
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 
@@ -24,11 +24,7 @@ def make(data: ReportData) -> RatesSection | None:
     result = RESULT.read(data.store)
     if result is None:
         return None
-    rows = [
-        [name, f"{found['hold']:.0f}", f"{found['motion']:.0f}"]
-        for name, found in result["trials"].items()
-    ]
-    return RatesSection(Table(("trial", "hold (1/s)", "motion (1/s)"), rows))
+    return RatesSection(Table(COLUMNS, rows(result)))
 
 
 SECTION = ReportSection(make, last=True)

@@ -1,4 +1,4 @@
-"""Mean event rates of a campaign's trials, before the motion and in it; kept in the store."""
+"""Mean event rates of trials before the motion and in it, stored with other results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SECONDS = 0.02
 
 
 def measure(store: Store, campaigns: Sequence[Collected]) -> dict[str, Any]:
-    """Return the rates by trial, events/s, and keep them in the store."""
+    """Return the rates by trial, events/s, and write them into the store."""
     trials = {
         f"{item.name}/{trial.id}": rates(recording)
         for item in campaigns
@@ -30,6 +30,17 @@ def measure(store: Store, campaigns: Sequence[Collected]) -> dict[str, Any]:
     make_folder(path.parent)
     write_json(path, result)
     return result
+
+
+COLUMNS = ("trial", "hold (1/s)", "motion (1/s)")
+
+
+def rows(result: dict[str, Any]) -> list[list[str]]:
+    """Return the rates of each trial below `COLUMNS`."""
+    return [
+        [name, f"{found['hold']:.0f}", f"{found['motion']:.0f}"]
+        for name, found in result["trials"].items()
+    ]
 
 
 def rates(recording: Recording) -> dict[str, float]:

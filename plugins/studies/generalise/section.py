@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures.intervals import Share, shares
 from sliplab.analysis.report.page import Content, Figure, Table, percent
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
@@ -15,9 +13,7 @@ from sliplab.analysis.report.programs import CommandResult
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.windows import share_data
 from sliplab.plugins.studies.document import GeneralisationResults, NotTrained
-from sliplab.storage.schema.summary import Summary
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
 
 RESULT = CommandResult("derived/generalisation/results.json", "sliplab generalise {store}")
 
@@ -71,9 +67,9 @@ def skin_section(
 
 
 def _make(data: ReportData) -> SkinSection | None:
-    if not isinstance(data.summary, Summary) or not data.collected_here:
+    if data.collected is None:
         return None
-    kinematic = data.summary.kinematic
+    kinematic = data.collected.kinematic
     return skin_section(
         RESULT.read(data.store),
         RESULT.command(data.store),
@@ -83,10 +79,5 @@ def _make(data: ReportData) -> SkinSection | None:
     )
 
 
-def _key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
-    found = RESULT.read(store)
-    return [] if found is None else [found]
-
-
-SECTION = ReportSection(_make, _key, last=True)
+SECTION = ReportSection(_make, RESULT.key, last=True)
 """Skins and levels in the report."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures.intervals import Changed, ChangePanel, lowered_and_raised
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
@@ -15,9 +14,7 @@ from sliplab.analysis.report.programs import CommandResult
 from sliplab.plugins.studies.document import SensitivityResults
 from sliplab.plugins.studies.guesses.results import FIGURES, UNITS, changes, figures
 from sliplab.plugins.studies.parameters import AS_IT_IS, NAMES
-from sliplab.storage.schema.summary import Summary
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
 
 RESULT = CommandResult("derived/guesses/results.json", "sliplab guesses {store}")
 DRAWN = ("strict", "incipient_ms", "gravity_lead_ms", "disturbance_lead_ms")
@@ -159,15 +156,10 @@ def _data(names: Sequence[str], lower: Side, higher: Side) -> dict[str, list[obj
 
 
 def _make(data: ReportData) -> SensitivitySection | None:
-    if not isinstance(data.summary, Summary) or not (data.simulated and data.collected_here):
+    if data.collected is None or not data.simulated:
         return None
     return sensitivity_section(RESULT.read(data.store), RESULT.command(data.store))
 
 
-def _key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
-    found = RESULT.read(store)
-    return [] if found is None else [found]
-
-
-SECTION = ReportSection(_make, _key, last=True)
+SECTION = ReportSection(_make, RESULT.key, last=True)
 """Assumed parameters in the report."""

@@ -1,4 +1,4 @@
-"""Sections of plug-ins: those of other packages stand in the report, and cannot end it."""
+"""Sections of plug-ins: those of other packages are in the report, and cannot end it."""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.command_line import here
@@ -26,9 +28,9 @@ LONG = "k" * 300
     ids=" ".join,
 )
 def test_a_name_that_is_too_long_is_wrong_input(
-    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: object
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
     done = here(*words)
     assert done.returncode == 2, done.stderr
     last = done.stderr.splitlines()[-1]

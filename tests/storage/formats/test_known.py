@@ -1,4 +1,4 @@
-"""The table of formats: those of another lab's package stand in it beside the core's."""
+"""The table of formats: it contains those of another lab's package and the core's."""
 
 from __future__ import annotations
 
