@@ -104,6 +104,9 @@ def command_line(words: Sequence[str] = ()) -> typer.Typer:
     for each, places in sorted(plugins().commands().items()):
         for place in places:
             _add(each, place, needed=each == word)
+    if words and word is None:  # the help
+        for fault in plugins().faults:
+            console.say(f"warning: {fault}")
     return app
 
 

@@ -28,6 +28,12 @@ from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fau
 
 LONGEST_SHOWN = 80
 """Characters of a file name that is too long."""
+_NAMES = {
+    errno.ENAMETOOLONG: "the file name is too long",
+    errno.EISDIR: "is a folder; give a file",
+    errno.EEXIST: "exists already as a file; give a folder or another name",
+}
+"""Errors of the system that are those of a given name."""
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
 _WITH_TRIALS = {
     "collect",
@@ -138,10 +144,10 @@ def failure(error: Exception) -> Failure:
     if isinstance(error, FileNotFoundError | NotADirectoryError) and error.filename:
         place = os.fsdecode(error.filename)
         return Failure(f"{place}: {os.strerror(error.errno or 0).lower()}", console.FAILED, place)
-    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
-        place = os.fsdecode(error.filename or "")
+    if isinstance(error, OSError) and error.errno in _NAMES:
+        place = os.fsdecode(error.filename2 or error.filename or "")
         shown = place if len(place) <= LONGEST_SHOWN else f"{place[:LONGEST_SHOWN]}..."
-        return Failure(f"{shown}: the file name is too long", console.WRONG_INPUT, shown or None)
+        return Failure(f"{shown}: {_NAMES[error.errno]}", console.WRONG_INPUT, shown or None)
     if isinstance(error, OSError) and error.filename:
         # of a copy the second file is the one that is written
         place = os.fsdecode(error.filename2 or error.filename)

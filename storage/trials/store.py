@@ -21,6 +21,7 @@ the next collection quarantines it and takes the trial again. docs/store.md has 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,6 +69,8 @@ AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that is to be retaken; mark of a failed attempt that is no longer
 counted."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
 
 def known_cause(folder: Path) -> Json | None:
@@ -429,8 +432,11 @@ class Store:
         """Return whether a folder holds a store; False for one that could hold one.
 
         Raises:
-            NoStore: it is a file, or a folder that holds something else.
+            NoStore: it is a URL, a file, or a folder that holds something else.
         """
+        if _URL.match(str(folder)):
+            text = "is a URL, not a folder; give a folder, then `sliplab push FOLDER URL`"
+            raise NoStore(folder, text)
         if (folder / STORE).exists():
             return True
         if folder.exists() and not folder.is_dir():

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from sliplab.flows.cli.app import command_line
 from sliplab.protocols import plugin
 from sliplab.protocols.plugin import Plugin, plugins
 from tests.conftest import ROOT
@@ -124,3 +125,11 @@ def test_names_from_before_a_move_still_work() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == ["True", "True", "sliplab.plugins.bench.interface"]
+
+
+def test_help_names_a_plug_in_that_cannot_be_used(installed: Any, capsys: Any) -> None:
+    installed("lab_broken_help", "import no_such_module_xyz\n")
+    command_line(("--help",))
+    said = capsys.readouterr().err
+    assert "warning: the plug-in lab_broken_help cannot be used: " in said
+    assert "no_such_module_xyz" in said
