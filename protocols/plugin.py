@@ -32,7 +32,9 @@ class Plugin:
     Attributes:
         commands: Typer applications by the first word of a command, or by the group that they
             extend, such as ``calibrate``.
-        documents: by kind, models of the JSON documents that it writes
+        studies: by name, studies (`analysis.study.Study`): each is a command with a result and a
+            page. One of a group, such as ``calibrate``, has the name ``GROUP NAME``.
+        documents: by kind, further models of the JSON documents that it writes
             (`storage.schema.document.Document`), each with the title of its schema.
         detectors: detectors of slip that the bench judges (`plugins.bench.interface.Detector`), by
             name: classes or functions without arguments.
@@ -47,6 +49,7 @@ class Plugin:
     """
 
     commands: Mapping[str, str] = field(default_factory=dict)
+    studies: Mapping[str, str] = field(default_factory=dict)
     documents: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     detectors: Mapping[str, str] = field(default_factory=dict)
     drivers: Mapping[str, str] = field(default_factory=dict)
@@ -71,11 +74,11 @@ class Plugins:
     faults: tuple[str, ...]
 
     def commands(self) -> dict[str, list[str]]:
-        """Return places of Typer applications by the first word of their commands."""
+        """Return places of Typer applications and studies by the first word of their commands."""
         words: dict[str, list[str]] = {}
         for plugin in self.found.values():
-            for word, place in plugin.commands.items():
-                words.setdefault(word, []).append(place)
+            for name, place in (*plugin.commands.items(), *plugin.studies.items()):
+                words.setdefault(name.split(" ")[0], []).append(place)
         return words
 
     def declared(self, what: str) -> dict[str, Any]:

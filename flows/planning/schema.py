@@ -72,13 +72,21 @@ class _Described(GenerateJsonSchema):
 
 def kinds() -> tuple[str, ...]:
     """Return the kinds of files and documents that have a schema."""
-    return (*FILES, *DOCUMENTS, *plugins().declared("documents"))
+    return (*FILES, *DOCUMENTS, *plugins().declared("documents"), *_studies())
+
+
+def _studies() -> dict[str, str]:
+    """Return the places of studies by the kinds of their results."""
+    return {name.split(" ")[-1]: place for name, place in plugins().declared("studies").items()}
 
 
 def document_model(kind: str) -> tuple[type[Document], str]:
     """Return the model of a document and the title of its schema."""
     if kind in DOCUMENTS:
         return DOCUMENTS[kind]
+    if kind in _studies():
+        study = import_foreign(_studies()[kind])
+        return study.result, study.title
     place, title = plugins().declared("documents")[kind]
     return import_foreign(place), title
 

@@ -8,14 +8,13 @@ _STRESS = "sliplab.plugins.bench.stress"
 PLUGIN = Plugin(
     commands={
         "bench": "sliplab.plugins.bench.command:app",
-        "stress": f"{_STRESS}.command:app",
     },
+    studies={"stress": f"{_STRESS}.study:STUDY"},
     documents={
         "bench": (
             "sliplab.plugins.bench.document:BenchResult",
             "The table of the bench of detectors, by SlipLab",
         ),
-        "stress": (f"{_STRESS}.document:StressRecord", "Detectors under nuisances, by SlipLab"),
     },
     hooks={"false_alarms": f"{_STRESS}.rates:report_alarms"},
 )

@@ -5,6 +5,9 @@ from __future__ import annotations
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 from sliplab.storage.schema.evaluation import Rate
 
+ALL = "all"
+"""In place of a nuisance: every trial."""
+
 
 class HourlyRate(Part):
     """A rate per hour with its 95 % interval over trials, null with one trial."""
@@ -45,6 +48,27 @@ class StressDetector(Part):
     stride_ms: Int
     figures: tuple[StressFigures, ...]
 
+    @property
+    def title(self) -> str:
+        """Name for people."""
+        return f"{self.network}: {self.rule}, {self.stride_ms} ms"
+
+    @property
+    def is_rule(self) -> bool:
+        """True for a network with its rule of detection."""
+        from sliplab.analysis.detectors.detectors import RULE  # slow to import
+
+        return self.rule.startswith(RULE)
+
+    def under(self, nuisance: str) -> StressFigures:
+        """Return the figures under one nuisance, all strengths together.
+
+        Raises:
+            StopIteration: there are none.
+        """
+        wanted = (nuisance, None)
+        return next(it for it in self.figures if (it.nuisance, it.strength) == wanted)
+
 
 class StressAccuracy(Part):
     """Strict accuracy of a network on the sample windows of one nuisance at one strength."""
@@ -72,3 +96,9 @@ class StressRecord(Document):
     hold_h: Number
     detectors: tuple[StressDetector, ...]
     accuracy: tuple[StressAccuracy, ...]
+
+    @property
+    def nuisances(self) -> list[str]:
+        """Names in the order of the figures."""
+        found = dict.fromkeys(it.nuisance for it in self.detectors[0].figures)
+        return [name for name in found if name != ALL]

@@ -33,11 +33,10 @@ from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.store_detectors import store_detectors
 from sliplab.plugins.bench.stress import judging as stress
-from sliplab.plugins.bench.stress import page
 from sliplab.plugins.bench.stress.document import StressAccuracy, StressDetector, StressRecord
 from sliplab.plugins.bench.stress.judging import StressTrial
 from sliplab.protocols import InputError, Plan, Trial
-from sliplab.storage.files import make_folder, write_json, write_text
+from sliplab.storage.files import make_folder
 from sliplab.storage.schema.evaluation import Rate
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -101,7 +100,7 @@ def request(
 
 
 def measure_stress(asked: Request) -> StressRecord:
-    """Take, label and judge what is missing; write the page and the numbers.
+    """Take and label the trials that are missing, and judge the detectors.
 
     Raises:
         StoreError: no trial has an onset.
@@ -136,7 +135,7 @@ def measure_stress(asked: Request) -> StressRecord:
             detectors.append(stress.stressed(judged.title, tuned.name, stride, rows))
         accuracy += _accuracy(judged.title, judged.model, labels, campaign, trials)
     first = trials[0][1].record
-    record = StressRecord(
+    return StressRecord(
         simulated=first.simulated,
         campaign=training_campaigns(asked.campaigns)[0].name,
         rig=campaign.info["rig"],
@@ -147,9 +146,6 @@ def measure_stress(asked: Request) -> StressRecord:
         detectors=stress.ordered(detectors),
         accuracy=tuple(accuracy),
     )
-    write_json(asked.out / f"{NAME}.json", record.to_json())
-    write_text(asked.out / f"{NAME}.html", page.render(record))
-    return record
 
 
 def _stress_trial(

@@ -22,10 +22,13 @@ from sliplab.analysis.detectors.latency import TrueSlip, median_with_lost
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.plugins.bench.alarms import ALARM_US
-from sliplab.plugins.bench.stress.document import HourlyRate, StressDetector, StressFigures
+from sliplab.plugins.bench.stress.document import (
+    ALL,
+    HourlyRate,
+    StressDetector,
+    StressFigures,
+)
 from sliplab.storage.schema.evaluation import Rate
-
-ALL = "all"
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sliplab.analysis.detectors.detectors import RULE
 from sliplab.analysis.report.alarms import DISTURBED, UNDISTURBED
 from sliplab.analysis.report.programs import STRESS
-from sliplab.plugins.bench.stress.document import StressRecord
-from sliplab.plugins.bench.stress.judging import ALL
+from sliplab.plugins.bench.stress.document import ALL, StressRecord
 from sliplab.storage.schema.evaluation import AlarmRate
 from sliplab.storage.streams import Json
 
@@ -31,7 +29,7 @@ def stress_alarms(record: StressRecord | None, network: str) -> dict[str, AlarmR
         network: its title in the record.
     """
     ours = () if record is None else record.detectors
-    rule = next((it for it in ours if it.network == network and it.rule.startswith(RULE)), None)
+    rule = next((it for it in ours if it.network == network and it.is_rule), None)
     found = {}
     for figures in () if rule is None else rule.figures:
         name = {ALL: DISTURBED, "none": UNDISTURBED}.get(figures.nuisance)

@@ -6,12 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 import yaml
 
 from sliplab.analysis.campaigns import collected, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks.models import wanted_models
+from sliplab.analysis.study import Finding
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
@@ -19,6 +21,7 @@ from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.study import Outcome
 from sliplab.plugins.bench.stress.document import StressRecord
 from sliplab.plugins.bench.stress.flow import measure_stress, request
+from sliplab.plugins.bench.stress.study import STUDY
 from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
@@ -55,7 +58,9 @@ def made(store: Store, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     """Its detectors under four trials."""
     folder = tmp_path_factory.mktemp("stress")
     asked = request(store, collected(store), disturbed(folder), None, folder / "out")
-    return folder, measure_stress(asked)
+    record = measure_stress(asked)
+    STUDY.write(Finding(record, asked.out))
+    return folder, record
 
 
 def test_every_detector_has_every_trial(made: tuple[Path, StressRecord]) -> None:
@@ -93,6 +98,11 @@ def test_numbers_and_page_say_simulated_and_nothing_is_taken_again(
     page = (folder / "out" / "stress.html").read_text()
     assert "simulated" in page
     assert all(name in page for name in ("none", "mix", "clean trials"))
+    table = pd.read_csv(folder / "out" / "tables" / "stress.detectors.figures.csv")
+    first, shown = record.detectors[0], table.iloc[0]
+    assert shown[["network", "nuisance", "simulated"]].to_list() == [first.network, "all", True]
+    assert shown["per_hour_high"] == pytest.approx(first.figures[0].per_hour.high)
+    assert len(table) == sum(len(it.figures) for it in record.detectors)
     trials = folder / "out" / "store" / "campaigns" / "stress" / "trials"
     before = {path: path.stat().st_mtime_ns for path in trials.rglob("data.h5")}
     asked = request(store, collected(store), folder / "nuisances.yaml", None, folder / "out")
