@@ -2,7 +2,7 @@
 
 A scene takes the lowest level whose onsets differ from the next level's by less than the onsets of
 two seeds differ. This is computed from onsets in closed form (`rigs.scene.onsets`), in milliseconds
-and without a simulation; `sliplab tradeoff --scene` measures the same on windows.
+and without a simulation; `benchmarks.scene_tradeoff` measures the same on windows.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Studies of a network and its scene: levels left out, assumed parameters, speed against error."""
+"""Studies of a network: levels left out, other skins, speed against error."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ PLUGIN = Plugin(
     commands=dict.fromkeys(("tradeoff", "generalise", "guesses"), f"{_STUDIES}.command:app"),
     sections={
         "skins": f"{_STUDIES}.generalise.section:SECTION",
-        "guesses": f"{_STUDIES}.guesses.section:SECTION",
         "tradeoff": f"{_STUDIES}.section:SECTION",
     },
-    searches={
-        name: f"{_STUDIES}.searches:{name}"
-        for name in ("generalisation", "guesses", "scene", "detector")
-    },
+    searches={name: f"{_STUDIES}.searches:{name}" for name in ("generalisation", "detector")},
 )

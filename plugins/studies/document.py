@@ -1,4 +1,4 @@
-"""Results of a store's sweeps: levels left out, other skins, assumed parameters.
+"""Results of a store's sweeps: levels left out, and other skins.
 
 Units are those of an evaluation. Every point has the key of what it was made of, so that only what
 is missing or stale is measured.
@@ -9,12 +9,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
-from sliplab.storage.schema.evaluation import (
-    ByClass,
-    Experiments,
-    Share,
-    TrialScore,
-)
+from sliplab.storage.schema.evaluation import ByClass, Share
 
 
 class UnseenScores(Share):
@@ -42,34 +37,3 @@ class GeneralisationResults(Document):
     simulated: Bool
     results: dict[str, UnseenScores | NotTrained]
     """By factor and level, such as `speed 4 mm/s`, or by skin, such as `skin 101`."""
-
-
-class TrialAtSetting(TrialScore):
-    """One trial at a setting of the scene."""
-
-    depth_zero_mm: Number | None
-    """The plate's position as the rig measured it."""
-
-
-class SettingScores(Part):
-    """A study's test trials, repeated with one assumed parameter of the scene changed."""
-
-    key: str = ""
-    parameter: str | None
-    """Its dotted name; null for the scene as it is."""
-    factor: Number
-    value: Number | None
-    windows: dict[str, tuple[Int, Int]]
-    """By trial, windows that were classified correctly, and all of its windows."""
-    trials: tuple[TrialAtSetting, ...]
-    experiments: Experiments
-
-
-class SensitivityResults(Document):
-    """Results that `sliplab guesses` keeps."""
-
-    simulated: Bool
-    change: Number
-    """Share by which each parameter is lowered and raised."""
-    settings: dict[str, SettingScores]
-    """By the setting's name."""

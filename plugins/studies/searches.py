@@ -13,15 +13,11 @@ from sliplab.plugins.studies.detector.grid import Axes
 from sliplab.plugins.studies.detector.run import tradeoff_detector
 from sliplab.plugins.studies.detector.search import SearchSize
 from sliplab.plugins.studies.generalise.run import SKINS, measure_generalisation
-from sliplab.plugins.studies.guesses.run import GUESSES, TRIALS, measure_guesses
-from sliplab.plugins.studies.parameters import in_all
-from sliplab.plugins.studies.results import RESULTS
-from sliplab.plugins.studies.scene.run import search_scene
+from sliplab.plugins.studies.section import RESULT
 
 LEVEL_S = 0.0004
 """Time of a level that is left out, per window and epoch."""
-SKIN_S, GUESS_S, SCENE_S, SEARCH_S = 25.0, 40.0, 120.0, 6000.0
-SCENE_TRIALS = 4
+SKIN_S, SEARCH_S = 25.0, 6000.0
 SIZE, AXES = SearchSize(), Axes()
 
 
@@ -40,45 +36,15 @@ def generalisation(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Se
     )
 
 
-def guesses(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search | None:
-    """Assumed parameters of the scene lowered and raised, where it is simulated."""
-    if not _simulated(planned):
-        return None
-    names = in_all(GUESSES, [each.rig.mock for each in run_requests])
-    return Search(
-        "guesses",
-        "settings",
-        GUESS_S * (1 + 2 * len(names)),
-        lambda store, campaigns: measure_guesses(store, campaigns, names, TRIALS).measured,
-    )
-
-
-def scene(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search | None:
-    """Speed against error of the scene of slides, where it is simulated."""
-    if not (planned.slides and _simulated(planned)):
-        return None
-    return Search(
-        "scene search",
-        "searches",
-        SCENE_S,
-        lambda store, campaigns: search_scene(store, campaigns, SCENE_TRIALS),
-    )
-
-
 def detector(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search | None:
     """Speed against error of the detector, where slides train a network."""
     if not planned.slides:
         return None
-    file = RESULTS["detector"].file
     return Search(
         "detector search",
         "trainings",
         SEARCH_S,
         lambda store, campaigns: tradeoff_detector(
-            store, campaigns, (store.folder / file).parent, SIZE, AXES
+            store, campaigns, (store.folder / RESULT.file).parent, SIZE, AXES
         )["made"],
     )
-
-
-def _simulated(planned: StudyPlan) -> bool:
-    return all(item.simulated for item in planned.campaigns)

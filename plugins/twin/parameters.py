@@ -1,7 +1,7 @@
 """The parameters of a simulated rig that a pilot may determine.
 
-None of them was measured when a rig file was written: they are assumed (`sliplab guesses`). Each is
-a number of the rig file's section `mock:`, positive, and is estimated as a logarithm, so that an
+None of them was measured when a rig file was written: they are assumed. Each is a
+number of the rig file's section `mock:`, positive, and is estimated as a logarithm, so that an
 interval is a factor either way. The threshold of events is not among them: contrast, threshold and
 its mismatch scale together without changing an event, so the threshold keeps the rig's value.
 """

@@ -277,9 +277,8 @@ REFUSED = {
     "evaluate STORE --model STORE/models/classes-seed0.pt": (1, ABOUT_SLIP),
     "report STORE --against STORE": (2, "is a report on recordings of classes"),
     "generalise STORE": (1, ABOUT_SLIP),
-    "guesses STORE": (1, "contains real trials"),
     "holdout STORE": (1, ABOUT_SLIP),
-    "tradeoff --detector STORE": (1, ABOUT_SLIP),
+    "tradeoff STORE": (1, ABOUT_SLIP),
     "review STORE": (1, ABOUT_SLIP),
     "sync STORE": (1, "there are no clocks to fit"),
 }

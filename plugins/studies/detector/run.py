@@ -1,4 +1,4 @@
-"""`sliplab tradeoff --detector`: speed of a detector against its errors, over a store's trials.
+"""`sliplab tradeoff`: speed of a detector against its errors, over a store's trials.
 
 A search is stored run by run, so it may be stopped, resumed, and made larger later.
 """

@@ -17,6 +17,7 @@ from pathlib import Path
 import distributed
 import pytest
 
+from benchmarks.scene_tradeoff.run import everywhere
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
@@ -24,7 +25,6 @@ from sliplab.flows.running import cluster as clusters
 from sliplab.flows.running import parallel_map, stopping
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
 from sliplab.flows.train import train
-from sliplab.plugins.studies.scene.run import everywhere
 from sliplab.protocols.errors import InputError
 from sliplab.storage.remote.mirror import open_mirror
 from sliplab.storage.remote.objects import Remote

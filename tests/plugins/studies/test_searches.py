@@ -17,20 +17,18 @@ from sliplab.plugins.studies.detector.grid import Axes
 from sliplab.plugins.studies.detector.search import SearchSize
 from sliplab.plugins.studies.generalise.run import measure_generalisation
 from sliplab.plugins.studies.generalise.section import RESULT as GENERALISATION
-from sliplab.plugins.studies.guesses.section import RESULT as GUESSES
-from sliplab.plugins.studies.results import RESULTS
+from sliplab.plugins.studies.section import RESULT
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store
 
 pytestmark = pytest.mark.programs
 
-NAMES = ["baselines", "generalisation", "guesses", "scene search", "detector search"]
+NAMES = ["baselines", "generalisation", "detector search"]
 
 
 def test_what_a_study_can_have(ran: tuple[list[RunRequest], Outcome]) -> None:
     slides, falls = ran[0]
     assert [each.name for each in searches([slides, falls])] == NAMES
-    assert [each.name for each in searches([falls])] == ["guesses"]
     real = slides.rig.model_copy(update={"driver": "devices"})
     assert not real.simulated
     slides, falls = (replace(run_request, rig=real) for run_request in (slides, falls))
@@ -62,8 +60,6 @@ def test_each_is_done_once_and_reported(
     monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1})
     few = partial(measure_generalisation, factors=("direction",), skins=1, trials=3, epochs=1)
     monkeypatch.setattr(planned_searches, "measure_generalisation", few)
-    monkeypatch.setattr(planned_searches, "GUESSES", ("event_camera.contrast",))
-    monkeypatch.setattr(planned_searches, "SCENE_TRIALS", 1)
     size = SearchSize(samples=40, epochs=1, trials=2, seeds=1, stride_ms=15)
     monkeypatch.setattr(planned_searches, "SIZE", size)
     axes = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(1.0,))
@@ -78,27 +74,16 @@ def test_each_is_done_once_and_reported(
         "evaluate": 0,
         "baselines": 1,
         "generalisation": 2,
-        "guesses": 3,
-        "scene search": 1,
         "detector search": 2,
         "report": 1,
     }
     store = Store.open(run_requests[0].store)
-    for result in (GENERALISATION, GUESSES, RESULTS["scene"], RESULTS["detector"]):
+    for result in (GENERALISATION, RESULT):
         assert result.read(store) is not None
     page = (run_requests[0].store / "report" / "index.html").read_text()
-    for whose in ("scene", "detector"):
-        assert f"The whole of the {whose}&#39;s search" in page
+    assert "The whole of the detector's search" in page
 
     again = study(run_requests, more=searches(run_requests))
     assert not any(step["done"] for step in again.steps)
-    assert {row.name: row.note for row in outcome.rows}["scene search"] == "1 search"
     notes = {row.name: (row.state, row.note) for row in again.rows}
     assert all(notes[name] == ("done", "nothing to do") for name in NAMES)
-
-    monkeypatch.setattr(planned_searches, "SCENE_TRIALS", 2)
-    third = {
-        step["step"]: step["done"]
-        for step in study(run_requests, more=searches(run_requests)).steps
-    }
-    assert third["scene search"] == 1

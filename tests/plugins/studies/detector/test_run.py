@@ -250,20 +250,20 @@ def test_a_stop_and_a_lack_of_labels_are_said(store: Store, monkeypatch: Any) ->
         search.sweep.run(bar.advance)
 
 
-def test_the_command_takes_one_of_its_two_subjects(store: Store, tmp_path: Path) -> None:
+def test_the_command_names_what_is_wrong_and_knows_its_old_form(
+    store: Store, tmp_path: Path
+) -> None:
     for words, message in (
-        ((), "exactly one of --scene"),
-        (("--scene", "p.yaml", "--detector", store.folder), "exactly one of --scene"),
-        (("--scene", "p.yaml", "--samples", 5), "--samples: belongs to --detector"),
-        (("--detector", store.folder, "--sensitivity"), "--sensitivity: belongs to --scene"),
-        (("--detector", store.folder, "--pool", 30), "--pool = 30: must divide"),
+        ((), "STORE: is needed"),
+        (("--scene", "p.yaml"), "has moved: python -m benchmarks.scene_tradeoff p.yaml"),
+        ((store.folder, "--pool", 30), "--pool = 30: must divide"),
+        (("--detector", store.folder, "--pool", 30), f"write: sliplab tradeoff {store.folder}"),
     ):
         done = here("tradeoff", *words)
         assert done.returncode == 2, done.stderr
         assert message in done.stderr.replace("\n", " ")
     done = here(
         "tradeoff",
-        "--detector",
         store.folder,
         "--dry-run",
         "--json",

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from benchmarks.scene_tradeoff.page import choice_pairs
 from sliplab.flows.scene_runs import changed
-from sliplab.plugins.studies.scene.page import choice_pairs
 from sliplab.plugins.twin.document import CheapestScene, EffectNeed
 from sliplab.plugins.twin.effects import EFFECTS
 from sliplab.plugins.twin.needs import flow as needs

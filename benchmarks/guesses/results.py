@@ -1,7 +1,7 @@
 """Sensitivity of a study's figures to assumed parameters of its simulated scene.
 
 Test trials of the study are repeated with one parameter lower, then higher, and evaluated by the
-study's own network and detection settings (`sliplab guesses`).
+study's own network and detection settings (`benchmarks.guesses`).
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from benchmarks.guesses.document import SensitivityResults, SettingScores, TrialAtSetting
+from benchmarks.scene_parameters import CHANGE, Setting
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.evaluation.trials import judge, summaries
@@ -23,8 +25,6 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.sweeps.runner import ResultFile, sample_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import several
-from sliplab.plugins.studies.document import SensitivityResults, SettingScores, TrialAtSetting
-from sliplab.plugins.studies.parameters import CHANGE, Setting
 from sliplab.storage.schema.evaluation import TrialLatency
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store, StoreError

@@ -9,8 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from sliplab.flows.scene_runs import Seen, changed, ideal, run, timed
-from sliplab.plugins.studies.scene.variants import (
+from benchmarks.scene_tradeoff.variants import (
     ClosedForm,
     Compared,
     Families,
@@ -18,6 +17,7 @@ from sliplab.plugins.studies.scene.variants import (
     compare_variants,
     variants,
 )
+from sliplab.flows.scene_runs import Seen, changed, ideal, run, timed
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.scene_tradeoff.plot import cost_against_error
+from benchmarks.scene_tradeoff.variants import table_rows
+from benchmarks.scene_tradeoff.windows import PHASES
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
-from sliplab.plugins.studies.plot import cost_against_error
-from sliplab.plugins.studies.scene.variants import table_rows
-from sliplab.plugins.studies.scene.windows import PHASES
 
 _HERE = Path(__file__).parent
 FAMILIES = {

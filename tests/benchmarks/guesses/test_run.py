@@ -8,27 +8,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
-from sliplab.analysis.campaigns import collected
-from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.report import report
-from sliplab.flows.study import Outcome
-from sliplab.plugins.studies.document import SensitivityResults, SettingScores
-from sliplab.plugins.studies.guesses import results as study_sensitivity
-from sliplab.plugins.studies.guesses import run as guesses
-from sliplab.plugins.studies.guesses.results import (
+from benchmarks.guesses import results as study_sensitivity
+from benchmarks.guesses import run as guesses
+from benchmarks.guesses.document import SensitivityResults, SettingScores
+from benchmarks.guesses.results import (
     FIGURES,
     StudySensitivity,
     changes,
     figures,
 )
-from sliplab.plugins.studies.guesses.run import TRIALS, guess_sweep, measure_guesses
-from sliplab.plugins.studies.guesses.section import sensitivity_section
-from sliplab.plugins.studies.parameters import AS_IT_IS, Setting
+from benchmarks.guesses.run import TRIALS, guess_sweep, measure_guesses
+from benchmarks.guesses.study import STUDY
+from benchmarks.scene_parameters import AS_IT_IS, Setting
+from sliplab.analysis.campaigns import collected
+from sliplab.flows.cli.study_command import study_app
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.study import Outcome
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store, StoreError
-from tests.command_line import here
+from sliplab.storage.trials.store import Store
 from tests.flows.conftest import shape_of
 
 pytestmark = pytest.mark.long
@@ -185,34 +185,13 @@ def test_another_network_is_another_measurement(
     assert len(guess_sweep(work, (GUESS,)).pending) == 3
 
 
-def test_the_report_shows_them(store: Store) -> None:
-    report(store, collected(store))
-    page = (store.folder / "report" / "index.html").read_text()
+def test_a_command_shows_them(store: Store) -> None:
+    done = CliRunner().invoke(study_app(STUDY), [str(store.folder), "--guess", GUESS, "--json"])
+    assert done.exit_code == 0, done.output
+    reported = json.loads(done.stdout)
+    assert set(reported["settings"]) == set(scores(store))
+    page = Path(reported["page"]).read_text()
     assert "Sensitivity to assumed scene parameters" in page
     assert "contrast of the markers" in page
-    data = (store.folder / "report/data/guesses.csv").read_text().splitlines()
-    assert data[0].startswith("simulated,guess") or "guess" in data[0]
-    assert len(data) == 3
-
-
-def test_a_file_of_another_shape_is_named(store: Store) -> None:
-    with pytest.raises(StoreError, match=r"derived/guesses/results\.json"):
-        sensitivity_section({"settings": {AS_IT_IS: {}}}, "sliplab guesses STORE")
-
-
-def test_how_it_is_said_on_the_command_line(store: Store) -> None:
-    done = here("guesses", store.folder, "--guess", GUESS, "--json")
-    assert done.returncode == 0, done.stderr
-    reported = json.loads(done.stdout)
-    assert list(reported) == ["simulated", "trials", "measured", "settings", "file"]
-    assert reported["settings"] == {
-        name: figures(setting) for name, setting in scores(store).items()
-    }
-    assert reported["trials"] == {"tiny": 2, "tiny_gravity": 2}
-    assert list(reported["settings"]) == list(kept(store))
-    table = here("guesses", store.folder, "--guess", GUESS)
-    assert "simulated" in table.stdout
-    wrong = here("guesses", store.folder, "--guess", "scene.friction.kinetc")
-    assert wrong.returncode == 2
-    assert "scene.friction.kinetc" in wrong.stderr
-    assert "scene.friction.kinetic" in wrong.stderr
+    tables = sorted(path.name for path in Path(reported["page"]).parent.glob("tables/*.csv"))
+    assert tables == ["guesses.settings.csv", "guesses.settings.trials.csv"]

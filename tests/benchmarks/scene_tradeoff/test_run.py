@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks import scene_parameters as sensitivity
+from benchmarks.scene_tradeoff import run as tradeoff
+from benchmarks.scene_tradeoff import sensitivity as scene_sensitivity
+from benchmarks.scene_tradeoff.page import render, sensitivity_markdown
+from benchmarks.scene_tradeoff.running import closed_form
+from benchmarks.scene_tradeoff.variants import Variant
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.running import stopping
 from sliplab.flows.scene_runs import changed, ideal, run
-from sliplab.plugins.studies import parameters as sensitivity
-from sliplab.plugins.studies.scene import run as tradeoff
-from sliplab.plugins.studies.scene import sensitivity as scene_sensitivity
-from sliplab.plugins.studies.scene.page import render, sensitivity_markdown
-from sliplab.plugins.studies.scene.running import closed_form
-from sliplab.plugins.studies.scene.variants import Variant
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file

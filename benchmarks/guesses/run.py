@@ -1,4 +1,4 @@
-"""`sliplab guesses`: sensitivity of a study's figures to assumed parameters of the scene.
+"""Sensitivity of a study's figures to assumed parameters of the scene.
 
 Some of a study's test trials are repeated on the same simulated rig with one parameter 20 %
 lower, then 20 % higher. They are relabelled and evaluated by the study's own network and detection
@@ -10,25 +10,22 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
+from benchmarks.guesses.document import SettingScores
+from benchmarks.guesses.results import Figures, StudySensitivity, figures
+from benchmarks.scene_parameters import NAMES, Setting, in_all, lower_and_higher
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.sweeps.runner import Sweep, Task, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
-from sliplab.plugins.studies.document import SettingScores
-from sliplab.plugins.studies.guesses.results import Figures, StudySensitivity, figures
-from sliplab.plugins.studies.parameters import NAMES, Setting, in_all, lower_and_higher
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
 TRIALS = 20
-GUESSES = tuple(NAMES)
-"""Assumed parameters that are varied by default."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +42,6 @@ class Measured:
     measured: int
     settings: dict[str, Figures]
     file: str
-
-    def to_json(self) -> Json:
-        """Return plain data for the command line."""
-        return {"simulated": True, **asdict(self)}
 
 
 def measure_guesses(
@@ -89,7 +82,7 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
     there = in_all(guesses, list(scenes.values()))
     for name in guesses:
         if name not in there:
-            known = ", ".join(GUESSES)
+            known = ", ".join(NAMES)
             raise InputError(
                 "GUESS",
                 "",

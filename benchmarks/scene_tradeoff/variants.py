@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from benchmarks.scene_tradeoff.error import SceneError, choose_by_windows, compare, mean_error
+from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
 from sliplab.flows.scene_runs import Onsets, Seen
-from sliplab.plugins.studies.scene.error import SceneError, choose_by_windows, compare, mean_error
-from sliplab.plugins.studies.scene.windows import SceneWindows, look, pooled
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Windows

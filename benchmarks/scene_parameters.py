@@ -1,7 +1,7 @@
 """Sensitivity analysis: one assumed number of the simulated scene lower, then higher.
 
 None of these numbers was measured on a real skin. The change of onsets and event rates of the scene
-alone says which are worth measuring first; `guesses` says the same of a whole study.
+alone says which are worth measuring first; `benchmarks.guesses` says the same of a whole study.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sliplab.plugins.studies.document import SettingScores, TrialAtSetting
-from sliplab.plugins.studies.guesses.results import changes, figures
+from benchmarks.guesses.document import SettingScores, TrialAtSetting
+from benchmarks.guesses.results import changes, figures
 from sliplab.storage.schema.evaluation import TrialLatency
 
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import scene_parameters as assumed
+from benchmarks.scene_parameters import Outcome
+from benchmarks.scene_tradeoff.variants import Variant
+from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.scene_runs import Seen, changed, run, with_true_times
-from sliplab.plugins.studies import parameters as assumed
-from sliplab.plugins.studies.parameters import Outcome
-from sliplab.plugins.studies.scene.variants import Variant
-from sliplab.plugins.studies.scene.windows import SceneWindows, look, pooled
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.levels import HIGHEST, slides_of, with_level

@@ -1,4 +1,4 @@
-"""`sliplab tradeoff --scene`: cost and error of each method to simulate a trial.
+"""Cost and error of each method to simulate a trial.
 
 Every variant runs the same trials with the same seeds. It is timed as the rig file has it, on this
 otherwise idle machine, and compared with the dearest variant without noise and
@@ -12,30 +12,26 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.sweeps.runner import sample_trials
-from sliplab.flows import scene_runs
-from sliplab.flows.running import console, orchestration
-from sliplab.flows.running.cluster import connected
-from sliplab.flows.scene_runs import changed
-from sliplab.plugins.studies import parameters as assumed
-from sliplab.plugins.studies.results import RESULTS
-from sliplab.plugins.studies.scene import page, running
-from sliplab.plugins.studies.scene.running import VariantJob, closed_form
-from sliplab.plugins.studies.scene.sensitivity import EVENT_TRIALS, measure_sensitivity
-from sliplab.plugins.studies.scene.variants import (
+from benchmarks import scene_parameters as assumed
+from benchmarks.scene_tradeoff import page, running
+from benchmarks.scene_tradeoff.running import VariantJob, closed_form
+from benchmarks.scene_tradeoff.sensitivity import EVENT_TRIALS, measure_sensitivity
+from benchmarks.scene_tradeoff.variants import (
     REFERENCE,
     make_families,
     scene_numbers,
     variants,
 )
+from sliplab.analysis.sweeps.runner import sample_trials
+from sliplab.flows import scene_runs
+from sliplab.flows.running import console, orchestration
+from sliplab.flows.running.cluster import connected
+from sliplab.flows.scene_runs import changed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.levels import at_level, choose_level
 from sliplab.rigs.rig_file import check_plan, load_rig_file
 from sliplab.storage.files import make_folder, write_json, write_text
-from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -141,17 +137,3 @@ def everywhere(
     task = orchestration.Opaque(("trade-off", work, jobs, keep, cluster))
     orchestration.run(parallel_map_flow, task, cluster)
     return [found[number] for number in range(len(jobs))]
-
-
-def search_scene(store: Store, campaigns: list[Collected], trials: int) -> int:
-    """Measure the scene of the first campaign of slides; return 0 if it had been done, else 1."""
-    item = training_campaigns(campaigns)[0]
-    path, kept = store.folder / RESULTS["scene"].file, Derived.of(store, "scene-search")
-    made_of = [item.plan.collection_hash, item.info["rig_hash"]]
-    key = make_key("scene search", 1, made_of, trials)
-    if path.exists() and kept.fresh("scene", key):
-        return 0
-    rig = item.campaign.folder / "rig.yaml"
-    tradeoff_scene(item.campaign.protocol_file, rig, path.parent, trials)
-    kept.write("scene", key, {"file": RESULTS["scene"].file})
-    return 1

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.plugins.studies.scene.error import (
+from benchmarks.scene_tradeoff.error import (
     Onsets,
     SceneError,
     Seen,
@@ -21,7 +21,7 @@ from sliplab.plugins.studies.scene.error import (
     mean_error,
     tensor_l1,
 )
-from sliplab.plugins.studies.scene.windows import look, pooled
+from benchmarks.scene_tradeoff.windows import look, pooled
 from sliplab.protocols.settings import Samples, Windows
 from sliplab.storage.streams import EventChunk
 

@@ -1,61 +1,62 @@
-"""Sensitivity of the study's figures to assumed scene parameters, in the report."""
+"""`python -m benchmarks.guesses STORE`: a study's figures with each assumed parameter changed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, Any
 
-from sliplab.analysis.report.figures.intervals import Changed, ChangePanel, lowered_and_raised
-from sliplab.analysis.report.page import Content, Figure, Table, number, percent
-from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
-from sliplab.analysis.report.programs import CommandResult
-from sliplab.plugins.studies.document import SensitivityResults
-from sliplab.plugins.studies.guesses.results import FIGURES, UNITS, changes, figures
-from sliplab.plugins.studies.parameters import AS_IT_IS, NAMES
-from sliplab.storage.streams import Json
+import typer
 
-RESULT = CommandResult("derived/guesses/results.json", "sliplab guesses {store}")
+from benchmarks.guesses.document import SensitivityResults
+from benchmarks.guesses.plot import Changed, ChangePanel, lowered_and_raised
+from benchmarks.guesses.results import FIGURES, UNITS, changes, figure_cells, figures
+from benchmarks.scene_parameters import AS_IT_IS, NAMES
+from sliplab.analysis.report.page import Figure, Table, number, percent
+from sliplab.analysis.study import Finding, Study
+from sliplab.flows.cli.common import CampaignOption, StoreArgument, opened_campaigns
+
+GUESSES = tuple(NAMES)
+"""Assumed parameters that are varied by default."""
 DRAWN = ("strict", "incipient_ms", "gravity_lead_ms", "disturbance_lead_ms")
 Side = Mapping[str, Mapping[str, Changed]]
 """Changes by figure and parameter."""
 
 
-@dataclass(frozen=True)
-class SensitivitySection(Content):
-    """Each assumed parameter lowered and raised on some of the test trials.
+def measure(
+    store: StoreArgument,
+    guess: Annotated[
+        list[str] | None,
+        typer.Option("--guess", help="Only this assumed parameter of the scene. Repeatable."),
+    ] = None,
+    trials: Annotated[
+        int, typer.Option("--trials", min=2, max=1_000_000, help="Test trials per campaign.")
+    ] = 20,
+    campaign: CampaignOption = None,
+) -> Finding[SensitivityResults]:
+    """Evaluate some test trials again with each assumed scene parameter 20 % lower and higher."""
+    opened, campaigns = opened_campaigns(store, campaign)
+    from benchmarks.guesses.run import measure_guesses  # imports Prefect
 
-    Attributes:
-        command: that measures it.
-        percent: by how much; trials: on how many.
-    """
-
-    template: ClassVar[Path] = Path(__file__).with_name("section.html")
-    command: str
-    percent: float = 0.0
-    trials: int = 0
-    figure: Figure | None = None
-    table: Table | None = None
-
-
-def sensitivity_section(found: Json | None, command: str) -> SensitivitySection:
-    """Show how figures change with each parameter.
-
-    Args:
-        found: results of `sliplab guesses`; None if there are none.
-
-    Raises:
-        StoreError: they are of another shape.
-    """
-    if found is None:
-        return SensitivitySection(command)
-    results = RESULT.parse(SensitivityResults, found)
-    with RESULT.shape_checked():
-        return _made(results, command)
+    found = measure_guesses(opened, campaigns, tuple(guess or GUESSES), trials)
+    return Finding(SensitivityResults.load(Path(found.file)), Path(found.file).parent)
 
 
-def _made(found: SensitivityResults, command: str) -> SensitivitySection:
+def shown(found: SensitivityResults) -> Iterator[Table | str]:
+    """Yield the figures at each setting."""
+    columns = ["setting", *(f"{text} ({UNITS[name]})" for name, text in FIGURES.items())]
+    rows = [
+        [
+            name.removeprefix("scene.").removeprefix("event_camera."),
+            *figure_cells(figures(setting)),
+        ]
+        for name, setting in found.settings.items()
+    ]
+    yield Table(columns, rows, "guesses, simulated")
+
+
+def view(found: SensitivityResults) -> dict[str, Any]:
+    """Return how figures change with each parameter."""
     settings = dict(found.settings)
     base = settings.pop(AS_IT_IS)
     unchanged = figures(base)
@@ -95,15 +96,14 @@ def _made(found: SensitivityResults, command: str) -> SensitivitySection:
         for name in names
     ]
     first = [AS_IT_IS, *(_value(key, unchanged[key], unit=False) for key in FIGURES)]
-    return SensitivitySection(
-        command,
-        share,
-        len(base.trials),
-        Figure(svg, name="guesses", data=_data(list(names), lower, higher)),
-        Table(
+    return {
+        "percent_changed": share,
+        "trials": len(base.trials),
+        "figures": Figure(svg, name="guesses", data=_data(list(names), lower, higher)),
+        "settings": Table(
             ("guess", *(f"{text} ({UNITS[key]})" for key, text in FIGURES.items())), [first, *rows]
         ),
-    )
+    }
 
 
 def _scale(key: str) -> float:
@@ -155,11 +155,13 @@ def _data(names: Sequence[str], lower: Side, higher: Side) -> dict[str, list[obj
     return data
 
 
-def _make(data: ReportData) -> SensitivitySection | None:
-    if data.collected is None or not data.simulated:
-        return None
-    return sensitivity_section(RESULT.read(data.store), RESULT.command(data.store))
-
-
-SECTION = ReportSection(_make, RESULT.key, last=True)
-"""Assumed parameters in the report."""
+STUDY = Study(
+    name="guesses",
+    title="Figures of a study with each assumed parameter changed, by SlipLab",
+    measure=measure,
+    result=SensitivityResults,
+    page=Path(__file__).with_name("page.html"),
+    view=view,
+    shown=shown,
+    example="python -m benchmarks.guesses my-study",
+)
