@@ -44,6 +44,7 @@ class Plugin:
         searches: by name, functions that return a search of a study (`analysis.study_plan.Search`)
             or None, given the study's plan and its run requests.
         formats: formats of recordings (`storage.formats.format.Format`) by name.
+        exports: forms of `sliplab export` (`flows.exports.Export`) by name.
         hooks: functions that the core calls, by the name of the place; docs/architecture.md lists
             the places.
     """
@@ -56,6 +57,7 @@ class Plugin:
     sections: Mapping[str, str] = field(default_factory=dict)
     searches: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, str] = field(default_factory=dict)
+    exports: Mapping[str, str] = field(default_factory=dict)
     hooks: Mapping[str, str] = field(default_factory=dict)
 
 

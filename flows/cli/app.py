@@ -13,6 +13,7 @@ from sliplab.flows.cli import (
     control,
     detect,
     exchange,
+    export,
     register,
     review,
     rigs,
@@ -68,6 +69,7 @@ for part in (
     study.app,
     store.app,
     exchange.app,
+    export.app,
 ):
     app.add_typer(part)
 

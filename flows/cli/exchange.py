@@ -1,4 +1,4 @@
-"""`sliplab import` and `export`: files of other programs."""
+"""`sliplab import`: files of other programs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from sliplab.flows.cli.common import (
     DATA,
     FAULTS,
     JsonOption,
-    StoreArgument,
     StoreOption,
     finish,
     new_store,
@@ -122,75 +121,3 @@ def import_(
     finish(result, f"imported into {store}", as_json)
     if failed:
         raise typer.Exit(console.FAILED)
-
-
-@app.command(
-    rich_help_panel=DATA,
-    epilog="Example: sliplab export my-store pilot --labels --output labels.csv",
-)
-def export(
-    store: StoreArgument,
-    what: Annotated[str, typer.Argument(help="A campaign name or a trial id.")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", help="Output folder; with --labels a .csv, .parquet or .json file."
-        ),
-    ],
-    form: Annotated[str, typer.Option("--format", help="File format: aedat4 or dsec.")] = "aedat4",
-    labels: Annotated[bool, typer.Option("--labels", help="Export the labels as a table.")] = False,
-    stream: Annotated[
-        str, typer.Option("--stream", help="Name of a further event camera's stream to export.")
-    ] = "events",
-    as_json: JsonOption = False,
-) -> None:
-    """Export trials in formats of other programs, or their labels as a table."""
-    from sliplab.storage.formats.export_trials import export_trials, label_table
-    from sliplab.storage.formats.known import export_formats, format_names, known_format
-    from sliplab.storage.remote.mirror import open_store
-    from sliplab.storage.trials.catalogue import write_table
-    from sliplab.storage.trials.registration import copy_registrations
-    from sliplab.storage.trials.store import REGISTRATIONS
-
-    opened = open_store(store)
-    campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
-    if what in campaigns:
-        campaign, names = campaigns[what], sorted(campaigns[what].committed())
-    else:
-        holders = [item for item in campaigns.values() if what in item.committed()]
-        if len(holders) != 1:
-            raise InputError(
-                store,
-                "",
-                what,
-                "is in several campaigns; name a trial or another campaign"
-                if holders
-                else f"is no campaign or committed trial; campaigns: {', '.join(campaigns)}",
-            )
-        campaign, names = holders[0], [what]
-    if labels:
-        table = label_table(opened, campaign.name, names)
-        write_table(table, output)
-        finish({"labels": len(table), "output": str(output)}, f"labels of {what}", as_json)
-        return
-    if form not in format_names() or known_format(form).export is None:
-        raise InputError("--format", "", form, one_of(form, export_formats()))
-    recordings = [campaign.recording(name) for name in names]
-    for recording in recordings:
-        if stream not in recording.streams("events") and stream != "events":
-            there = ", ".join(recording.streams("events")) or "none"
-            text = f"trial {recording.trial_id} has the streams of events: {there}"
-            raise InputError("--stream", "", stream, text)
-    with console.bar("export (trials)", len(names)) as bar:
-        result = export_trials(
-            recordings,
-            output,
-            form,
-            campaign.name,
-            lambda trial: bar.advance(1, trial),
-            stream,
-        )
-    copy_registrations(campaign, output / REGISTRATIONS / campaign.name)
-    if not as_json:
-        result = {key: value for key, value in result.items() if key != "files"}
-    finish(result, f"exported to {output}", as_json)

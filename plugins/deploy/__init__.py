@@ -4,4 +4,8 @@ from __future__ import annotations
 
 from sliplab.protocols.plugin import Plugin
 
-PLUGIN = Plugin(commands={"export-model": "sliplab.plugins.deploy.command:app"})
+_COMMAND = "sliplab.plugins.deploy.command"
+PLUGIN = Plugin(
+    commands={"export-model": f"{_COMMAND}:app"},
+    exports={"onnx": f"{_COMMAND}:ONNX", "card": f"{_COMMAND}:CARD"},
+)

@@ -1,56 +1,57 @@
-"""`sliplab export-model`."""
+"""`sliplab export MODEL --as onnx`: a trained network for other programs and chips."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sliplab.flows.cli.common import DATA, CampaignOption, JsonOption
+from sliplab.flows.cli.common import CampaignOption, JsonOption
+from sliplab.flows.cli.export import former
+from sliplab.flows.exports import Export, Exported, ExportRequest
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
-    from sliplab.plugins.deploy.run import Exported
+    from sliplab.plugins.deploy.run import Exported as Figures
+
+WINDOWS = 256
+"""The ONNX file is checked on so many."""
 
 app = typer.Typer()
 
 
-@app.command(
-    "export-model",
-    rich_help_panel=DATA,
-    epilog="Example: sliplab export-model my-store/models/seed0.pt --out exported",
-)
+@app.command("export-model", hidden=True)
 def export_model(
-    model: Annotated[Path, typer.Argument(help="A trained network: STORE/models/seed0.pt.")],
-    out: Annotated[Path, typer.Option("--out", help="Output folder; created if missing.")],
-    store: Annotated[
-        Path | None,
-        typer.Option(
-            "--store", help="Store that provides the test windows; default: the model's own."
-        ),
-    ] = None,
+    model: Annotated[Path, typer.Argument()],
+    out: Annotated[Path, typer.Option("--out")],
+    store: Annotated[Path | None, typer.Option("--store")] = None,
     campaign: CampaignOption = None,
-    onnx: Annotated[
-        bool, typer.Option("--onnx/--no-onnx", help="Write ONNX, checked against Sinabs.")
-    ] = True,
-    windows: Annotated[
-        int,
-        typer.Option(
-            "--windows", min=1, max=1_000_000, help="Number of windows to check the ONNX file on."
-        ),
-    ] = 256,
+    onnx: Annotated[bool, typer.Option("--onnx/--no-onnx")] = True,
+    windows: Annotated[int, typer.Option("--windows", min=1, max=1_000_000)] = WINDOWS,
     as_json: JsonOption = False,
 ) -> None:
-    """Export a network as ONNX, with its resource use on a Speck chip and a model card."""
+    """Former name of `export`."""
+    given = {"store": store, "campaign": campaign}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if onnx:
+        options["windows"] = windows
+    form = "onnx" if onnx else "card"
+    former("export-model", ExportRequest(str(model), "", form, out, options), as_json)
+
+
+def write(request: ExportRequest) -> Exported:
+    """Write a network's resource use on a Speck chip and its model card, and ONNX unless `card`."""
     from sliplab.flows.detecting.request import load_model
     from sliplab.storage.remote.mirror import open_store
 
+    model, out = Path(request.place), request.output
+    store = request.options.get("store")
     if out.exists() and not out.is_dir():
-        raise InputError("--out", "", str(out), "must be a folder")
+        raise InputError("--output", "", str(out), "must be a folder")
     fitted = load_model(model)
     folder = store or model.resolve().parent.parent
     if store is None and not (folder / "store.json").exists():
@@ -59,17 +60,26 @@ def export_model(
     prepare_store(folder)
     from sliplab.plugins.deploy.run import export_model as run
 
-    result = run(model, fitted, out, opened, campaign, onnx=onnx, checked=windows)
+    result = run(
+        model,
+        fitted,
+        out,
+        opened,
+        request.options.get("campaign"),
+        onnx=request.form == "onnx",
+        checked=request.options.get("windows", WINDOWS),
+    )
     for warning in (*result["warnings"], *result["problems"]):
         console.say(f"warning: {warning}")
-    if as_json:
-        console.print_json(result)
-    else:
-        simulated = " (simulated data)" if result["simulated"] else ""
-        console.print_pairs(f"exported to {out}{simulated}", _model_pairs(result))
+    simulated = " (simulated data)" if result["simulated"] else ""
+    return Exported(f"exported to {out}{simulated}", result, _model_pairs(result))
 
 
-def _model_pairs(result: Exported) -> dict[str, str]:
+CARD = Export("model", write, frozenset({"store", "campaign"}))
+ONNX = Export("model", write, CARD.options | {"windows"})
+
+
+def _model_pairs(result: Figures) -> dict[str, object]:
     change, accuracy = result["change"], result["accuracy"]
     checked = result["onnx_windows_equal"]
     return {

@@ -1,67 +1,60 @@
-"""`sliplab publish`: a store as a data set that others cite and load."""
+"""`sliplab export --as croissant`: a store as a data set that others cite and load."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import (
-    DATA,
-    CampaignOption,
-    JsonOption,
-    PlaceArgument,
-    finish,
-    located,
-)
+from sliplab.flows.cli.common import CampaignOption, JsonOption, PlaceArgument, located
+from sliplab.flows.cli.export import former
+from sliplab.flows.exports import Export, Exported, ExportRequest
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, one_of
-
-if TYPE_CHECKING:
-    from sliplab.plugins.publish.publication import Publication
-    from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, Store
 
 app = typer.Typer()
 
 
-@app.command(
-    rich_help_panel=DATA,
-    epilog="Example: sliplab publish my-store --as croissant --output published",
-)
+@app.command(hidden=True)
 def publish(
     store: PlaceArgument,
-    form: Annotated[str, typer.Option("--as", help="Format: croissant or mcap or lerobot.")],
-    output: Annotated[Path, typer.Option("--output", help="The new folder; must not exist.")],
+    form: Annotated[str, typer.Option("--as")],
+    output: Annotated[Path, typer.Option("--output")],
     campaign: CampaignOption = None,
-    title: Annotated[
-        str | None, typer.Option("--title", help="Title; default: the campaigns' names.")
-    ] = None,
-    creator: Annotated[
-        list[str] | None, typer.Option("--creator", help="Name of an author. Repeatable.")
-    ] = None,
-    licence: Annotated[
-        str | None, typer.Option("--licence", help="SPDX id of the licence, such as CC-BY-4.0.")
-    ] = None,
+    title: Annotated[str | None, typer.Option("--title")] = None,
+    creator: Annotated[list[str] | None, typer.Option("--creator")] = None,
+    licence: Annotated[str | None, typer.Option("--licence")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Publish committed trials as a data set in one folder, with a data card and checksums."""
+    """Former name of `export`."""
     from sliplab.plugins.publish.forms import forms
-    from sliplab.plugins.publish.forms import publish as write
+
+    if form not in forms():
+        raise InputError("--as", "", form, one_of(form, forms()))
+    given = {"campaign": campaign, "title": title, "creator": creator, "licence": licence}
+    options = {name: value for name, value in given.items() if value is not None}
+    former("publish", ExportRequest(store, "", form, output, options), as_json)
+
+
+def write(request: ExportRequest) -> Exported:
+    """Write committed trials as a data set in one folder, with a data card and checksums."""
+    from sliplab.plugins.publish.forms import publish as publish_as
     from sliplab.plugins.publish.publication import About, Publication
     from sliplab.storage.process import now
     from sliplab.storage.remote.mirror import open_store
 
-    if form not in (known := forms()):
-        raise InputError("--as", "", form, one_of(form, known))
-    opened = open_store(located(store))
-    campaigns = _campaigns(opened, campaign)
+    options = request.options
+    opened = open_store(located(request.place))
+    campaigns = _campaigns(opened, options.get("campaign"))
     names = ", ".join(item.name for item in campaigns)
+    licence = options.get("licence")
     about = About(
-        f"Tactile slip trials: {names}" if title is None else title,
-        tuple(creator or ()),
+        options.get("title", f"Tactile slip trials: {names}"),
+        tuple(options.get("creator", ())),
         licence,
         now()[:10],
     )
@@ -69,12 +62,14 @@ def publish(
     if licence is None:
         console.say("warning: no --licence: nobody may use the data until there is one")
     with console.bar("publish (trials)", publication.count) as bar:
-        result = write(publication, output, form, lambda name: bar.advance(1, name))
-    finish(result, f"published in {output}{_mark(publication)}", as_json)
+        result = publish_as(
+            publication, request.output, request.form, lambda name: bar.advance(1, name)
+        )
+    mark = " (simulated data)" if publication.simulated else ""
+    return Exported(f"published in {request.output}{mark}", result)
 
 
-def _mark(publication: Publication) -> str:
-    return " (simulated data)" if publication.simulated else ""
+EXPORT = Export("store", write, frozenset({"campaign", "title", "creator", "licence"}))
 
 
 def _campaigns(store: Store, names: Sequence[str] | None) -> tuple[Campaign, ...]:

@@ -173,15 +173,24 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
     Raises:
         InputError: it ends in something else than .csv, .parquet or .json.
     """
+    check_table_path(path)
     kinds: dict[str, Callable[[], bytes]] = {
         ".csv": lambda: table.to_csv(index=False).encode(),
         ".parquet": lambda: _parquet(table),
         ".json": lambda: table.to_json(orient="records").encode(),
     }
-    if path.suffix not in kinds:
-        raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
     make_folder(path.parent)
     write_bytes(path, kinds[path.suffix]())
+
+
+def check_table_path(path: Path) -> None:
+    """Check that a table can be written to a path.
+
+    Raises:
+        InputError: it ends in something else than .csv, .parquet or .json.
+    """
+    if path.suffix not in (".csv", ".parquet", ".json"):
+        raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
 
 
 def _parquet(table: pd.DataFrame) -> bytes:

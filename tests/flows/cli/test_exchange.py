@@ -58,13 +58,16 @@ def test_in_and_out(tmp_path: Path, sliplab: Any) -> None:
     assert code == 0
     assert "left out" not in said
     assert pd.read_parquet(tmp_path / "t.parquet")["trial"].tolist() == ["slide"]
-    code, reported, _ = sliplab("export", store, "slide", "--output", out, "--json")
+    code, reported, _ = sliplab(
+        "export", store, "slide", "--as", "aedat4", "--output", out, "--json"
+    )
     assert (code, json.loads(reported)["events"]) == (0, 50)
     code, reported, _ = sliplab("import", "aedat4", out, "--store", store, "--name", "b", "--json")
     assert (code, json.loads(reported)["imported"]) == (0, ["slide"])
     assert not Store.open(store).simulated
-    code, *_ = sliplab("export", store, "a", "--labels", "--output", tmp_path / "l.csv")
-    assert code == 0
+    code, _, said = sliplab("export", store, "a", "--as", "labels", "--output", tmp_path / "l.csv")
+    assert code == 1
+    assert "a has no labels" in said
 
 
 def test_a_command_that_needs_a_protocol_says_that_there_is_none(
@@ -209,8 +212,8 @@ def test_mutated_headers_give_one_message_and_leave_nothing(
         (("import", "word", "bad.aedat4", "--store", "s", "--name", "a"), "must be one of"),
         (("import", ".", "--store", "s", "--name", "a"), "holds 2 files for the trial bad"),
         (("export", "ours", "nothing", "--output", "o"), "is no campaign"),
-        (("export", "ours", "c", "--output", "o", "--format", "word"), "must be one of"),
-        (("export", "ours", "c", "--labels", "--output", "o.xls"), "must end in"),
+        (("export", "ours", "c", "--output", "o", "--as", "word"), "must be one of"),
+        (("export", "ours", "c", "--as", "labels", "--output", "o.xls"), "must end in"),
     ],
 )
 def test_wrong_input_is_exit_2(

@@ -183,7 +183,7 @@ def test_export_and_publish_take_registrations_along(tmp_path: Path) -> None:
     path = add_registration(Store.open(store).campaign("small"), CONTENT)
     path.with_name("0001.json.ots").write_bytes(bytes.fromhex(sha256(path)))
     answer("export", store, "small", "--output", tmp_path / "out")
-    answer("publish", store, "--as", "croissant", "--output", tmp_path / "data")
+    answer("export", store, "--as", "croissant", "--output", tmp_path / "data")
     for copy in (
         tmp_path / "out" / "registrations" / "small",
         tmp_path / "data" / "campaigns" / "small" / "registrations",

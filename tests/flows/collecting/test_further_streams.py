@@ -584,7 +584,7 @@ def test_a_publication_has_their_files_and_describes_their_columns(
 ) -> None:
     folder = tmp_path / "published"
     answer(
-        "publish",
+        "export",
         taken.folder.parents[3],
         "--as",
         "croissant",

@@ -178,7 +178,7 @@ def test_text_that_is_not_utf_8_is_one_line_where_it_cannot_be_kept(tmp_path: Pa
     store = tmp_path / BYTES
     answer("collect", "pilot", "--rig", "rehearsal", "--store", store, "--trials", 1)
     output = ("--as", "croissant", "--output", store / "published", "--licence", "CC0-1.0")
-    done = here("publish", store, *output)
+    done = here("export", store, *output)
     assert done.returncode == 2
     assert "is not UTF-8; rename the file or folder" in done.stderr
     assert "Traceback" not in done.stderr
