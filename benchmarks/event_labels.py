@@ -2,8 +2,8 @@
 
 `python -m benchmarks.event_labels [TRIALS]` takes slides spread over the kinematic grid on the
 simulated rig, with events and tracks, and labels them from their events: as they are, with ten
-times the noise, and with events lost or added. Prints the table of docs/decisions/0115. All figures
-are simulated.
+times the noise, and with events lost or added. Prints the figures of
+docs/decisions/one-camera.md, by speed and nuisance. All figures are simulated.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Press depths of a gravity trial, by whether the heaviest plate slips in the recorded hold.
 
-`python -m benchmarks.holds [N]` prints the table of docs/decisions/0083: N trials (20 by default)
-of the gravity protocol with the heaviest plate, all speeds, on the simulated rig with other press
-depths, times and scenes. Simulated; mechanics alone, nothing is trained.
+`python -m benchmarks.holds [N]` prints the figures of docs/decisions/depth.md: N trials (20 by
+default) of the gravity protocol with the heaviest plate, all speeds, on the simulated rig with
+other press depths, times and scenes. Simulated; mechanics alone, nothing is trained.
 """
 
 from __future__ import annotations

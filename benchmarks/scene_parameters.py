@@ -65,8 +65,8 @@ NAMES = {
     "event_camera.threshold": "threshold of events",
     "event_camera.noise_hz": "noise of events",
 }
-"""Titles of the assumed numbers: the three families of decision 12 that decide accuracy, and
-whatever moves an onset or a rate by a tenth (its table)."""
+"""Titles of the assumed numbers: those that decide accuracy (docs/decisions/scene.md), and
+whatever moves an onset or a rate by a tenth (`sliplab tradeoff --scene --sensitivity`)."""
 
 
 @dataclass(frozen=True)

@@ -80,9 +80,9 @@ _ITEM = re.compile(r"(- |1\. )\S")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put every record under Decisions, so that none can be forgotten."""
+    """Put every page of decisions under Decisions, so that none can be forgotten."""
     section = next(item for item in config.nav if "Decisions" in item)
-    section["Decisions"] += [f"decisions/{path.name}" for path in _records()]
+    section["Decisions"] += [f"decisions/{path.name}" for path in _decisions()]
     return config
 
 
@@ -114,16 +114,18 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return "\n".join(lines)
 
 
-def _records() -> list[Path]:
-    return sorted((DOCS / "decisions").glob("[0-9]*.md"))
+def _decisions() -> list[Path]:
+    """The pages of decisions by subject, the history last."""
+    pages = set((DOCS / "decisions").glob("*.md")) - {DOCS / "decisions" / "template.md"}
+    return sorted(pages, key=lambda path: (path.stem == "history", path.stem))
 
 
 def decisions() -> str:
     """The list of decisions."""
-    lines = ["# Decisions", "", "Why things are as they are: context, decision, consequences.", ""]
-    for path in _records():
-        number, _, title = path.read_text().splitlines()[0].removeprefix("# ").partition(". ")
-        lines.append(f"- {number}: [{title}]({path.name})")
+    lines = ["# Decisions", "", "What is in force, by subject, and why.", ""]
+    for path in _decisions():
+        title = path.read_text().splitlines()[0].removeprefix("# ")
+        lines.append(f"- [{title}]({path.name})")
     return "\n".join(lines) + "\n"
 
 

@@ -2,7 +2,7 @@
 
 They reject combinations that are valid key by key but surely unintended: an unknown factor, one
 direction twice, a plate that is never caught. They do not apply to the copies of protocols in
-stores, so that collected trials stay usable (docs/decisions/0069).
+stores, so that collected trials stay usable (docs/decisions/protocols.md).
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class Split(StrictModel):
     """Trials that train, choose the model, and test it.
 
     ``ranked``: repetitions ranked by a hash inside each condition, conditions spread evenly
-    inside the strata (docs/decisions/0006). ``leave_conditions_out``: whole levels are held out.
+    inside the strata. ``leave_conditions_out``: whole levels are held out.
     """
 
     method: Literal["ranked", "leave_conditions_out"] = "ranked"

@@ -4,7 +4,7 @@ A split that is cut from a ranking of all trials moves when a level is added. He
 in [0, 1) is (rank of its repetition in its condition + u) / repetitions, where u is a point of a
 low-discrepancy sequence over the condition's levels, shifted by a hash of its stratum. So adding
 a level to any factor moves nothing, and every stratum still gets its shares to within about one
-trial (docs/decisions/0006 has the measured counts).
+trial (docs/decisions/test-trials.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A chunk is the unit that flows from a device through the rig into the recording being written.
 Nothing here converts a time: raw device times are stored unchanged, and clock maps are added
-later (docs/decisions/0002). All times are int64.
+later (docs/decisions/time.md). All times are int64.
 """
 
 from __future__ import annotations

@@ -4,8 +4,7 @@ Camera, arm and sync box each stamp the same pulses with clocks that started on 
 pulses are coded, so the trains fit together at one place only; `clocks.pulse_match`
 finds that place and the pairs, `analysis.clocks.clock_line` the line through them, and this file
 says whether to trust it. It must say no rather than be wrong: a regular train, which fits
-everywhere, is refused, and so is one whose residuals are not jitter (docs/decisions/0002,
-docs/clocks.md).
+everywhere, is refused, and so is one whose residuals are not jitter (docs/clocks.md).
 
 Times stay int64; floats hold differences only.
 """

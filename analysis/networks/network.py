@@ -35,7 +35,7 @@ themselves, so that events can also silence."""
 
 FIRST_DRIVE = 0.3
 """Current of every output in a step of a window without events, before training, in thresholds. One
-that began far below its threshold would never be reached (docs/decisions/0056)."""
+that began far below its threshold would never be reached."""
 
 SPIKING = ("iaf1", "iaf2", "iaf3", "iaf4")
 """Names of the spiking layers, one after each layer of `WEIGHTED`."""
@@ -53,8 +53,8 @@ def build(
     and give (n * steps, outputs) spikes; output j is of class j % classes (`by_class`). Weights are
     torch's default draw times ``settings.weight_scale``; hidden neurons' biases are drawn from
     `FIRST_BIAS`, outputs begin at `FIRST_DRIVE`, and convolutions have no biases
-    (docs/decisions/0054, 0056, 0059); with ``settings.biases`` off no layer has. torch's global
-    random state is unchanged.
+    (docs/decisions/networks.md); with ``settings.biases`` off no layer has. torch's global random
+    state is unchanged.
 
     Args:
         settings: channels, kernels, hidden neurons, outputs, weight scale.

@@ -52,8 +52,7 @@ def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) 
 
     Constant, or falling from the full rate to nothing along half a cosine over all steps of all
     epochs (Loshchilov and Hutter, 2017, without restarts); and at the very beginning rising in a
-    line. The last steps are nearly none: weights come to rest instead of being caught in a jump
-    (docs/decisions/0057).
+    line. The last steps are nearly none: weights come to rest instead of being caught in a jump.
 
     Args:
         step, steps: done in this epoch, and all of an epoch.

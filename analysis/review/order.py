@@ -1,7 +1,7 @@
 """Trials in the order of what a review of their label would change, and what reviews would gain.
 
 A trial's score is the largest expected change of any figure, as a share of the width of that
-figure's own 95 % interval over trials (decision 126).
+figure's own 95 % interval over trials.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ the flow still has to tell it that it crashed (a minute of retries), and it outl
 parent. This one leads its own session, and the kernel ends it when its parent dies.
 
 It starts while its parent does other things: only asking for its `url` waits for it. What it leaves
-out, so that it keeps up with short trials, is in `LEAN` (docs/decisions/0039).
+out, so that it keeps up with short trials, is in `LEAN`.
 
-It asks every client for a password, and answers no page but its own (docs/decisions/0071).
+It asks every client for a password, and answers no page but its own (docs/decisions/prefect.md).
 
 Run as a module it is the server; imported it starts one.
 """

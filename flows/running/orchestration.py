@@ -3,10 +3,10 @@
 `configure_prefect` must run before Prefect is imported, for Prefect reads its settings then. A
 server that the user names with PREFECT_API_URL is used instead of the embedded one.
 
-No campaign waits for its server (docs/decisions/0095). Prefect's engine calls it in the flow's own
-thread, when a run begins and when it ends; `ServerLink` gives each of these requests a limit. A run
-that cannot begin there is made without Prefect. An end that was not delivered is saved in the
-store (`run_records`), from where the next command reports it. One line says so.
+No campaign waits for its server (docs/decisions/prefect.md). Prefect's engine calls it in the
+flow's own thread, when a run begins and when it ends; `ServerLink` gives each of these requests a
+limit. A run that cannot begin there is made without Prefect. An end that was not delivered is saved
+in the store (`run_records`), from where the next command reports it. One line says so.
 """
 
 from __future__ import annotations

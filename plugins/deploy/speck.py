@@ -1,6 +1,6 @@
 """Check whether the network fits a Speck (DynapCNN) chip, layer by layer, without the chip.
 
-The vendor's compiler lives in a package that this program never imports (docs/decisions/0009), so
+The vendor's compiler lives in a package that this program never imports, so
 the rules are here as a table with their sources:
 
 - cores and their memories: Sinabs 3.1.3, "Available Network Architecture" (its documentation,

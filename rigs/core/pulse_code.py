@@ -6,7 +6,7 @@ file sets which one the sync box sends (`protocols.timing.Timing.code`):
 
 * ``lfsr``: bits of a maximal 32-bit linear-feedback shift register. A run of 32 bits repeats after
   4,294,967,295 ticks (497 days at 100 Hz), and every seed starts at another position: two trials
-  share no sequence (docs/decisions/0078).
+  share no sequence (docs/decisions/clocks.md).
 * ``irregular``: pulses at pseudo-random intervals, for a box that generates intervals, not bits.
 * ``regular``: pulses at equal intervals after one long gap, the start marker, for a box that can
   do nothing else. Only a device that records the marker can be aligned without ambiguity.

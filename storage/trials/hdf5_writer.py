@@ -11,8 +11,8 @@ costs more than their data. So every file begins as a copy of one that has all c
 and rows wait in memory until they are whole chunks.
 
 Format 2 differs from 1 in the storage of events: LZ4 instead of zstd, and times after the offset in
-32 bits (docs/decisions/0020). A reader need not know which it has. Format 3 is format 2 with an
-index that ends before the last event (docs/decisions/0067).
+32 bits (docs/decisions/data-files.md). A reader need not know which it has. Format 3 is format 2
+with an index that ends before the last event.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The kernel releases the lock when the holder ends, however it ends. The file's content names
 the holder and is valid only while the lock is held. Where locks do not reach other machines,
 the note of another machine's holder is believed until a person deletes it. A file system without
-locks, or with non-exclusive locks, is refused (docs/decisions/0070).
+locks, or with non-exclusive locks, is refused (docs/decisions/trials-on-disk.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A program that opens a file for writing sets a flag in the superblock, and clears it when it closes
 the file. Where it died, the flag stays, HDF5 refuses the file, and its checksum no longer fits,
-although no data changed (HDF5 File Format Specification 3.0, II.A; decision 137).
+although no data changed (HDF5 File Format Specification 3.0, II.A).
 """
 
 from __future__ import annotations
