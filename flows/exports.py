@@ -1,0 +1,182 @@
+"""What `sliplab export` writes: forms by their names; plug-ins add further ones.
+
+A form is of a store, of trials (a campaign or one trial), or of a trained network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import import_foreign
+from sliplab.protocols.shown import one_of
+from sliplab.storage.errors import StoreError
+from sliplab.storage.trials.store import Campaign, Store
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What is exported, and where to.
+
+    Attributes:
+        place: a store's folder or URL, or a model's file.
+        part: a campaign or a trial of the store; empty: all of it.
+        form: name of the form. output: folder or file to write.
+        options: those that were given, by name.
+    """
+
+    place: str
+    part: str
+    form: str
+    output: Path
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written: a title and pairs for people, and JSON for programs."""
+
+    title: str
+    result: Mapping[str, Any]
+    pairs: Mapping[str, object] | None = None
+
+
+@dataclass(frozen=True)
+class Export:
+    """A form, which `protocols.plugin.Plugin.exports` names.
+
+    Attributes:
+        of: what it is of. options: names of the options that it takes.
+    """
+
+    of: Literal["store", "trials", "model"]
+    write: Callable[[ExportRequest], Exported]
+    options: frozenset[str] = frozenset()
+
+
+TITLES = {
+    "store": "a store",
+    "trials": "a campaign or a trial of a store",
+    "model": "a trained network",
+}
+
+
+def export_names() -> list[str]:
+    """Return the names of all forms."""
+    from sliplab.storage.formats.known import export_formats
+
+    return [*export_formats(), "labels", *plugins().declared("exports")]
+
+
+def known_export(name: str) -> Export:
+    """Return a form.
+
+    Raises:
+        InputError: there is none of this name.
+        PluginError: its plug-in cannot be imported.
+    """
+    from sliplab.storage.formats.known import export_formats
+
+    if name == "labels":
+        return Export("trials", _labels)
+    if name in export_formats():
+        return Export("trials", _trials, frozenset({"stream"}))
+    places = plugins().declared("exports")
+    if name not in places:
+        raise InputError("--as", "", name, one_of(name, export_names()))
+    found: Export = import_foreign(places[name])
+    return found
+
+
+def run_export(request: ExportRequest) -> Exported:
+    """Check a request, and write it.
+
+    Raises:
+        InputError: an option that the form does not take, or a part that is missing or too much.
+    """
+    form = known_export(request.form)
+    for name in request.options:
+        if name not in form.options:
+            holders = [each for each in export_names() if name in known_export(each).options]
+            text = f"does not belong to --as {request.form}, but to {' and '.join(holders)}"
+            raise InputError(f"--{name}", "", None, text)
+    if form.of == "trials" and not request.part:
+        raise InputError(
+            "PART", "", None, f"is needed: --as {request.form} is of {TITLES[form.of]}"
+        )
+    if form.of != "trials" and request.part:
+        text = f"is too much: --as {request.form} is of {TITLES[form.of]}"
+        raise InputError("PART", "", request.part, text)
+    return form.write(request)
+
+
+def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
+    """Return a store, a campaign of it, and the trials that are asked for."""
+    from sliplab.flows.cli.common import located
+    from sliplab.storage.remote.mirror import open_store
+
+    folder, part = located(request.place), request.part
+    opened = open_store(folder)
+    campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
+    if part in campaigns:
+        return opened, campaigns[part], sorted(campaigns[part].committed())
+    holders = [item for item in campaigns.values() if part in item.committed()]
+    if len(holders) != 1:
+        text = (
+            "is in several campaigns; name a trial or another campaign"
+            if holders
+            else f"is no campaign or committed trial; campaigns: {', '.join(campaigns)}"
+        )
+        raise InputError(folder, "", part, text)
+    return opened, holders[0], [part]
+
+
+def _labels(request: ExportRequest) -> Exported:
+    """Write the labels of trials as a table."""
+    from sliplab.storage.formats.export_trials import label_table
+    from sliplab.storage.trials.catalogue import check_table_path, write_table
+
+    check_table_path(request.output)
+    opened, campaign, names = _chosen(request)
+    table = label_table(opened, campaign.name, names)
+    if not len(table):
+        raise StoreError(
+            f"{opened.folder}: {request.part} has no labels; run: sliplab label {opened.folder}"
+        )
+    write_table(table, request.output)
+    return Exported(
+        f"labels of {request.part}", {"labels": len(table), "output": str(request.output)}
+    )
+
+
+def _trials(request: ExportRequest) -> Exported:
+    """Write trials in a format of other programs."""
+    from sliplab.storage.formats.export_trials import export_trials
+    from sliplab.storage.trials.registration import copy_registrations
+    from sliplab.storage.trials.store import REGISTRATIONS
+
+    _, campaign, names = _chosen(request)
+    stream = request.options.get("stream", "events")
+    recordings = [campaign.recording(name) for name in names]
+    for recording in recordings:
+        if stream not in recording.streams("events") and stream != "events":
+            there = ", ".join(recording.streams("events")) or "none"
+            text = f"trial {recording.trial_id} has the streams of events: {there}"
+            raise InputError("--stream", "", stream, text)
+    with console.bar("export (trials)", len(names)) as bar:
+        result = export_trials(
+            recordings,
+            request.output,
+            request.form,
+            campaign.name,
+            lambda trial: bar.advance(1, trial),
+            stream,
+        )
+    copy_registrations(campaign, request.output / REGISTRATIONS / campaign.name)
+    pairs = {key: value for key, value in result.items() if key != "files"}
+    return Exported(f"exported to {request.output}", result, pairs)

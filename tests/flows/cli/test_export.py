@@ -1,0 +1,66 @@
+"""`sliplab export WHAT --as FORM`: one command for trials, stores and networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sliplab.flows.exports import export_names, known_export
+from tests.command_line import answer, here
+from tests.flows.older import older_store
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return older_store(tmp_path_factory.mktemp("export") / "store")
+
+
+def test_every_form_is_known() -> None:
+    assert set(export_names()) == {
+        "aedat4",
+        "dsec",
+        "labels",
+        "croissant",
+        "mcap",
+        "lerobot",
+        "onnx",
+        "card",
+    }
+    assert {known_export(name).of for name in export_names()} == {"trials", "store", "model"}
+
+
+def test_former_options_give_the_same_files_and_name_the_new_ones(
+    store: Path, tmp_path: Path
+) -> None:
+    asked = ("export", store, "small", "--output")
+    new, old = tmp_path / "new", tmp_path / "old"
+    found = answer(*asked, new, "--as", "dsec")
+    done = here(*asked, old, "--format", "dsec")
+    assert done.returncode == 0
+    assert f"write: sliplab export {store} small --as dsec" in " ".join(done.stderr.split())
+    assert found["trials"] == len(list(new.glob("*.h5"))) == len(list(old.glob("*.h5")))
+    for path in new.glob("*.csv"):
+        assert path.read_bytes() == (old / path.name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ((), 2, "--as: is needed: must be one of aedat4, dsec, labels"),
+        (("--as", "dsek"), 2, "--as = dsek: must be one of"),
+        (("--as", "dsec"), 2, "PART: is needed: --as dsec is of a campaign or a trial"),
+        (("small", "--as", "mcap"), 2, "PART = small: is too much: --as mcap is of a store"),
+        (("small", "--as", "dsec", "--licence", "MIT"), 2, "--licence: does not belong to --as"),
+        (("--as", "mcap", "--windows", "3"), 2, "to --as mcap, but to onnx"),
+        (("small", "--as", "labels"), 1, "small has no labels; run: sliplab label"),
+        (("nothing", "--as", "dsec"), 2, "is no campaign or committed trial"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    store: Path, tmp_path: Path, words: tuple[str, ...], code: int, says: str
+) -> None:
+    done = here("export", store, *words, "--output", tmp_path / "out.csv")
+    assert done.returncode == code, done.stderr
+    assert says in " ".join(done.stderr.split())
+    assert list(tmp_path.iterdir()) == []
