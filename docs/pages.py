@@ -207,7 +207,7 @@ def commands() -> str:
 
 def _walk(words: str, command: Any) -> Iterator[tuple[str, Any]]:
     if hasattr(command, "commands"):
-        for name, inner in command.commands.items():
+        for name, inner in ((n, c) for n, c in command.commands.items() if not c.hidden):
             yield from _walk(f"{words} {name}", inner)
     else:
         yield words, command

@@ -80,11 +80,11 @@ def known_export(name: str) -> Export:
         InputError: there is none of this name.
         PluginError: its plug-in cannot be imported.
     """
-    from sliplab.storage.formats.known import export_formats
+    from sliplab.storage.formats.known import format_names, known_format
 
     if name == "labels":
         return Export("trials", _labels)
-    if name in export_formats():
+    if name in format_names() and known_format(name).export is not None:
         return Export("trials", _trials, frozenset({"stream"}))
     places = plugins().declared("exports")
     if name not in places:

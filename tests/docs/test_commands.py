@@ -39,7 +39,7 @@ def test_every_printed_command_is_one_that_there_is(page: Path) -> None:
 def _leaves(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     for name, each in getattr(command, "commands", {}).items():
         yield from _leaves(each, (*words, name))
-    if not hasattr(command, "commands"):
+    if not hasattr(command, "commands") and not command.hidden:  # hidden: former names
         yield words, command
 
 
