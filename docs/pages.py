@@ -93,6 +93,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/commands.md": commands,
         "reference/protocol-file.md": protocol_file,
         "reference/rig-file.md": rig_file,
+        "reference/driver-rules.md": driver_rules,
         **{f"reference/{kind}-document.md": partial(document, kind) for kind in _DOCUMENTS},
     }
     for name, make in pages.items():
@@ -154,6 +155,18 @@ differ, and all others from that file. [Bring up a rig](../howto/bring-up-a-rig.
 by their values; for editors there is [rig.json](../schema/rig.json).
 
 {tables(models["RigFile"], models)}"""
+
+
+def driver_rules() -> str:
+    """Every rule that a driver is tested by."""
+    from sliplab.plugins.driver_kit.rule_tables import rule_tables
+
+    return f"""# Rules for drivers
+
+`conformance` tests a driver on its fake by these rules
+([Write a driver](../howto/write-a-driver.md#the-rules-for-drivers)).
+
+{rule_tables()}"""
 
 
 def document(kind: str) -> str:

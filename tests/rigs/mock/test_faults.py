@@ -288,7 +288,7 @@ def test_every_kind_is_documented_with_its_parameters() -> None:
 
     from sliplab.rigs.mock.fault_settings import AnyFault
 
-    text = Path(ROOT / "docs" / "faults.md").read_text().split("## Once each")[0]
+    text = Path(ROOT / "docs" / "faults.md").read_text().split("## Outcome of each fault")[0]
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     assert set(rows) == set(KINDS)
     common = {"kind", "trial", "at_s", "since"}
