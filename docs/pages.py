@@ -64,7 +64,7 @@ _DOCUMENTS = {
     "power": (
         "The trials that claims need",
         "`report/power.json`: after how many trials claims are called in campaigns that were drawn "
-        "from a pilot ([Fewer trials](../fewer.md#how-many-are-enough)).",
+        "from a pilot ([Claims](../claims.md#how-many-trials-claims-need)).",
     ),
     "reflex": (
         "The study of reflexes",

@@ -215,6 +215,24 @@ def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
     assert "b_mb" not in page.read_text()
 
 
+def test_figures_of_kinds_form_a_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(kept.COLUMNS, "clocks", ("wrong", "late"))
+    folder, page = tmp_path / "results", tmp_path / "RESULTS.md"
+    folder.mkdir()
+    (folder / kept.STUDIES).write_text("\n## Studies\n")
+    result = a_result("clocks", "2026-01-01", trains=9.0, late_kink=0.5, kink_wrong=0.0, late_x=1.0)
+    kept.keep(result, ("clocks",), folder, page)
+    assert page.read_text().splitlines()[-7:] == [
+        "| figure | value | wrong | late |",
+        "| --- | ---: | ---: | ---: |",
+        "| trains | 9 |  |  |",
+        "| kink |  | 0 | 0.5 |",
+        "| x |  |  | 1 |",
+        "",
+        "## Studies",
+    ]
+
+
 def test_an_unknown_name_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
