@@ -155,8 +155,8 @@ def rig_file() -> str:
     return f"""# Rig files
 
 Every key of a rig file. A file that begins with `extends: OTHER.yaml` has only the keys that
-differ. [Bring up a rig](../howto/bring-up-a-rig.md) explains how to determine the values; the schema
-for editors is [rig.json](../schema/rig.json).
+differ. [Bring up a rig](../howto/bring-up-a-rig.md) explains how to determine the values; the
+schema for editors is [rig.json](../schema/rig.json).
 
 {tables(models["RigFile"], models)}"""
 
