@@ -1,4 +1,4 @@
-"""Summary of label checks against the truth: figures, and the tables of docs/labels.md."""
+"""Summary of label checks against the truth: figures and tables (docs/labels.md has excerpts)."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ _COLUMNS = (
 
 
 def tables(sets: Sequence[Sequence[Checked]]) -> str:
-    """The tables of docs/labels.md."""
+    """Return the tables, of which docs/labels.md has excerpts."""
     clean, fallen, hard = sets
     lines = ["| | " + " | ".join(title for _, title, _ in _COLUMNS) + " |"]
     lines.append("| --- |" + " ---: |" * len(_COLUMNS))

@@ -1,10 +1,11 @@
 """Labels against the simulation's truth: random trials drawn as pictures, nuisances on.
 
-`python -m benchmarks.labels_truth` prints the tables of docs/labels.md (60 slides, 12 falls and 24
-slides with glare, hidden markers and a trembling camera); `python -m benchmarks labels_truth`
-gives the same numbers as figures. Clocks are perfect, so that what is measured is the labelling.
-Nothing is stored: frames go straight to the trackers, which see what a stored video would show them
-(it is lossless). True centres come from a second run that draws nothing.
+`python -m benchmarks.labels_truth` prints its tables, of which docs/labels.md has excerpts (60
+slides, 12 falls and 24 slides with glare, hidden markers and a trembling camera);
+`python -m benchmarks labels_truth` gives the same numbers as figures. Clocks are perfect, so that
+what is measured is the labelling. Nothing is stored: frames go straight to the trackers, which see
+what a stored video would show them (it is lossless). True centres come from a second run that draws
+nothing.
 """
 
 from __future__ import annotations

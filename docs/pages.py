@@ -1,6 +1,7 @@
 """Pages of the site that are made from the program itself when it is built, so that they are true.
 
-The command line, the keys of protocol and rig files and of documents, and the list of decisions.
+The changelog, the command line, the keys of protocol and rig files and of documents, and the list
+of decisions.
 """
 
 from __future__ import annotations
@@ -89,6 +90,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made here."""
     pages: dict[str, Callable[[], str]] = {
+        "changes.md": changes,
         "decisions/index.md": decisions,
         "reference/commands.md": commands,
         "reference/protocol-file.md": protocol_file,
@@ -130,6 +132,11 @@ def decisions() -> str:
     return "\n".join(lines) + "\n"
 
 
+def changes() -> str:
+    """Return the changelog as a page."""
+    return (DOCS.parent / "CHANGELOG.md").read_text().replace("](docs/", "](")
+
+
 def protocol_file() -> str:
     """Every key of a protocol file."""
     from sliplab.flows.planning.schema import file_schema
@@ -137,8 +144,8 @@ def protocol_file() -> str:
     schema = file_schema("protocol")
     return f"""# Protocol files
 
-Every key that a protocol may have. [Write a protocol](../howto/write-a-protocol.md) says how they
-go together, and how an editor completes and checks them, by [its schema](../schema/protocol.json).
+Every key of a protocol. [Write a protocol](../howto/write-a-protocol.md) explains how they work
+together, and how an editor completes and checks them with [the schema](../schema/protocol.json).
 
 {tables(schema, schema["definitions"])}"""
 
@@ -150,9 +157,9 @@ def rig_file() -> str:
     models = file_schema("rig")["definitions"]
     return f"""# Rig files
 
-Every key that a rig file may have. A file that begins with `extends: OTHER.yaml` has those that
-differ, and all others from that file. [Bring up a rig](../howto/bring-up-a-rig.md) says how to come
-by their values; for editors there is [rig.json](../schema/rig.json).
+Every key of a rig file. A file that begins with `extends: OTHER.yaml` has only the keys that
+differ. [Bring up a rig](../howto/bring-up-a-rig.md) explains how to determine the values; the
+schema for editors is [rig.json](../schema/rig.json).
 
 {tables(models["RigFile"], models)}"""
 
@@ -177,14 +184,14 @@ def document(kind: str) -> str:
     schema = file_schema(kind)
     return f"""# {title}
 
-{text} Programs check what they read by [{kind}.json](../schema/{kind}.json). A key that a version
-does not know is kept; one that is not needed may be missing in documents of older versions.
+{text} JSON Schema: [{kind}.json](../schema/{kind}.json). Unknown keys are preserved; optional
+keys may be missing in documents of older versions.
 
 {tables(schema, schema["definitions"])}"""
 
 
 def commands() -> str:
-    """The whole command line, as `--help` says it."""
+    """Return the page of the command line, from the texts of `--help`."""
     import typer
 
     from sliplab.flows.cli.app import command_line
@@ -192,14 +199,8 @@ def commands() -> str:
     lines = [
         "# Commands",
         "",
-        "Every command takes `--json`: one JSON object on standard output, everything else on",
-        "standard error. Exit codes: 0 done, 1 it ran and failed (a damaged recording too), 2 the",
-        "input was wrong (the message names file, key, value and what would be right; a missing",
-        "store is wrong input),",
-        "130 interrupted. With `--json` a command that ends before it has a result prints",
-        '`{"error": {"file", "key", "value", "message", "exit_code"}}`, null where nothing is',
-        "known; `key` is the option or argument where no file is wrong. Where several faults were",
-        "found together, `faults` lists each with its file, key, value and message.",
+        "Every command takes `--json`. Exit codes and the JSON of an error:",
+        "[all commands](index.md#all-commands).",
         "",
     ]
     for words, command in _walk("sliplab", typer.main.get_command(command_line())):

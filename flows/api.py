@@ -238,7 +238,7 @@ class Trial:
 
     @cached_property
     def label(self) -> dict[str, Any]:
-        """The trial's label as it is stored (docs/labels.md lists its keys).
+        """The trial's label as it is stored (`sliplab schema label` prints its keys).
 
         Raises:
             StoreError: the trial has no label yet.

@@ -17,6 +17,7 @@ from tests.conftest import ROOT
 
 PAGES = [
     ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
     *sorted(path for path in (ROOT / "docs").rglob("*.md") if "decisions" not in path.parts),
     *sorted((ROOT / "docs" / "decisions").glob("*.md")),
 ]
