@@ -66,7 +66,7 @@ NAMES = {
     "event_camera.noise_hz": "noise of events",
 }
 """Titles of the assumed numbers: those that decide accuracy (docs/decisions/scene.md), and
-whatever moves an onset or a rate by a tenth (`sliplab tradeoff --scene --sensitivity`)."""
+whatever moves an onset or a rate by a tenth (`benchmarks.scene_tradeoff`)."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`sliplab export-model`: export of a trained network as ONNX and for a Speck, with a model card.
+"""A trained network as ONNX and for a Speck, with a model card (`sliplab export --as onnx`).
 
 Nothing is written until everything is complete and the ONNX file reproduces Sinabs' spike counts.
 """

@@ -31,5 +31,7 @@ def rule_tables() -> str:
     sections = []
     for title, rules in _RULES.items():
         rows = [f"| {rule.name} | {rule.right} |" for each in rules for rule in each.all]
-        sections.append("\n".join([f"## {title}", "", "| rule | right is |", "| --- | --- |", *rows]))
+        sections.append(
+            "\n".join([f"## {title}", "", "| rule | right is |", "| --- | --- |", *rows])
+        )
     return "\n\n".join(sections) + "\n"

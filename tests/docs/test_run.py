@@ -65,10 +65,10 @@ streams: {events: {format: aedat4}}
 def test_cheap_commands_run_as_printed(checkout: Path) -> None:
     (checkout / "lab.yaml").write_text(load_rig_file(Path("rehearsal"))[1])
     # what exchange.md takes in
-    assert run("sliplab export data pilot --format aedat4 --output recordings", checkout).code == 0
+    assert run("sliplab export data pilot --as aedat4 --output recordings", checkout).code == 0
     # what publish.md takes in
-    assert run("sliplab publish data --as mcap --output bags", checkout).code == 0
-    assert run("sliplab publish data --as croissant --output slides", checkout).code == 0
+    assert run("sliplab export data --as mcap --output bags", checkout).code == 0
+    assert run("sliplab export data --as croissant --output slides", checkout).code == 0
     # a recording that was cut short, and a data set with its adapter
     whole = min((checkout / "recordings").glob("*.aedat4"))
     (checkout / "cut.aedat4").write_bytes(whole.read_bytes()[:-5000])

@@ -64,14 +64,15 @@ def test_command_study_and_section(ran: Ran, tmp_path: Path) -> None:
     assert search.run(store, campaigns) == count > 0
     found = answer("rates", store.folder)
     assert found["simulated"] is True
-    assert len(found["trials"]) == count
-    assert all(each["motion"] > each["hold"] > 0 for each in found["trials"].values())
+    assert len(found["rates"]) == count
+    assert all(each["motion"] > each["hold"] > 0 for each in found["rates"])
+    assert found["rates"][0]["trial"] in Path(found["page"]).read_text()
 
     assert sections_key(store, campaigns) != before  # the next report is made again
     *_, last = plugin_sections(ReportData(store, campaigns, True), last=True)
     assert isinstance(last, Rendered)
     assert (last.title, "(simulated)" in last.html) == ("Event rates", True)
-    assert next(iter(found["trials"])) in last.html
+    assert found["rates"][0]["trial"] in last.html
 
 
 @pytest.mark.usefixtures("subject")

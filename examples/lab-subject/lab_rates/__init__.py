@@ -1,11 +1,11 @@
-"""Event rates before and during the motion: a command, a study, its section, and a detector."""
+"""Event rates before and in the motion: a study, its report section, and a detector."""
 
 from __future__ import annotations
 
 from sliplab.protocols.plugin import Plugin
 
 PLUGIN = Plugin(
-    commands={"rates": "lab_rates.command:app"},
+    studies={"rates": "lab_rates.study:STUDY"},
     searches={"rates": "lab_rates.study:search"},
     sections={"rates": "lab_rates.section:SECTION"},
     detectors={"lab_jump": "lab_rates.detector:Jump"},

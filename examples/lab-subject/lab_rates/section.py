@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from lab_rates.study import COLUMNS, RESULT, rows
+from lab_rates.study import RESULT, Rates, table
 from sliplab.analysis.report.page import Content, Table
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 
@@ -24,7 +24,7 @@ def make(data: ReportData) -> RatesSection | None:
     result = RESULT.read(data.store)
     if result is None:
         return None
-    return RatesSection(Table(COLUMNS, rows(result)))
+    return RatesSection(table(RESULT.parse(Rates, result)))
 
 
 SECTION = ReportSection(make, last=True)
