@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -33,7 +33,9 @@ class Finding(Generic[ResultT]):
     Attributes:
         folder: of its files. stem: their name without an ending; empty: the study's.
         failed: the command ends with exit code 1, such as for a limit that is exceeded.
-        error: is raised when everything is written.
+        error: is raised when everything is written, in place of anything that is shown.
+        more: further arguments of `Study.view` and `shown`: what the result does not hold.
+        named: further files and folders, by their keys in the JSON of the command.
     """
 
     result: ResultT
@@ -41,6 +43,8 @@ class Finding(Generic[ResultT]):
     stem: str = ""
     failed: bool = False
     error: Exception | None = None
+    more: tuple[Any, ...] = ()
+    named: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -54,10 +58,10 @@ class Study(Generic[ResultT]):
             help; it imports what is slow to import when it is called.
         result: the document that it returns.
         page: a template that extends ``page.html``.
-        view: returns the values of the template.
-        shown: returns what the terminal shows: tables and lines.
+        view: returns the values of the template, given the result and `Finding.more`.
+        shown: returns what the terminal shows, tables and lines, given the same.
         example: a command line for the help.
-        group: of commands that the command belongs to, such as ``calibrate``.
+        kind: of the schema; empty: the name.
     """
 
     name: str
@@ -65,10 +69,10 @@ class Study(Generic[ResultT]):
     measure: Callable[..., Finding[ResultT]]
     result: type[ResultT]
     page: Path
-    view: Callable[[ResultT], Mapping[str, Any]]
-    shown: Callable[[ResultT], Iterable[Table | str]]
+    view: Callable[..., Mapping[str, Any]]
+    shown: Callable[..., Iterable[Table | str]]
     example: str
-    group: str = ""
+    kind: str = ""
 
     def paths(self, found: Finding[ResultT]) -> tuple[Path, Path]:
         """Return where the page and the document go."""
@@ -80,19 +84,19 @@ class Study(Generic[ResultT]):
         make_folder(found.folder)
         page, document = self.paths(found)
         write_json(document, found.result.to_json())
-        write_text(page, self.render(found.result))
+        write_text(page, self.render(found.result, *found.more))
         write_tables(found.folder / TABLES, page.stem, found.result)
         return page
 
-    def render(self, result: ResultT) -> str:
-        """Return the page."""
+    def render(self, result: ResultT, *more: Any) -> str:
+        """Return the page of a result and of `Finding.more`."""
         from sliplab.analysis.report.page import render_page
 
         return render_page(
             self.page,
             simulated=bool(getattr(result, "simulated", False)),
             result=result,
-            **self.view(result),
+            **self.view(result, *more),
         )
 
     def read(self, path: Path) -> ResultT:

@@ -16,8 +16,9 @@ import yaml
 
 from sliplab.flows.running import orchestration
 from sliplab.flows.scene_runs import changed
+from sliplab.plugins.twin.drift.document import FRICTION
 from sliplab.plugins.twin.drift.estimates import drifts
-from sliplab.plugins.twin.drift.flow import FRICTION, OneSpecimen
+from sliplab.plugins.twin.drift.flow import OneSpecimen
 from sliplab.plugins.twin.parameters import drawn
 from sliplab.plugins.twin.statistics import of_names
 from sliplab.plugins.twin.worlds import Slides, World, guess_of, other_specimen, simulated

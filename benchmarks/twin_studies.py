@@ -55,6 +55,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration
 from sliplab.flows.train import train
 from sliplab.plugins.twin.calibrate import calibrate_scene, request
+from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError
@@ -201,7 +202,8 @@ def calibrated(asked: argparse.Namespace, folder: Path, hidden: Path) -> Path:
     try:
         fitting = prior_of(BANK, asked.seed)
         wanted = request(assumed, twin, asked.bank, fitting.spread, fitting.seed)
-        calibrate_scene(store, item, replace(wanted, needs=False))
+        fitted = calibrate_scene(store, item, replace(wanted, needs=False))
+        STUDY.write(finding(twin, *fitted))
     finally:
         copytree(kept, worlds, dirs_exist_ok=True)
     return twin

@@ -50,12 +50,14 @@ class Table:
 
     Attributes:
         commands: which columns hold commands, to be copied.
+        spare: how many of the last columns a narrow terminal may leave out.
     """
 
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
     commands: Sequence[int] = ()
+    spare: int = 0
     long: ClassVar[int] = 40
     """A cell of more characters is broken into lines."""
 

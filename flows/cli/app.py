@@ -23,7 +23,6 @@ from sliplab.flows.cli import (
     study,
 )
 from sliplab.flows.cli.common import RESEARCH
-from sliplab.flows.cli.study_command import study_app
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
@@ -119,6 +118,8 @@ def _add(word: str, place: str, needed: bool) -> None:
     try:
         part = import_foreign(place)
         if not isinstance(part, typer.Typer):
+            from sliplab.flows.cli.study_command import study_app
+
             part = study_app(part)
     except PluginError as error:
         if needed:

@@ -18,17 +18,17 @@ def study_app(study: Study[Any]) -> typer.Typer:
     def run(as_json: bool, **options: Any) -> None:
         found = study.measure(**options)
         page = study.write(found)
-        if as_json:
-            console.print_json({"page": str(page), **found.result.to_json()})
-        else:
-            for part in study.shown(found.result):
-                if isinstance(part, str):
-                    console.say(part)
-                else:
-                    console.print_table(part.caption, part.columns, part.rows)
-            console.say(f"page: {page}")
         if found.error is not None:
             raise found.error
+        if as_json:
+            places = {name: str(path) for name, path in {"page": page, **found.named}.items()}
+            console.print_json({**places, **found.result.to_json()})
+        for part in study.shown(found.result, *found.more):
+            if isinstance(part, str):
+                console.say(part)
+            elif not as_json:
+                console.print_table(part.caption, part.columns, part.rows, spare=part.spare)
+        console.say(f"page: {page}")
         if found.failed:
             raise typer.Exit(console.FAILED)
 

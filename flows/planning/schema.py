@@ -12,16 +12,18 @@ from __future__ import annotations
 import ast
 import inspect
 import sys
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
+from sliplab.analysis.study import Study
 from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plugin import plugins
-from sliplab.protocols.plugins import import_foreign
+from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
@@ -75,17 +77,21 @@ def kinds() -> tuple[str, ...]:
     return (*FILES, *DOCUMENTS, *plugins().declared("documents"), *_studies())
 
 
-def _studies() -> dict[str, str]:
-    """Return the places of studies by the kinds of their results."""
-    return {name.split(" ")[-1]: place for name, place in plugins().declared("studies").items()}
+def _studies() -> dict[str, Study[Any]]:
+    """Return the studies that can be imported by the kinds of their results."""
+    found = {}
+    for place in plugins().declared("studies").values():
+        with suppress(PluginError):
+            study = import_foreign(place)
+            found[study.kind or study.name] = study
+    return found
 
 
 def document_model(kind: str) -> tuple[type[Document], str]:
     """Return the model of a document and the title of its schema."""
     if kind in DOCUMENTS:
         return DOCUMENTS[kind]
-    if kind in _studies():
-        study = import_foreign(_studies()[kind])
+    if (study := _studies().get(kind)) is not None:
         return study.result, study.title
     place, title = plugins().declared("documents")[kind]
     return import_foreign(place), title

@@ -4,17 +4,8 @@ from __future__ import annotations
 
 from sliplab.protocols.plugin import Plugin
 
-_STRESS = "sliplab.plugins.bench.stress"
+_BENCH = "sliplab.plugins.bench"
 PLUGIN = Plugin(
-    commands={
-        "bench": "sliplab.plugins.bench.command:app",
-    },
-    studies={"stress": f"{_STRESS}.study:STUDY"},
-    documents={
-        "bench": (
-            "sliplab.plugins.bench.document:BenchResult",
-            "The table of the bench of detectors, by SlipLab",
-        ),
-    },
-    hooks={"false_alarms": f"{_STRESS}.rates:report_alarms"},
+    studies={"bench": f"{_BENCH}.study:STUDY", "stress": f"{_BENCH}.stress.study:STUDY"},
+    hooks={"false_alarms": f"{_BENCH}.stress.rates:report_alarms"},
 )

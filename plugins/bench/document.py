@@ -103,3 +103,8 @@ class BenchResult(Document):
     scenes: dict[str, Int]
     hours: dict[str, Number]
     detectors: tuple[BenchDetector, ...]
+
+    @property
+    def command(self) -> str:
+        """Command that makes it."""
+        return f"sliplab bench{' --small' if self.size == 'small' else ''} --seed {self.seed}"

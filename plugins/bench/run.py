@@ -36,14 +36,12 @@ from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.plugins.bench.registry import contents, make_detector
 from sliplab.plugins.bench.scenes import Drawn
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import write_json
 from sliplab.storage.process import out_of_reach
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.workers import WORKERS
 
 ENTRIES_VERSION = 2
 """Incremented when a shipped detector has other figures or intervals on the same scenes."""
-NUMBERS = "bench.json"
 Advance = Callable[[], None]
 
 
@@ -268,7 +266,7 @@ def run_bench(
     Args:
         names: of detectors, see `registry`. size: one of `SIZES`.
         seed: of the test worlds.
-        folder: keeps what a detector gave, and the table.
+        folder: keeps what a detector gave.
         workers: processes at the most; each simulates the scenes for itself.
 
     Raises:
@@ -296,7 +294,7 @@ def run_bench(
     if missing:
         _judge_each([Job(name, SIZES[size], seed) for name in missing], workers, keep)
     found = [kept.load(key[:16], KeptDetector) for key in keys.values()]
-    result = BenchResult(
+    return BenchResult(
         simulated=True,
         version=VERSION,
         size=size,
@@ -305,5 +303,3 @@ def run_bench(
         hours=found[0].hours,
         detectors=tuple(ranked([one.row for one in found])),
     )
-    write_json(folder / NUMBERS, result.to_json())
-    return result

@@ -6,17 +6,11 @@ from sliplab.protocols.plugin import Plugin
 
 _CLAIMS = "sliplab.plugins.claims"
 PLUGIN = Plugin(
-    commands={"power": f"{_CLAIMS}.power.command:app"},
-    documents={
-        "power": (
-            f"{_CLAIMS}.power.document:PowerRecord",
-            "Trials that claims need, by SlipLab",
-        ),
-    },
+    studies={"power": f"{_CLAIMS}.power.study:STUDY"},
     sections={"claims": f"{_CLAIMS}.section:SECTION"},
     hooks={
         "more_trials": f"{_CLAIMS}.rounds:ClaimWatch",
         "begun_trials": f"{_CLAIMS}.document:begun_trials",
-        "forecast": f"{_CLAIMS}.power.command:forecast",
+        "forecast": f"{_CLAIMS}.power.study:forecast",
     },
 )

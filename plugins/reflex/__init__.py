@@ -6,9 +6,6 @@ from sliplab.protocols.plugin import Plugin
 
 _REFLEX = "sliplab.plugins.reflex"
 PLUGIN = Plugin(
-    commands={"reflex": f"{_REFLEX}.command:app"},
-    documents={
-        "reflex": (f"{_REFLEX}.document:ReflexStudy", "Drops that reflexes prevent, by SlipLab")
-    },
+    studies={"reflex": f"{_REFLEX}.study:STUDY"},
     drivers={"robotiq_2f": f"{_REFLEX}.robotiq_2f:DRIVER"},
 )

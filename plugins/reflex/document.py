@@ -92,6 +92,11 @@ class ReflexRow(Part):
     """99th percentile of network and command together."""
 
 
+def title_of(it: ReflexRow | ReflexTrial) -> str:
+    """Return detector and reflex for people."""
+    return "no reflex" if it.reflex is None else f"{it.reflex} ({it.detector})"
+
+
 class ReflexStudy(Document):
     """Results of `sliplab reflex`."""
 

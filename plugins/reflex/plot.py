@@ -18,7 +18,7 @@ from sliplab.analysis.report.figures.style import (
     WIDTH,
     svg_text,
 )
-from sliplab.plugins.reflex.document import ReflexRow, ReflexTrial
+from sliplab.plugins.reflex.document import ReflexRow, ReflexTrial, title_of
 
 PART_COLOURS = {
     "window": BLUE,
@@ -27,11 +27,6 @@ PART_COLOURS = {
     "command": PURPLE,
     "actuator": RED,
 }
-
-
-def title_of(it: ReflexRow | ReflexTrial) -> str:
-    """Return detector and reflex for people."""
-    return "no reflex" if it.reflex is None else f"{it.reflex} ({it.detector})"
 
 
 def outcomes(rows: Sequence[ReflexRow], trials: Sequence[ReflexTrial], *, simulated: bool) -> str:

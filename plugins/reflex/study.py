@@ -1,299 +1,173 @@
-"""`sliplab reflex`: how many drops a reflex prevents on a simulated rig, and how fast it is.
-
-The plate of gravity trials hangs on the sensor, which retracts. Every trial is run without a
-reflex, and with each detector and reflex. Results are stored in `OUT/reflex.json`, each as soon as
-its trial is over, so a stopped study resumes. Nothing is recorded, and the rig does not go to its
-safe state.
-"""
+"""`sliplab reflex`: drops that reflexes prevent on a simulated rig."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-import numpy.typing as npt
+import typer
 
-from sliplab.analysis.detectors.detectors import Tuned
-from sliplab.analysis.detectors.live import Counting, counting_of
-from sliplab.analysis.sweeps.runner import ResultFile, Sweep
-from sliplab.flows.detect import detect
-from sliplab.flows.detecting.request import DetectRequest, make_detect_request, make_reflex
-from sliplab.flows.running import console
-from sliplab.flows.store_detectors import detectors_of
-from sliplab.plugins.reflex import page
-from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
-from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
-from sliplab.protocols import InputError, Plan, Trial, load_plan
-from sliplab.protocols.hashing import hash_data, hash_text
-from sliplab.protocols.program import ACTING, Move, Step
-from sliplab.protocols.settings import Detection
-from sliplab.rigs.build import build_rig, loopback_rig
-from sliplab.rigs.core.capabilities import PlateCourse, Truth
-from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
-from sliplab.storage.files import write_json, write_text
-from sliplab.storage.streams import Json
+from sliplab.analysis.study import Finding, Study
+from sliplab.plugins.reflex.document import ReflexRow, ReflexStudy, ReflexTrial, title_of
 
-NAME = "reflex"
-VERSION = 1
-"""Version of the measurement; stored results of another version are measured again."""
-HOLD_S = 1.0
-"""Time for which the arm stays after a reflex; a plate that slides at its end has dropped."""
-STEP_MS = 20
-"""Step of the stored heights."""
+if TYPE_CHECKING:
+    from sliplab.analysis.report.page import Table
 
-
-def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    return np.array([[1, 0, 0]], np.int64)
-
-
-_NEVER: Counting = _no_slip
-"""No-slip outputs for trials without a reflex, in which nothing is detected."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One trial with a detector and a reflex, or without; a point of the sweep."""
-
-    trial: Trial
-    detector: str | None
-    reflex: str | None
-    key: str
-
-    @property
-    def name(self) -> str:
-        """Trial, detector and reflex."""
-        return f"{self.trial.id} {self.detector or 'none'} {self.reflex or 'none'}"
-
-    @property
-    def title(self) -> str:
-        """The name."""
-        return self.name
-
-
-@dataclass(frozen=True)
-class Request:
-    """Request of a study, checked.
-
-    Attributes:
-        requests: one of each detector, without a reflex.
-    """
-
-    rig: RigFile
-    plan: Plan
-    requests: Mapping[str, DetectRequest]
-    cases: Sequence[Case]
-    out: Path
-
-
-def request(
-    place: Path,
-    rig: Path,
-    out: Path,
-    protocol: Path = Path(NAME),
-    reflexes: Sequence[str] = (),
-    count: int = 1,
-    detectors: Sequence[str] = (),
-) -> Request:
-    """Check a request.
-
-    Args:
-        reflexes: left out, all that the rig can do. detectors: left out, all of a store.
-        count: trials of each condition.
-
-    Raises:
-        InputError: model, rig, protocol, detector or reflex; the message says what would be right.
-        StoreError: a network of the store is missing or stale.
-    """
-    file, text = load_rig_file(rig)
-    if not file.simulated:
-        right = "must be a simulated rig: drops and forces are those of its scene"
-        raise InputError("--rig", "", file.name, right)
-    plan = load_plan(protocol)
-    if plan.protocol.collection.plate is None:
-        raise InputError("--protocol", "", protocol, "must be of gravity trials: no plate falls")
-    trials = [it for it in plan if it.role == "measured" and it.repetition <= count]
-    requests = {
-        name: make_detect_request(
-            rig,
-            it.model,
-            protocol=protocol,
-            trial=trials[0].id,
-            detector=it.detector,
-            stride_ms=it.stride_ms,
-        )
-        for name, it in detectors_of(place, detectors).items()
-    }
-    if not reflexes:
-        can_grip = () if file.gripper_range is None else ("grip:0.4",)
-        reflexes = ("stop", "press:0.4", *can_grip)
-    made = hash_data([VERSION, rig_hash(text), plan.protocol.model_dump(mode="json")])
-    cases = []
-    for trial in trials:
-        cases.append(Case(trial, None, None, hash_data([made, trial.id])))
-        for name, asked in requests.items():
-            rule = _numbers(asked.detection)
-            for reflex in reflexes:
-                make_reflex(reflex, file, plan, trial, HOLD_S)  # raises before anything moves
-                key = hash_data([made, trial.id, asked.model_sha256, rule, reflex])
-                cases.append(Case(trial, name, reflex, key))
-    return Request(next(iter(requests.values())).rig, plan, requests, cases, out)
-
-
-def _numbers(detection: Detection | Tuned) -> Json:
-    """Return the settings of a rule, or the hash of another detector's numbers."""
-    if isinstance(detection, Detection):
-        return detection.model_dump(mode="json")
-    text = json.dumps(asdict(detection), default=lambda array: array.tolist())
-    return {"name": detection.name, "numbers": hash_text(text)}
-
-
-def measure_reflexes(asked: Request) -> ReflexStudy:
-    """Run what is not stored yet, and write the page; return all results.
-
-    Raises:
-        RigError: a device failed; finished results are stored.
-        KeyboardInterrupt: the user stopped it; the arm is stopped, finished results are stored.
-    """
-    head: Json = {
-        "simulated": True,
-        "rig": asked.rig.name,
-        "protocol": asked.plan.name,
-        "virtual_time": asked.rig.in_virtual_time,
-        "detectors": {name: it.model_sha256 for name, it in asked.requests.items()},
-    }
-    kept = ResultFile(asked.out / f"{NAME}.json", ReflexStudy, "trials", head)
-    with ExitStack() as done:
-        build = done.enter_context(_builder(asked.rig))
-        networks = {name: counting_of(it.fitted) for name, it in asked.requests.items()}
-        sweep = Sweep(
-            asked.cases, kept, lambda case, _: (measure(asked, case, networks, build), None)
-        )
-        simulated = "simulated trials" if asked.rig.in_virtual_time else "trials in real time"
-        bar = done.enter_context(console.bar(f"reflexes ({simulated})", len(sweep.pending)))
-        sweep.run(bar.advance)
-    known = kept.load().trials
-    trials = {case.name: known[case.name] for case in asked.cases}
-    rows = reflex_rows(trials.values())
-    study = ReflexStudy.model_validate({**head, "rows": rows, "trials": trials})
-    write_json(kept.path, study.to_json())
-    write_text(asked.out / f"{NAME}.html", page.render(study))
-    return study
-
-
-@contextmanager
-def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
-    """Yield a function that builds the rig of a trial; a loopback rig's fakes run for all."""
-    if file.in_virtual_time:
-        yield build_rig
-        return
-    from sliplab.rigs.loopback.client import Loopback
-
-    assert file.devices is not None
-    stage = Loopback(file.scene, file.timing, file.devices, file.streams)
-    try:
-        yield lambda rig: loopback_rig(rig, stage)
-    finally:
-        stage.close()
-
-
-@dataclass
-class Seen:
-    """The simulation's own record of a trial's motion, until the sensor leaves the plate."""
-
-    began_ns: int | None = None
-    truth: Truth | None = None
-    course: PlateCourse | None = None
-
-    def by(self, build: Callable[[RigFile], Rig]) -> Callable[[RigFile], Rig]:
-        """Return a function that builds the same rig, observed."""
-
-        def observed(file: RigFile) -> Rig:
-            rig = build(file)
-            take_step = rig.take_step
-
-            def looking(index: int, step: Step, *rest: Any) -> Any:
-                assert rig.simulation is not None
-                if step.phase in ACTING and self.began_ns is None:
-                    rig.simulation.watch_plate()
-                    self.began_ns = rig.arm.now_ns()
-                elif step.phase == "release" and self.began_ns is not None:
-                    self.truth = rig.simulation.truth(self.began_ns)
-                    self.course = rig.simulation.plate_course(self.began_ns)
-                return take_step(index, step, *rest)
-
-            rig.take_step = looking  # type: ignore[assignment,method-assign]
-            return rig
-
-        return observed
+COLUMNS = (
+    "reflex",
+    "trials",
+    "dropped",
+    "drops prevented (95 %)",
+    "too early",
+    "missed",
+    "fallen (mm), median",
+    "95 %",
+    "extra force (N), median",
+    "largest",
+)
+REACTION = ("reflex", "total (ms)", "window", "sensor", "network", "command", "actuator", "p99")
+MOST_SHOWN = 7
+"""Courses in the figure of one trial."""
 
 
 def measure(
-    asked: Request,
-    case: Case,
-    networks: Mapping[str, Counting],
-    build: Callable[[RigFile], Rig] = build_rig,
-) -> ReflexTrial:
-    """Run one trial.
+    model: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MODEL|STORE", help="A trained network, or a store with all its detectors."
+        ),
+    ],
+    rig: Annotated[
+        Path, typer.Option("--rig", help="A simulated rig: a rig file (YAML), or a name.")
+    ] = Path("mock-gripper"),
+    protocol: Annotated[
+        Path, typer.Option("--protocol", help="Gravity trials (YAML); default: reflex.")
+    ] = Path("reflex"),
+    reflexes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--reflex",
+            help="stop, press:MM or grip:MM. Repeatable. Default: stop, press:0.4, and grip:0.4 "
+            "on a rig with a gripper.",
+        ),
+    ] = None,
+    detectors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--detector",
+            help="Of a store: network or paper (with the rule), or another. Repeatable. Default: "
+            "all.",
+        ),
+    ] = None,
+    trials: Annotated[
+        int, typer.Option("--trials", min=1, max=10_000, help="Trials of each condition.")
+    ] = 1,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the page and its numbers.")] = Path(
+        "sliplab-reflex"
+    ),
+) -> Finding[ReflexStudy]:
+    """Run trials with and without reflexes: drops prevented, way fallen, force, reaction time."""
+    if model.is_dir():
+        from sliplab.flows.steps import prepare_store
+        from sliplab.storage.remote.mirror import open_store
 
-    Args:
-        networks: by the names of their detectors.
+        open_store(model)
+        prepare_store(model)  # before anything imports Prefect
+    from sliplab.plugins.reflex.flow import measure_reflexes, request
+
+    asked = request(model, rig, out, protocol, reflexes or (), trials, detectors or ())
+    return Finding(measure_reflexes(asked), out)
+
+
+def shown(study: ReflexStudy) -> Iterator[Table]:
+    """Yield the table of reflexes."""
+    from sliplab.analysis.report.page import Table
+
+    yield Table(COLUMNS, [_cells(row) for row in study.rows], "reflexes, simulated")
+
+
+def view(study: ReflexStudy) -> dict[str, object]:
+    """Return what the page shows."""
+    from sliplab.analysis.report.page import Figure, Table
+    from sliplab.plugins.reflex import plot
+
+    simulated, rows, trials = study.simulated, study.rows, list(study.trials.values())
+    reacting = [row for row in rows if row.reaction is not None]
+    courses = _example(study)
+    return {
+        "count": len({it.trial for it in trials}),
+        "outcomes": Figure(plot.outcomes(rows, trials, simulated=simulated)),
+        "table_of_outcomes": Table(COLUMNS, [_cells(row) for row in rows]),
+        "fallen": Figure(plot.fallen(rows, trials, simulated=simulated)),
+        "reactions": Figure(plot.reactions(rows, simulated=simulated)) if reacting else None,
+        "table_of_reactions": Table(REACTION, [_reaction_cells(row) for row in reacting]),
+        "courses": Figure(plot.courses(courses, simulated=simulated)),
+        "example": courses[0].trial,
+    }
+
+
+def _cells(row: ReflexRow) -> list[str]:
+    """Return a row's outcome below `COLUMNS`."""
+    from sliplab.analysis.report.page import number
+
+    return [
+        title_of(row),
+        str(row.trials),
+        str(row.dropped),
+        _prevented(row),
+        str(row.early),
+        str(row.missed) if row.reflex else "–",
+        number(row.fallen_mm, 2),
+        number(row.fallen_p95_mm, 2),
+        number(row.extra_n, 2),
+        number(row.most_extra_n, 2),
+    ]
+
+
+def _prevented(row: ReflexRow) -> str:
+    from sliplab.analysis.report.page import percent
+
+    if row.reflex is None or row.low is None or row.high is None:
+        return "–"
+    span = f"{percent(row.low, 0).removesuffix(' %')} to {percent(row.high, 0)}"
+    return f"{row.prevented} of {row.would_drop} ({span})"
+
+
+def _reaction_cells(row: ReflexRow) -> list[str]:
+    from sliplab.analysis.report.page import number
+
+    times = (row.total_ms, *(getattr(row.reaction, name) for name in REACTION[2:-1]))
+    return [title_of(row), *(number(ms, 1) for ms in times), number(row.computer_p99_ms, 2)]
+
+
+def _example(study: ReflexStudy) -> list[ReflexTrial]:
+    """Return one trial without a reflex, and with each reflex and detector; at most `MOST_SHOWN`.
+
+    It is the middle one of those that drop without a reflex. Where there are more detectors, each
+    reflex is shown with the one that prevents the most drops, and the one that prevents the fewest.
     """
-    plan, trial = asked.plan, case.trial
-    wanted, counting = next(iter(asked.requests.values())), _NEVER
-    if case.detector is not None and case.reflex is not None:
-        made = make_reflex(case.reflex, asked.rig, plan, trial, HOLD_S)
-        wanted = replace(asked.requests[case.detector], reflex=made)
-        counting = networks[case.detector]
-    seen = Seen()
-    order = replace(wanted, trial=trial)
-    summary = detect(order, counting=counting, build=seen.by(build), show=False)
-    truth, course = seen.truth, seen.course
-    assert truth is not None
-    assert course is not None
-    reference_ms = truth["reference_ns"] / 1e6
-    slip, gross = (
-        None if ns is None else ns / 1e6 - reference_ms
-        for ns in (truth["first_slip_ns"], truth["gross_ns"])
-    )
-    parts = detected_ms = extra_n = None
-    reflex = summary["reflex"]
-    if reflex is not None and reflex["done"]:
-        detected_ms = reflex["trial_s"] * 1e3 - reference_ms
-        extra_n = extra_force_n(course["t_ms"], course["normal_n"], detected_ms)
-        took = reflex["reaction_ms"]
-        parts = ReactionParts(
-            window=detected_ms - (0.0 if slip is None else slip),
-            sensor=took["sensor"],
-            network=took["network"],
-            command=took["command"],
-            actuator=took["actuator"],
-        )
-    heights = course["height_mm"]
-    return ReflexTrial(
-        trial=trial.id,
-        mass_kg=plan.mass_kg(trial) or 0.0,
-        speed_mm_s=_speed_mm_s(plan, trial),
-        detector=case.detector,
-        reflex=case.reflex,
-        slip_ms=slip,
-        detected_ms=detected_ms,
-        gross_ms=gross,
-        dropped=dropped(course["t_ms"], heights, course["stroke_mm"]),
-        fallen_mm=heights[0] - heights[-1],
-        extra_n=extra_n,
-        parts=parts,
-        heights_mm=tuple(round(mm, 4) for mm in heights[::STEP_MS]),
-        step_ms=STEP_MS,
-    )
+    trials = list(study.trials.values())
+    drops = [it.trial for it in trials if it.reflex is None and it.dropped]
+    chosen = drops[len(drops) // 2] if drops else trials[0].trial
+    found = [it for it in trials if it.trial == chosen]
+    if len(found) > MOST_SHOWN:
+        ends: set[tuple[str | None, str | None]] = {(None, None)}
+        for reflex in {row.reflex for row in study.rows if row.reflex is not None}:
+            rows = [row for row in study.rows if row.reflex == reflex]
+            for choose in (max, min):
+                ends.add((choose(rows, key=lambda row: row.prevented).detector, reflex))
+        found = [it for it in found if (it.detector, it.reflex) in ends]
+    return sorted(found, key=lambda it: (it.reflex is not None, it.reflex or "", it.detector or ""))
 
 
-def _speed_mm_s(plan: Plan, trial: Trial) -> float:
-    """Speed of the trial's motion in contact."""
-    moves = [it for it in plan.program(trial).steps if isinstance(it, Move) and it.phase in ACTING]
-    return moves[0].speed_mm_s
+STUDY = Study(
+    name="reflex",
+    title="Drops that reflexes prevent, by SlipLab",
+    measure=measure,
+    result=ReflexStudy,
+    page=Path(__file__).with_name("page.html"),
+    view=view,
+    shown=shown,
+    example="sliplab reflex my-study --rig mock_gripper",
+)

@@ -21,13 +21,11 @@ import numpy as np
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.scene_runs import changed
-from sliplab.plugins.twin import page
 from sliplab.plugins.twin.contact_estimates import NOT_LOGGED, papillae, read_contact
 from sliplab.plugins.twin.contact_slips import find_slips
 from sliplab.plugins.twin.document import (
     MisfitCheck,
     ParameterFit,
-    QuantityCompared,
     StatisticSeen,
     TwinFit,
 )
@@ -38,7 +36,7 @@ from sliplab.plugins.twin.needs.judging import Marks, marks
 from sliplab.plugins.twin.parameters import GAIN_SLOPES, settings_of, value_of
 from sliplab.plugins.twin.pilots import LEVEL, ZEROS_MM, Pilot, read_pilot
 from sliplab.plugins.twin.posterior import Bank, Posterior, posterior, widened
-from sliplab.plugins.twin.shown import QUANTITIES, Shown, compare, show
+from sliplab.plugins.twin.shown import SameTrials, Shown, compare, show
 from sliplab.plugins.twin.statistics import Statistics, of_names
 from sliplab.plugins.twin.worlds import (
     Prior,
@@ -55,7 +53,7 @@ from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
 from sliplab.rigs.twin import FittedValue, Range, TwinRecord
-from sliplab.storage.files import make_folder, write_json, write_text
+from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -201,8 +199,10 @@ def fit_scene(store: Store, pilot: Pilot, prior: Prior, worlds: int) -> SceneFit
     return SceneFit(prior, pilot, observed, seen, bank, found, skin)
 
 
-def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinFit:
-    """Fit a rig's scene to a campaign's slides; write the twin's rig file, page and numbers.
+def calibrate_scene(
+    store: Store, item: Collected, wanted: Calibration
+) -> tuple[TwinFit, SameTrials]:
+    """Fit a rig's scene to a campaign's slides, and write the twin's rig file.
 
     Raises:
         StoreError: the campaign has no slides, or they are not labelled.
@@ -219,10 +219,12 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
     worlds = judging_worlds(scene)
     judged = [pilot.slides[trial.id] for trial in pilot.judged]
     twin, before = predict(worlds)
-    shown = (
+    trials = SameTrials(
         [show(slide) for slide in judged],
         [one.shown for one in twin],
         [one.shown for one in before],
+        ring_of(wanted.rig),
+        pilot.streams,
     )
     needs = Needs()
     if wanted.needs:
@@ -248,7 +250,7 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
         parameters=parameter_fits(scene, wanted.rig, gain_error or 0.0, checks),
         statistics=seen_statistics(scene),
         checks=checks,
-        compared=compared(*shown),
+        compared=compare(trials),
         needs=needs.effects,
         cheapest=needs.cheapest,
         gain_error=gain_error,
@@ -268,18 +270,13 @@ def calibrate_scene(store: Store, item: Collected, wanted: Calibration) -> TwinF
             )
             for it in fit.parameters
         },
-        misfits=tuple(f"{it.stream}: {it.title}" for it in fit.checks if it.found),
+        misfits=tuple(f"{it.stream}: {it.title}" for it in fit.misfits),
         needs={it.title: it.verdict for it in fit.needs},
     )
     write_twin(wanted, scene, record)
     write_samples(samples_file(wanted.out), scene.found)
     write_cheapest(wanted.out, needs)
-    write_json(wanted.out.with_suffix(".json"), fit.to_json())
-    rings = ring_of(wanted.rig)
-    text = page.render(fit, wanted.out.stem, *shown, rings, pilot.streams)
-    make_folder(wanted.out.parent)
-    write_text(wanted.out.with_suffix(".html"), text)
-    return fit
+    return fit, trials
 
 
 def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
@@ -398,24 +395,6 @@ def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
             high=None if high is None else float(high),
         )
     return found
-
-
-def compared(
-    pilot: Sequence[Shown], twin: Sequence[Sequence[Shown]], before: Sequence[Sequence[Shown]]
-) -> tuple[QuantityCompared, ...]:
-    """Return the test trials' quantities with those of simulated worlds."""
-    if not pilot:
-        return ()
-    return tuple(
-        QuantityCompared(
-            title=QUANTITIES[it.name],
-            pilot=it.pilot,
-            twin=it.twin,
-            before=it.before,
-            scatter=it.scatter,
-        )
-        for it in compare(pilot, twin, before)
-    )
 
 
 def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None:

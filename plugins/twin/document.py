@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
@@ -145,6 +146,20 @@ class TwinFit(Document):
     cheapest: CheapestScene | None = None
     gain_error: Number | None = None
 
+    @property
+    def misfits(self) -> list[MisfitCheck]:
+        """Effects that the pilot shows, and the scene lacks."""
+        return [check for check in self.checks if check.found]
+
+
+TrainedOn = Literal["own", "twin", "drawn", "assumed"]
+TITLES: Mapping[TrainedOn, str] = {
+    "own": "the tested rig's own trials",
+    "twin": "the twin",
+    "drawn": "rigs drawn from the twin's posterior",
+    "assumed": "the rig file as it was",
+}
+
 
 class Behind(Part):
     """Strict accuracy of the first network less that of another, 0 to 1.
@@ -169,7 +184,7 @@ class GapNetwork(Part):
         behind: of the first network; null for that.
     """
 
-    trained_on: Literal["own", "twin", "drawn", "assumed"]
+    trained_on: TrainedOn
     rig: str
     simulated: Bool
     rigs: Int
@@ -179,6 +194,14 @@ class GapNetwork(Part):
     f1: Number | None
     experiments: Experiments
     behind: Behind | None
+
+    @property
+    def title(self) -> str:
+        """What it was trained on, for people."""
+        title = TITLES[self.trained_on]
+        if self.rigs > 1:
+            title = f"{self.rigs} {title}"
+        return f"{title} (simulated)" if self.simulated else title
 
 
 class TwinGap(Document):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
@@ -17,37 +17,31 @@ from sliplab.analysis.report.figures.style import (
     Array,
     svg_text,
 )
+from sliplab.plugins.twin.document import ParameterFit
+from sliplab.plugins.twin.shown import Course, SameTrials, Shown
+
+PANELS = 3
+"""Test trials that are drawn over time."""
 
 
-@dataclass(frozen=True)
-class Factor:
-    """A parameter's interval over its assumed value.
-
-    Attributes:
-        low, middle, high: of the fit. least, most: of the worlds that were simulated.
-    """
-
-    title: str
-    low: float
-    middle: float
-    high: float
-    least: float
-    most: float
-    identified: bool
-
-
-def intervals(factors: Sequence[Factor], *, simulated: bool) -> str:
+def intervals(parameters: Sequence[ParameterFit], *, simulated: bool) -> str:
     """Draw each parameter's 95 % interval as factors of what the rig file assumed."""
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(6.4, 0.6 + 0.2 * len(factors)))
-        for row, it in enumerate(factors):
-            axes.plot([it.least, it.most], [row, row], color="#dddddd", lw=6, solid_capstyle="butt")
+        figure, axes = plt.subplots(figsize=(6.4, 0.6 + 0.2 * len(parameters)))
+        titles = []
+        for row, it in enumerate(parameters):
+            least, middle, most = (x / it.assumed for x in (it.least, it.value, it.most))
+            axes.plot([least, most], [row, row], color="#dddddd", lw=6, solid_capstyle="butt")
+            if it.low is None or it.high is None:
+                titles.append(f"{it.title} (withheld)")
+                continue
+            titles.append(it.title)
             colour = BLUE if it.identified else GREY
-            axes.plot([it.low, it.high], [row, row], color=colour, lw=2)
-            axes.plot(it.middle, row, "o", color=colour, ms=4)
+            axes.plot([it.low / it.assumed, it.high / it.assumed], [row, row], color=colour, lw=2)
+            axes.plot(middle, row, "o", color=colour, ms=4)
         axes.axvline(1.0, color="black", lw=0.8)
-        axes.set_yticks(range(len(factors)), [it.title for it in factors])
-        axes.set_ylim(len(factors) - 0.5, -0.5)
+        axes.set_yticks(range(len(titles)), titles)
+        axes.set_ylim(len(titles) - 0.5, -0.5)
         axes.set_xscale("log")
         ticks = [0.5, 0.7, 1.0, 1.4, 2.0]
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -56,9 +50,45 @@ def intervals(factors: Sequence[Factor], *, simulated: bool) -> str:
         axes.plot([], [], color=BLUE, lw=2, label="identified, 95 %")
         axes.plot([], [], color=GREY, lw=2, label="not identified")
         axes.plot([], [], color="#dddddd", lw=6, label="simulated worlds")
-        handles, titles = axes.get_legend_handles_labels()
-        figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
+        figure.legend(loc="outside lower center", ncols=3, fontsize=8)
         return svg_text(figure, simulated)
+
+
+def of_trials(trials: SameTrials, *, simulated: bool) -> Iterator[tuple[str, str]]:
+    """Yield figures of the test trials, each with its caption; none without any."""
+    if not trials.pilot:
+        return
+    events = all(it.map is not None for it in trials.pilot)
+    if events:
+        rates = _curves(trials, lambda it: it.rate)
+        yield (
+            over_time(rates, "positive events/s", simulated=simulated),
+            "Positive events per second, in bins of 0.1 s.",
+        )
+    moved = _curves(trials, lambda it: it.moved)
+    yield (
+        over_time(moved, "moved (mm)", simulated=simulated),
+        "Mean displacement of the markers along the slide.",
+    )
+    of_pilot = np.stack([it.slips_s for it in trials.pilot])
+    twin, before = (
+        np.nanmedian([[it.slips_s for it in world] for world in worlds], axis=0)
+        for worlds in (trials.twin, trials.before)
+    )
+    yield (
+        slip_order(of_pilot, twin, before, trials.rings, simulated=simulated),
+        "Time of each marker's slip in each test trial, since the slide began: median of the "
+        "worlds, over the pilot's.",
+    )
+    if events:
+        means = (
+            np.mean([it.map for world in worlds for it in world if it.map is not None], axis=0)
+            for worlds in ([trials.pilot], trials.twin, trials.before)
+        )
+        yield (
+            maps(*means, simulated=simulated),
+            "Positive events of the slides in the middle of the event camera's picture.",
+        )
 
 
 @dataclass(frozen=True)
@@ -74,6 +104,21 @@ class Curves:
     pilot: Array
     twin: Array
     before: Array
+
+
+def _curves(trials: SameTrials, of: Callable[[Shown], Course | None]) -> list[Curves]:
+    """Return a course of the first trials, the worlds' at the times of the pilot's."""
+    found = []
+    for k, trial in enumerate(trials.pilot[:PANELS]):
+        own = of(trial)
+        theirs = [[of(world[k]) for world in worlds] for worlds in (trials.twin, trials.before)]
+        if own is not None:
+            aligned = (
+                np.stack([np.interp(own[0], *course) for course in courses if course is not None])
+                for courses in theirs
+            )
+            found.append(Curves(trial.trial, *own, *aligned))
+    return found
 
 
 def over_time(panels: Sequence[Curves], label: str, *, simulated: bool) -> str:

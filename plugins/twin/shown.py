@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sliplab.plugins.twin.document import QuantityCompared
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.storage.streams import F64
 
@@ -148,48 +149,43 @@ def show(trial: PilotTrial) -> Shown:
 
 
 @dataclass(frozen=True)
-class Compared:
-    """One quantity of the test trials: the pilot's, the twin's and the rig's as it was.
+class SameTrials:
+    """Test trials of a pilot, and the same trials in simulated worlds.
 
     Attributes:
-        name: of `QUANTITIES`. pilot: mean over the trials.
-        twin, before: mean difference from the pilot, of worlds of the twin, and of the rig file.
-        scatter: standard deviation of a trial's difference between two worlds of the twin.
+        twin, before: worlds of the twin, and of the rig file as it was.
+        rings: layer of each marker, (m,). streams: that the pilot has.
     """
 
-    name: str
-    pilot: float
-    twin: float
-    before: float
-    scatter: float
+    pilot: Sequence[Shown]
+    twin: Sequence[Sequence[Shown]]
+    before: Sequence[Sequence[Shown]]
+    rings: F64
+    streams: frozenset[str]
 
 
-def compare(
-    pilot: Sequence[Shown], twin: Sequence[Sequence[Shown]], before: Sequence[Sequence[Shown]]
-) -> list[Compared]:
-    """Compare the same trials of a pilot and of several worlds, quantity by quantity.
-
-    Args:
-        pilot: test trials. twin, before: worlds, each with these trials in this order.
-    """
-    real = _table(pilot)
-    of_twin = {name: np.stack([_table(world)[name] for world in twin]) for name in QUANTITIES}
-    of_rig = {name: np.stack([_table(world)[name] for world in before]) for name in QUANTITIES}
+def compare(trials: SameTrials) -> tuple[QuantityCompared, ...]:
+    """Compare the trials of a pilot and of several worlds, quantity by quantity."""
+    if not trials.pilot:
+        return ()
+    real = _table(trials.pilot)
+    of_twin, of_rig = ([_table(world) for world in it] for it in (trials.twin, trials.before))
     found = []
-    for name in QUANTITIES:
+    for name, title in QUANTITIES.items():
         if np.isnan(real[name]).all():
             continue
+        twin, before = (np.stack([table[name] for table in it]) for it in (of_twin, of_rig))
         with np.errstate(all="ignore"):
             found.append(
-                Compared(
-                    name,
-                    float(np.nanmean(real[name])),
-                    float(np.nanmean(of_twin[name] - real[name])),
-                    float(np.nanmean(of_rig[name] - real[name])),
-                    float(np.sqrt(np.nanmean(np.nanvar(of_twin[name], axis=0, ddof=1)))),
+                QuantityCompared(
+                    title=title,
+                    pilot=float(np.nanmean(real[name])),
+                    twin=float(np.nanmean(twin - real[name])),
+                    before=float(np.nanmean(before - real[name])),
+                    scatter=float(np.sqrt(np.nanmean(np.nanvar(twin, axis=0, ddof=1)))),
                 )
             )
-    return found
+    return tuple(found)
 
 
 def _table(trials: Sequence[Shown]) -> Mapping[str, F64]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import (
     BaseModel,
@@ -26,7 +26,9 @@ from pydantic_core.core_schema import no_info_plain_validator_function
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
-from sliplab.storage.streams import Json
+
+if TYPE_CHECKING:  # loads numpy
+    from sliplab.storage.streams import Json
 
 Int = Annotated[int, Strict(), _Field(ge=-(2**63), lt=2**63)]
 """A whole number of 64 bits; 1.0 and true are none."""

@@ -93,6 +93,14 @@ def test_terminal_shows_tables_and_lines(tmp_path: Path) -> None:
     assert f"page: {tmp_path / 'out' / 'rates.html'}" in done.output.replace("\n", "")
 
 
+def test_json_names_further_files_and_lines_stand_beside_it(tmp_path: Path) -> None:
+    made = study(tmp_path, named={"folder": tmp_path})
+    done = CliRunner().invoke(study_app(made), ["--json"])
+    assert json.loads(done.stdout)["folder"] == str(tmp_path)
+    assert "rates of the hold" in done.stderr
+    assert "rate (1/s)" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("ends", "code"), [({"failed": True}, 1), ({"error": InputError("--trials", "", 2, "no")}, 1)]
 )
@@ -105,6 +113,7 @@ def test_what_fails_has_its_files_all_the_same(
     assert (tmp_path / "out" / "friction.json").exists()
     if "error" in ends:
         assert done.exception is ends["error"]
+        assert not done.output
 
 
 def test_lists_in_lists_become_tables_with_the_cells_above_them() -> None:

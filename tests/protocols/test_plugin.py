@@ -44,7 +44,7 @@ def test_a_command_of_the_core_loads_no_plug_in(tmp_path: Path) -> None:
     assert loaded("plan", "pilot", "--json") == []
     options = ("--rig", "mock", "--store", str(tmp_path / "store"), "--trials", "1")
     assert loaded("collect", "pilot", *options) == []
-    assert "sliplab.plugins.bench.command" in loaded("bench", "--help")
+    assert "sliplab.plugins.bench.study" in loaded("bench", "--help")
     assert "sliplab.plugins.bench.run" not in loaded("bench", "--help")
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
+MOST_OPEN = 0.5
+"""A claim that is open at the end of more campaigns than this share is out of the plan's reach."""
+
 
 class Spread(Part):
     """A number of trials over the drawn campaigns; null: more than the plan has."""
@@ -44,6 +47,11 @@ class ClaimPower(Part):
     """Of each condition that would call it, where most campaigns of the plan do not: by widths that
     fall with the root of the number of trials, an estimate; null: not needed, or unknown."""
     widths: tuple[WidthLine, ...]
+
+    @property
+    def out_of_reach(self) -> bool:
+        """True where most campaigns of the plan do not call it."""
+        return self.never > MOST_OPEN
 
 
 class CurvePoint(Part):

@@ -10,7 +10,7 @@ import numpy as np
 
 from sliplab.plugins.claims.document import ClaimState
 from sliplab.plugins.claims.evidence import Grid
-from sliplab.plugins.claims.power.document import ClaimPower, Spread, WidthLine
+from sliplab.plugins.claims.power.document import MOST_OPEN, ClaimPower, Spread, WidthLine
 from sliplab.plugins.claims.power.resampling import ONE_SESSION, Pilot, Sessions
 from sliplab.plugins.claims.simulated import Course, claims_of, course
 from sliplab.plugins.claims.states import is_called, states
@@ -22,8 +22,6 @@ LINES = 10
 """Number of campaigns whose widths are stored."""
 POINTS = 8
 """Looks at which they are, at most."""
-MOST_OPEN = 0.5
-"""A claim that is open at the end of more campaigns than this share is out of the plan's reach."""
 
 
 @dataclass(frozen=True)

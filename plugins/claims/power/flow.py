@@ -29,7 +29,7 @@ from sliplab.plugins.claims import trial_figures as figures
 from sliplab.plugins.claims.blocks import F64, I64
 from sliplab.plugins.claims.document import TrialFigures
 from sliplab.plugins.claims.evidence import Grid
-from sliplab.plugins.claims.power import learning, page
+from sliplab.plugins.claims.power import learning
 from sliplab.plugins.claims.power.document import Learning, PowerRecord
 from sliplab.plugins.claims.power.drawing import SHARES, Drawing, Drawn, claim_powers, spread
 from sliplab.plugins.claims.power.resampling import (
@@ -52,12 +52,10 @@ from sliplab.protocols.yaml_file import (
     raise_all,
     validate,
 )
-from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
-NAME = "power"
 FEWEST = 6
 """Trials of a pilot with a figure."""
 FEWEST_TRAINING = 8
@@ -232,22 +230,6 @@ def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
         )
     model = judging_model(plan, None)
     return foretell(request(pilot, collected(pilot), plan, model, classifier=None))
-
-
-def measure_power(asked: Request, out: Path) -> PowerRecord:
-    """Draw campaigns and write `power.html` and `power.json`.
-
-    Args:
-        out: their folder.
-
-    Raises:
-        InputError: the pilot has too few figures, or lacks levels of the protocol.
-    """
-    record = foretell(asked)
-    make_folder(out)
-    write_json(out / f"{NAME}.json", record.to_json())
-    write_text(out / f"{NAME}.html", page.render(record))
-    return record
 
 
 def foretell(asked: Request) -> PowerRecord:

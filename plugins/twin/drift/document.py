@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
+FRICTION = "scene.friction.kinetic"
+"""The parameter that a limit is for."""
+
 
 class ReferenceFit(Part):
     """A parameter as one reference trial shows it, over its value at the line's begin.
@@ -67,3 +70,13 @@ class DriftFit(Document):
     parameters: tuple[ParameterDrift, ...]
     limit_percent: Number | None
     beyond: Bool
+
+    @property
+    def friction(self) -> ParameterDrift:
+        """The parameter that a limit is for."""
+        return next(it for it in self.parameters if it.key == FRICTION)
+
+    @property
+    def identified(self) -> list[ParameterDrift]:
+        """Parameters that single references tell of."""
+        return [it for it in self.parameters if it.identified]

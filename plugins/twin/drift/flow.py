@@ -12,15 +12,13 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from time import monotonic
 
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import orchestration
-from sliplab.plugins.twin.drift import page
-from sliplab.plugins.twin.drift.document import DriftFit, ParameterDrift, ReferenceFit
+from sliplab.plugins.twin.drift.document import FRICTION, DriftFit, ParameterDrift, ReferenceFit
 from sliplab.plugins.twin.drift.estimates import FEWEST, Drift, drifts
 from sliplab.plugins.twin.parameters import PARAMETERS, Parameter, value_of
 from sliplab.plugins.twin.pilot import PilotTrial
@@ -37,12 +35,9 @@ from sliplab.plugins.twin.worlds import (
 from sliplab.protocols import Trial
 from sliplab.protocols.shown import plural
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.files import write_json, write_text
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
 
-FRICTION = "scene.friction.kinetic"
-"""The parameter that a limit is for."""
 MADE = frozenset(
     {
         "scene.friction.papilla_scatter",
@@ -164,22 +159,20 @@ def calibrate_drift(
     store: Store,
     item: Collected,
     rig: RigFile,
-    out: Path,
     *,
     worlds: int,
     spread: float,
     seed: int,
     limit_percent: float | None = None,
 ) -> DriftFit:
-    """Fit a campaign's references one by one; write `drift.html` and `drift.json`.
+    """Fit a campaign's references one by one.
 
     Args:
-        out: their folder. worlds, spread, seed: see `Prior`.
-        limit_percent: largest change of friction.
+        worlds, spread, seed: see `Prior`. limit_percent: largest change of friction.
 
     Raises:
         InputError: the campaign was imported.
-        StoreError: see `read_references`; or friction has a limit and is not identified.
+        StoreError: see `read_references`.
     """
     began = monotonic()
     orchestration.configure_prefect(store.folder)
@@ -191,7 +184,7 @@ def calibrate_drift(
         for it, one in zip(prior.parameters, found, strict=True)
     )
     friction = next(it for it in parameters if it.key == FRICTION)
-    fit = DriftFit(
+    return DriftFit(
         simulated=bool(item.info.get("simulated")),
         campaign=item.name,
         rig=rig.name,
@@ -204,15 +197,6 @@ def calibrate_drift(
         limit_percent=limit_percent,
         beyond=limit_percent is not None and beyond(friction, limit_percent),
     )
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "drift.json", fit.to_json())
-    write_text(out / "drift.html", page.render(fit))
-    if limit_percent is not None and not friction.identified:
-        raise StoreError(
-            f"campaign '{item.name}': its single references do not tell of friction, which --limit "
-            f"is for: press deeper or slide further in collection.references ({out}/drift.html)"
-        )
-    return fit
 
 
 def parameter_drift(
@@ -258,24 +242,6 @@ def parameter_drift(
 def beyond(it: ParameterDrift, limit_percent: float) -> bool:
     """Return whether a parameter changed by more than a limit, its whole interval being beyond."""
     return it.identified and (it.change_low > limit_percent or it.change_high < -limit_percent)
-
-
-def verdict(fit: DriftFit) -> str:
-    """Return the verdict on the drift as text."""
-    friction = next(it for it in fit.parameters if it.key == FRICTION)
-    simulated = "simulated " if fit.simulated else ""
-    found = (
-        f"campaign '{fit.campaign}': {friction.title} changed by {friction.change_percent:+.1f} % "
-        f"(95 %: {friction.change_low:+.1f} to {friction.change_high:+.1f}) over "
-        f"{len(friction.references)} {simulated}reference trials; at most {fit.limit_percent:g} % "
-        "is allowed"
-    )
-    if not fit.beyond:
-        return f"{found}: within, or not surely beyond"
-    return (
-        f"{found}. The skin wears: look at it, clean or change it, and take the trials since then "
-        "again with `sliplab again`"
-    )
 
 
 def _percent(logarithm: float) -> float:

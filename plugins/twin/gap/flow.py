@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.evaluation.trials import Judged, judge, summaries
@@ -26,20 +25,17 @@ from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running import console
 from sliplab.flows.train import train
-from sliplab.plugins.twin.document import Behind, GapNetwork, TwinGap
+from sliplab.plugins.twin.document import TITLES, Behind, GapNetwork, TrainedOn, TwinGap
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file, write_drawn
-from sliplab.plugins.twin.gap import page
 from sliplab.plugins.twin.gap.scores import behind, macro_f1
 from sliplab.protocols import InputError, Plan, load_plan
 from sliplab.protocols.settings import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import read_rig, rig_path, rig_yaml
-from sliplab.storage.files import make_folder, write_json, write_text
+from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.trials.store import Store, StoreError
 
-NAME = "gap"
 TRAINING = ("train", "validation")
-TrainedOn = Literal["own", "twin", "drawn", "assumed"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +105,7 @@ def request(
 
 
 def measure_gap(wanted: Gap) -> TwinGap:
-    """Train what is missing and test all networks; write the page and the numbers.
+    """Train what is missing and test all networks.
 
     Raises:
         StoreError: a tested trial has no label, or a folder holds trials of another twin.
@@ -117,11 +113,11 @@ def measure_gap(wanted: Gap) -> TwinGap:
     make_folder(wanted.out)
     networks = [*own_network(wanted)]
     for name, run_requests in requests(wanted).items():
-        console.say(f"network of {page.TITLES[name]} (simulated)")
+        console.say(f"network of {TITLES[name]} (simulated)")
         networks.append(simulated_network(name, run_requests))
     judged = [tested(wanted, network.model) for network in networks]
     first = judged[0]
-    found = TwinGap(
+    return TwinGap(
         simulated=any(item.info.get("simulated") for item in wanted.tested),
         campaigns=tuple(item.name for item in wanted.tested),
         trials=len(first.rows),
@@ -132,9 +128,6 @@ def measure_gap(wanted: Gap) -> TwinGap:
             for network, one in zip(networks, judged, strict=True)
         ),
     )
-    write_json(wanted.out / f"{NAME}.json", found.to_json())
-    write_text(wanted.out / f"{NAME}.html", page.render(found))
-    return found
 
 
 def own_network(wanted: Gap) -> Iterator[Trained]:

@@ -126,12 +126,17 @@ def test_the_command_prints_what_it_writes(folder: Path) -> None:
     done = here("bench", *NAMES, "--small", "--folder", folder, "--json")
     assert done.returncode == 0, done.stderr
     data = json.loads(done.stdout)
+    assert data.pop("page") == str(folder / "bench.html")
     assert data == json.loads((folder / "bench.json").read_text())
     assert data["simulated"] is True
     assert "simulated" in (folder / "bench.svg").read_text()
+    page = (folder / "bench.html").read_text()
+    assert all(
+        text in page for text in ("simulated", "over 2 test worlds", "<svg", "decision (us)")
+    )
     shown = here("bench", *NAMES, "--small", "--folder", folder)
     assert "bench 1, small, seed 1 (simulated)" in shown.stdout
-    said = " ".join(shown.stdout.split())
+    said = " ".join(shown.stderr.split())
     assert "over 2 test worlds and 1 with nuisances; below 24 trials or worlds, here 1" in said
     for row in data["detectors"]:
         assert row["curve"][0]["test"]["worlds"] == 2

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
-from sliplab.plugins.reflex.page import render
 from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
+from sliplab.plugins.reflex.study import STUDY
 
 T_MS = np.arange(0.0, 1000.0).tolist()
 
@@ -115,7 +115,7 @@ def test_the_page_says_that_it_is_simulated_and_holds_every_row() -> None:
         rows=reflex_rows(trials.values()),
         trials=trials,
     )
-    text = render(study)
+    text = STUDY.render(study)
     for part in ("simulated", "grip:0.4 (network)", "3 of 3 (29 to 100 %)", "no reflex", "p99"):
         assert part in text
     again = ReflexStudy.model_validate(study.to_json())
@@ -133,4 +133,4 @@ def test_a_study_without_a_reflex_has_a_page() -> None:
         rows=reflex_rows(trials.values()),
         trials=trials,
     )
-    assert "Reaction time" not in render(study)
+    assert "Reaction time" not in STUDY.render(study)

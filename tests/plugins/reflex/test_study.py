@@ -12,10 +12,12 @@ import yaml
 
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.live import counting_of
+from sliplab.analysis.study import Finding
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome
-from sliplab.plugins.reflex import study
+from sliplab.plugins.reflex import flow
 from sliplab.plugins.reflex.rows import reflex_rows
+from sliplab.plugins.reflex.study import STUDY
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
 from tests.command_line import here
@@ -43,15 +45,15 @@ def said(state: int) -> np.ndarray:
 def test_who_cries_always_or_never_is_at_the_bottom(
     model: Path, fast: Path, tmp_path: Path
 ) -> None:
-    asked = study.request(model, RIG, tmp_path, fast, ("stop", "grip:0.4"))
+    asked = flow.request(model, RIG, tmp_path, fast, ("stop", "grip:0.4"))
     name = next(iter(asked.requests))
     bare = [case for case in asked.cases if case.reflex is None]
     countings = {"always": lambda x: said(1), "never": lambda x: said(0)}
-    trials = [study.measure(asked, case, {}) for case in bare]
+    trials = [flow.measure(asked, case, {}) for case in bare]
     for detector, counting in countings.items():
         for case in asked.cases:
             if case.reflex is not None:
-                made = study.measure(asked, case, {name: counting})
+                made = flow.measure(asked, case, {name: counting})
                 trials.append(made.model_copy(update={"detector": detector}))
     rows = {(row.detector, row.reflex): row for row in reflex_rows(trials)}
     assert rows[None, None].dropped == 1
@@ -67,9 +69,9 @@ def test_what_was_done_is_kept_and_not_done_again(
 ) -> None:
     """A stop after the first trial loses it not; another reflex adds to what there is."""
     measured: list[str] = []
-    measure = study.measure
+    measure = flow.measure
 
-    def counting(asked: study.Request, case: study.Case, *rest: object) -> object:
+    def counting(asked: flow.Request, case: flow.Case, *rest: object) -> object:
         if measured and measured[-1] == "stop":
             measured.append("go")
             raise KeyboardInterrupt
@@ -77,15 +79,16 @@ def test_what_was_done_is_kept_and_not_done_again(
         measured.append(case.reflex or "none")
         return made
 
-    monkeypatch.setattr(study, "measure", counting)
-    asked = study.request(model, RIG, tmp_path, fast, ("stop", "press:0.2"))
+    monkeypatch.setattr(flow, "measure", counting)
+    asked = flow.request(model, RIG, tmp_path, fast, ("stop", "press:0.2"))
     with pytest.raises(KeyboardInterrupt):
-        study.measure_reflexes(asked)
+        flow.measure_reflexes(asked)
     assert measured == ["none", "stop", "go"]
-    found = study.measure_reflexes(asked)
+    found = flow.measure_reflexes(asked)
     assert measured == ["none", "stop", "go", "press:0.2"]
     assert [row.reflex for row in found.rows] == [None, "stop", "press:0.2"]
-    again = study.measure_reflexes(replace(asked, cases=asked.cases[:2]))
+    STUDY.write(Finding(found, tmp_path))
+    again = flow.measure_reflexes(replace(asked, cases=asked.cases[:2]))
     assert len(measured) == 4
     assert [row.reflex for row in again.rows] == [None, "stop"]
     assert (tmp_path / "reflex.html").is_file()
@@ -97,18 +100,18 @@ def test_a_store_has_all_its_detectors(
     """Each at its level and stride; one reacts in a trial, and another one's name is refused."""
     place = ran[0][0].store
     rule, tuned = "network", "cusum counts"
-    asked = study.request(place, RIG, tmp_path, fast, ("stop",), detectors=[rule, tuned])
+    asked = flow.request(place, RIG, tmp_path, fast, ("stop",), detectors=[rule, tuned])
     assert [it.detector for it in asked.cases] == [None, rule, tuned]
     assert isinstance(asked.requests[rule].detection, Detection)
     found = asked.requests[tuned]
     assert isinstance(found.detection, Tuned)
     assert found.stride_ms == 10
     counting = counting_of(found.fitted)
-    made = [study.measure(asked, case, {tuned: counting}) for case in asked.cases[::2]]
+    made = [flow.measure(asked, case, {tuned: counting}) for case in asked.cases[::2]]
     assert made[0].detected_ms is None
     assert made[1].detected_ms is not None
     with pytest.raises(InputError, match="must be one of network, paper, smoothing, "):
-        study.request(place, RIG, tmp_path, fast, detectors=["smooth"])
+        flow.request(place, RIG, tmp_path, fast, detectors=["smooth"])
     keys = {it.key for it in asked.cases}
     assert len(keys) == len(asked.cases)
 
@@ -156,8 +159,8 @@ def test_wrong_input_is_said(model: Path, fast: Path, tmp_path: Path) -> None:
         (model, RIG, fast, ("press:9",), "at most press:"),
     ):
         with pytest.raises(InputError, match=right):
-            study.request(place, rig, tmp_path / "out", protocol, reflexes)
-    assert [case.reflex for case in study.request(model, Path("mock"), tmp_path, fast).cases] == [
+            flow.request(place, rig, tmp_path / "out", protocol, reflexes)
+    assert [case.reflex for case in flow.request(model, Path("mock"), tmp_path, fast).cases] == [
         None,
         "stop",
         "press:0.4",

@@ -17,20 +17,22 @@ from jsonschema import Draft7Validator
 from typer.testing import CliRunner
 
 import sliplab
-from sliplab.analysis.campaigns import collected
-from sliplab.flows.cli.app import app
+from sliplab.analysis.campaigns import Collected, collected
+from sliplab.flows.cli.app import command_line
 from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.schema import file_schema
 from sliplab.flows.scene_runs import changed
 from sliplab.plugins.twin import calibrate, worlds
 from sliplab.plugins.twin.camera_estimates import NOISE_TREND
-from sliplab.plugins.twin.document import MisfitCheck, TwinFit
+from sliplab.plugins.twin.document import MisfitCheck, ParameterFit, TwinFit
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file
 from sliplab.plugins.twin.misfits import CHECKS
 from sliplab.plugins.twin.parameters import PARAMETERS, value_of
 from sliplab.plugins.twin.pilot import pilot_trial, slide_of
 from sliplab.plugins.twin.pilots import Pilot, read_pilot, simulate_pilot
+from sliplab.plugins.twin.shown import SameTrials
 from sliplab.plugins.twin.statistics import Statistics
+from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
@@ -55,6 +57,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def requested(tmp_path: Path, **changes: Any) -> calibrate.Calibration:
     wanted = {"worlds": 100, "spread": 0.5, "seed": 1} | changes
     return calibrate.request(Path("rehearsal"), tmp_path / "twin.yaml", **wanted)
+
+
+def fitted(store: Store, item: Collected, wanted: calibrate.Calibration) -> TwinFit:
+    """Fit a twin, and write all its files."""
+    fit, trials = calibrate.calibrate_scene(store, item, wanted)
+    STUDY.write(finding(wanted.out, fit, trials))
+    return fit
 
 
 def answering(
@@ -132,7 +141,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     signed = {it.key: observed.effects[it.key] for it in CHECKS if it.signed}
     shown = answering(wanted, finite, EFFECTS | signed)
     monkeypatch.setattr(worlds.World, "statistics", shown)
-    fit = calibrate.calibrate_scene(store, item, wanted)
+    fit = fitted(store, item, wanted)
     known = [it for it in fit.parameters if it.identified]
     assert len(known) == len(wanted.prior.parameters)
     for it in known:
@@ -186,7 +195,7 @@ def test_no_interval_where_a_misfit_touches_its_parameter(
     monkeypatch.setattr(worlds.World, "statistics", shown)
     drifting = replace(observed, effects=observed.effects | {NOISE_TREND: 30.0})
     monkeypatch.setattr(Pilot, "statistics", lambda *_: drifting)
-    fit = calibrate.calibrate_scene(store, item, replace(wanted, needs=False))
+    fit = fitted(store, item, replace(wanted, needs=False))
     title = "noise of the event camera drifts during the pilot"
     assert [check.title for check in fit.checks if check.found] == [title]
     withheld = {it.key for it in fit.parameters if it.withheld}
@@ -220,7 +229,7 @@ def test_what_is_not_told_keeps_the_rigs_value(
     monkeypatch.setattr(
         Pilot, "statistics", lambda *_: Statistics({"only": 2.0}, dict.fromkeys(EFFECTS, 100.0))
     )
-    fit = calibrate.calibrate_scene(store, item, wanted)
+    fit = fitted(store, item, wanted)
     assert [it.key for it in fit.parameters if it.identified] == [PARAMETERS[0].key]
     for it in fit.parameters[1:]:
         assert it.value == it.assumed
@@ -252,6 +261,19 @@ def test_a_misfit_ends_with_exit_code_1(
         share=1e-6,
         found=True,
     )
+    friction = ParameterFit(
+        key="scene.friction.kinetic",
+        title="kinetic friction",
+        unit="",
+        assumed=0.8,
+        value=0.7,
+        low=None,
+        high=None,
+        least=0.5,
+        most=1.2,
+        identified=True,
+        withheld=(line.title,),
+    )
     fit = TwinFit(
         simulated=True,
         campaign="pilot",
@@ -262,17 +284,20 @@ def test_a_misfit_ends_with_exit_code_1(
         worlds=100,
         predicted=2,
         seconds=1.0,
-        parameters=(),
+        parameters=(friction,) * 9,
         statistics={},
         checks=(line,),
     )
-    monkeypatch.setattr(calibrate, "calibrate_scene", lambda *_: fit)
+    trials = SameTrials((), (), (), np.zeros(19), frozenset())
+    monkeypatch.setattr(calibrate, "calibrate_scene", lambda *_: (fit, trials))
     asked = ["calibrate", "scene", str(store.folder), "--rig", "rehearsal"]
     asked += ["--out", str(tmp_path / "twin.yaml")]
     for json in ([], ["--json"]):
-        done = CliRunner().invoke(app, [*asked, *json])
+        done = CliRunner().invoke(command_line(), [*asked, *json])
         assert done.exit_code == 1
         assert "light that flickers" in done.stdout + done.stderr
+    assert "light that flickers" in (tmp_path / "twin.html").read_text()
+    assert TwinFit.load(tmp_path / "twin.json") == fit
 
 
 def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
@@ -294,7 +319,7 @@ def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
         folder = tmp_path / level
         sliplab.collect("pilot", rig=rig, store=folder, trials=1)
         said = CliRunner().invoke(
-            app,
+            command_line(),
             [
                 "calibrate",
                 "scene",
@@ -328,7 +353,7 @@ def test_a_hidden_rig_is_found(tmp_path: Path) -> None:
     sliplab.collect("pilot", rig=hidden, store=tmp_path / "store").label()
     store = Store(tmp_path / "store")
     (item,) = collected(store, None)
-    fit = calibrate.calibrate_scene(store, item, requested(tmp_path))
+    fit = fitted(store, item, requested(tmp_path))
     found = {it.key: it for it in fit.parameters}
     for key, value in values.items():
         assert found[key].identified, key

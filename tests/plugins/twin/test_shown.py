@@ -7,6 +7,8 @@ import pytest
 
 from sliplab.plugins.twin.pilot import Camera, Forces, PilotTrial, Slide
 from sliplab.plugins.twin.shown import (
+    QUANTITIES,
+    SameTrials,
     Shown,
     compare,
     event_map,
@@ -82,10 +84,11 @@ def test_worlds_are_compared_trial_by_trial() -> None:
     pilot = shown(1.0, 1.4)
     twin = [shown(1.1, 1.5), shown(0.9, 1.3)]
     before = [shown(1.5, 1.9)] * 2
-    first = compare(pilot, twin, before)[0]
-    assert first.name == "first_slip_s"
+    found = compare(SameTrials(pilot, twin, before, np.zeros(3), frozenset()))
+    first = found[0]
+    assert first.title == QUANTITIES["first_slip_s"]
     assert first.pilot == pytest.approx(1.3)
     assert first.twin == pytest.approx(0.0, abs=1e-9)
     assert first.before == pytest.approx(0.5)
     assert first.scatter == pytest.approx(0.2 / np.sqrt(2))
-    assert "hold_events_per_s" not in {it.name for it in compare(pilot, twin, before)}
+    assert QUANTITIES["hold_events_per_s"] not in {it.title for it in found}

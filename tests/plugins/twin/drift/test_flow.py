@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 
 import sliplab
 from sliplab.analysis.campaigns import Collected, collected
-from sliplab.flows.cli.app import app
+from sliplab.flows.cli.app import command_line
 from sliplab.flows.planning.schema import file_schema
 from sliplab.plugins.twin import worlds
 from sliplab.plugins.twin.calibrate import fitted_rig
 from sliplab.plugins.twin.drift import flow as drift
-from sliplab.plugins.twin.drift.document import DriftFit
+from sliplab.plugins.twin.drift.document import FRICTION, DriftFit
 from sliplab.plugins.twin.parameters import value_of
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.statistics import Statistics
@@ -87,7 +87,7 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
 
     def reference(slides: Sequence[PilotTrial], *_: Any) -> Statistics:
         values = {it.key: value_of(rig.scene, it) for it in prior.parameters}
-        values[drift.FRICTION] *= friction[slides[0].trial]
+        values[FRICTION] *= friction[slides[0].trial]
         return of(values, np.random.default_rng(int(1e6 * friction[slides[0].trial])))
 
     def everywhere(title: str, work: Any, jobs: Sequence[Any], done: Any = None) -> list[Any]:
@@ -117,11 +117,11 @@ def test_friction_that_falls_is_found_and_nothing_else(
         str(tmp_path / "out"),
         "--json",
     ]
-    done = CliRunner().invoke(app, [*words, "--limit", "20"])
+    done = CliRunner().invoke(command_line(), [*words, "--limit", "20"])
     assert done.exit_code == 0, done.output
     fit = DriftFit.load(tmp_path / "out" / "drift.json")
-    assert [it.key for it in fit.parameters if it.changed] == [drift.FRICTION]
-    friction = next(it for it in fit.parameters if it.key == drift.FRICTION)
+    assert [it.key for it in fit.parameters if it.changed] == [FRICTION]
+    friction = fit.friction
     expected = 100.0 * (min(worn.values()) - 1.0)
     assert friction.change_low < expected < friction.change_high
     assert friction.change_percent == pytest.approx(expected, abs=0.5)
@@ -140,7 +140,7 @@ def test_a_limit_that_is_exceeded_is_exit_1(
     store: Store, worn: dict[str, float], tmp_path: Path
 ) -> None:
     done = CliRunner().invoke(
-        app,
+        command_line(),
         [
             "calibrate",
             "drift",
@@ -162,11 +162,11 @@ def test_a_limit_that_is_exceeded_is_exit_1(
     assert "more than 5" in (tmp_path / "drift.html").read_text()
 
 
-def fitted(folder: Path, out: Path) -> None:
+def fitted(folder: Path) -> None:
     rig, _ = load_rig_file(Path("rehearsal"))
     store = Store(folder)
     (item,) = collected(store, None)
-    drift.calibrate_drift(store, item, rig, out, worlds=100, spread=0.5, seed=1)
+    drift.calibrate_drift(store, item, rig, worlds=100, spread=0.5, seed=1)
 
 
 def test_a_campaign_without_references_to_fit_is_refused(tmp_path: Path) -> None:
@@ -177,11 +177,11 @@ def test_a_campaign_without_references_to_fit_is_refused(tmp_path: Path) -> None
         str(write(tmp_path / "a.yaml", without)), rig=rig, store=tmp_path / "a", trials=1
     )
     with pytest.raises(StoreError, match="has 0 reference trials, and a trend takes 3"):
-        fitted(tmp_path / "a", tmp_path)
+        fitted(tmp_path / "a")
     protocol = write(tmp_path / "b.yaml", with_references(2, "1 mm"))
     sliplab.collect(str(protocol), rig=rig, store=tmp_path / "b", trials=1)
     with pytest.raises(StoreError, match="has no label yet; run `sliplab label` first"):
-        fitted(tmp_path / "b", tmp_path)
+        fitted(tmp_path / "b")
     with pytest.raises(InputError, match="must be a simulated rig with driver: mock"):
         fitted_rig(Path("ur5"))
 
@@ -191,9 +191,9 @@ def test_imported_campaigns_and_other_motions_have_no_drift(
 ) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     words = ["import", tmp_path / "slide.h5", "--store", tmp_path / "s", "--name", "theirs"]
-    assert CliRunner().invoke(app, [*map(str, words)]).exit_code == 0
+    assert CliRunner().invoke(command_line(), [*map(str, words)]).exit_code == 0
     with pytest.raises(StoreError, match="imported without an adapter"):
-        fitted(tmp_path / "s", tmp_path)
+        fitted(tmp_path / "s")
     (item,) = collected(store, None)
     monkeypatch.setattr(drift, "read_slide", lambda *_: None)
     with pytest.raises(StoreError, match="is no straight slide"):
@@ -221,14 +221,14 @@ def change(tmp_path: Path, seed: int, per_m: float, limit: float | None = None) 
     base, _ = load_rig_file(base_file)
     (item,) = collected(Store(store), None)
     return drift.calibrate_drift(
-        Store(store), item, base, tmp_path, worlds=150, spread=0.5, seed=1, limit_percent=limit
+        Store(store), item, base, worlds=150, spread=0.5, seed=1, limit_percent=limit
     )
 
 
 @pytest.mark.long
 def test_wear_of_a_skin_is_found_in_its_size(tmp_path: Path) -> None:
     fit = change(tmp_path, 7, -0.5, 5.0)
-    friction = next(it for it in fit.parameters if it.key == drift.FRICTION)
+    friction = fit.friction
     # 44 slides of 9 mm, in which a tip lags behind by some 3 mm: 0.26 m, and 0.24 m by the last
     # reference
     assert friction.identified

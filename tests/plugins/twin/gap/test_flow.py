@@ -12,6 +12,7 @@ import yaml
 from jsonschema import Draft7Validator
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.study import Finding
 from sliplab.flows.judge_network import judge_model
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.planning.schema import file_schema
@@ -19,6 +20,7 @@ from sliplab.flows.study import Outcome
 from sliplab.plugins.twin.document import TwinGap
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file, write_samples
 from sliplab.plugins.twin.gap import flow as gap
+from sliplab.plugins.twin.gap.study import STUDY
 from sliplab.plugins.twin.posterior import Estimate, Posterior
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols import InputError
@@ -96,6 +98,7 @@ def found(wanted: gap.Gap) -> TwinGap:
         assert {path.relative_to(wanted.out).parts[0] for path in before} == {"twin"}
         patch.setattr(gap, "train", train)
         measured = gap.measure_gap(wanted)
+    STUDY.write(Finding(measured, wanted.out))
     assert before.items() <= made(wanted.out).items()
     return measured
 
