@@ -24,7 +24,7 @@ class ExportRequest:
     """What is exported, and where to.
 
     Attributes:
-        place: a store's folder or URL, or a model's file.
+        place: a store's folder, or a model's file.
         part: a campaign or a trial of the store; empty: all of it.
         form: name of the form. output: folder or file to write.
         options: those that were given, by name.
@@ -93,8 +93,8 @@ def known_export(name: str) -> Export:
     return found
 
 
-def run_export(request: ExportRequest) -> Exported:
-    """Check a request, and write it.
+def check_export(request: ExportRequest) -> Export:
+    """Return the form of a request that is right.
 
     Raises:
         InputError: an option that the form does not take, or a part that is missing or too much.
@@ -112,15 +112,14 @@ def run_export(request: ExportRequest) -> Exported:
     if form.of != "trials" and request.part:
         text = f"is too much: --as {request.form} is of {TITLES[form.of]}"
         raise InputError("PART", "", request.part, text)
-    return form.write(request)
+    return form
 
 
 def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     """Return a store, a campaign of it, and the trials that are asked for."""
-    from sliplab.flows.cli.common import located
     from sliplab.storage.remote.mirror import open_store
 
-    folder, part = located(request.place), request.part
+    folder, part = Path(request.place), request.part
     opened = open_store(folder)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
     if part in campaigns:

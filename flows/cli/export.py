@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import DATA, JsonOption, finish
+from sliplab.flows.cli.common import DATA, JsonOption, finish, located
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import one_of
@@ -99,9 +100,12 @@ def export(
 
 def write(request: ExportRequest, as_json: bool) -> None:
     """Run an export and print its result."""
-    from sliplab.flows.exports import run_export
+    from sliplab.flows.exports import check_export
 
-    done = run_export(request)
+    form = check_export(request)
+    if form.of != "model":
+        request = replace(request, place=str(located(request.place)))
+    done = form.write(request)
     finish(done.result if as_json or done.pairs is None else done.pairs, done.title, as_json)
 
 

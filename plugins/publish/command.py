@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption, PlaceArgument, located
+from sliplab.flows.cli.common import CampaignOption, JsonOption, PlaceArgument
 from sliplab.flows.cli.export import former
 from sliplab.flows.exports import Export, Exported, ExportRequest
 from sliplab.flows.running import console
@@ -48,7 +48,7 @@ def write(request: ExportRequest) -> Exported:
     from sliplab.storage.remote.mirror import open_store
 
     options = request.options
-    opened = open_store(located(request.place))
+    opened = open_store(Path(request.place))
     campaigns = _campaigns(opened, options.get("campaign"))
     names = ", ".join(item.name for item in campaigns)
     licence = options.get("licence")
