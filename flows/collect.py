@@ -62,12 +62,10 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
     request = run_request.content
     with (
         shown(request) as progress,
-        open_session(request) as session,
+        open_session(request, progress) as session,
         timed(Store(request.store), f"collect {request.campaign}"),
     ):
         collector, trials = session.collector, session.trials
-        collector.on_trial = progress.on_trial_done
-        session.supervisor.on_pause = progress.on_pause
         # inside a flow Prefect has installed its own handlers
         with progress.begin(trials), stopping.signals():
             collector.rig.connect()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -92,8 +93,19 @@ class _MockSimulation:
         return plate_course(world, int(world.clocks.arm.to_device(since_arm_ns)))
 
 
-def build_rig(file: RigFile) -> Rig:
+ShouldStop = Callable[[], bool]
+
+
+def never() -> bool:
+    """Return False: no stop is ever requested."""
+    return False
+
+
+def build_rig(file: RigFile, should_stop: ShouldStop = never) -> Rig:
     """Build the rig that a rig file describes; its arm is not connected yet.
+
+    Args:
+        should_stop: returns whether a stop was requested; looked at while anything moves.
 
     Raises:
         RigError: a device that must be present at this stage, such as a camera, is missing.
@@ -101,15 +113,15 @@ def build_rig(file: RigFile) -> Rig:
     """
     if file.driver == "mock":
         further = simulated_streams(file.streams)
-        return simulated_rig(file, build_mock(file.scene, file.timing, further))
+        return simulated_rig(file, build_mock(file.scene, file.timing, further), should_stop)
     assert file.devices is not None
     need_libraries(file.devices, file.streams)
     if file.driver == "loopback":
-        return _loopback_rig(file, file.devices)
-    return _real_rig(file, file.devices)
+        return _loopback_rig(file, file.devices, should_stop)
+    return _real_rig(file, file.devices, should_stop)
 
 
-def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
+def simulated_rig(file: RigFile, devices: MockDevices, should_stop: ShouldStop = never) -> Rig:
     """Build the rig that a rig file describes on the given simulated devices."""
     return Rig(
         name=file.name,
@@ -135,6 +147,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         gripper=devices.gripper,
         grip_opening_mm=file.grip_opening_mm or 0.0,
         simulation=_MockSimulation(devices),
+        should_stop=should_stop,
     )
 
 
@@ -165,36 +178,42 @@ def calibrated_arm(file: RigFile, devices: DeviceSettings) -> BaseArmSettings:
     return arm.model_copy(update={"limits": limits, "tool": tool})
 
 
-def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
+def _real_rig(file: RigFile, devices: DeviceSettings, should_stop: ShouldStop) -> Rig:
     console = ConsoleOperator()
     person = PersonAtPlate(console, devices.plate.mass_kg) if devices.plate else None
-    return _driven_rig(file, devices, person or console, person, None)
+    return _driven_rig(file, devices, person or console, person, None, should_stop)
 
 
-def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
+def _loopback_rig(file: RigFile, devices: DeviceSettings, should_stop: ShouldStop) -> Rig:
     """Build a rig of real drivers; fakes in a separate process show the simulated scene."""
     from sliplab.rigs.loopback.client import Loopback
 
     with ExitStack() as undo:
         stage = Loopback(file.scene, file.timing, devices, file.streams)
         undo.callback(stage.close)
-        rig = loopback_rig(file, stage)
-        rig.on_close = (stage.close,)
+        rig = loopback_rig(file, stage, should_stop, (stage.close,))
         undo.pop_all()
     return rig
 
 
-def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
+def loopback_rig(
+    file: RigFile,
+    stage: Loopback,
+    should_stop: ShouldStop = never,
+    on_close: tuple[Callable[[], None], ...] = (),
+) -> Rig:
     """Build a rig of real drivers on running fakes, which stay the caller's to close.
 
     Args:
         file: a `loopback` rig file with the arm and the scene that `stage` simulates.
+        on_close: called last when the rig is closed.
 
     Raises:
         RigError: a fake cannot be reached.
     """
     assert file.devices is not None
-    return _driven_rig(file, stage.reached_by(file.devices), stage, stage, stage)
+    reached = stage.reached_by(file.devices)
+    return _driven_rig(file, reached, stage, stage, stage, should_stop, on_close)
 
 
 def _driven_rig(
@@ -203,6 +222,8 @@ def _driven_rig(
     operator: Operator,
     plate: Plate | None,
     shown: Loopback | None,
+    should_stop: ShouldStop,
+    on_close: tuple[Callable[[], None], ...] = (),
 ) -> Rig:
     """Build a rig of drivers; if one fails, the others are closed again.
 
@@ -246,6 +267,8 @@ def _driven_rig(
             gripper=_gripper(devices),
             grip_opening_mm=file.grip_opening_mm or 0.0,
             simulation=shown,
+            should_stop=should_stop,
+            on_close=on_close,
         )
         undo.pop_all()
     return rig

@@ -132,8 +132,7 @@ class Measurement:
             _confirm()
         today = date.today()
         with held(self.file):
-            rig = build.build_rig(self.file)
-            rig.should_stop = stopping.requested
+            rig = build.build_rig(self.file, stopping.requested)
             try:
                 if with_arm:
                     rig.connect()

@@ -14,7 +14,7 @@ import shutil
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from typing import Protocol
@@ -58,6 +58,10 @@ from sliplab.storage.versions import RECORDING, installed_versions
 interruptible(Rig.run_trial)
 
 
+def _ignore(trial: Trial) -> None:
+    """Take no note of a trial that was committed."""
+
+
 class Rounds(Protocol):
     """Decides between two rounds of trials which are next: what the hook `more_trials` opens."""
 
@@ -89,8 +93,30 @@ class CollectionSession:
         return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
 
+class Listener(Protocol):
+    """Follows a session, such as a progress display."""
+
+    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+        """Take note of a trial that is ``committed``, ``set aside`` or ``skipped``."""
+
+    def on_pause(self, seconds: float) -> None:
+        """Take note of a pause that is over."""
+
+
+class NoListener:
+    """Follows nothing."""
+
+    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+        """Do nothing."""
+
+    def on_pause(self, seconds: float) -> None:
+        """Do nothing."""
+
+
 @contextmanager
-def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
+def open_session(
+    run_request: RunRequest, listener: Listener | None = None
+) -> Iterator[CollectionSession]:
     """Open a session for a collection; the rig is closed when the block ends.
 
     Raises:
@@ -98,30 +124,34 @@ def open_session(run_request: RunRequest) -> Iterator[CollectionSession]:
         StoreError: its disk is full, read-only or failing.
         CampaignStopped: reference trials had drifted.
     """
+    listener = listener or NoListener()
     store = Store.create(run_request.store)
     with store_lock(store, collects=run_request.campaign):
         campaign = _recover(store, run_request)
-        supervisor = CollectionSupervisor(run_request, store, campaign)
+        supervisor = CollectionSupervisor(run_request, store, campaign, on_pause=listener.on_pause)
         supervisor.begin()
         # the rig is closed before results are computed
         with (
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,
         ):
-            rig = build_rig(run_request.rig)
-            rig.should_stop = stopping.requested
+            rig = build_rig(run_request.rig, stopping.requested)
             campaign.add_bench_record(_session_record(run_request, campaign))
             collector = TrialCollector(
-                run_request.plan, run_request.rig, rig, campaign, run_request.metadata.operator
+                run_request.plan,
+                run_request.rig,
+                rig,
+                campaign,
+                run_request.metadata.operator,
+                on_trial=listener.on_trial_done,
+                on_commit=_ignore if rounds is None else rounds.committed,
+                supervisor=supervisor,
             )
-            collector.supervisor = supervisor
-            supervisor.fresh_start = collector.fresh_start
             try:
                 trials = run_request.due_trials(campaign)
                 left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
                 if rounds is not None:
                     trials = rounds.next_trials()[: run_request.most]
-                    collector.on_commit = rounds.committed
                 yield CollectionSession(collector, supervisor, trials, left_out, rounds)
             finally:
                 rig.close()
@@ -213,8 +243,8 @@ class TrialCollector:
     rig: Rig
     campaign: Campaign
     operator: str = ""
-    on_trial: Callable[[Trial, str], None] = field(default=lambda trial, outcome: None)
-    on_commit: Callable[[Trial], None] = field(default=lambda trial: None)
+    on_trial: Callable[[Trial, str], None] = NoListener().on_trial_done
+    on_commit: Callable[[Trial], None] = _ignore
     supervisor: CollectionSupervisor | None = None
     taken: int = 0
     retaken: int = 0
@@ -245,10 +275,14 @@ class TrialCollector:
         self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:
-        if self.supervisor is None or self.supervisor.may_take(trial):
+        if self.supervisor is None:
             return True
-        self.on_trial(trial, "skipped")
-        return False
+        may = self.supervisor.may_take(trial)
+        if self.supervisor.was_paused():
+            self.fresh_start()
+        if not may:
+            self.on_trial(trial, "skipped")
+        return may
 
     def _finish(self, trial: Trial, outcome: str) -> None:
         if outcome == "committed":

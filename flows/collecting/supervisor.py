@@ -36,7 +36,6 @@ class CollectionSupervisor:
     Attributes:
         wait: waits some seconds, and answers stop requests.
         on_pause: called with the seconds of a pause when it is over.
-        fresh_start: called after a pause: the rig may have changed.
         clock: returns seconds since 1970; decides when the window ends.
     """
 
@@ -46,16 +45,17 @@ class CollectionSupervisor:
         store: Store,
         campaign: Campaign,
         disk: DiskWatch | None = None,
+        on_pause: Callable[[float], None] = lambda seconds: None,
     ) -> None:
         self._run_request, self._store, self._campaign = run_request, store, campaign
         self.disk = DiskWatch(run_request, campaign) if disk is None else disk
         self._references = ReferenceWatch(run_request, campaign)
         self.wait: Callable[[float], None] = stopping.wait
-        self.on_pause: Callable[[float], None] = lambda seconds: None
-        self.fresh_start: Callable[[], None] = lambda: None
+        self.on_pause = on_pause
         self.clock: Callable[[], float] = time.time
         self._seen: frozenset[str] = frozenset()
         self._paused: Request | None = None
+        self._was_paused = False
         self._skipped = frozenset(control.skipped(campaign))
         self._retakes: set[str] = set()
 
@@ -82,6 +82,11 @@ class CollectionSupervisor:
         self._check_window(trial)
         self.disk.check(trial)
         return True
+
+    def was_paused(self) -> bool:
+        """Return whether there was a pause since the last call: the rig may have changed."""
+        found, self._was_paused = self._was_paused, False
+        return found
 
     def after(self, trial: Trial, outcome: str) -> None:
         """Update the disk estimate and the drift check after a trial.
@@ -159,7 +164,7 @@ class CollectionSupervisor:
             waited += POLL_S
         console.say("resumed")
         self.on_pause(waited)
-        self.fresh_start()
+        self._was_paused = True
 
     def _names(self) -> frozenset[str]:
         try:

@@ -379,8 +379,8 @@ def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
     rigs: list[Rig] = []
     asked = iter([False] * 250)
 
-    def built(file: Any) -> Rig:
-        rigs.append(build_rig(file))
+    def built(file: Any, should_stop: Any) -> Rig:
+        rigs.append(build_rig(file, should_stop))
         return rigs[-1]
 
     monkeypatch.setattr("sliplab.rigs.build.build_rig", built)

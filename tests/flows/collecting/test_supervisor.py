@@ -43,7 +43,6 @@ def supervised(
     store = Store.open(folder / "store")
     run_request = make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
     work.supervisor = CollectionSupervisor(run_request, store, campaign)
-    work.supervisor.fresh_start = work.fresh_start
 
     def never(seconds: float) -> None:
         raise AssertionError("waits")
