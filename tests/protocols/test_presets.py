@@ -113,7 +113,6 @@ def test_the_network_beside_shares_data_and_differs_in_all_else() -> None:
         }
     )
     found = ours.comparison_settings()
-    assert found is not None
     for section in ("labelling", "windows", "samples", "split"):
         assert getattr(found, section) == getattr(ours, section)
     assert (found.training.epochs, found.training.seeds) == (3, (4,))

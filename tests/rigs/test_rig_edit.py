@@ -59,7 +59,6 @@ def test_only_the_entry_changes(tmp_path: Path) -> None:
     assert written.kept == tmp_path / "lab.before-2026-12-01.yaml"
     assert written.kept.read_text() == MOCK
     again = write_entries(path, path, {}, today=DAY)
-    assert again.kept is not None
     assert again.kept.name == "lab.before-2026-12-01-2.yaml"
 
 

@@ -263,7 +263,6 @@ def test_an_address_is_whole(host: str, tmp_path: Path) -> None:
 )
 def test_whole_addresses_are_taken(host: str, tmp_path: Path) -> None:
     rig, _ = load_rig_file(_real(tmp_path, _arm(host=host)))
-    assert rig.devices is not None
     assert rig.devices.arm.host == host
 
 
@@ -288,7 +287,6 @@ def test_shipped_rigs_are_in_millimetres(name: str) -> None:
 def test_the_loopback_arm_has_room_for_every_shipped_press() -> None:
     """Its own limits count from the taught plane, and depth zero may be found behind it."""
     rig = load_rig_file(ROOT / "rigs" / "loopback.yaml")[0]
-    assert rig.devices is not None
     limits = rig.devices.arm.limits
     for path in sorted((ROOT / "protocols").glob("*.yaml")):
         plan = load_plan(path)

@@ -239,7 +239,6 @@ def test_a_device_with_another_driver_takes_the_place_of_the_one_below(tmp_path:
     path = tmp_path / "mine.yaml"
     path.write_text(f"extends: {shipped_rigs()['ur5']}\nname: mine\ndevices: {{arm: {arm}}}\n")
     devices = load_rig_file(path)[0].devices
-    assert devices is not None
     assert (devices.arm.driver, devices.arm.host) == ("abb", "10.0.0.2")
     assert devices.frame_camera.trigger_line == "Line1"
 

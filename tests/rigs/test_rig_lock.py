@@ -41,8 +41,6 @@ def real() -> RigFile:
 
 def with_port(file: RigFile, host: str, port: str) -> RigFile:
     """The same rig with another arm and sync box."""
-    assert file.devices is not None
-    assert file.devices.sync_box is not None
     box = file.devices.sync_box.model_copy(update={"port": port})
     arm = file.devices.arm.model_copy(update={"host": host})
     devices = file.devices.model_copy(update={"arm": arm, "sync_box": box})
@@ -68,8 +66,6 @@ def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) ->
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    assert holder.stdout is not None
-    assert holder.stdin is not None
     try:
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(Locked) as refused, held(real()):

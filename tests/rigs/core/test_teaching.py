@@ -21,7 +21,6 @@ TRACKS = {"frame_camera": {"level": "tracks"}}
 
 
 def find(chunk: FrameChunk) -> Any:
-    assert chunk.markers_px is not None
     return chunk.markers_px.astype(np.float64)
 
 
@@ -232,7 +231,6 @@ def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose() -> None:
         jog_poses(rig, [("", "touched centre")])
     fault = {"kind": "arm_protective_stop", "at_s": 0.1, "since": "trial"}
     rig = make_rig(faults=[fault])
-    assert rig.simulation is not None
     rig.simulation.begin_trial(1)
     rig.clock.wait(0.5)
     with pytest.raises(ArmFault, match="protective stop"):

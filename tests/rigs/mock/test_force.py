@@ -220,7 +220,6 @@ def test_drawn_cross_talk_belongs_to_the_seed_and_keeps_its_share() -> None:
 def test_zero_takes_drift_and_load_away() -> None:
     rig = force_rig(force={**QUIET, "drift_n_per_min": 5.0, "bias": "trial"})
     force = rig.force
-    assert force is not None
     assert force.zeroing == "trial"
     devices = build_mock(MockSettings(force={**QUIET, "bias": "trial"}))
     go_to(devices, 2.4)
@@ -256,7 +255,6 @@ def test_its_delay_is_held_against_the_timing() -> None:
 
 def test_the_rig_that_ships_has_it() -> None:
     file, _ = load_rig_file(Path("mock-force"))
-    assert file.timing.force is not None
     assert file.timing.force.grade == "host time"
     assert file.scene.force is not None
     plain, _ = load_rig_file(Path("mock"))
@@ -282,7 +280,6 @@ def torn_rig(seed: int, delay: Delay | None = None) -> Rig:
     scene = MockSettings.model_validate(file.scene.model_dump() | changes)
     timing = file.timing
     if delay is not None:
-        assert timing.force is not None
         force = timing.force.model_copy(update={"delay": delay})
         timing = timing.model_copy(update={"force": force})
     rig = build_rig(file.model_copy(update={"mock": scene, "timing": timing}))
@@ -338,7 +335,6 @@ def steps_within(
         found = Taken(rigs[seed % 2], folder / str(seed), seed)
         off = abs(found.force_step_ns - found.event_step_ns)
         steps += off <= found.stated_ns
-        assert found.truth is not None
         pairs = np.array(found.truth["clocks"]["force"])
         force = found.sync.devices["force"]
         error = np.abs(np.asarray(force.map.to_reference(pairs[:, 0])) - pairs[:, 1])

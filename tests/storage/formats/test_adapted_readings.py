@@ -63,10 +63,8 @@ def test_readings_alone_are_a_trial(campaign: Campaign) -> None:
     assert readings.t_ns.tolist() == [round(0.127 * k * 1000) * 10**6 for k in range(30)]
     assert found.clocks.reference == "sensor1"
     span = (0, 3_683_001_000)
-    assert found.record.imported is not None
     assert (found.record.imported.span_ns, recorded_span(found)) == (span, span)
     given = found.record.imported.given
-    assert given is not None
     assert [(each.name, each.start_ns, each.end_ns) for each in given.spans] == [("hold", *span)]
     assert found.record.recorded_s == pytest.approx(3.683, abs=1e-5)
 

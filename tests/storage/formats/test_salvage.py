@@ -45,8 +45,6 @@ class Outcome:
 
     @property
     def lost(self) -> Lost | None:
-        assert self.found is not None
-        assert self.found.record.imported is not None
         return self.found.record.imported.lost
 
 
@@ -95,7 +93,6 @@ def _try(folder: Path, name: str, data: bytes) -> tuple[Outcome, Outcome]:
         assert isinstance(plain.error, DamagedFile)
         assert f"; --salvage imports {_counted(saved)} events up to " in plain.error.message
         lost = saved.lost
-        assert lost is not None
         assert 0 <= lost.at_byte <= len(data)
         assert 0 <= lost.unread_bytes <= len(data)
         assert lost.reason
@@ -103,7 +100,6 @@ def _try(folder: Path, name: str, data: bytes) -> tuple[Outcome, Outcome]:
 
 
 def _counted(outcome: Outcome) -> str:
-    assert outcome.found is not None
     return f"{outcome.found.record.counts.events:,}"
 
 
@@ -214,10 +210,8 @@ def test_the_table_at_the_end_of_aedat4_counts_what_is_lost(tmp_path: Path) -> N
     data[at + 8 : at + 8 + size] = bytes(size)
     path.write_bytes(data)
     outcome = _import(tmp_path / "store", path, salvage=True)
-    assert outcome.found is not None
     assert _is_prefix(outcome.found) == 17 * PACKET
     lost = outcome.lost
-    assert lost is not None
     assert (lost.at_byte, lost.unread_bytes) == (at, len(data) - at)
     assert (lost.events, lost.frames) == (13 * PACKET, 1)
     assert outcome.found.record.counts.frames == 2
@@ -252,11 +246,9 @@ def test_an_event_outside_of_the_camera_is_no_damage(tmp_path: Path) -> None:
         for low in range(0, COUNT, PACKET):
             file.events(0, part_of(whole, low, low + PACKET))
     for outcome in _try(tmp_path, "aedat4", path.read_bytes()):
-        assert outcome.found is not None
         expected = np.delete(whole.t_us, wrong)
         np.testing.assert_array_equal(outcome.found.events().t_us, expected)
         imported = outcome.found.record.imported
-        assert imported is not None
         assert imported.dropped == {"events outside of the sensor": 1}
 
 
@@ -271,7 +263,6 @@ def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
     outcome = _import(tmp_path / "store", path, salvage=True)
     assert outcome.found is not None
     assert _is_prefix(outcome.found) == 11 * PACKET
-    assert outcome.lost is not None
     assert outcome.lost.events == 19 * PACKET
     assert outcome.lost.at_byte <= info.byte_offset
 
@@ -283,14 +274,11 @@ def test_the_statistics_of_mcap_count_the_frames_that_are_lost(tmp_path: Path) -
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     outcome = _import(tmp_path / "store", path, salvage=True)
-    assert outcome.found is not None
     assert 0 < _is_prefix(outcome.found) < COUNT
-    assert outcome.lost is not None
     assert outcome.lost.frames == 3 - outcome.found.record.counts.frames
     assert outcome.lost.events is None
     path.write_bytes(data[:-1])
     cut = _import(tmp_path / "cut", path, salvage=True)
-    assert cut.lost is not None
     assert cut.lost.frames is None
 
 
@@ -307,7 +295,6 @@ def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
     assert text.startswith("a.aedat4: is not whole: it is cut short")
     assert f"{lost['unread_bytes']:,} bytes were not read" in text
     (recording,) = store.campaign("theirs").recordings()
-    assert recording.record.imported is not None
     assert [f"a.aedat4: {one}" for one in recording.record.imported.warnings] == [text]
     assert salvaged(store) == ["theirs/a"]
     assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]

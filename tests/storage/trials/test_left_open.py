@@ -43,7 +43,6 @@ def held(path: Path, mode: str, how: str) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-c", HOLD, str(path), mode, how]
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as program:
         try:
-            assert program.stdout is not None
             assert program.stdout.readline() == "open\n"
             yield program
         finally:

@@ -167,8 +167,6 @@ def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Pat
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    assert holder.stdout is not None
-    assert holder.stdin is not None
     try:
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(Locked) as refused, exclusive(path, "the rig"):

@@ -76,7 +76,6 @@ def test_a_plate_that_comes_late_or_goes_leaves_gaps_and_no_shift(tmp_path: Path
     chunks = [tracks(5, False), tracks(4, True, 5), tracks(3, False, 9), tracks(2, True, 12)]
     recording = Recording(take(where, "t", chunks))
     plate = recording.tracks().plate_px
-    assert plate is not None
     assert np.isfinite(plate[:, 0]).tolist() == [False] * 5 + [True] * 4 + [False] * 3 + [True] * 2
     assert np.array_equal(plate[5:9], chunks[1].plate_px)
     assert verify(Store.open(tmp_path / "s")) == []

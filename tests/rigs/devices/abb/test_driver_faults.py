@@ -203,7 +203,6 @@ def test_the_controller_stops_the_arm_when_the_program_is_killed(abb_pair: MakeA
 def test_a_stop_for_want_of_beats_is_told(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
-    assert arm._watchdog is not None
     arm._watchdog.pause()
     until(lambda: arm._run.done, 1.0 + BUSY_S)
     fails(arm.progress, 0.0, "was stopped by its controller's watchdog: no heartbeat")

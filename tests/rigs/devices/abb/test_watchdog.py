@@ -39,7 +39,6 @@ def test_the_module_is_loaded_into_a_task_whose_end_stops_the_arm() -> None:
 
 def test_the_stand_in_has_the_cycle_of_the_module_and_beats_fit_into_every_limit() -> None:
     found = re.search(r"CONST num cycle_s:=([0-9.]+);", MODULE)
-    assert found is not None
     assert float(found[1]) == WATCH_S
     shortest = AbbSettings.model_json_schema()["properties"]["watchdog_s"]["anyOf"][0]["minimum"]
     assert shortest > BEAT_S + WATCH_S
