@@ -274,9 +274,7 @@ def test_a_plate_that_falls_is_caught(action: str, key: str, says: str, tmp_path
     assert says in error.message
 
 
-def test_protocols_in_stores_are_held_to_the_rules_of_their_day(
-    small: dict[str, Any], tmp_path: Path
-) -> None:
+def test_protocols_in_stores_are_held_to_the_rules_of_their_day(small: Any, tmp_path: Path) -> None:
     """A campaign that was collected under rules without some of today's can still be used."""
     path = tmp_path / "protocol.yaml"
     small["analysis"]["split"]["strata"] = ["depht", "speed"]

@@ -87,9 +87,7 @@ def test_what_cannot_be_meant_is_refused_with_its_key(
     assert more == ([f"collection.stopping.{key[:-3]}[1]"] if key.endswith("levels[0]") else [])
 
 
-def test_adaptive_order_needs_claims_and_a_choice_needs_it(
-    tmp_path: Path, small: dict[str, Any]
-) -> None:
+def test_adaptive_order_needs_claims_and_a_choice_needs_it(tmp_path: Path, small: Any) -> None:
     with pytest.raises(InputError, match=r"collection\.stopping.*is needed by order: adaptive"):
         load_plan(written(tmp_path, small, order="adaptive"))
     with pytest.raises(InputError, match=r"collection\.choice.*only used by order: adaptive"):
@@ -110,9 +108,7 @@ def test_claims_change_no_trial_and_no_hash(tmp_path: Path, small: dict[str, Any
     assert claimed.collection_hash == chosen.collection_hash == plain.collection_hash
 
 
-def test_rounds_go_through_all_levels_that_a_person_changes(
-    tmp_path: Path, small: dict[str, Any]
-) -> None:
+def test_rounds_go_through_all_levels_that_a_person_changes(tmp_path: Path, small: Any) -> None:
     small["collection"]["context"] = {"skin": {"values": ["a", "b"], "changeover": "person"}}
     small["collection"]["repetitions"] = 4
     plain = load_plan(written(tmp_path, small))
@@ -139,9 +135,7 @@ def test_stored_protocol_with_repeated_claim_empty_key_and_low_most_is_read(
     assert keys == ["block", "claims[1]", "most", "model"]
 
 
-def test_first_round_with_enabled_levels_above_most_is_refused(
-    tmp_path: Path, small: dict[str, Any]
-) -> None:
+def test_first_round_with_enabled_levels_above_most_is_refused(tmp_path: Path, small: Any) -> None:
     small["collection"]["factors"]["depth"]["optional"] = [3.0]
     path = written(tmp_path, small, stopping={"claims": [CLAIM], "most": 40})
     assert len(load_plan(path)) == 36

@@ -114,9 +114,7 @@ def test_a_person_is_asked_once_and_told_when_it_ends() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_said(
-    tmp_path: Path, change: dict[str, Any], limits: dict[str, str | None], said: str
-) -> None:
+def test_what_is_wrong_is_said(tmp_path: Path, change: Any, limits: Any, said: str) -> None:
     change = change or {"apply": "$nuisance"}
     with pytest.raises(InputError, match=said):
         edited(tmp_path, change, **limits)

@@ -229,9 +229,7 @@ WRITTEN = [
 
 
 @pytest.mark.parametrize("change", WRITTEN, ids=["canonical", "centimetres"])
-def test_levels_with_and_without_unit_give_the_same_trials(
-    tmp_path: Path, change: tuple[str, str]
-) -> None:
+def test_levels_with_and_without_unit_give_the_same_trials(tmp_path: Path, change: Any) -> None:
     text = (ROOT / "protocols" / "pilot.yaml").read_text()
     path = tmp_path / "pilot.yaml"
     path.write_text(text.replace(*change))

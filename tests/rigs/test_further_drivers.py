@@ -186,9 +186,7 @@ def usb(serial: str | None) -> dict[str, Any]:
         (usb("A"), usb("B"), False),
     ],
 )
-def test_two_devices_are_not_one(
-    first: dict[str, Any], side: dict[str, Any], same: bool, tmp_path: Path
-) -> None:
+def test_two_devices_are_not_one(first: Any, side: Any, same: bool, tmp_path: Path) -> None:
     streams = {"side": {**SIDE, "device": side}}
     if not same:
         file = real_rig(tmp_path, streams, event_camera=first)

@@ -72,9 +72,7 @@ def test_a_result_that_is_no_rig_file_is_not_written(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
 
 
-def test_a_disk_that_fails_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> None:
     path = mine(tmp_path)
     write = rig_edit.write_text
 

@@ -91,9 +91,7 @@ def test_a_driver_of_another_package_is_used_and_imported_only_then(install: Ins
         ({"driver": "ur"}, "event_camera.driver", "is the driver of a kind of arm"),
     ],
 )
-def test_a_message_names_key_value_and_cure(
-    install: Install, camera: dict[str, Any], key: str, says: str
-) -> None:
+def test_a_message_names_key_value_and_cure(install: Any, camera: Any, key: str, says: str) -> None:
     install("lab_camera", CAMERA.format(name="lab"), "lab = lab_camera:DRIVER")
     with pytest.raises(InputError) as caught:
         devices(**camera)

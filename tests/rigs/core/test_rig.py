@@ -152,9 +152,7 @@ def test_a_trial_depends_on_nothing_that_ran_before() -> None:
         ({"arm": "host time"}, {"box reads"}),
     ],
 )
-def test_what_is_read_besides_is_what_the_timing_needs(
-    timing: dict[str, Any], streams: set[str]
-) -> None:
+def test_what_is_read_besides_is_what_the_timing_needs(timing: Any, streams: set[str]) -> None:
     data = {**RIG, "timing": timing, "mock": {"frame_camera": {"level": "tracks"}}}
     rig = build_rig(validate(RigFile, data, "test"))
     rig.connect()
@@ -228,9 +226,7 @@ def test_a_protective_stop_leaves_the_arm_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
-def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(
-    error: BaseException,
-) -> None:
+def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(error: Any) -> None:
     rig = make_rig()
     notes = watched(rig)
     with pytest.raises(type(error)):

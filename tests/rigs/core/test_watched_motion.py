@@ -800,9 +800,7 @@ def frozen(chunk: EventChunk) -> EventChunk:
     ],
     ids=["touch_off", "touch"],
 )
-def test_events_that_stop_while_the_plate_is_sought_stop_the_arm(
-    then: Callable[[EventChunk], EventChunk], seek: Callable[[Rig], Any]
-) -> None:
+def test_events_that_stop_while_the_plate_is_sought_stop_the_arm(then: Any, seek: Any) -> None:
     rig = make_rig("rehearsal", None, event_camera={"width": 640, "height": 480})
     stops_at(rig, -0.5, then)
     deepest = depths(rig)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -72,9 +74,7 @@ def test_the_local_scale_is_the_root_of_the_area_that_a_small_square_covers(
 @pytest.mark.parametrize(
     ("tilt", "k1"), [((0.0, 0.0), 0.0), ((3.0, -4.0), 0.0), ((-20.0, 12.0), -0.3)]
 )
-def test_the_camera_is_the_lens_of_the_plates_pictures(
-    tilt: tuple[float, float], k1: float
-) -> None:
+def test_the_camera_is_the_lens_of_the_plates_pictures(tilt: Any, k1: float) -> None:
     camera = BoardCamera(20.0, 1920, 1200, tilt, (k1,), 300.0)
     lens = Lens(20.0, 1920, 1200, tilt_deg=tilt, k1=k1, distance_mm=300.0)
     places = np.array([[10.0, 5.0], [-20.0, -9.0], [0.0, 0.0], [40.0, 25.0]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,9 +95,7 @@ def test_a_zip_that_unpacks_to_more_than_the_limit_is_refused(
     assert len(bring(BASE, path, tmp_path / "store").recording("ann").events()) == 5000
 
 
-def test_an_archive_of_arrays_beyond_the_limit_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_archive_of_arrays_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
     folder = folder_of(tmp_path)
     np.savez_compressed(folder / "events.npz", t=np.zeros(200_000), x=np.zeros(200_000))
     monkeypatch.setattr(tables, "MOST_BYTES", 3 << 20)

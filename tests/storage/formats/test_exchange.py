@@ -213,9 +213,7 @@ def test_a_frame_is_at_the_middle_of_its_exposure(tmp_path: Path) -> None:
         ({0: 70, 3: 40}, 70_000),  # no end
     ],
 )
-def test_the_middle_of_exposure_in_older_files(
-    tmp_path: Path, fields: dict[int, int], middle: int
-) -> None:
+def test_the_middle_of_exposure_in_older_files(tmp_path: Path, fields: Any, middle: int) -> None:
     path = tmp_path / "old.aedat4"
     with Aedat4Writer(path, {0: Stream("FRME", "frames", (1, 1), "x")}) as file:
         times = struct.pack("<5q", *(fields.get(n, 0) for n in range(5)))
@@ -568,9 +566,7 @@ def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> Non
         )
 
 
-def test_without_faery_its_files_are_refused_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_faery_its_files_are_refused_by_name(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.plugins.formats.event_stream.LIBRARY", "no_such_library")
     (tmp_path / "a.es").write_bytes(b"Event Stream\2\0\0\1")
     with pytest.raises(InputError, match="pip install"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,9 +89,7 @@ def declare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, P
     return put
 
 
-def test_format_of_another_package_is_imported_and_exported(
-    declare: Callable[[str, Plugin], None], tmp_path: Path
-) -> None:
+def test_format_of_another_package_is_imported_and_exported(declare: Any, tmp_path: Path) -> None:
     declare(TICKS, Plugin(formats={"ticks": "lab_ticks:TICKS"}))
     assert format_names()[-1] == "ticks"
     assert export_formats() == ["aedat4", "dsec", "ticks"]
@@ -118,9 +117,7 @@ def test_format_of_another_package_is_imported_and_exported(
     assert sum(len(chunk) for chunk in again.events()) == 10
 
 
-def test_layout_of_another_package_joins_files(
-    declare: Callable[[str, Plugin], None], tmp_path: Path
-) -> None:
+def test_layout_of_another_package_joins_files(declare: Any, tmp_path: Path) -> None:
     declare(
         TICKS,
         Plugin(formats={"halves": "lab_ticks:HALVES"}, hooks={"layout": "lab_ticks:LAYOUT"}),
@@ -137,9 +134,7 @@ def test_layout_of_another_package_joins_files(
     assert skipped_in(folder, MIXED) == []
 
 
-def test_unusable_format_is_named_and_harms_no_other(
-    declare: Callable[[str, Plugin], None], tmp_path: Path
-) -> None:
+def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Path) -> None:
     declare("TICKS = 4", Plugin(formats={"ticks": "lab_ticks:TICKS", "none": "lab_none:NONE"}))
     assert "ticks" not in dict(known_formats())
     reason = "cannot be loaded: lab_ticks:TICKS is a int, not a Format"

@@ -187,9 +187,7 @@ def test_events_that_can_be_right_are_kept_and_others_counted(tmp_path: Path, ca
     assert _dropped(found) == dropped
 
 
-def test_a_trial_committed_before_a_signal_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trial_committed_before_a_signal_stays(tmp_path: Path, monkeypatch: Any) -> None:
     _dsec(tmp_path / "a.h5", TIMES)
     take = import_module._take
 

@@ -306,9 +306,7 @@ EVT2 = (0x80000001, 1 << 28 | 2 << 22 | 5 << 11 | 7, 3 << 22 | 1500 << 11 | 1400
 @pytest.mark.parametrize(
     ("header", "size"), [("", None), ("% format EVT2;width=1600;height=1500\n", [1600, 1500])]
 )
-def test_a_size_that_no_header_gives_is_unknown(
-    tmp_path: Path, header: str, size: list[int] | None
-) -> None:
+def test_a_size_that_no_header_gives_is_unknown(tmp_path: Path, header: str, size: Any) -> None:
     _raw(tmp_path / "a", f"% evt 2.0\n{header}", EVT2)
     (found,) = _import(tmp_path / "store", tmp_path / "a")
     assert found.record.geometry.event_px == (None if size is None else tuple(size))

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import pytest
@@ -161,9 +162,7 @@ def test_a_pull_that_was_cut_goes_on(
     assert tree(back.folder, "campaigns") == tree(store.folder, "campaigns")
 
 
-def test_a_damaged_object_is_named_and_sent_anew(
-    store: Store, remote: Remote, tmp_path: Path
-) -> None:
+def test_a_damaged_object_is_named_and_sent_anew(store: Store, remote: Any, tmp_path: Path) -> None:
     push(store, remote)
     manifest = trial_manifest(the(store), TRIALS[1])
     objects = tmp_path / "shared" / objects_folder("c")
@@ -284,9 +283,7 @@ def test_a_manifest_leads_nowhere_else(
     assert not list((tmp_path / "back").rglob("x*"))
 
 
-def test_names_and_objects_of_others_are_refused(
-    store: Store, remote: Remote, tmp_path: Path
-) -> None:
+def test_names_and_objects_of_others_are_refused(store: Store, remote: Any, tmp_path: Path) -> None:
     push(store, remote)
     trials = tmp_path / "shared/campaigns/c/trials"
     shutil.copy(trials / f"{TRIALS[0]}.json", trials / "other=1mm.json")  # of something else
@@ -368,9 +365,7 @@ def test_a_mirror_fetches_what_is_read(
     assert not (the(again_there).folder / "trials" / TRIALS[2] / "data.h5").exists()
 
 
-def test_versions_and_places_that_cannot_be_used(
-    store: Store, remote: Remote, tmp_path: Path
-) -> None:
+def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_path: Path) -> None:
     with pytest.raises(RemoteMissing, match="does not contain a pushed store"):
         pull(remote, tmp_path / "back")
     assert not (tmp_path / "back").exists()

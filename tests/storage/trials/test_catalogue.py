@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -139,18 +140,14 @@ def test_an_index_that_cannot_be_used_is_made_anew(
     assert read == ["a", "b", "c"] * 2
 
 
-def test_what_changed_just_now_is_not_trusted(
-    where: Campaign, read: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_changed_just_now_is_not_trusted(where: Campaign, read: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(module, "FRESH_NS", 3600 * 10**9)
     for _ in range(2):
         catalogue(_store(where))
     assert read == ["a", "b", "c"] * 2
 
 
-def test_a_store_that_cannot_be_written_to_has_a_catalogue(
-    where: Campaign, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_cannot_be_written_to_has_a_catalogue(where: Any, monkeypatch: Any) -> None:
     def refuse(path: Path, data: bytes) -> None:
         raise PermissionError(path)
 
@@ -217,9 +214,7 @@ def test_expressions_without_bound_are_refused_unevaluated(
         ("side.isin(['left'])", ["a"]),
     ],
 )
-def test_expressions_of_columns_numbers_and_text_select_rows(
-    expression: str, found: list[str]
-) -> None:
+def test_expressions_of_columns_numbers_and_text_select_rows(expression: str, found: Any) -> None:
     table = pd.DataFrame(
         {"trial": ["a", "b"], "depth_mm": [2.4, 3.4], "side": ["left", "right"], "events": [4, 6]}
     )

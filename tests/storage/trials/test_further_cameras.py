@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -242,9 +243,7 @@ def test_a_killed_trial_goes_to_quarantine_with_its_streams(tmp_path: Path) -> N
     assert verify(Store.open(tmp_path / "s")) == []
 
 
-def test_they_are_pushed_and_fetched_when_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_they_are_pushed_and_fetched_when_read(tmp_path: Path, monkeypatch: Any) -> None:
     folder = taken(tmp_path)
     monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
     url = f"file://{tmp_path / 'bucket'}"

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -52,9 +53,7 @@ def test_a_file_system_without_locks_is_refused(
 
 
 @pytest.mark.parametrize("number", [SILENT, errno.ENOLCK])
-def test_a_collection_there_takes_no_trial(
-    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_collection_there_takes_no_trial(number: int, tmp_path: Path, monkeypatch: Any) -> None:
     """Two of them would run into each other: the first is refused like the second."""
     without_locks(monkeypatch, number)
     store = tmp_path / "s"
@@ -74,9 +73,7 @@ def test_a_collection_there_takes_no_trial(
 
 
 @pytest.mark.parametrize("number", [SILENT, *REFUSED])
-def test_a_rig_is_not_driven_without_a_lock(
-    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rig_is_not_driven_without_a_lock(number: int, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setenv(ENVIRONMENT, str(tmp_path / "locks"))
     without_locks(monkeypatch, number)
     file, _ = load_rig_file(Path("ur5"))
@@ -137,9 +134,7 @@ def test_locks_that_other_machines_do_not_see(
         pass
 
 
-def test_a_store_on_such_a_share_says_whose_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_on_such_a_share_says_whose_it_is(tmp_path: Path, monkeypatch: Any) -> None:
     store = Store.create(tmp_path / "s")
     monkeypatch.setattr(lock, "_alone", lambda _: "fuse.sshfs")
     (store.folder / STORE_LOCK).write_text(json.dumps({"pid": 12, "host": "nas", "boot": "b"}))

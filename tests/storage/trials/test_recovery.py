@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -112,9 +113,7 @@ def test_committed_trial_is_not_replaced(tmp_path: Path) -> None:
     assert (where.folder / "trials" / "t" / "record.json").read_bytes() == before
 
 
-def test_data_are_flushed_before_the_record_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_are_flushed_before_the_record_is_written(tmp_path: Path, monkeypatch: Any) -> None:
     """A record on the disk says that the data are, too."""
     order: list[str] = []
     real = os.fsync

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,9 +155,7 @@ def test_a_stop_from_outside_ends_the_path(abb_pair: MakeAbb, kind: Kind, state:
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
-def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(
-    abb_pair: MakeAbb, kind: Kind
-) -> None:
+def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(abb_pair: Any, kind: Kind) -> None:
     arm, robot = abb_pair(arm={"watchdog_s": None})
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
@@ -170,9 +169,7 @@ def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 @pytest.mark.parametrize("stage", [Stage.CONNECTING, Stage.UPLOADING])
-def test_a_link_lost_while_connecting_or_uploading(
-    abb_pair: MakeAbb, kind: Kind, stage: Stage
-) -> None:
+def test_a_link_lost_while_connecting_or_uploading(abb_pair: Any, kind: Kind, stage: Stage) -> None:
     arm, robot = abb_pair(connected=False, faults=[Fault(kind, stage)])
     fails(arm.connect, (7 + START_REQUESTS) * REQUEST_S, "check its power")
     assert arm.state() is ArmState.DISCONNECTED

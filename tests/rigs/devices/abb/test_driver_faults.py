@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
@@ -211,9 +212,7 @@ def test_a_stop_for_want_of_beats_is_told(abb_pair: MakeAbb) -> None:
     assert len(arm.progress().finished) == 1
 
 
-def test_a_controller_without_the_watchdog_must_be_accepted_in_so_many_words(
-    abb_pair: MakeAbb,
-) -> None:
+def test_a_controller_without_the_watchdog_must_be_accepted_in_so_many_words(abb_pair: Any) -> None:
     arm, robot = abb_pair(connected=False, watchdog=False)
     fails(arm.connect, 10 * REQUEST_S, r"load docs/rapid/sliplab_watchdog\.mod.*watchdog_s: null")
     without = AbbArm(abb_settings(robot.host, watchdog_s=None))

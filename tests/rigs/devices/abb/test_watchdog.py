@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
@@ -61,9 +62,7 @@ class Signals:
 
 
 @pytest.mark.parametrize("ahead", [*AHEAD, float("nan")])
-def test_echo_of_a_task_that_has_ended_is_no_echo(
-    ahead: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_echo_of_a_task_that_has_ended_is_no_echo(ahead: float, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.abb.watchdog.ECHO_S", 0.02)
     settings = AbbSettings.model_validate(
         {"host": "127.0.0.1", "limits": {"low_mm": [0, 0, 0], "high_mm": [9, 9, 9]}}

@@ -8,6 +8,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -146,9 +147,7 @@ def test_the_clock_may_be_anybodys() -> None:
 # -- faults ------------------------------------------------------------------------------------
 
 
-def test_a_reset_is_told_at_once_and_the_next_start_works(
-    wire: FakeSyncBox, box: SerialSyncBox
-) -> None:
+def test_a_reset_is_told_at_once_and_the_next_start_works(wire: FakeSyncBox, box: Any) -> None:
     box.start(100.0, SEED)
     pulses_of(box, 3)
     wire.reset()
@@ -186,9 +185,7 @@ def test_silence_ends_a_train(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     assert pulses_of(box, 1)[0] == 0
 
 
-def test_a_host_that_was_busy_has_not_heard_a_silence(
-    wire: FakeSyncBox, box: SerialSyncBox
-) -> None:
+def test_a_host_that_was_busy_has_not_heard_a_silence(wire: FakeSyncBox, box: Any) -> None:
     box.start(200.0, SEED)
     pulses_of(box, 3)
     port = box._port
@@ -207,9 +204,7 @@ def test_no_answer_is_a_fault(wire: FakeSyncBox, box: SerialSyncBox, ask: str) -
     assert "start the trial again" in text
 
 
-def test_a_late_answer_is_not_taken_for_that_of_the_next_try(
-    wire: FakeSyncBox, box: SerialSyncBox
-) -> None:
+def test_a_late_answer_is_not_taken_for_that_of_the_next_try(wire: FakeSyncBox, box: Any) -> None:
     box.connect()
     first = box.read_clock()
     wire.answer_late()
@@ -283,9 +278,7 @@ def test_reports_missing_at_the_end_are_counted(wire: FakeSyncBox, box: SerialSy
     assert box.losses.pulses >= 5
 
 
-def test_what_nobody_reads_is_counted_and_not_kept(
-    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_nobody_reads_is_counted_and_not_kept(wire: Any, box: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.driver.MOST_WAITING", 5)
     box.start(1000.0, SEED)
     end = time.monotonic() + 5.0
@@ -298,9 +291,7 @@ def test_what_nobody_reads_is_counted_and_not_kept(
     assert box.losses.pulses == 0
 
 
-def test_what_the_box_refuses_is_said(
-    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_box_refuses_is_said(wire: FakeSyncBox, box: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.fake.MOST_HZ", 50.0)
     with pytest.raises(SyncBoxFault, match="refuses ARM: rate must be"):
         box.start(100.0, SEED)
@@ -344,9 +335,7 @@ def test_nobody_answers(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     assert "no answer on" in fault_of(box.connect, 1.0 + ANSWER_S)
 
 
-def test_another_device_answers(
-    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_device_answers(wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.fake.NAME", "sliplab-sync-box 99")
     with pytest.raises(SyncBoxFault, match="sliplab-sync-box 99"):
         box.connect()
@@ -356,9 +345,7 @@ def test_another_device_answers(
     ("rate_hz", "seed", "word"),
     [(0.5, 1, "rate"), (1001.0, 1, "rate"), (100.0001, 1, "steps of 0.001"), (100.0, 0, "seed")],
 )
-def test_a_train_that_cannot_be_sent(
-    box: SerialSyncBox, rate_hz: float, seed: int, word: str
-) -> None:
+def test_a_train_that_cannot_be_sent(box: Any, rate_hz: float, seed: int, word: str) -> None:
     with pytest.raises(RigError, match=word):
         box.start(rate_hz, seed)
 
@@ -457,9 +444,7 @@ def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
 
 
 @pytest.mark.parametrize("us", ["999999999", "99999999999999", "99999999999999999999"])
-def test_a_garbled_exposure_far_ahead_costs_one(
-    wire: FakeSyncBox, box: SerialSyncBox, us: str
-) -> None:
+def test_a_garbled_exposure_far_ahead_costs_one(wire: FakeSyncBox, box: Any, us: str) -> None:
     """Believed, it would come after all that follow, and none of them could be."""
     say = wire._say
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -77,9 +78,7 @@ def test_a_slide_at_1_6_mm_s_is_straight_and_at_its_speed(
     check_slide(robot_of, arm_on, 1.6, rate)
 
 
-def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(robot_of: Any, arm_on: MakeArm) -> None:
     check_slide(robot_of, arm_on, 0.6, rate=5.0)  # 25 s of controller time
 
 
@@ -99,9 +98,7 @@ def check_slide(robot_of: MakeRobot, arm_on: MakeArm, speed: float, rate: float)
     assert chunk.xyz_mm[-1] == pytest.approx(at(15.0).xyz_mm, abs=1e-6)
 
 
-def test_a_path_of_segments_is_followed_from_rest_to_rest(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_path_of_segments_is_followed_from_rest_to_rest(robot_of: Any, arm_on: MakeArm) -> None:
     arm = arm_on(robot_of(rate=5.0))
     spans = follow(
         arm, Segment(at(10.0), 20.0), Segment(at(10.0, 297.0), 5.0), Segment(at(0.0), 40.0)
@@ -115,9 +112,7 @@ def test_a_path_of_segments_is_followed_from_rest_to_rest(
     assert arm.state() is ArmState.READY
 
 
-def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(robot_of: Any, arm_on: Any) -> None:
     robot = robot_of()
     tool = {"tcp_mm": (0, 0, 120), "tcp_rotvec_deg": (0, 0, 90), "mass_kg": 0.4}
     arm = arm_on(robot, tool=tool)
@@ -130,9 +125,7 @@ def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(
     assert abs(arm.now_ns() / 1e9 - robot.clock.now_s()) < 0.5
 
 
-def test_sync_pulses_are_rising_edges_in_controller_time(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_sync_pulses_are_rising_edges_in_controller_time(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of(digital_inputs=lambda t_s: int(t_s * 10) % 2 << 3)  # 5 Hz on input 3
     arm = arm_on(robot, sync_input=3)
     arm.read_pulses()
@@ -144,9 +137,7 @@ def test_sync_pulses_are_rising_edges_in_controller_time(
     assert np.all(pulses % 200_000_000 >= 100_000_000 - 8_000_000)
 
 
-def test_a_stop_in_a_slide_stands_still_soon_and_says_so(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_stop_in_a_slide_stands_still_soon_and_says_so(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     arm = arm_on(robot)
     arm.start([Segment(at(15.0), 1.6), Segment(at(0.0), 1.6)])
@@ -181,9 +172,7 @@ def test_a_stop_goes_on_as_far_as_it_says(robot_of: MakeRobot, arm_on: MakeArm) 
     assert min(gone) < 40.0 * (arm.stopping_s(40.0) + 0.01)
 
 
-def test_no_move_follows_a_stop_however_short_the_segments(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_no_move_follows_a_stop_however_short_the_segments(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     arm = arm_on(robot)
     for attempt in range(3):

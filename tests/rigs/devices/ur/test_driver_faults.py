@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -162,9 +163,7 @@ def test_a_link_lost_while_connecting_or_uploading(
     assert arm.state() is ArmState.READY
 
 
-def test_a_controller_that_takes_commands_and_never_answers(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_controller_that_takes_commands_and_never_answers(robot_of: Any, arm_on: MakeArm) -> None:
     """Its stream flows and its program says that it runs, but nothing happens any more."""
     robot = robot_of()
     arm = arm_on(robot)
@@ -177,9 +176,7 @@ def test_a_controller_that_takes_commands_and_never_answers(
     assert arm.state() is ArmState.READY
 
 
-def test_a_dead_control_client_leaves_two_ways_to_stop(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_dead_control_client_leaves_two_ways_to_stop(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     arm = arm_on(robot)
     arm.start(SLIDE)
@@ -213,9 +210,7 @@ def test_a_stopped_arm_is_not_taken_control_of(robot_of: MakeRobot, arm_on: Make
     assert robot.program.uploads == 0
 
 
-def test_a_second_client_is_refused_and_the_first_slides_on(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_second_client_is_refused_and_the_first_slides_on(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     first = arm_on(robot)
     first.start([Segment(TARGET, 10.0)])
@@ -237,9 +232,7 @@ def test_registers_that_are_taken_are_told(robot_of: MakeRobot) -> None:
         fails(arm.connect, ur_control.START_S, "another client has control of it.*EtherNet/IP")
 
 
-def test_a_bad_call_is_an_error_and_the_client_lives_on(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_bad_call_is_an_error_and_the_client_lives_on(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     arm_on(robot, connected=False)
     control = ControlProcess(robot.host, 125)
@@ -254,9 +247,7 @@ def test_a_bad_call_is_an_error_and_the_client_lives_on(
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_somebody_elses_program_is_not_taken_over(
-    robot_of: MakeRobot, arm_on: MakeArm, paused: bool
-) -> None:
+def test_somebody_elses_program_is_not_taken_over(robot_of: Any, arm_on: Any, paused: bool) -> None:
     """A paused one waits to be resumed; the control client would end it without a word."""
     robot = robot_of()
     ur_ports.send_script(robot.host, "def palletise():\n  sleep(1000)\nend\n", 1.0)
@@ -281,9 +272,7 @@ def test_an_arm_without_power_is_said_to_have_none(robot_of: MakeRobot, arm_on: 
     assert arm.state() is ArmState.READY
 
 
-def test_a_slider_that_is_moved_while_sliding_ends_the_path(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_slider_that_is_moved_while_sliding_ends_the_path(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     arm = arm_on(robot)
     arm.start(SLIDE)

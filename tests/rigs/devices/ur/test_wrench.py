@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,9 +56,7 @@ def test_it_reads_the_wrench_with_the_arms_times(robot_of: MakeRobot, arm_on: Ma
     assert np.allclose(found.torque_nm, [0.1, 0.2, 0.3])
 
 
-def test_the_plates_reaction_is_the_force_on_the_plate(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_the_plates_reaction_is_the_force_on_the_plate(robot_of: Any, arm_on: MakeArm) -> None:
     frame = PlateFrame.taught([(400, 0, 300), (400, 60, 300), (400, 0, 360)])
     pushed = frame.axes.T @ np.array([0.5, 0.0, 3.0])  # on the plate, in the base
     robot = robot_of()

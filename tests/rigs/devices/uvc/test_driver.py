@@ -143,9 +143,7 @@ def pipe() -> Iterator[VideoPipe]:
 
 
 @pytest.mark.realtime
-def test_pictures_come_unchanged_cut_to_the_region_and_in_order(
-    pipe: VideoPipe, until: Until
-) -> None:
+def test_pictures_come_unchanged_cut_to_the_region_and_in_order(pipe: Any, until: Until) -> None:
     images = np.random.default_rng(7).integers(0, 256, (20, 48, 64)).astype(np.uint8)
     camera = UvcCamera(UvcSettings(device=pipe.path, back_pressure_s=0.2, **SMALL), 10.0)
     try:
@@ -198,9 +196,7 @@ class Changing:
         return self.retrieve()
 
 
-def test_pictures_of_another_size_are_a_fault(
-    until: Until, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_of_another_size_are_a_fault(until: Until, monkeypatch: Any) -> None:
     right, wrong = np.zeros((48, 64, 3), np.uint8), np.zeros((24, 64, 3), np.uint8)
     device = Changing([right, right, right, wrong])
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
