@@ -16,28 +16,11 @@ from hypothesis import strategies as st
 from sliplab.protocols import InputError, Protocol, load_plan, make_plan
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from tests.conftest import ROOT
-from tests.protocols.planning import plan_of, refused
+from tests.protocols.planning import plan_of, put, refused, rows
 
 COLLECTION = "collection"
 LEFT_OUT = {"method": "leave_conditions_out", "test_levels": {"depth": ["2.4 mm"]}}
 SPED = "{every: 5, condition: {depth: 2, speed: 1, direction: 0, sped: 1}}"
-
-
-def parts_of(place: str) -> list[Any]:
-    """Return the keys and numbers of a place like ``motion[1].speed``."""
-    found = re.findall(r"[^.\[\]]+", place)
-    return [int(part) if part.isdigit() else part for part in found]
-
-
-def put(data: Any, place: str, value: Any) -> None:
-    """Put a value at a place like ``motion[1].speed``, or drop what is there if it is None."""
-    *parts, last = parts_of(place)
-    for part in parts:
-        data = data[part]
-    if value is None:
-        del data[last]
-    else:
-        data[last] = value
 
 
 # section: the place and what is put there (nothing: dropped) | the key of the fault after the
@@ -101,11 +84,7 @@ CASES = {
         validation_levels: {depth: [0.24 cm]} | .depth | is already held out for testing""",
     "": "name: ../x | | pattern",
 }
-ROWS = [
-    (section, *(part.strip() for part in row.split("|")))
-    for section, rows in CASES.items()
-    for row in rows.strip().splitlines()
-]
+ROWS = [(section, *row) for section, table in CASES.items() for row in rows(table)]
 
 
 @pytest.mark.parametrize(("section", "change", "key", "says"), ROWS)

@@ -10,6 +10,7 @@ import yaml
 
 from sliplab.protocols import InputError, load_plan
 from sliplab.protocols.claims import Claim
+from tests.protocols.planning import rows
 
 CLAIM = {"figure": "lead", "statistic": "p05", "at_least": "360 ms"}
 SHARE = {"figure": "accuracy", "at_least": "90 %"}
@@ -53,10 +54,9 @@ STOPPING = """
 """
 
 
-def rows(table: str) -> list[Any]:
+def read(table: str) -> list[Any]:
     """Return the rows of a table: a mapping, and texts."""
-    cells = [[part.strip() for part in row.split("|")] for row in table.strip().splitlines()]
-    return [(yaml.safe_load(f"{{{first}}}"), *others) for first, *others in cells]
+    return [(yaml.safe_load(f"{{{first}}}"), *others) for first, *others in rows(table)]
 
 
 def claim(change: dict[str, Any]) -> dict[str, Any]:
@@ -65,8 +65,8 @@ def claim(change: dict[str, Any]) -> dict[str, Any]:
 
 
 WRONG = [
-    *(({"claims": [claim(change)]}, f"claims[0]{key}", said) for change, key, said in rows(CLAIMS)),
-    *(({"claims": [CLAIM], **change}, key, right) for change, key, right in rows(STOPPING)),
+    *(({"claims": [claim(change)]}, f"claims[0]{key}", said) for change, key, said in read(CLAIMS)),
+    *(({"claims": [CLAIM], **change}, key, right) for change, key, right in read(STOPPING)),
     (
         {"claims": [CLAIM, SHARE, {**CLAIM, "at_least": "0.36 s"}]},
         "claims[2]",
@@ -170,7 +170,7 @@ collection.repetitions = 2 must be at least 3, or collection.choice.batch = 12 m
 """
 
 
-@pytest.mark.parametrize(("collection", "stopping", "lacks"), rows(FEW))
+@pytest.mark.parametrize(("collection", "stopping", "lacks"), read(FEW))
 def test_warning_of_claim_with_too_few_blocks_names_key_and_remedy(
     tmp_path: Path, small: dict[str, Any], collection: dict[str, Any], stopping: str, lacks: str
 ) -> None:
