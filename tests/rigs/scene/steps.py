@@ -36,18 +36,8 @@ def run(
     full[:, : sensor.shape[1]] = sensor
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     rows = times(steps, h) if t_ns is None else t_ns
-    advance(
-        springs.table,
-        springs.friction,
-        springs.law,
-        tips.state,
-        rows,
-        full,
-        np.zeros(steps + 1),
-        track,
-        load,
-        springs.spots,
-    )
+    law = springs.table, springs.friction, springs.law
+    advance(*law, tips.state, rows, full, np.zeros(steps + 1), track, load, springs.spots)
     return track, load.reshape(steps, n, 3)
 
 
@@ -66,30 +56,14 @@ def fall(
     """Track of a released plate under `sensor` (depth alone, or x, y, depth), and steps taken."""
     steps, n = len(sensor), len(springs.gap)
     full = np.zeros((steps, 5))
-    if sensor.ndim == 1:
-        full[:, 2] = sensor
-    else:
-        full[:, : sensor.shape[1]] = sensor
+    full[:, [2] if sensor.ndim == 1 else range(sensor.shape[1])] = sensor.reshape(steps, -1)
     pull = np.broadcast_to(mass * 9.81 if weight is None else weight, steps).astype(float)
     pull = np.concatenate([[2 * pull[0] - pull[min(1, steps - 1)]], pull])
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     rows = times(steps, h) if t_ns is None else t_ns
-    done, _ = advance_free(
-        springs.table,
-        springs.friction,
-        springs.law,
-        tips.state,
-        rows,
-        full,
-        motion,
-        mass,
-        pull,
-        stiction,
-        -25.0,
-        track,
-        load,
-        springs.spots,
-    )
+    law = springs.table, springs.friction, springs.law
+    plate = motion, mass, pull, stiction, -25.0
+    done, _ = advance_free(*law, tips.state, rows, full, *plate, track, load, springs.spots)
     return track[:done], done
 
 

@@ -215,12 +215,12 @@ def test_each_stream_has_its_clock_to_the_nanosecond_after_an_hour(
     clock = {"offset_ms": float(offset_ms), "drift_ppm": float(drift_ppm)}
     poses = {"files": "{who}/arm.csv", "format": "csv", "unit": "ns", "length": "m", "angle": "rad"}
     poses["columns"] = {key: key for key in ("t", "x", "y", "z", "rx", "ry", "rz")}
-    force = {"files": "{who}/force.npy", "format": "numpy", "unit": "ns", "clock": clock}
-    force["columns"] = {"t": "when", **{name: name for name in axes}}
+    felt = {"files": "{who}/force.npy", "format": "numpy", "unit": "ns", "clock": clock}
+    felt["columns"] = {"t": "when", **{name: name for name in axes}}
     warm = {"files": "{who}/heat.npy", "format": "numpy", "unit": "s", "quantity_unit": "degC"}
     warm["columns"] = {"t": 0, "value": 1}
     poses["clock"] = {**clock, "uncertainty_ms": 0.25}
-    streams = {"poses": poses, "wrenches": {"force": force}, "scalars": {"heat": warm}}
+    streams = {"poses": poses, "wrenches": {"force": felt}, "scalars": {"heat": warm}}
     made = adapter(streams)
     recording = imported(made, tmp_path)
     with recording.open() as reader:

@@ -38,7 +38,8 @@ DAMAGE = """
     write campaign.json { | is not JSON | damaged
     write campaign.json DEEP | is not JSON | damaged
     write campaign.json {} | lacks 'name' | damaged
-    write protocol.yaml protocol: 20 | protocol.yaml: does not match its checksum; `slip | damaged
+    write protocol.yaml protocol: 20 | protocol.yaml: does not match its checksum; \
+`sliplab collect` | damaged
     write protocol.yaml a: &x [*x] | cannot be read | damaged
     write rig.yaml \xff | cannot be read | damaged
     remove rig.yaml | rig.yaml: cannot be | damaged
@@ -62,7 +63,7 @@ checksums | damaged
 """.replace("DEEP", "[" * 100_000).replace("NOBODY", str(NOBODY))
 
 
-def _damage(folder: Path, how: str, place: str, text: str) -> None:
+def _damage(folder: Path, how: str, place: str, text: str = "") -> None:
     path = folder / place
     if how == "write":
         path.write_bytes(text.encode("latin-1"))
@@ -80,7 +81,7 @@ def test_verify_names_it_and_what_is_whole_stays_readable(
 ) -> None:
     where = campaign(tmp_path / "s")
     whole = [commit(where, name) for name in ("t", "whole")][1]
-    _damage(where.folder, *f"{change}  ".split(" ", 2))
+    _damage(where.folder, *change.split(" ", 2))
     store = Store.open(tmp_path / "s")
     problems = verify(store)
     kinds = {"damaged": DAMAGED, "unfinished": UNFINISHED}
