@@ -118,10 +118,8 @@ def test_format_of_another_package_is_imported_and_exported(declare: Any, tmp_pa
 
 
 def test_layout_of_another_package_joins_files(declare: Any, tmp_path: Path) -> None:
-    declare(
-        TICKS,
-        Plugin(formats={"halves": "lab_ticks:HALVES"}, hooks={"layout": "lab_ticks:LAYOUT"}),
-    )
+    hooks = {"layout": "lab_ticks:LAYOUT"}
+    declare(TICKS, Plugin(formats={"halves": "lab_ticks:HALVES"}, hooks=hooks))
     folder = tmp_path / "in"
     folder.mkdir()
     for name, first_us in (("1.half", 1000), ("2.half", 3000)):
@@ -149,12 +147,11 @@ def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Pat
 
 def test_file_of_the_core_loads_no_other_format(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4")
-    found = loaded(
-        "import", str(tmp_path / "a.aedat4"), "--store", str(tmp_path / "store"), "--name", "a"
-    )
+    file, store = str(tmp_path / "a.aedat4"), str(tmp_path / "store")
+    found = loaded("import", file, "--store", store, "--name", "a")
     assert "sliplab.plugins.formats.lab.layout" in found  # a run's folder may lie around the file
     for name in ("prophesee", "event_stream", "ros.mcap", "ros.bags", "lerobot"):
         assert f"sliplab.plugins.formats.{name}" not in found
     out = str(tmp_path / "out")
-    found = loaded("export", str(tmp_path / "store"), "a", "--format", "aedat4", "--output", out)
+    found = loaded("export", store, "a", "--format", "aedat4", "--output", out)
     assert not [name for name in found if name.startswith("sliplab.plugins.formats.")]

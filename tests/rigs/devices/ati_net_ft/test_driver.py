@@ -34,13 +34,17 @@ def make() -> Iterator[Make]:
     with ExitStack() as stack:
 
         def build(
-            connected: bool = True, wire: dict[str, Any] | None = None, **settings: Any
+            connected: bool = True, wire: Any = None, rows: int | None = None, **settings: Any
         ) -> tuple[AtiNetFt, FakeNetFt]:
+            """Started, and read from until there are so many rows, if that is a number."""
             fake = stack.enter_context(FakeNetFt(own_address(), **(wire or {})))
             sensor = AtiNetFt(settings_for(fake, **settings))
             stack.callback(sensor.close)
             if connected:
                 sensor.connect()
+            if rows is not None:
+                sensor.start()
+                gather(sensor, rows)
             return sensor, fake
 
         yield build
@@ -213,18 +217,14 @@ def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
 
 
 def test_what_is_no_record_is_counted(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.inject(Kind.MALFORMED, 2)
     gather(sensor, 20)
     assert (sensor.counts.malformed, sensor.counts.lost) == (2, 2)
 
 
 def test_silence_is_a_fault(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.inject(Kind.SILENCE)
     assert "nothing came for 0.3 s" in fault_of(sensor, SILENCE_S)
     with pytest.raises(RigError, match="nothing came"):
@@ -235,26 +235,20 @@ def test_silence_is_a_fault(make: Make) -> None:
 
 
 def test_a_sensor_without_power_is_a_fault(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.close()
     assert "force sensor: " in fault_of(sensor, SILENCE_S)
     sensor.close()
 
 
 def test_a_saturated_sensor_is_a_fault(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.inject(Kind.SATURATED)
     assert "0xC0000000: force or torque out of range" in fault_of(sensor, 0.5)
 
 
 def test_a_sensor_that_begins_anew_is_a_fault(make: Make) -> None:
-    sensor, fake = make(wire={"ticks": 10**6})
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(wire={"ticks": 10**6}, rows=5)
     fake.inject(Kind.RESTART)
     assert "it restarted" in fault_of(sensor, 0.5)
 
@@ -285,9 +279,7 @@ def test_a_saturated_sensor_does_not_connect(make: Make) -> None:
 
 
 def test_closing_ends_the_stream_and_may_be_repeated(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     sensor.close()
     sensor.close()
     until(lambda: not fake.streaming, 2.0)
