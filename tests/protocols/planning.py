@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ import pytest
 import yaml
 
 from sliplab.protocols import InputError, Plan, load_plan
+from tests.conftest import ROOT
 
 
 def plan_of(data: dict[str, Any], folder: Path, *enable: str) -> Plan:
@@ -48,3 +52,11 @@ def put_all(data: Any, changes: str, where: str = "") -> None:
     for change in changes.split(";"):
         place, _, value = change.partition(":")
         put(data, f"{where}.{place.strip()}", yaml.safe_load(value))
+
+
+def said_by(code: str, *words: str, **environment: str) -> str:
+    """What code prints in a process of its own, at the checkout's root."""
+    line, env = (sys.executable, "-c", code, *words), {**os.environ, **environment}
+    how: Any = {"capture_output": True, "text": True, "check": True, "timeout": 120}
+    said: str = subprocess.run(line, cwd=ROOT, env=env, **how).stdout
+    return said

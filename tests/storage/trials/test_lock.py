@@ -7,8 +7,6 @@ import fcntl
 import json
 import os
 import signal
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from sliplab.storage.trials.lock import STORE_LOCK, Locked, NoLocks, exclusive
 from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
+from tests.storage.holders import holder_of
 
 REFUSED = [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL]
 SILENT = 0
@@ -155,23 +154,13 @@ with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
 
 def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, path],
-        cwd=ROOT,
-        text=True,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    try:
-        assert holder.stdout.readline() == "held\n"
+    with holder_of(HOLDER, path) as holder:
         with pytest.raises(Locked) as refused, exclusive(path, "the rig"):
             pass
         who = refused.value.holder
         assert who["pid"] == holder.pid
-        assert (
-            f"the rig is in use by another program (pid {holder.pid} of {process.user_name()} on "
-            in str(refused)
-        )
+        said = f"is in use by another program (pid {holder.pid} of {process.user_name()} on "
+        assert f"the rig {said}" in str(refused)
         assert "for the store somewhere, since 20" in str(refused.value)
         assert process.is_here(who)
         # another start with this number is another process, and gets no signal
@@ -180,11 +169,6 @@ def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Pat
         assert holder.poll() is None
         assert process.send(who, signal.SIGKILL)
         assert holder.wait(timeout=60) == -signal.SIGKILL
-    finally:
-        holder.kill()
-        holder.wait(timeout=60)
-        holder.stdin.close()
-        holder.stdout.close()
     assert not process.is_here(who)
     assert not process.send(who, signal.SIGTERM)
     with exclusive(path, "the rig"):
