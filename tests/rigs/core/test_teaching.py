@@ -36,6 +36,12 @@ def depth(rig: Rig) -> float:
     return rig.position().depth_mm
 
 
+@pytest.fixture
+def rig() -> Rig:
+    """The shipped mock rig."""
+    return make_rig()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("wrong_mm", [0.0, 0.7, -0.6])
 @pytest.mark.parametrize("way", [None, find], ids=["events", "markers"])
@@ -140,8 +146,7 @@ def test_a_stop_request_stops_the_arm_first(looks: int, way: Any) -> None:
     assert depth(rig) <= -1.5 + 1e-6
 
 
-def test_ctrl_c_stops_the_arm_first() -> None:
-    rig = make_rig()
+def test_ctrl_c_stops_the_arm_first(rig: Rig) -> None:
     notes = watched(rig)
     count = rig.central_events
     looks = iter(range(200))
@@ -184,8 +189,7 @@ def test_markers_that_never_move_end_the_touch_soon_after_the_events() -> None:
         touch(rig, 0.0, 0.0, QUICK, 1, lambda chunk: np.repeat(still, len(chunk), 0))
 
 
-def test_events_that_are_looked_for_elsewhere_are_no_touch() -> None:
-    rig = make_rig()
+def test_events_that_are_looked_for_elsewhere_are_no_touch(rig: Rig) -> None:
     rig.centre_px = (60.0, 60.0)
     with pytest.raises(RigError, match="found no plate"):
         touch(rig, 0.0, 0.0, QUICK, 1)
@@ -200,31 +204,27 @@ def test_a_creep_that_is_none_cannot_be_asked_for(wrong: dict[str, float]) -> No
         Creep(**wrong)
 
 
-def test_the_rate_is_that_of_touching_off() -> None:
+def test_the_rate_is_that_of_touching_off(rig: Rig) -> None:
     """A protocol's `rezero` and `teach zero` find the same surface with the same seed."""
-    rig = make_rig()
     taught = touch(rig, 0.0, 0.0, Creep(clearance_mm=1.5, search_mm=1.5), 7).depth_mm
     assert rig.touch_off(0.5, 1.5, 7) == pytest.approx(taught, abs=0.02)
     assert RateTouch(0).limit == 10
 
 
-def test_a_person_jogs_and_confirms() -> None:
-    rig = make_rig()
+def test_a_person_jogs_and_confirms(rig: Rig) -> None:
     poses = jog_poses(rig, [("", "touched centre"), ("", "touched right"), ("", "touched above")])
     places = [rig.plate_frame.position(pose.xyz_mm) for pose in poses]
     assert [round(p.x_mm) for p in places] == [0, 12, 0]
     assert all(abs(p.depth_mm) < 0.15 for p in places)
 
 
-def test_a_person_who_says_stop_is_heard() -> None:
-    rig = make_rig()
+def test_a_person_who_says_stop_is_heard(rig: Rig) -> None:
     rig.operator.ask = lambda task, prompt, expected: False  # type: ignore[method-assign]
     with pytest.raises(StopRequested):
         jog_poses(rig, [("", "touched centre")])
 
 
-def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose() -> None:
-    rig = make_rig()
+def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose(rig: Rig) -> None:
     rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
     rig.arm.start([type_segment(rig, -20.0)])
     with pytest.raises(RigError, match="is still moving"):
@@ -243,8 +243,7 @@ def type_segment(rig: Rig, depth_mm: float) -> Any:
     return Segment(rig.plate_frame.pose(Position(0.0, 0.0, depth_mm)), 5.0)
 
 
-def test_looking_gives_frames_and_moves_nothing() -> None:
-    rig = make_rig()
+def test_looking_gives_frames_and_moves_nothing(rig: Rig) -> None:
     rig.frames.set_region(64, 64)
     notes = watched(rig)
     chunk = grab_frames(rig)
@@ -252,8 +251,7 @@ def test_looking_gives_frames_and_moves_nothing() -> None:
     assert "arm.start" not in notes
 
 
-def test_stirring_shows_the_whole_skin() -> None:
-    rig = make_rig()
+def test_stirring_shows_the_whole_skin(rig: Rig) -> None:
     counts = press_in_circles(rig, 2.4, 1.0, 2.0, 1)
     assert counts.shape == (2, 480, 640)
     assert counts.sum(axis=(1, 2)).min() > 10_000
@@ -263,8 +261,7 @@ def test_stirring_shows_the_whole_skin() -> None:
     assert depth(rig) == pytest.approx(-5.0, abs=0.01)
 
 
-def test_a_stop_while_stirring_stops_the_arm() -> None:
-    rig = make_rig()
+def test_a_stop_while_stirring_stops_the_arm(rig: Rig) -> None:
     asked = iter([False] * 30)
     rig.should_stop = lambda: next(asked, True)
     notes = watched(rig)

@@ -93,8 +93,7 @@ def test_verify_names_it_and_what_is_whole_stays_readable(
         assert len(Recording(whole).events()) == 1000
 
 
-def test_what_is_damaged_is_never_read(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_what_is_damaged_is_never_read(where: Campaign, tmp_path: Path) -> None:
     _flip(commit(where, "t") / "data.h5")
     _flip(commit(where, "u") / "record.json")
     commit(where, "whole")
@@ -129,16 +128,14 @@ def test_what_is_partial_is_no_trial_and_is_quarantined_with_its_cause(tmp_path:
     commit(where, "short")
 
 
-def test_a_partial_trial_gives_way_to_the_one_that_is_taken(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_partial_trial_gives_way_to_the_one_that_is_taken(where: Campaign) -> None:
     (commit(where, "t") / "frames.mkv").unlink()
     commit(where, "t")
     assert where.committed() == {"t"}
     assert where.quarantined()[0]["cause"].endswith("frames.mkv: is missing")
 
 
-def test_damaged_trials_are_set_aside_when_asked(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_damaged_trials_are_set_aside_when_asked(where: Campaign, tmp_path: Path) -> None:
     _flip(commit(where, "t") / "data.h5")
     commit(where, "whole")
     store = Store.open(tmp_path / "s")
@@ -148,8 +145,7 @@ def test_damaged_trials_are_set_aside_when_asked(tmp_path: Path) -> None:
     assert verify(store) == []
 
 
-def test_a_cause_that_cannot_be_read_is_unknown(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_cause_that_cannot_be_read_is_unknown(where: Campaign) -> None:
     writer = where.begin("t", None, 100)
     writer.abandon()
     (where.quarantine(writer.folder, "gate: x") / "cause.json").write_text("{")
@@ -157,8 +153,7 @@ def test_a_cause_that_cannot_be_read_is_unknown(tmp_path: Path) -> None:
     assert where.failed_attempts() == {}
 
 
-def test_a_damaged_description_says_what_to_do(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_damaged_description_says_what_to_do(where: Campaign) -> None:
     commit(where, "t")
     (where.folder / "campaign.json").unlink()
     assert where.begun
@@ -191,8 +186,7 @@ def test_a_campaign_cannot_be_named_out_of_the_store(tmp_path: Path) -> None:
             store.campaign(name)
 
 
-def test_data_that_point_out_of_their_file_are_refused(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_data_that_point_out_of_their_file_are_refused(where: Campaign, tmp_path: Path) -> None:
     writer = where.begin("t", None, 100)
     fill(writer, with_frames=False)
     path = writer.seal() / "data.h5"

@@ -228,8 +228,7 @@ def test_verify_holds_files_and_record_against_each_other(
     assert any(problem in found.what for found in verify(Store.open(tmp_path / "s")))
 
 
-def test_a_killed_trial_goes_to_quarantine_with_its_streams(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_killed_trial_goes_to_quarantine_with_its_streams(where: Any, tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     send(writer)
     writer.abandon()

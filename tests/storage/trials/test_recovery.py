@@ -75,16 +75,14 @@ def test_incomplete_trial_is_quarantined(tmp_path: Path, damage: Callable[[Path]
     assert [item["cause"] for item in where.quarantined()] == ["interrupted"]
 
 
-def test_trial_of_another_name_or_of_a_failed_gate_is_not_committed(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_trial_of_another_name_or_of_a_failed_gate_is_not_committed(where: Campaign) -> None:
     killed(where, "t", quality={"passed": False, "gates": {}})
     killed(where, "u")
     shutil.move(where.folder / "incoming" / "u", where.folder / "incoming" / "v")
     assert recover(where) == []
 
 
-def test_failed_attempt_killed_before_its_rename_keeps_its_cause(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_failed_attempt_killed_before_its_rename_keeps_its_cause(where: Campaign) -> None:
     fail(where, "t", 0)
     os.rename(where.folder / "quarantine" / "t.1", where.folder / "incoming" / "t")
     assert recover(where) == []
@@ -103,8 +101,7 @@ def test_trial_killed_on_its_way_to_quarantine_is_unfinished_and_moved(tmp_path:
     assert verify(Store.open(tmp_path / "s")) == []
 
 
-def test_committed_trial_is_not_replaced(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_committed_trial_is_not_replaced(where: Campaign) -> None:
     killed(where)
     commit(where, "u")
     os.rename(where.folder / "trials" / "u", where.folder / "trials" / "t")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,13 +10,12 @@ from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import FRAME, campaign, commit, fail, fill, record
 
 
-def test_a_committed_trial_reads_as_it_was_written(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_committed_trial_reads_as_it_was_written(where: Campaign, tmp_path: Path) -> None:
     recording = Recording(commit(where, "a=1mm,r=1"))
     assert where.committed() == {"a=1mm,r=1"}
     assert recording.record.counts.events == 1000
@@ -29,8 +29,7 @@ def test_the_same_trial_is_the_same_bytes(tmp_path: Path) -> None:
     assert sums[0] == sums[1]
 
 
-def test_spooled_frames_are_the_same_video(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_spooled_frames_are_the_same_video(where: Campaign) -> None:
     folders = []
     for name, spool in (("live", False), ("spooled", True)):
         writer = where.begin(name, FRAME, 100, spool=spool)
@@ -41,8 +40,7 @@ def test_spooled_frames_are_the_same_video(tmp_path: Path) -> None:
     assert not (folders[1] / "frames.raw").exists()
 
 
-def test_what_was_not_committed_is_quarantined_with_its_cause(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_what_was_not_committed_is_quarantined_with_its_cause(where: Any, tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     fill(writer)
     writer.abandon()
@@ -57,16 +55,14 @@ def test_what_was_not_committed_is_quarantined_with_its_cause(tmp_path: Path) ->
     assert verify(Store.open(tmp_path / "s")) == []
 
 
-def test_a_failed_attempt_keeps_its_data_and_counts(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_failed_attempt_keeps_its_data_and_counts(where: Campaign) -> None:
     for attempt in range(2):
         fail(where, "t", attempt)
     assert where.failed_attempts() == {"t": 2}
     assert (where.folder / "quarantine" / "t.2" / "data.h5").exists()
 
 
-def test_a_trial_is_never_committed_twice(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_trial_is_never_committed_twice(where: Campaign) -> None:
     commit(where, "t")
     writer = where.begin("t", FRAME, 100)
     fill(writer)
@@ -106,8 +102,7 @@ def test_verify_names_each_damage(name: str, tmp_path: Path) -> None:
     assert all("whole" not in problem.path for problem in problems)
 
 
-def test_verify_sees_a_record_that_does_not_fit_its_data(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_verify_sees_a_record_that_does_not_fit_its_data(where: Campaign, tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     fill(writer, count=900)
     writer.commit(record("t"), Provenance())
@@ -115,8 +110,7 @@ def test_verify_sees_a_record_that_does_not_fit_its_data(tmp_path: Path) -> None
     assert problem.what == "900 events, the record says 1000"
 
 
-def test_names_cannot_lead_out_of_the_store(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_names_cannot_lead_out_of_the_store(where: Campaign) -> None:
     for name in ("../x", "a/b", "", ".hidden", "a\0b", "x" * 300):
         with pytest.raises(StoreError, match="cannot be the name"):
             where.begin(name, None, 100)

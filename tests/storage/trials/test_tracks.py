@@ -92,8 +92,7 @@ def test_the_same_tracks_are_the_same_bytes_and_units_are_said(tmp_path: Path) -
             assert file[name].attrs["unit"].startswith("px")
 
 
-def test_the_catalogue_says_what_there_is(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_the_catalogue_says_what_there_is(where: Campaign, tmp_path: Path) -> None:
     commit(where, "a")
     take(where, "b", [tracks(20, False)])
     table = catalogue(Store.open(tmp_path / "s"))
@@ -101,8 +100,7 @@ def test_the_catalogue_says_what_there_is(tmp_path: Path) -> None:
     assert list(table["frames"]) == [12, 20]
 
 
-def test_what_is_not_there_is_said(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_what_is_not_there_is_said(where: Campaign) -> None:
     with pytest.raises(ValueError, match="contains no tracks"):
         Recording(commit(where, "a")).tracks()
 
