@@ -14,13 +14,8 @@ from sliplab.protocols.templates import templates, written_out
 from tests.conftest import ROOT, SMALL
 from tests.protocols.planning import plan_of, refused
 
-KINEMATIC = {
-    "template": "kinematic",
-    "depth": "$depth",
-    "distance": "9 mm",
-    "speed": "$speed",
-    "direction": "$direction",
-}
+KINEMATIC = {"template": "kinematic", "depth": "$depth", "distance": "9 mm", "speed": "$speed"}
+KINEMATIC["direction"] = "$direction"
 
 
 def small(motion: Any, *unused: str) -> dict[str, Any]:
@@ -52,10 +47,8 @@ def test_shipped_protocols_are_made_from_templates(name: str, tmp_path: Path) ->
 
 
 def test_a_template_is_its_phases(tmp_path: Path) -> None:
-    plan, same = (
-        plan_of(small(KINEMATIC), tmp_path),
-        plan_of(small(SMALL["collection"]["motion"]), tmp_path),
-    )
+    plan = plan_of(small(KINEMATIC), tmp_path)
+    same = plan_of(small(SMALL["collection"]["motion"]), tmp_path)
     assert [plan.program(trial) for trial in plan] == [same.program(trial) for trial in same]
     assert plan.collection_hash == same.collection_hash
 

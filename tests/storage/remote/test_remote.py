@@ -213,10 +213,8 @@ def test_a_trial_that_is_wanted_again_goes_and_comes_back(
     assert push(store, remote).replaced == 1
     assert pull(remote, tmp_path / "back").replaced == 1
     assert tree(tmp_path / "back/campaigns/c", "trials") == tree(the(store).folder, "trials")
-    causes = {
-        item["cause"].split(":")[0] for item in the(Store.open(tmp_path / "back")).quarantined()
-    }
-    assert causes == {"withdrawn", "replaced"}
+    aside = the(Store.open(tmp_path / "back")).quarantined()
+    assert {item["cause"].split(":")[0] for item in aside} == {"withdrawn", "replaced"}
 
 
 def test_two_stores_do_not_mix(store: Store, remote: Remote, tmp_path: Path) -> None:
@@ -297,13 +295,8 @@ def test_names_and_objects_of_others_are_refused(store: Store, remote: Any, tmp_
     done = pull(remote, tmp_path / "back")
     assert done.pulled == 1
     reported = " ".join(done.problems)
-    for part in (
-        "belongs to another trial or campaign",
-        "'a b'",
-        "'c d'",
-        "no checksum of data.h5",
-        "is incomplete",
-    ):
+    named = ("belongs to another trial or campaign", "'a b'", "'c d'")
+    for part in (*named, "no checksum of data.h5", "is incomplete"):
         assert part in reported
     assert len(verify_remote(remote)[1]) == len(done.problems)
 
@@ -311,10 +304,8 @@ def test_names_and_objects_of_others_are_refused(store: Store, remote: Any, tmp_
 @settings(max_examples=150)
 @given(st.data())
 def test_a_mutated_manifest_is_refused(data: st.DataObject) -> None:
-    files = {
-        name: Checksum("a" * 64, 3)
-        for name in ("data.h5", "record.json", "checksums.json", "provenance.json")
-    }
+    names = ("data.h5", "record.json", "checksums.json", "provenance.json")
+    files = dict.fromkeys(names, Checksum("a" * 64, 3))
     whole = Manifest("trials", "c", "t", files, "take").dump()
     assert parse(whole, "trials", "c", "t", "here").files == files
     at = data.draw(st.integers(0, len(whole) - 1))
@@ -376,13 +367,8 @@ def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_
     write_json(store.folder / "store.json", {"format": 1})
     with pytest.raises(StoreError, match="sliplab migrate"):
         push(store, remote)
-    for url in (
-        "lab",
-        "s3://me:hunter2@b/x",
-        "s3://b/x?token=hunter2",
-        "zip::s3://b/x",
-        "file:///a/../b",
-    ):
+    secret = ("s3://me:hunter2@b/x", "s3://b/x?token=hunter2")
+    for url in ("lab", *secret, "zip::s3://b/x", "file:///a/../b"):
         with pytest.raises(InputError) as wrong:
             Remote(url)
         assert "hunter2" not in wrong.value.message
