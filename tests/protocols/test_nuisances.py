@@ -103,15 +103,7 @@ def test_a_person_is_asked_once_and_told_when_it_ends() -> None:
         ({}, {"twist": None}, r"limits.twist: is needed.*'rotation' turns the sensor"),
         ({}, {"twist": "0.3 deg"}, r"twist of 0.4 deg, over collection.limits.twist = 0.3 deg"),
         ({}, {"twist_speed": "4 deg/s"}, r"5 deg/s.*limits.twist_speed = 4 deg/s"),
-        (
-            {
-                "elements": {
-                    "arm_motion": {"kind": "arm_motion", "distance": "8 mm", "speed": "20 mm/s"}
-                }
-            },
-            {},
-            "reaches x",
-        ),
+        ({"elements": {"arm_motion": FAR}}, {}, "reaches x"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, change: Any, limits: Any, said: str) -> None:

@@ -41,9 +41,8 @@ def test_a_zip_gives_what_its_folder_gives(tmp_path: Path) -> None:
         with a.open() as first, b.open() as second:
             for column in ("events/t", "events/x", "poses/xyz", "frames/t"):
                 np.testing.assert_array_equal(first.column(column), second.column(column))
-            np.testing.assert_array_equal(
-                first.wrenches("force").force_n, second.wrenches("force").force_n
-            )
+            forces = [reader.wrenches("force").force_n for reader in (first, second)]
+            np.testing.assert_array_equal(*forces)
 
 
 def _zip_of_one(tmp_path: Path) -> Path:
@@ -100,10 +99,8 @@ def test_an_archive_of_arrays_beyond_the_limit_is_refused(tmp_path: Path, monkey
     np.savez_compressed(folder / "events.npz", t=np.zeros(200_000), x=np.zeros(200_000))
     monkeypatch.setattr(tables, "MOST_BYTES", 3 << 20)
     made = adapter(trials={"files": "{who}/events.npz", "id": "{who}"})
-    columns = {"t": "t", "x": "x"}
-    made["streams"] = {
-        "events": {**EVENTS, "format": "numpy", "columns": columns, "size_px": [8, 1]}
-    }
+    table = {"format": "numpy", "columns": {"t": "t", "x": "x"}, "size_px": [8, 1]}
+    made["streams"] = {"events": {**EVENTS, **table}}
     refused(made, tmp_path, "events.npz: streams.events: holds more than 3 MiB")
     monkeypatch.setattr(tables, "MOST_BYTES", 4 << 20)
     assert len(imported(made, tmp_path).events()) == 200_000

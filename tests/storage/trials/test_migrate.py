@@ -44,10 +44,8 @@ def test_it_migrates_forward_with_a_copy_kept(tmp_path: Path) -> None:
     assert verify(store) == []
     copies = files(kept(store, 1))
     assert copies == {name: before[name] for name in copies}
-    assert copies.keys() == {
-        "store.json",
-        *(f"campaigns/c/{n}" for n in ("campaign.json", "protocol.yaml", "rig.yaml")),
-    }
+    names = ("campaign.json", "protocol.yaml", "rig.yaml")
+    assert copies.keys() == {"store.json", *(f"campaigns/c/{name}" for name in names)}
     after = files(store.folder)
     assert all(after[name] == before[name] for name in before if "/trials/" in name)
     assert migrate(store) == []
@@ -111,9 +109,8 @@ def test_a_newer_trial_is_refused_by_name(tmp_path: Path) -> None:
     commit(campaign_, "n", format=99)
     with pytest.raises(StoreError, match=r"record.json: format = 99: was written by a newer"):
         _ = campaign_.recording("n").record
-    assert [p.what for p in verify(store) if p.trial == "n"] == [
-        "was written by a newer version (format 99)"
-    ]
+    found = [p.what for p in verify(store) if p.trial == "n"]
+    assert found == ["was written by a newer version (format 99)"]
     folder = commit(campaign_, "m")
     (folder / "data.h5").chmod(0o644)
     with h5py.File(folder / "data.h5", "r+") as file:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +29,20 @@ def torn(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:20])
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda folder: None,
-        lambda folder: (folder / "checksums.json").unlink(),
-        lambda folder: torn(folder / "checksums.json"),
-    ],
-    ids=["before the rename", "before the checksums", "in the checksums"],
-)
-def test_killed_commit_is_completed(tmp_path: Path, damage: Callable[[Path], None]) -> None:
-    where = campaign(tmp_path / "s")
+def damage(folder: Path, how: str) -> None:
+    """Delete, tear or add files, as in ``-record.json ~data.h5 +x.json``."""
+    for word in how.split():
+        path = folder / word[1:]
+        if word[0] == "+":
+            path.write_text("{}")
+        else:
+            {"-": Path.unlink, "~": torn}[word[0]](path)
+
+
+@pytest.mark.parametrize("how", ["", "-checksums.json", "~checksums.json"])
+def test_killed_commit_is_completed(where: Campaign, tmp_path: Path, how: str) -> None:
     whole = commit(where, "u")
-    damage(killed(where))
+    damage(killed(where), how)
     (problem,) = verify(Store.open(tmp_path / "s"))
     assert problem.kind == "unfinished"
     assert problem.path.endswith("incoming/t")
@@ -53,22 +54,13 @@ def test_killed_commit_is_completed(tmp_path: Path, damage: Callable[[Path], Non
         assert (where.folder / "trials" / "t" / name).read_bytes() == (whole / name).read_bytes()
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda folder: (folder / "record.json").unlink(),
-        lambda folder: torn(folder / "record.json"),
-        lambda folder: torn(folder / "data.h5"),
-        lambda folder: [torn(folder / "data.h5"), (folder / "checksums.json").unlink()],
-        lambda folder: [(folder / "frames.mkv").unlink(), (folder / "checksums.json").unlink()],
-        lambda folder: (folder / "provenance.json").unlink(),
-        lambda folder: (folder / "elsewhere.json").write_text("{}"),
-        lambda folder: (folder / "frames.raw").write_text("x"),
-    ],
-)
-def test_incomplete_trial_is_quarantined(tmp_path: Path, damage: Callable[[Path], None]) -> None:
-    where = campaign(tmp_path / "s")
-    damage(killed(where))
+INCOMPLETE = """-record.json; ~record.json; ~data.h5; ~data.h5 -checksums.json
+-frames.mkv -checksums.json; -provenance.json; +elsewhere.json; +frames.raw"""
+
+
+@pytest.mark.parametrize("how", re.split(r"; |\n", INCOMPLETE))
+def test_incomplete_trial_is_quarantined(where: Campaign, how: str) -> None:
+    damage(killed(where), how)
     assert recover(where) == []
     assert where.sweep() == 1
     assert where.committed() == set()
