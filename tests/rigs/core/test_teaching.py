@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.program import Position
-from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError, Segment
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.core.teaching import Creep, grab_frames, jog_poses, press_in_circles, touch
 from sliplab.rigs.core.touching import RateTouch
 from sliplab.storage.streams import FrameChunk
+from tests.rigs.altered import depths
 from tests.rigs.core.test_rig import after_the_stop, make_rig, watched
 
 QUICK = Creep(clearance_mm=1.5, search_mm=1.0)
@@ -26,9 +27,8 @@ def find(chunk: FrameChunk) -> Any:
 
 def off(rig: Rig, mm: float) -> Rig:
     """The rig with a plane that lies `mm` before the one it has."""
-    rig.plate_frame = PlateFrame(
-        rig.plate_frame.origin - mm * rig.plate_frame.axes[2], rig.plate_frame.axes
-    )
+    origin, axes = rig.plate_frame.origin, rig.plate_frame.axes
+    rig.plate_frame = PlateFrame(origin - mm * axes[2], axes)
     return rig
 
 
@@ -74,14 +74,7 @@ def test_without_tremor_and_aligned_the_markers_still_tell() -> None:
 
 def test_a_touch_that_never_comes_ends_at_the_hard_limit() -> None:
     rig = off(make_rig(), 5.0)
-    deepest = []
-    pose = rig.arm.pose
-
-    def noted() -> Any:
-        deepest.append(rig.plate_frame.position(pose().xyz_mm).depth_mm)
-        return pose()
-
-    rig.arm.pose = noted  # type: ignore[method-assign]
+    deepest = depths(rig)
     with pytest.raises(RigError, match=r"hard limit of 1 mm .*--search"):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert max(deepest) == pytest.approx(1.0, abs=0.01)
@@ -226,7 +219,7 @@ def test_a_person_who_says_stop_is_heard(rig: Rig) -> None:
 
 def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose(rig: Rig) -> None:
     rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
-    rig.arm.start([type_segment(rig, -20.0)])
+    rig.arm.start([Segment(rig.plate_frame.pose(Position(0.0, 0.0, -20.0)), 5.0)])
     with pytest.raises(RigError, match="is still moving"):
         jog_poses(rig, [("", "touched centre")])
     fault = {"kind": "arm_protective_stop", "at_s": 0.1, "since": "trial"}
@@ -235,12 +228,6 @@ def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose(rig: Rig) -> None:
     rig.clock.wait(0.5)
     with pytest.raises(ArmFault, match="protective stop"):
         jog_poses(rig, [("", "elsewhere")])
-
-
-def type_segment(rig: Rig, depth_mm: float) -> Any:
-    from sliplab.rigs.core.capabilities import Segment
-
-    return Segment(rig.plate_frame.pose(Position(0.0, 0.0, depth_mm)), 5.0)
 
 
 def test_looking_gives_frames_and_moves_nothing(rig: Rig) -> None:

@@ -54,8 +54,7 @@ def test_fingers_stall_at_their_force_and_never_pass_it(depth_mm: float, speed: 
     limit_n = pressed(devices, depth_mm) + 1.0
     most = peak_n(devices, limit_n, speed=speed)
     assert limit_n - 0.3 < most < limit_n
-    state = devices.gripper and devices.gripper.state()
-    assert state
+    state = devices.gripper.state()
     assert state.stalled
     assert 38.0 < state.opening_mm < 40.0
     devices.clock.wait(5.0)
@@ -79,9 +78,8 @@ def test_what_fingers_close_is_depth() -> None:
     for devices in (by_arm, by_fingers):
         devices.clock.wait(10.0)
         devices.world.advance()
-    np.testing.assert_allclose(
-        by_fingers.world.physics.tips.normal, by_arm.world.physics.tips.normal, rtol=1e-3
-    )
+    normals = (devices.world.physics.tips.normal for devices in (by_fingers, by_arm))
+    np.testing.assert_allclose(*normals, rtol=1e-3)
 
 
 def test_how_often_the_state_is_read_changes_nothing() -> None:

@@ -111,11 +111,7 @@ def test_every_device_sees_the_same_pulses_on_its_own_clock(devices: Any, trial:
 
 
 def test_clocks_count_from_other_days(trial: Trial) -> None:
-    starts = [
-        trial.events["t_us"][0] * 1000,
-        trial.frames["t_ns"][0],
-        trial.poses["t_ns"][0],
-    ]
+    starts = [trial.events["t_us"][0] * 1000, trial.frames["t_ns"][0], trial.poses["t_ns"][0]]
     assert min(starts) > 1_000_000_000
     assert min(abs(a - b) for a in starts for b in starts if a is not b) > 1_000_000_000
 

@@ -12,7 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sliplab.rigs.scene.contact import BLOCK, LANES, Step, make_blocks, move_tips, store_state
-from sliplab.rigs.scene.friction import friction_knots
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
 from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import (
@@ -23,14 +22,12 @@ from sliplab.rigs.scene.springs import (
     SLIDING,
     STUCK,
     Springs,
-    make_springs,
     new_tips,
 )
 from sliplab.storage.kernels import njit
-from tests.rigs.scene.steps import MU, ideal_skin, line, run, springs_of
+from tests.rigs.scene.steps import RICH, ideal_skin, line, rough, run, springs_of
 
-SWITCHES = {"static_excess": 0.03, "strengthening": 0.01, "relaxation_share": 0.2}
-SWITCHES["damping_s"] = 0.01
+SWITCHES = {**RICH, "damping_s": 0.01}
 
 
 @njit()
@@ -90,8 +87,7 @@ def test_tips_that_share_a_block_are_as_alone(
 ) -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08, friction_scatter=0.05), seed)
     options = {name: value for name, value in SWITCHES.items() if name != off}
-    knots = friction_knots(skin, MU, variation, 0.5, seed)
-    springs = make_springs(skin, knots, level, exact_turns=exact, **options)
+    springs = rough(skin, variation, seed, level, exact_turns=exact, **options)
     corners = [(0.0,) * 6, *waypoints]
     way = np.concatenate([line(a, b, steps) for a, b in zip(corners, waypoints, strict=False)])
     alone, together = both(springs, way[:, :5], way[:, 5], h)
@@ -102,7 +98,7 @@ def test_tips_that_share_a_block_are_as_alone(
 @pytest.mark.long
 def test_the_scenes_of_that_test_have_every_kind_of_step() -> None:
     corners = [(0, 0, -0.3), (0, 0, 3.2), (6, 0, 3.2), (6, 5, 2.0), (4, 1, 3.4), (4, 1, 0.2)]
-    springs = make_springs(ideal_skin(), friction_knots(ideal_skin(), MU, 0.3, 0.5, 1), **SWITCHES)
+    springs = rough(ideal_skin(), 0.3, 1, **SWITCHES)
     way = np.concatenate([line(a, b, 400) for a, b in itertools.pairwise(corners)])
     alone, together = both(springs, way, np.zeros(len(way)), 2e-3)
     assert np.array_equal(alone, together, equal_nan=True)

@@ -9,16 +9,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.scene.friction import friction_knots, grip_at
+from sliplab.rigs.scene.friction import grip_at
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
-from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK, make_springs, new_tips
+from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK, new_tips
 from tests.rigs.scene.steps import (
     MU,
+    RICH,
     at,
     ideal_skin,
     line,
     places,
     pressed,
+    rough,
     run,
     slid,
     springs_of,
@@ -26,7 +28,6 @@ from tests.rigs.scene.steps import (
 )
 
 LEVELS = pytest.mark.parametrize("level", [1, 2, 3])
-ALL = {"static_excess": 0.03, "relaxation_share": 0.2, "strengthening": 0.01}
 
 
 @LEVELS
@@ -64,7 +65,7 @@ def test_slip_starts_at_mu_n_over_k_on_a_straight_path_whatever_the_step() -> No
 def test_slip_runs_from_the_outer_layer_inwards(depth: float, direction: int, level: int) -> None:
     geometry = SkinGeometry(height_scatter_mm=0.08, position_scatter_mm=0.05, friction_scatter=0.05)
     skin = make_skin(geometry, seed=3)
-    springs = make_springs(skin, friction_knots(skin, MU, 0.05, 0.5, seed=9), level, **ALL)
+    springs = rough(skin, 0.05, 9, level, **RICH)
     tips = pressed(springs, depth)
     angle = math.radians(direction)
     end = (15 * math.cos(angle), 15 * math.sin(angle), depth)
@@ -203,7 +204,7 @@ def test_leaving_and_touching_again_resets_the_slider(level: int) -> None:
 
 def test_chunks_do_not_matter() -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08), seed=2)
-    springs = make_springs(skin, friction_knots(skin, MU, 0.05, 0.5, 4), **ALL)
+    springs = rough(skin, 0.05, 4, **RICH)
     path = np.vstack([line((0, 0, 0), (0, 0, 2.6), 300), line((0, 0, 2.6), (4, 2, 2.6), 700)])
     whole, parts = new_tips(19), new_tips(19)
     track, _ = run(springs, whole, path)
@@ -231,8 +232,7 @@ def test_every_force_stays_inside_its_cone(
     seed: int, waypoints: Any, share: float, level: int, variation: float, excess: float, h: float
 ) -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08, friction_scatter=0.05), seed)
-    knots = friction_knots(skin, MU, variation, 0.5, seed)
-    springs = make_springs(skin, knots, level, static_excess=excess, relaxation_share=share)
+    springs = rough(skin, variation, seed, level, static_excess=excess, relaxation_share=share)
     tips, last = new_tips(19), (0.0, 0.0, -1.0)
     for waypoint in waypoints:
         track, load = run(springs, tips, line(last, waypoint, 60), h)

@@ -23,9 +23,8 @@ def runs() -> tuple[np.ndarray, np.ndarray]:
     settings = MockSettings(seed=1)
     skin = skin_of(settings)
     rows, motion = [], []
-    for seed, (depth, speed, direction, _) in enumerate(
-        itertools.product(DEPTHS, SPEEDS, DIRECTIONS, range(3))
-    ):
+    grid = itertools.product(DEPTHS, SPEEDS, DIRECTIONS, range(3))
+    for seed, (depth, speed, direction, _) in enumerate(grid):
         springs = springs_of(settings, skin, seed)
         run = run_slide(springs, depth, speed, direction, step_mm=0.25)
         rows.append(run.slipped_s)
@@ -89,12 +88,8 @@ def test_markers_move_most_while_loading_and_little_in_gross_slip(runs: Any) -> 
 
 def test_an_even_scene_is_silent_in_gross_slip() -> None:
     """Without friction that varies, nothing tells gross slip from holding still."""
-    settings = MockSettings.model_validate(
-        {
-            "seed": 1,
-            "scene": {"friction": {"path_variation": 0.0, "static_excess": 0.0}},
-        }
-    )
+    friction = {"path_variation": 0.0, "static_excess": 0.0}
+    settings = MockSettings.model_validate({"seed": 1, "scene": {"friction": friction}})
     run = run_slide(springs_of(settings, skin_of(settings), 1), 2.8, 1.0, step_mm=0.25)
     motion = _motion(run, settings.event_camera.shift_mm_per_n)
     assert motion[4] < 1e-3 * motion[0]

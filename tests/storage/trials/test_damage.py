@@ -63,7 +63,7 @@ checksums | damaged
 """.replace("DEEP", "[" * 100_000).replace("NOBODY", str(NOBODY))
 
 
-def _damage(folder: Path, how: str, place: str, text: str = "") -> None:
+def damage(folder: Path, how: str, place: str, text: str = "") -> None:
     path = folder / place
     if how == "write":
         path.write_bytes(text.encode("latin-1"))
@@ -81,7 +81,7 @@ def test_verify_names_it_and_what_is_whole_stays_readable(
 ) -> None:
     where = campaign(tmp_path / "s")
     whole = [commit(where, name) for name in ("t", "whole")][1]
-    _damage(where.folder, *change.split(" ", 2))
+    damage(where.folder, *change.split(" ", 2))
     store = Store.open(tmp_path / "s")
     problems = verify(store)
     kinds = {"damaged": DAMAGED, "unfinished": UNFINISHED}

@@ -43,6 +43,12 @@ def _with(folder: Path, data: bytes) -> Recording:
     return Recording(folder)
 
 
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store without anything."""
+    return Store.create(tmp_path / "store")
+
+
 # what is put in a record's place (nothing: dropped)
 RECORDS = """
     condition: 2.4 mm
@@ -136,8 +142,7 @@ def test_checksums_are_text_and_a_number(tmp_path: Path, said: Any) -> None:
     "name",
     ["../x", "/x", "a/b", "..", "", ".hidden", "a\\b", "a\nb", "a\0b", "C:x", "x" * 252, "a..b"],
 )
-def test_names_stay_in_the_store(tmp_path: Path, name: str) -> None:
-    store = Store.create(tmp_path / "store")
+def test_names_stay_in_the_store(store: Store, name: str) -> None:
     for use in (
         lambda: store.campaign(name),
         lambda: store.campaign("c").recording(name),
@@ -150,8 +155,7 @@ def test_names_stay_in_the_store(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["campaigns", "control", "derived", "models", "report", "before"])
-def test_a_link_out_of_the_store_is_refused(tmp_path: Path, name: str) -> None:
-    store = Store.create(tmp_path / "store")
+def test_a_link_out_of_the_store_is_refused(store: Store, tmp_path: Path, name: str) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "inside").mkdir()
     os.symlink(tmp_path / "outside", store.folder / name)
@@ -173,8 +177,7 @@ def test_a_quarantine_that_leads_out_is_refused(tmp_path: Path) -> None:
     assert list((tmp_path / "outside").iterdir()) == []
 
 
-def test_derived_results_that_lead_out_are_refused(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "store")
+def test_derived_results_that_lead_out_are_refused(store: Store, tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "derived").mkdir()
     os.symlink(tmp_path / "outside", store.folder / "derived" / "labels")
@@ -194,8 +197,7 @@ def test_a_request_that_leads_out_is_left_out(tmp_path: Path, change: dict[str, 
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", '{"did": 1}', "{", '{"did": {"a": NaN}}'])
-def test_a_damaged_answer_is_an_empty_one(tmp_path: Path, text: str) -> None:
-    store = Store.create(tmp_path / "store")
+def test_a_damaged_answer_is_an_empty_one(store: Store, text: str) -> None:
     asked = control.ask(store, "pause")
     (store.folder / "control" / "000001.done.json").write_text(text)
     assert control.answered(store, asked) == {"did": {}}

@@ -1,6 +1,5 @@
 """A trial is there whole or not at all, and verify sees every damage."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,9 @@ from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
+from tests.protocols.planning import rows
 from tests.storage.trial_files import FRAME, campaign, commit, fail, fill, record
+from tests.storage.trials.test_damage import damage
 
 
 def test_a_committed_trial_reads_as_it_was_written(where: Campaign, tmp_path: Path) -> None:
@@ -70,31 +71,25 @@ def test_a_trial_is_never_committed_twice(where: Campaign) -> None:
         writer.commit(record("t"), Provenance())
 
 
-def _flip(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
+# what is done to a trial's file | what verify says
+DAMAGE = """
+    flip data.h5 | does not match its checksum
+    flip frames.mkv | does not match
+    write data.h5 x | has 1 bytes
+    remove frames.mkv | is missing
+    change record.json | does not match
+    remove checksums.json | cannot be read
+    write notes.txt x | does not belong here
+"""
 
 
-DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "flipped bit": (lambda t: _flip(t / "data.h5"), "does not match its checksum"),
-    "flipped bit in the video": (lambda t: _flip(t / "frames.mkv"), "does not match"),
-    "cut short": (lambda t: (t / "data.h5").write_bytes(b"x"), "has 1 bytes"),
-    "file gone": (lambda t: (t / "frames.mkv").unlink(), "is missing"),
-    "record changed": (
-        lambda t: write_json(t / "record.json", record("t", block=7).to_json()),
-        "does not match",
-    ),
-    "checksums gone": (lambda t: (t / "checksums.json").unlink(), "cannot be read"),
-    "stranger": (lambda t: (t / "notes.txt").write_text("x"), "does not belong here"),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_verify_names_each_damage(name: str, tmp_path: Path) -> None:
-    damage, says = DAMAGE[name]
-    where = campaign(tmp_path / "s")
-    damage(commit(where, "t"))
+@pytest.mark.parametrize(("change", "says"), rows(DAMAGE))
+def test_verify_names_each_damage(change: str, says: str, where: Campaign, tmp_path: Path) -> None:
+    trial = commit(where, "t")
+    if change == "change record.json":
+        write_json(trial / "record.json", record("t", block=7).to_json())
+    else:
+        damage(trial, *change.split(" ", 2))
     commit(where, "whole")
     problems = verify(Store.open(tmp_path / "s"))
     assert problems

@@ -74,9 +74,8 @@ def test_an_encoder_that_fails_says_so_and_blocks_nobody(tmp_path: Path, monkeyp
                 raise ValueError("out of ink")
             return av.VideoFrame.from_numpy_buffer(image, format=format)
 
-    monkeypatch.setattr(
-        "sliplab.storage.trials.video.av", SimpleNamespace(**{**vars(av), "VideoFrame": Broken})
-    )
+    codec = SimpleNamespace(**{**vars(av), "VideoFrame": Broken})
+    monkeypatch.setattr("sliplab.storage.trials.video.av", codec)
     writer = VideoWriter(tmp_path / "v.mkv", *FRAME, 100)
     # fewer than the queues hold: nothing waits, and closing tells what happened
     writer.write(frames(20).images[:2])
