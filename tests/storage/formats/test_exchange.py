@@ -538,13 +538,6 @@ def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> Non
         import_trials(store, "c", trials_in(path, kind), path, kind)
 
 
-def test_without_faery_its_files_are_refused_by_name(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("sliplab.plugins.formats.event_stream.LIBRARY", "no_such_library")
-    (tmp_path / "a.es").write_bytes(b"Event Stream\2\0\0\1")
-    with pytest.raises(InputError, match="pip install"):
-        _import(tmp_path / "store", tmp_path / "a.es")
-
-
 def test_pairs_of_pickles(tmp_path: Path) -> None:
     names = ["a_events_on.pickle", "a_events_off.pickle", "b_events_on.pkl", "times.pickle"]
     found = [(p.stem, bool(p.on), bool(p.off)) for p in lab.pairs([tmp_path / n for n in names])]

@@ -7,13 +7,10 @@ import pytest
 
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.trial import Provenance
-from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
-from tests.protocols.planning import rows
 from tests.storage.trial_files import FRAME, campaign, commit, fail, fill, record
-from tests.storage.trials.test_damage import damage
 
 
 def test_a_committed_trial_reads_as_it_was_written(where: Campaign, tmp_path: Path) -> None:
@@ -71,44 +68,12 @@ def test_a_trial_is_never_committed_twice(where: Campaign) -> None:
         writer.commit(record("t"), Provenance())
 
 
-# what is done to a trial's file | what verify says
-DAMAGE = """
-    flip data.h5 | does not match its checksum
-    flip frames.mkv | does not match
-    write data.h5 x | has 1 bytes
-    remove frames.mkv | is missing
-    change record.json | does not match
-    remove checksums.json | cannot be read
-    write notes.txt x | does not belong here
-"""
-
-
-@pytest.mark.parametrize(("change", "says"), rows(DAMAGE))
-def test_verify_names_each_damage(change: str, says: str, where: Campaign, tmp_path: Path) -> None:
-    trial = commit(where, "t")
-    if change == "change record.json":
-        write_json(trial / "record.json", record("t", block=7).to_json())
-    else:
-        damage(trial, *change.split(" ", 2))
-    commit(where, "whole")
-    problems = verify(Store.open(tmp_path / "s"))
-    assert problems
-    assert any(says in problem.what for problem in problems)
-    assert all("whole" not in problem.path for problem in problems)
-
-
 def test_verify_sees_a_record_that_does_not_fit_its_data(where: Campaign, tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     fill(writer, count=900)
     writer.commit(record("t"), Provenance())
     (problem,) = verify(Store.open(tmp_path / "s"))
     assert problem.what == "900 events, the record says 1000"
-
-
-def test_names_cannot_lead_out_of_the_store(where: Campaign) -> None:
-    for name in ("../x", "a/b", "", ".hidden", "a\0b", "x" * 300):
-        with pytest.raises(StoreError, match="cannot be the name"):
-            where.begin(name, None, 100)
 
 
 def test_a_folder_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
@@ -122,15 +87,3 @@ def test_a_folder_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
     write_json(other / "store.json", {"format": 99})
     with pytest.raises(StoreError, match="format = 99"):
         Store.open(other)
-
-
-def test_a_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
-    path = tmp_path / ".lock"
-    with (
-        exclusive(path, "the store"),
-        pytest.raises(Locked, match=r"the store is in use by another program \(pid \d+ of "),
-        exclusive(path, "the store"),
-    ):
-        raise AssertionError("two holders")
-    with exclusive(path, "the store"):
-        pass
