@@ -58,6 +58,12 @@ def registered(where: Campaign, count: int = 1) -> list[Path]:
     return [add_registration(where, CONTENT) for _ in range(count)]
 
 
+@pytest.fixture
+def path(where: Campaign) -> Path:
+    """A registration."""
+    return registered(where)[0]
+
+
 def problems(where: Campaign) -> dict[str, str]:
     """What is wrong, by the file's name."""
     return {path.name: what for path, what in registration_problems(where)}
@@ -118,15 +124,13 @@ def test_changed_file_is_named(
     assert (Path(found.path).name, found.kind, found.campaign) == (name, DAMAGED, "c")
 
 
-def test_other_spaces_are_named(where: Campaign) -> None:
-    (path,) = registered(where)
+def test_other_spaces_are_named(path: Path, where: Campaign) -> None:
     os.chmod(path, 0o644)
     path.write_text(json.dumps(json.loads(path.read_bytes())))
     assert "not as it was written" in problems(where)["0001.json"]
 
 
-def test_every_cut_or_changed_byte_is_named(where: Campaign) -> None:
-    (path,) = registered(where)
+def test_every_cut_or_changed_byte_is_named(path: Path, where: Campaign) -> None:
     os.chmod(path, 0o644)
     whole = path.read_bytes()
     for at in range(0, len(whole), 7):
@@ -158,8 +162,7 @@ def test_damaged_earlier_registration_refuses_another_one(where: Campaign) -> No
     assert registration_files(where) == [first]
 
 
-def test_temporary_and_foreign_files_are_named(where: Campaign, tmp_path: Path) -> None:
-    (path,) = registered(where)
+def test_temporary_and_foreign_files_are_named(path: Path, where: Campaign, tmp_path: Path) -> None:
     (path.parent / "notes.txt").write_text("")
     (path.parent / f".0002.json.{2**22 + 1}.tmp").write_text("")
     found = {Path(it.path).name: it.kind for it in verify(Store.open(tmp_path / "store"))}
@@ -187,8 +190,7 @@ def test_stamp_goes_to_the_registration_it_is_of(where: Any, tmp_path: Path, end
         attach_stamp(files, stamp)
 
 
-def test_nothing_is_registered_after_a_damaged_registration(where: Campaign) -> None:
-    (path,) = registered(where)
+def test_nothing_is_registered_after_a_damaged_registration(path: Path, where: Campaign) -> None:
     path.chmod(0o644)
     path.write_text(path.read_text().replace('"planned": 3', '"planned": 4'))
     with pytest.raises(StoreError, match="does not match its checksum; restore it from a copy"):
@@ -218,16 +220,14 @@ def test_stamp_of_another_kind_or_missing_is_refused(where: Campaign, tmp_path: 
         attach_stamp(files, Path(os.fspath(tmp_path)).with_suffix(".tsr"))
 
 
-def test_changed_stamp_and_stamp_without_registration_are_named(where: Campaign) -> None:
-    (path,) = registered(where)
+def test_changed_stamp_and_stamp_without_registration_are_named(path: Any, where: Campaign) -> None:
     path.with_name("0001.json.tsr").write_bytes(b"of another file")
     path.with_name("0007.json.ots").write_bytes(b"")
     assert "SHA-256" in problems(where)["0001.json.tsr"]
     assert problems(where)["0007.json.ots"] == "is of no registration"
 
 
-def test_push_and_pull_take_registrations_along(where: Campaign, tmp_path: Path) -> None:
-    (path,) = registered(where)
+def test_push_and_pull_take_registrations_along(path: Any, where: Campaign, tmp_path: Path) -> None:
     path.with_name("0001.json.tsr").write_bytes(bytes.fromhex(sha256(path)))
     commit(where, "a")
     remote = Remote(f"file://{tmp_path / 'shared'}")

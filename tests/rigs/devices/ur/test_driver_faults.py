@@ -41,9 +41,11 @@ TARGET = Pose((400.0, 15.0, 300.0), HOME.rotvec_deg)
 SLIDE = [Segment(TARGET, 1.6)]
 
 
-def sliding(arm: UrArm, robot: Any) -> None:
+def sliding(arm: UrArm, robot: Any) -> tuple[Any, Any]:
+    """Start a slide, and wait until the arm moves."""
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+    return arm, robot
 
 
 def fails(action: Callable[[], object], within_s: float, match: str) -> float:
@@ -166,8 +168,7 @@ def test_a_controller_that_takes_commands_and_never_answers(ur_pair: MakeUr) -> 
 
 
 def test_a_dead_control_client_leaves_two_ways_to_stop(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair()
-    sliding(arm, robot)
+    arm, robot = sliding(*ur_pair())
     arm._control.kill()
     began = time.monotonic()
     arm.stop()
@@ -257,8 +258,7 @@ def test_an_arm_without_power_is_said_to_have_none(ur_pair: MakeUr) -> None:
 
 
 def test_a_slider_that_is_moved_while_sliding_ends_the_path(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair()
-    sliding(arm, robot)
+    arm, robot = sliding(*ur_pair())
     robot.set_slider(0.5)
     until(lambda: arm._run.done, 2.0)
     fails(arm.progress, 0.0, "slider is at 50%, so the move was too slow")
@@ -285,8 +285,7 @@ def test_a_controller_clock_that_falls_back_ends_the_stream(ur_pair: MakeUr, mov
 
 
 def test_a_stream_of_nonsense_is_a_lost_one(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair()
-    sliding(arm, robot)
+    arm, robot = sliding(*ur_pair())
     robot.program.joints_deg[2] = float("nan")
     until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
     fails(arm.stop, 2 * driver.PORT_S + 2 * driver.STILL_S, "cannot be confirmed at rest")
@@ -321,8 +320,7 @@ def test_a_link_lost_as_the_move_begins_is_no_arm_at_rest(
 
 
 def test_a_stop_after_close_still_stops(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair()
-    sliding(arm, robot)
+    arm, robot = sliding(*ur_pair())
     arm.close()
     arm.stop()
     assert not robot.moving()
