@@ -161,9 +161,7 @@ def test_parts_whose_times_stop_are_silence(events: int, edges_us: np.ndarray) -
 
 
 @realtime
-def test_a_recording_is_played_as_it_was_made(
-    opened: Callable[..., Prophesee], tmp_path: Path
-) -> None:
+def test_a_recording_is_played_as_it_was_made(opened: Any, tmp_path: Path) -> None:
     sent = some_events(count=2000, step_us=500)
     edges = np.array([1_100_000, 1_200_000], np.int64)
     data = Header(3, SIZE, "512").text() + Evt3Encoder().encode(sent, edges, trigger=1)
@@ -200,9 +198,7 @@ def test_a_file_that_is_no_recording(opened: Callable[..., Prophesee], tmp_path:
 # -- the maker's library -------------------------------------------------------------------
 
 
-def test_a_computer_without_the_library_is_told_in_one_line(
-    opened: Callable[..., Prophesee],
-) -> None:
+def test_a_computer_without_the_library_is_told_in_one_line(opened: Any) -> None:
     said = "needs metavision_hal, which comes with the Metavision SDK or OpenEB: install one of"
     with pytest.raises(RigError, match=said) as raised:
         opened()
@@ -319,9 +315,7 @@ def buffer(events: EventChunk, *edges: tuple[int, int, int]) -> tuple[Any, Any]:
 
 
 @realtime
-def test_a_camera_is_read_by_the_makers_library(
-    hal: dict[str, HalDevice], opened: Callable[..., Prophesee]
-) -> None:
+def test_a_camera_is_read_by_the_makers_library(hal: dict[str, HalDevice], opened: Any) -> None:
     device = hal["0512"]
     assert ping(PropheseeSettings(serial="0512")) is None
     assert "no camera 77; the library lists Prophesee" in str(ping(PropheseeSettings(serial="77")))
@@ -348,9 +342,7 @@ def test_a_camera_is_read_by_the_makers_library(
         until(lambda: camera.read() is None, 3.0)
 
 
-def test_a_camera_that_is_absent_is_a_fault(
-    hal: dict[str, HalDevice], opened: Callable[..., Prophesee]
-) -> None:
+def test_a_camera_that_is_absent_is_a_fault(hal: dict[str, HalDevice], opened: Any) -> None:
     with pytest.raises(RigError, match="camera 77: no such camera"):
         opened(serial="77")
     hal.clear()

@@ -46,35 +46,16 @@ def rows(decoder: Decoder, *parts: bytes) -> list[tuple[int, int, int, int]]:
     ]
 
 
+# before any time: dropped; the low part is 0 until it is sent; a single event leaves the vector's
+# column where it was
 STREAM = words(
-    (ADDR_Y, 9),
-    (ADDR_X, 1),  # before any time: dropped
-    (TIME_HIGH, 2),
-    (ADDR_Y, 100),
-    (ADDR_X, 5),  # the low part is 0 until it is sent
-    (TIME_LOW, 7),
-    (ADDR_X, ON | 6),
-    (BASE_X, ON | 20),
-    (VECT_12, 0b1000_0000_0001),
-    (VECT_12, 0b10),
-    (VECT_8, 0b1000_0000),
-    (ADDR_X, 3),
-    (VECT_8, 0b1),  # a single event leaves the vector's column where it was
-    (TIME_HIGH, 3),
-    (ADDR_Y, 101),
+    *((ADDR_Y, 9), (ADDR_X, 1), (TIME_HIGH, 2), (ADDR_Y, 100), (ADDR_X, 5), (TIME_LOW, 7)),
+    *((ADDR_X, ON | 6), (BASE_X, ON | 20), (VECT_12, 0b1000_0000_0001), (VECT_12, 0b10)),
+    *((VECT_8, 0b1000_0000), (ADDR_X, 3), (VECT_8, 0b1), (TIME_HIGH, 3), (ADDR_Y, 101)),
     (VECT_8, 0b1),
 )
-EVENTS = [
-    (8192, 5, 100, 0),
-    (8199, 6, 100, 1),
-    (8199, 20, 100, 1),
-    (8199, 31, 100, 1),
-    (8199, 33, 100, 1),
-    (8199, 51, 100, 1),
-    (8199, 3, 100, 0),
-    (8199, 52, 100, 1),
-    (12288, 60, 101, 1),
-]
+PLACES = ((6, 1), (20, 1), (31, 1), (33, 1), (51, 1), (3, 0), (52, 1))
+EVENTS = [(8192, 5, 100, 0), *((8199, x, 100, p) for x, p in PLACES), (12288, 60, 101, 1)]
 
 
 def test_words_mean_what_the_maker_says() -> None:
@@ -97,11 +78,8 @@ def test_triggers_have_an_input_an_edge_and_a_time() -> None:
     cd = [1 << 28 | 3 << 22 | 40 << 11 | 50, TIME_HIGH << 28 | 11, 10 << 28 | 2 << 22 | 4 << 8 | 1]
     data = np.array([TIME_HIGH << 28 | 10, *cd], "<u4").tobytes()
     two = Evt2Decoder().decode(data)
-    assert (two.events.t_us.tolist(), two.events.x.tolist(), two.events.y.tolist()) == (
-        [643],
-        [40],
-        [50],
-    )
+    assert [two.events.t_us[0], two.events.x[0], two.events.y[0]] == [643, 40, 50]
+    assert len(two.events) == 1
     assert (two.trigger_us.tolist(), two.trigger_id.tolist()) == ([706], [4])
     assert two.trigger_up.tolist() == [True]
 
@@ -127,17 +105,9 @@ def test_a_clock_that_falls_back_is_no_new_turn() -> None:
 
 
 def by_faery(path: Path) -> list[tuple[int, int, int, int]]:
-    packets = list(faery.events_stream_from_file(path, file_type="evt"))
-    whole = np.concatenate(packets)
-    return list(
-        zip(
-            whole["t"].tolist(),
-            whole["x"].tolist(),
-            whole["y"].tolist(),
-            whole["on"].astype(int).tolist(),
-            strict=True,
-        )
-    )
+    whole = np.concatenate(list(faery.events_stream_from_file(path, file_type="evt")))
+    columns = (whole[name].astype(int).tolist() for name in ("t", "x", "y", "on"))
+    return list(zip(*columns, strict=True))
 
 
 def random_evt3(rng: np.random.Generator, count: int) -> bytes:
@@ -213,10 +183,8 @@ def test_what_is_encoded_is_read_by_another_library(tmp_path: Path) -> None:
     events = EventChunk(*(column[kept] for column in vars(events).values()))
     data = Evt3Encoder().encode(events, np.empty(0, np.int64))
     (path := tmp_path / "a.raw").write_bytes(Header(3, SIZE, "1").text() + data)
-    sent = list(
-        zip(*(getattr(events, name).tolist() for name in ("t_us", "x", "y", "p")), strict=True)
-    )
-    assert by_faery(path) == sent
+    columns = (getattr(events, name).tolist() for name in ("t_us", "x", "y", "p"))
+    assert by_faery(path) == list(zip(*columns, strict=True))
 
 
 def test_what_is_encoded_is_decoded_in_any_parts_and_over_turns_of_the_clock() -> None:

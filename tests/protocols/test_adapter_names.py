@@ -24,14 +24,8 @@ TABLE = {"files": "x", "format": "csv", "unit": "s", "columns": {"t": "t", "valu
     ],
 )
 def test_wrong_name_is_shown(tmp_path: Path, sections: dict[str, Any], message: str) -> None:
-    made = {
-        "adapter": 1,
-        "name": "a",
-        "experiment": "classes",
-        "trials": {"files": "x"},
-        "streams": {"scalars": {"s": TABLE}},
-        **sections,
-    }
+    made = {"adapter": 1, "name": "a", "experiment": "classes", "trials": {"files": "x"}}
+    made |= {"streams": {"scalars": {"s": TABLE}}, **sections}
     (tmp_path / "a.yaml").write_text(yaml.safe_dump(made))
     with pytest.raises(InputError) as caught:
         load_adapter(tmp_path / "a.yaml")

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from sliplab.protocols import InputError, load_plan
 from tests.conftest import ROOT, SMALL
-from tests.protocols.planning import plan_of
+from tests.protocols.planning import plan_of, refused, rows
 
 SKIN: dict[str, Any] = {"values": ["smooth", "ridged"], "changeover": "person"}
 ROOM: dict[str, Any] = {"unit": "degC", "values": [21, 35.5], "changeover": "person"}
@@ -72,11 +73,8 @@ def test_the_plate_is_still_a_changeover() -> None:
 
 def test_a_skin_can_be_held_out(tmp_path: Path) -> None:
     data = with_context(skin=SKIN, temperature=ROOM)
-    data["analysis"]["split"] = {
-        "method": "leave_conditions_out",
-        "test_levels": {"skin": ["ridged"]},
-        "validation_levels": {"temperature": ["35.5 degC"]},
-    }
+    split = {"method": "leave_conditions_out", "test_levels": {"skin": ["ridged"]}}
+    data["analysis"]["split"] = {**split, "validation_levels": {"temperature": ["35.5 degC"]}}
     for trial in plan_of(data, tmp_path):
         condition = dict(trial.condition)
         held = "validation" if str(condition["temperature"]) == "35.5" else "train"
@@ -109,10 +107,8 @@ def test_no_context_is_as_if_the_section_were_not_there(tmp_path: Path) -> None:
 
 def test_a_serial_number_is_text(tmp_path: Path) -> None:
     data = with_context(sensor={"values": ["0042", "NT-7.b"], "changeover": "person"})
-    assert {plan.describe(t)["sensor"] for plan in [plan_of(data, tmp_path)] for t in plan} == {
-        "0042",
-        "NT-7.b",
-    }
+    plan = plan_of(data, tmp_path)
+    assert {plan.describe(trial)["sensor"] for trial in plan} == {"0042", "NT-7.b"}
 
 
 def test_levels_that_nobody_changes_are_noted(tmp_path: Path) -> None:
@@ -121,25 +117,23 @@ def test_levels_that_nobody_changes_are_noted(tmp_path: Path) -> None:
     assert note.startswith("collection.context.skin: has 2 levels and nobody is asked")
 
 
-WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
-    "a number without a unit": ({"sensor": {"values": [42]}}, "sensor", "quote a number that is"),
-    "text with a unit": ({"room": {"unit": "degC", "values": ["hot"]}}, "room", "words have none"),
-    "a path": ({"skin": {"values": ["../x"]}}, "skin.values[0]", "letters, digits"),
-    "a factor's name": ({"speed": {"values": ["fast"]}}, "speed", "is a factor already"),
-    "a column's name": ({"role": {"values": ["a"]}}, "role", "is a column of every table"),
-    "a wrong name": ({"Skin": {"values": ["a"]}}, "Skin", "a small letter"),
-    "an unknown unit": ({"room": {"unit": "K", "values": [1]}}, "room.unit", "must be one of"),
-    "no levels": ({"skin": {"values": []}}, "skin", "at least one"),
-}
+WRONG = """
+    sensor: {values: [42]} | sensor | quote a number that is
+    room: {unit: degC, values: [hot]} | room | words have none
+    skin: {values: [../x]} | skin.values[0] | letters, digits
+    speed: {values: [fast]} | speed | is a factor already
+    role: {values: [a]} | role | is a column of every table
+    Skin: {values: [a]} | Skin | a small letter
+    room: {unit: K, values: [1]} | room.unit | must be one of
+    skin: {values: []} | skin | at least one
+"""
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_context_is_named(case: str, tmp_path: Path) -> None:
-    context, key, says = WRONG[case]
-    with pytest.raises(InputError) as caught:
-        plan_of(with_context(**context), tmp_path)
-    assert caught.value.key == f"collection.context.{key}"
-    assert says in caught.value.expected
+@pytest.mark.parametrize(("context", "key", "says"), rows(WRONG))
+def test_wrong_context_is_named(context: str, key: str, says: str, tmp_path: Path) -> None:
+    error = refused(with_context(**yaml.safe_load(context)), tmp_path)
+    assert error.key == f"collection.context.{key}"
+    assert says in error.expected
 
 
 def test_context_that_is_to_move_something_is_refused(tmp_path: Path) -> None:

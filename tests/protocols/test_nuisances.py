@@ -35,15 +35,19 @@ def under(plan: Plan, name: str, strength: int = 100) -> Trial:
     return min(found, key=lambda trial: trial.id)
 
 
-def test_all_that_ship_are_levels_of_the_shipped_protocol() -> None:
-    plan = load_plan(Path("nuisances"))
+@pytest.fixture
+def plan() -> Plan:
+    """The shipped protocol."""
+    return load_plan(Path("nuisances"))
+
+
+def test_all_that_ship_are_levels_of_the_shipped_protocol(plan: Plan) -> None:
     assert set(plan.levels["nuisance"]) == {NONE, MIX, *SHIPPED}
     assert plan.program(under(plan, NONE)).nuisances == ()
     assert plan.program(under(plan, MIX)).nuisances == tuple(SHIPPED.values())
 
 
-def test_strength_multiplies_sizes() -> None:
-    plan = load_plan(Path("nuisances"))
+def test_strength_multiplies_sizes(plan: Plan) -> None:
     (half,), (double,) = (plan.program(under(plan, "brush", s)).nuisances for s in (50, 200))
     assert (half.force, double.force) == (SHIPPED["brush"].force / 2, SHIPPED["brush"].force * 2)
     assert half.every == double.every
@@ -52,8 +56,7 @@ def test_strength_multiplies_sizes() -> None:
 @pytest.mark.parametrize(
     ("name", "step"), [("arm_motion", Move), ("rotation", Twist), ("regrasp", Move)]
 )
-def test_the_arm_moves_in_the_hold_and_comes_back(name: str, step: type) -> None:
-    plan = load_plan(Path("nuisances"))
+def test_the_arm_moves_in_the_hold_and_comes_back(plan: Plan, name: str, step: type) -> None:
     steps = plan.program(under(plan, name)).steps
     still = plan.program(under(plan, NONE)).steps
     made = [(k, each) for k, each in enumerate(steps) if each.phase == "nuisance"]
@@ -70,8 +73,7 @@ def test_the_arm_moves_in_the_hold_and_comes_back(name: str, step: type) -> None
     assert others == [each for each in still if each.phase != "hold"]
 
 
-def test_a_person_is_asked_once_and_told_when_it_ends() -> None:
-    plan = load_plan(Path("nuisances"))
+def test_a_person_is_asked_once_and_told_when_it_ends(plan: Plan) -> None:
     asked = {}
     for trial in plan:
         for task in plan.tasks_before(trial):
@@ -103,20 +105,10 @@ def test_a_person_is_asked_once_and_told_when_it_ends() -> None:
         ({}, {"twist": None}, r"limits.twist: is needed.*'rotation' turns the sensor"),
         ({}, {"twist": "0.3 deg"}, r"twist of 0.4 deg, over collection.limits.twist = 0.3 deg"),
         ({}, {"twist_speed": "4 deg/s"}, r"5 deg/s.*limits.twist_speed = 4 deg/s"),
-        (
-            {
-                "elements": {
-                    "arm_motion": {"kind": "arm_motion", "distance": "8 mm", "speed": "20 mm/s"}
-                }
-            },
-            {},
-            "reaches x",
-        ),
+        ({"elements": {"arm_motion": FAR}}, {}, "reaches x"),
     ],
 )
-def test_what_is_wrong_is_said(
-    tmp_path: Path, change: dict[str, Any], limits: dict[str, str | None], said: str
-) -> None:
+def test_what_is_wrong_is_said(tmp_path: Path, change: Any, limits: Any, said: str) -> None:
     change = change or {"apply": "$nuisance"}
     with pytest.raises(InputError, match=said):
         edited(tmp_path, change, **limits)

@@ -2,9 +2,6 @@
 
 import copy
 import json
-import os
-import subprocess
-import sys
 from collections import Counter
 from decimal import Decimal
 from itertools import pairwise
@@ -18,6 +15,7 @@ from hypothesis import strategies as st
 from sliplab.protocols import Dwell, InputError, Move, Plan, Protocol, load_plan, make_plan
 from sliplab.protocols.yaml_file import validate
 from tests.conftest import ROOT, SMALL
+from tests.protocols.planning import said_by
 
 
 def plan_of(data: dict[str, Any]) -> Plan:
@@ -101,35 +99,18 @@ def test_the_order_is_the_same_in_any_process(hash_seed: str) -> None:
         "p = load_plan(Path('protocols/kinematic.yaml'));"
         "print(json.dumps([[t.id, t.split, t.seed] for t in p]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONHASHSEED": hash_seed},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
+    said = said_by(code, PYTHONHASHSEED=hash_seed)
     here = load_plan(ROOT / "protocols" / "kinematic.yaml")
-    assert json.loads(done.stdout) == [[t.id, t.split, t.seed] for t in here]
+    assert json.loads(said) == [[t.id, t.split, t.seed] for t in here]
 
 
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [
-        ("kinematic", 864),
-        ("gravity", 180),
-        ("disturbance", 80),
-        ("pilot", 36),
-        ("pilot_gravity", 8),
-        ("press_twist", 54),
-    ],
-)
+SHIPPED = {"kinematic": 864, "gravity": 180, "disturbance": 80, "pilot": 36, "pilot_gravity": 8}
+
+
+@pytest.mark.parametrize(("name", "count"), [*SHIPPED.items(), ("press_twist", 54)])
 def test_shipped_protocols(name: str, count: int) -> None:
     plan = load_plan(ROOT / "protocols" / f"{name}.yaml")
-    assert len(plan) == count
-    assert plan.warnings() == []
-    assert plan.protocol.name == name
+    assert (plan.protocol.name, len(plan), plan.warnings()) == (name, count, [])
 
 
 def test_the_optional_disturbance_level_adds_trials_only() -> None:
@@ -162,11 +143,8 @@ def test_splits_of_the_full_grid() -> None:
 
 def test_conditions_can_be_left_out() -> None:
     data = copy.deepcopy(SMALL)
-    data["analysis"]["split"] = {
-        "method": "leave_conditions_out",
-        "validation_levels": {"direction": ["90.0 deg"]},
-        "test_levels": {"depth": ["3.40 mm"]},
-    }
+    split = {"method": "leave_conditions_out", "validation_levels": {"direction": ["90.0 deg"]}}
+    data["analysis"]["split"] = {**split, "test_levels": {"depth": ["3.40 mm"]}}
     for trial in plan_of(data):
         condition = dict(trial.condition)
         held = condition["depth"] == Decimal("3.4")
@@ -250,15 +228,7 @@ def test_the_plan_is_read_without_heavy_libraries() -> None:
         "heavy = {'torch', 'numba', 'cv2', 'prefect', 'pandas', 'scipy', 'h5py', 'samna'};"
         "print(sorted(heavy & set(sys.modules)))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-    assert done.stdout.strip() == "[]"
+    assert said_by(code).strip() == "[]"
 
 
 def test_a_plan_file_says_where_it_came_from(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from sliplab.flows.cli.app import command_line
 from sliplab.protocols import plugin
 from sliplab.protocols.plugin import Plugin, plugins
 from tests.conftest import ROOT
+from tests.protocols.planning import said_by
 
 LOADED = """
 import contextlib, io, json, sys
@@ -29,14 +29,7 @@ print(json.dumps([name for name in sys.modules if name.startswith("sliplab.plugi
 
 def loaded(*words: str) -> list[str]:
     """Run a command in a new process; return the modules of plug-ins that it loads."""
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED, json.dumps(words)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found: list[str] = json.loads(done.stdout.splitlines()[-1])
+    found: list[str] = json.loads(said_by(LOADED, json.dumps(words)).splitlines()[-1])
     return found
 
 
@@ -121,10 +114,7 @@ def test_names_from_before_a_move_still_work() -> None:
         "from sliplab.analysis.bench import registry; import sliplab.plugins.bench.registry as r;"
         "print(old is new, registry is r, new.__spec__.name)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["True", "True", "sliplab.plugins.bench.interface"]
+    assert said_by(code).split() == ["True", "True", "sliplab.plugins.bench.interface"]
 
 
 def test_help_names_a_plug_in_that_cannot_be_used(installed: Any, capsys: Any) -> None:

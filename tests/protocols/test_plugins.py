@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,17 +46,13 @@ def test_package_that_fails_exits_or_hangs_on_import_is_one_error(
     assert all(thread.name != "limit of an import" for thread in threading.enumerate())
 
 
-def test_package_that_imports_gives_its_attribute(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_package_that_imports_gives_its_attribute(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_good_one.py").write_text("DRIVER = 5")
     assert import_foreign("lab_good_one:DRIVER") == 5
 
 
-def test_interrupt_during_an_import_is_passed_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_during_an_import_is_passed_on(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_stopped.py").write_text("raise KeyboardInterrupt")
     with pytest.raises(KeyboardInterrupt):

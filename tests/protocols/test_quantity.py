@@ -6,13 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.protocols.quantity import (
-    canonical,
-    level_order,
-    parse,
-    parse_or_ref,
-    to_decimal,
-)
+from sliplab.protocols.quantity import canonical, level_order, parse, parse_or_ref, to_decimal
 from sliplab.protocols.units import TABLE, Unit, canonical_of
 
 decimals = st.decimals(
@@ -20,37 +14,23 @@ decimals = st.decimals(
 )
 
 
-@pytest.mark.parametrize(
-    ("text", "unit", "value"),
-    [
-        ("2.4 mm", "mm", "2.4"),
-        ("2.40mm", "mm", "2.4"),
-        ("0.24 cm", "mm", "2.4"),
-        ("2400 um", "mm", "2.4"),
-        ("1e1 mm", "mm", "10"),
-        (" 50 ms ", "s", "0.05"),
-        ("205 g", "kg", "0.205"),
-        ("125 %", "percent", "125"),
-        ("-.5 mm", "mm", "-0.5"),
-    ],
-)
-def test_one_quantity_however_it_is_written(text: str, unit: str, value: str) -> None:
+WRITTEN = """2.4 mm = 2.4 mm; 2.40mm = 2.4 mm; 0.24 cm = 2.4 mm; 2400 um = 2.4 mm; 1e1 mm = 10 mm
+; 50 ms  = 0.05 s; 205 g = 0.205 kg; 125 % = 125 percent; -.5 mm = -0.5 mm"""
+
+
+@pytest.mark.parametrize("row", WRITTEN.split(";"))
+def test_one_quantity_however_it_is_written(row: str) -> None:
+    text, same = row.split(" = ")
+    value, unit = same.split()
     assert canonical(parse(text, unit)) == value
 
 
+NUMBER = ("2.4", "nan mm", "inf mm", "two mm", True, None)
+LENGTHS = {2.4: "has no unit", "2.4 kg": "must be one of: mm, um, cm, m", "1e999 mm": "at most 1e9"}
+
+
 @pytest.mark.parametrize(
-    ("raw", "says"),
-    [
-        (2.4, "has no unit"),
-        ("2.4", "number with a unit"),
-        ("2.4 kg", "must be one of: mm, um, cm, m"),
-        ("nan mm", "number with a unit"),
-        ("inf mm", "number with a unit"),
-        ("1e999 mm", "at most 1e9"),
-        ("two mm", "number with a unit"),
-        (True, "number with a unit"),
-        (None, "number with a unit"),
-    ],
+    ("raw", "says"), [*LENGTHS.items(), *((raw, "number with a unit") for raw in NUMBER)]
 )
 def test_what_is_no_length_is_refused(raw: object, says: str) -> None:
     with pytest.raises(ValueError, match=says):

@@ -15,13 +15,8 @@ from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.recorded import RecordedPlan, RecordedTrial, natural, split_recorded
 from sliplab.protocols.yaml_file import validate
 
-HEAD: dict[str, Any] = {
-    "adapter": 1,
-    "name": "touch",
-    "experiment": "classes",
-    "trials": {"files": "*.raw"},
-    "streams": {"events": {"format": "raw"}},
-}
+HEAD: dict[str, Any] = {"adapter": 1, "name": "touch", "experiment": "classes"}
+HEAD |= {"trials": {"files": "*.raw"}, "streams": {"events": {"format": "raw"}}}
 
 
 def head(**keys: Any) -> Adapter:

@@ -20,28 +20,9 @@ from sliplab.rigs.core.registry import listed, load_driver
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 
-SECRETS = [
-    "password",
-    "passwrd",
-    "pasword",
-    "passord",
-    "paswrd",
-    "Passwort",
-    "pass",
-    "pwd",
-    "passphrase",
-    "secret",
-    "secrt",
-    "client_secret",
-    "token",
-    "tokn",
-    "api_key",
-    "apiKey",
-    "key",
-    "auth",
-    "credentials",
-    "AWS_SECRET_ACCESS_KEY",
-]
+NAMES = """password passwrd pasword passord paswrd Passwort pass pwd passphrase secret secrt token
+client_secret tokn api_key apiKey key auth credentials AWS_SECRET_ACCESS_KEY"""
+SECRETS = NAMES.split()
 
 
 @pytest.mark.parametrize("name", SECRETS)
@@ -49,9 +30,8 @@ def test_names_of_secrets(name: str) -> None:
     assert is_secret(name)
     error = InputError("rig.yaml", f"devices.arm.{name}", "hunter2", "is 'hunter2': unknown key")
     assert error.message == f"rig.yaml: devices.arm.{name} = {MASK}: is '{MASK}': unknown key"
-    assert shown({"arm": [{name: "hunter2", "n": Decimal("2.4")}]}) == (
-        f"{{arm: [{{{name}: {MASK}, n: 2.4}}]}}"
-    )
+    text = f"{{arm: [{{{name}: {MASK}, n: 2.4}}]}}"
+    assert shown({"arm": [{name: "hunter2", "n": Decimal("2.4")}]}) == text
 
 
 def _names(kind: Any, seen: set[Any]) -> set[str]:
@@ -131,22 +111,11 @@ def test_long_text_is_shown_at_once() -> None:
         assert len(shown_key(text)) <= 1000
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        "hunter2",
-        "'hunter2'",
-        '"hunter2"',
-        "|-\n    hunter2\n    hunter2",
-        ">\n    hunter2",
-        "hunter2 hunter2",
-        "!!str hunter2",
-        "12345",
-        "[hunter2, 1]",
-        "{a: hunter2}",
-        "&x hunter2",
-    ],
-)
+WRITTEN = """hunter2 | 'hunter2' | "hunter2" | |-\n    hunter2\n    hunter2 | >\n    hunter2
+ | hunter2 hunter2 | !!str hunter2 | 12345 | [hunter2, 1] | {a: hunter2} | &x hunter2"""
+
+
+@pytest.mark.parametrize("value", re.split(r"\s\| ", WRITTEN))
 def test_a_file_without_its_secrets(value: str) -> None:
     text = f"# a rig\narm:\n  passwrd: {value}\n  port: 5  # kept\nlist: [{{token: {'7' * 9}}}]\n"
     assert mask_secrets(text) == (

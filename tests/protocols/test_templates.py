@@ -12,15 +12,10 @@ import yaml
 from sliplab.protocols import Dwell, Move, Position, load_plan
 from sliplab.protocols.templates import templates, written_out
 from tests.conftest import ROOT, SMALL
-from tests.protocols.planning import plan_of, refused
+from tests.protocols.planning import plan_of, refused, rows
 
-KINEMATIC = {
-    "template": "kinematic",
-    "depth": "$depth",
-    "distance": "9 mm",
-    "speed": "$speed",
-    "direction": "$direction",
-}
+KINEMATIC = {"template": "kinematic", "depth": "$depth", "distance": "9 mm", "speed": "$speed"}
+KINEMATIC["direction"] = "$direction"
 
 
 def small(motion: Any, *unused: str) -> dict[str, Any]:
@@ -52,10 +47,8 @@ def test_shipped_protocols_are_made_from_templates(name: str, tmp_path: Path) ->
 
 
 def test_a_template_is_its_phases(tmp_path: Path) -> None:
-    plan, same = (
-        plan_of(small(KINEMATIC), tmp_path),
-        plan_of(small(SMALL["collection"]["motion"]), tmp_path),
-    )
+    plan = plan_of(small(KINEMATIC), tmp_path)
+    same = plan_of(small(SMALL["collection"]["motion"]), tmp_path)
     assert [plan.program(trial) for trial in plan] == [same.program(trial) for trial in same]
     assert plan.collection_hash == same.collection_hash
 
@@ -69,22 +62,23 @@ def test_every_parameter_takes_a_factor(tmp_path: Path) -> None:
     assert waits == {0.5, 1.0}
 
 
-WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
-    "another template": ({"template": "pull"}, "template", "must be one of disturbance, gravity"),
-    "no template": ({"template": None}, "template", "must be one of"),
-    "a parameter too many": ({"dept": "2 mm"}, "dept", "did you mean 'depth'?"),
-    "a wrong unit": ({"distance": "9 kg"}, "distance", "must be one of: mm"),
-    "no unit": ({"distance": 9}, "distance", "has no unit"),
-    "out of range": ({"press": "-1 mm/s"}, "press", "must be more than 0 mm/s"),
-    "over a limit": ({"depth": "4 mm", "speed": "$depth2"}, "speed", "unknown factor $depth2"),
-    "too fast": ({"travel": "51 mm/s"}, "travel", "exceeds collection.limits.speed"),
-}
+WRONG = """
+    template: pull | template | must be one of disturbance, gravity
+    template: ~ | template | must be one of
+    dept: 2 mm | dept | did you mean 'depth'?
+    distance: 9 kg | distance | must be one of: mm
+    distance: 9 | distance | has no unit
+    press: -1 mm/s | press | must be more than 0 mm/s
+    depth: 4 mm, speed: $depth2 | speed | unknown factor $depth2
+    travel: 51 mm/s | travel | exceeds collection.limits.speed
+"""
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_said_of_the_parameter(case: str, tmp_path: Path) -> None:
-    change, key, says = WRONG[case]
-    error = refused(small({**KINEMATIC, **change}), tmp_path)
+@pytest.mark.parametrize(("change", "key", "says"), rows(WRONG))
+def test_what_is_wrong_is_said_of_the_parameter(
+    change: str, key: str, says: str, tmp_path: Path
+) -> None:
+    error = refused(small({**KINEMATIC, **yaml.safe_load(f"{{{change}}}")}), tmp_path)
     assert error.key == f"collection.motion.{key}"
     assert says in error.expected
 

@@ -11,7 +11,7 @@ import yaml
 
 from sliplab.protocols import Dwell, InputError, Move, Plan, Position, Twist, load_plan
 from tests.conftest import ROOT
-from tests.protocols.planning import plan_of
+from tests.protocols.planning import plan_of, put_all, refused, rows
 
 PRESS_TWIST: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "press_twist.yaml").read_text())
 
@@ -54,35 +54,27 @@ def test_opposite_angles_are_two_conditions(tmp_path: Path) -> None:
     assert len(changed(tmp_path, limits=limits | {"duration": "100 s"}, factors=angles)) == 54
 
 
-@pytest.mark.parametrize(
-    ("change", "key", "says"),
-    [
-        ({"limits": {"twist": "30 deg"}}, "collection.factors.angle.values[0]", "twist = 30"),
-        ({"limits": {"twist": None}}, "collection.limits.twist", "is needed"),
-        ({"limits": {"twist_speed": "5 deg/s"}}, "collection.factors.speed.values[1]", "is over"),
-        (
-            {"factors": {"angle": {"unit": "deg", "values": [0]}}},
-            "collection.factors.angle.values[0]",
-            "must not be 0",
-        ),
-        (
-            {"factors": {"speed": {"unit": "deg/s", "values": [-4]}}},
-            "collection.factors.speed.values[0]",
-            "more than 0 deg/s in collection.motion.speed",
-        ),
-        (
-            {"factors": {"speed": {"unit": "mm/s", "values": [4]}}},
-            "collection.factors.speed.unit",
-            "must be deg/s where $speed stands",
-        ),
-        ({"plate": {"mass": "0.2 kg"}}, "collection.motion", "cannot twist on a sliding plate"),
-    ],
-)
-def test_a_wrong_twist_is_named(change: Any, key: str, says: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        changed(tmp_path, **change)
-    assert caught.value.key == key
-    assert says in caught.value.expected
+# changes of the collection | the key | what is said
+WRONG = """
+    limits.twist: 30 deg | factors.angle.values[0] | twist = 30
+    limits.twist: | limits.twist | is needed
+    limits.twist_speed: 5 deg/s | factors.speed.values[1] | is over
+    factors.angle: {unit: deg, values: [0]} | factors.angle.values[0] | must not be 0
+    factors.speed: {unit: deg/s, values: [-4]} | factors.speed.values[0] | more than 0 deg/s in \
+collection.motion.speed
+    factors.speed: {unit: mm/s, values: [4]} | factors.speed.unit | must be deg/s where $speed \
+stands
+    plate: {mass: 0.2 kg} | motion | cannot twist on a sliding plate
+"""
+
+
+@pytest.mark.parametrize(("change", "key", "says"), rows(WRONG))
+def test_a_wrong_twist_is_named(change: str, key: str, says: str, tmp_path: Path) -> None:
+    data = copy.deepcopy(PRESS_TWIST)
+    put_all(data, change, "collection")
+    error = refused(data, tmp_path)
+    assert error.key == f"collection.{key}"
+    assert says in error.expected
 
 
 def test_twists_add_up_to_the_limit(tmp_path: Path) -> None:

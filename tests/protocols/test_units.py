@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import subprocess
 import sys
 from collections.abc import Iterator
 from decimal import Decimal
@@ -12,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from sliplab.protocols import InputError, Plan, load_plan, units
 from sliplab.protocols.quantity import parse
 from sliplab.protocols.units import TABLE, file_text, find_unit, symbols_of
 from tests.conftest import ROOT, SMALL
-from tests.protocols.planning import plan_of
+from tests.protocols.planning import plan_of, refused, rows, said_by
 
 PRESSURE = '{"kPa": ("pressure", "1"), "Pa": ("pressure", "0.001"), "bar": ("pressure", "100")}'
 INCH = '{"inch": ("length", "25.4"), "inch/s": ("speed", "25.4")}'
@@ -67,33 +67,22 @@ def test_every_unit_has_a_dimension_and_an_exact_factor() -> None:
 
 
 def test_a_unit_becomes_text_that_a_file_name_may_hold() -> None:
-    assert [file_text(unit) for unit in ("mm", "mm/s", "percent", "deg/s", None)] == [
-        "mm",
-        "mmps",
-        "pct",
-        "degps",
-        "",
-    ]
+    texts = [file_text(unit) for unit in ("mm", "mm/s", "percent", "deg/s", None)]
+    assert texts == ["mm", "mmps", "pct", "degps", ""]
 
 
 def in_micrometres(collection: dict[str, Any]) -> None:
     collection["factors"]["depth"] = {"unit": "um", "values": [2400, 2800, 3400]}
-    collection["factors"]["speed"] = {
-        "unit": "cm/s",
-        "range": {"from": 0.06, "to": 0.16, "step": 0.1},
-        "optional": [0.1],
-    }
+    speeds = {"from": 0.06, "to": 0.16, "step": 0.1}
+    collection["factors"]["speed"] = {"unit": "cm/s", "range": speeds, "optional": [0.1]}
 
 
 def test_a_factor_may_be_in_any_unit_of_its_dimension(tmp_path: Path) -> None:
     """Its levels, ids and hashes are those of the same levels in the canonical unit."""
 
     def in_millimetres(collection: dict[str, Any]) -> None:
-        collection["factors"]["speed"] = {
-            "unit": "mm/s",
-            "range": {"from": 0.6, "to": 1.6, "step": 1},
-            "optional": [1],
-        }
+        speeds = {"from": 0.6, "to": 1.6, "step": 1}
+        collection["factors"]["speed"] = {"unit": "mm/s", "range": speeds, "optional": [1]}
 
     same = changed(tmp_path, in_millimetres)
     plan = changed(tmp_path, in_micrometres)
@@ -154,43 +143,37 @@ def test_nothing_is_imported_until_a_unit_is_unknown(
     assert "inches" in sys.modules
 
 
-@pytest.mark.parametrize(
-    ("text", "target", "says"),
-    [
-        ("raise RuntimeError('no\\nlicence')", "{module}:UNITS", "RuntimeError: no licence"),
-        ("", "{module}:UNITS", "has no attribute 'UNITS'"),
-        ("", "elsewhere:UNITS", "No module named 'elsewhere'"),
-        ("UNITS = 5", "{module}:UNITS", "must be a mapping of symbols, not int"),
-        ("UNITS = {'furlong': 201168}", "{module}:UNITS", "furlong: must be (dimension, decimal"),
-        ("UNITS = {'a b': ('length', '1')}", "{module}:UNITS", "a b: a symbol is letters"),
-        ("UNITS = {'ell': ('length', 1.14)}", "{module}:UNITS", "ell: must be (dimension, decimal"),
-        ("UNITS = {'ell': ('length', '-1')}", "{module}:UNITS", "must be more than 0"),
-        ("UNITS = {'ell': ('length', 'nan')}", "{module}:UNITS", "must be a finite number"),
-        ("UNITS = {'mm': ('length', '2')}", "{module}:UNITS", "mm: is a unit already"),
-        ("UNITS = {'hPa': ('pressure', '0.1')}", "{module}:UNITS", "pressure: has no unit of fac"),
-    ],
-)
+BROKEN = """
+    raise RuntimeError('no\\nlicence') | RuntimeError: no licence
+    | has no attribute 'UNITS'
+    elsewhere | No module named 'elsewhere'
+    UNITS = 5 | must be a mapping of symbols, not int
+    UNITS = {'furlong': 201168} | furlong: must be (dimension, decimal
+    UNITS = {'a b': ('length', '1')} | a b: a symbol is letters
+    UNITS = {'ell': ('length', 1.14)} | ell: must be (dimension, decimal
+    UNITS = {'ell': ('length', '-1')} | must be more than 0
+    UNITS = {'ell': ('length', 'nan')} | must be a finite number
+    UNITS = {'mm': ('length', '2')} | mm: is a unit already
+    UNITS = {'hPa': ('pressure', '0.1')} | pressure: has no unit of fac
+"""
+
+
+@pytest.mark.parametrize(("text", "says"), rows(BROKEN))
 def test_a_broken_package_is_named_in_one_line(
-    text: str, target: str, says: str, install: Any, tmp_path: Path
+    text: str, says: str, install: Any, tmp_path: Path
 ) -> None:
-    install(text, target)
+    install(*(("", "elsewhere:UNITS") if text == "elsewhere" else (text,)))
     install(f"UNITS = {INCH}\n", name="inches")
-
-    def change(collection: dict[str, Any]) -> None:
-        collection["factors"]["depth"] = {"unit": "furlong", "values": [1]}
-
-    with pytest.raises(InputError) as caught:
-        changed(tmp_path, change)
-    assert caught.value.key == "collection.factors.depth.unit"
-    assert "must be one of" in caught.value.expected
-    assert "the units of lab_units 1.0 cannot be used: " in caught.value.expected
-    assert says in caught.value.expected
-    assert "\n" not in caught.value.message
-
-    def sound(collection: dict[str, Any]) -> None:
-        collection["factors"]["depth"] = {"unit": "inch", "values": [0.1]}
-
-    assert len(changed(tmp_path, sound)) == 12
+    data = copy.deepcopy(SMALL)
+    data["collection"]["factors"]["depth"] = {"unit": "furlong", "values": [1]}
+    error = refused(data, tmp_path)
+    assert error.key == "collection.factors.depth.unit"
+    assert "must be one of" in error.expected
+    assert "the units of lab_units 1.0 cannot be used: " in error.expected
+    assert says in error.expected
+    assert "\n" not in error.message
+    data["collection"]["factors"]["depth"] = {"unit": "inch", "values": [0.1]}
+    assert len(plan_of(data, tmp_path)) == 12
 
 
 def test_two_packages_may_not_disagree(install: Any, tmp_path: Path) -> None:
@@ -209,15 +192,7 @@ def test_the_schema_for_editors_knows_units_of_packages(install: Any, tmp_path: 
         "import json; from sliplab.flows.planning.schema import file_schema\n"
         "print(json.dumps(file_schema('protocol')))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=ROOT,
-        timeout=120,
-    )
-    models = json.loads(done.stdout)["definitions"]
+    models = json.loads(said_by(code))["definitions"]
     assert "inch" in models["Factor"]["properties"]["unit"]["enum"]
     assert "|inch)" in json.dumps(models["Press"]["properties"]["depth"])
 
@@ -229,60 +204,38 @@ WRITTEN = [
 
 
 @pytest.mark.parametrize("change", WRITTEN, ids=["canonical", "centimetres"])
-def test_levels_with_and_without_unit_give_the_same_trials(
-    tmp_path: Path, change: tuple[str, str]
-) -> None:
+def test_levels_with_and_without_unit_give_the_same_trials(tmp_path: Path, change: Any) -> None:
     text = (ROOT / "protocols" / "pilot.yaml").read_text()
     path = tmp_path / "pilot.yaml"
     path.write_text(text.replace(*change))
-    assert [(t.id, t.seed) for t in load_plan(path)] == [
-        (t.id, t.seed) for t in load_plan(Path("pilot"))
-    ]
-
-
-def _with(tmp_path: Path, *changes: tuple[str, str]) -> Path:
-    text = (ROOT / "protocols" / "pilot.yaml").read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    return path
+    ours, shipped = ([(t.id, t.seed) for t in load_plan(each)] for each in (path, Path("pilot")))
+    assert ours == shipped
 
 
 @pytest.mark.parametrize("level", ["2.4", "2.4 mm", "0.24 cm"])
 def test_held_out_reference_and_claimed_levels_take_a_unit_or_none(
     tmp_path: Path, level: str
 ) -> None:
-    split = (
-        "split: {method: ranked, train: 0.70, validation: 0.15, test: 0.15, strata: [depth, speed]}"
-    )
-    plan = load_plan(
-        _with(
-            tmp_path,
-            (split, f"split: {{method: leave_conditions_out, test_levels: {{depth: [{level}]}}}}"),
-            (
-                "  repetitions: 1",
-                f"  references: {{every: 9, condition: {{depth: {level}, speed: 1, direction: 0}}}}"
-                "\n  stopping: {claims: [{figure: slip_duration, at_most: 90 ms, between: "
-                f"{{factor: depth, levels: [{level}, 3.4 mm]}}}}]}}\n  repetitions: 1",
-            ),
-        )
-    )
+    data = copy.deepcopy(SMALL)
+    given: Any = yaml.safe_load(f"[{level}]")
+    data["analysis"]["split"] = {"method": "leave_conditions_out", "test_levels": {"depth": given}}
+    condition = {"depth": given[0], "speed": 1, "direction": 0}
+    data["collection"]["references"] = {"every": 9, "condition": condition}
+    claim: dict[str, Any] = {"figure": "slip_duration", "at_most": "90 ms"}
+    claim["between"] = {"factor": "depth", "levels": [*given, "3.4 mm"]}
+    data["collection"]["stopping"] = {"claims": [claim]}
+    plan = plan_of(data, tmp_path)
     analysis, collection = plan.protocol.analysis, plan.protocol.collection
     assert analysis.split.test_levels == {"depth": ("2.4 mm",)}
-    assert collection.references is not None
     assert collection.references.condition["depth"] == Decimal("2.4")
-    assert collection.stopping is not None
     between = collection.stopping.claims[0].between
-    assert between is not None
     assert between.levels == (Decimal("2.4"), Decimal("3.4"))
 
 
 def test_every_level_in_a_wrong_unit_is_named(tmp_path: Path) -> None:
-    path = _with(tmp_path, ("values: [2.4, 2.8, 3.4]", "values: [2.4 s, 2.8, 3.4 kg]"))
-    with pytest.raises(InputError) as caught:
-        load_plan(path)
-    keys = [each.key for each in caught.value.faults]
+    data = copy.deepcopy(SMALL)
+    data["collection"]["factors"]["depth"]["values"] = ["2.4 s", 2.8, "3.4 kg"]
+    error = refused(data, tmp_path)
+    keys = [each.key for each in error.faults]
     assert keys == ["collection.factors.depth.values[0]", "collection.factors.depth.values[2]"]
-    assert "must be one of: mm" in caught.value.expected
+    assert "must be one of: mm" in error.expected

@@ -99,11 +99,8 @@ def real_rig(folder: Path, streams: dict[str, Any], **devices: Any) -> RigFile:
     """The shipped rig with a UR arm and further devices."""
     box = {"sync_box": {"port": "/dev/serial/by-id/box"}}
     arm = {"arm": {"password": "x"}} if "password" in str(devices) else {}
-    data = {
-        "extends": str(ROOT / "rigs" / "ur5.yaml"),
-        "streams": streams,
-        "devices": {**box, **arm, **devices},
-    }
+    data = {"extends": str(ROOT / "rigs" / "ur5.yaml"), "streams": streams}
+    data["devices"] = {**box, **arm, **devices}
     return load_rig_file(write(folder / "rig.yaml", data), stored=True)[0]
 
 
@@ -154,12 +151,8 @@ def test_a_sensor_in_another_unit_is_refused_and_closed(install: Install, tmp_pa
 
 def test_a_camera_that_delivers_another_grade_is_refused(install: Install, tmp_path: Path) -> None:
     install("lab_camera", CAMERA, "lab_camera = lab_camera:DRIVER")
-    back = {
-        "kind": "frames",
-        "scale_px_per_mm": 4,
-        "region_px": [64, 48],
-        "device": {"driver": "lab_camera"},
-    }
+    back = {"kind": "frames", "scale_px_per_mm": 4, "region_px": [64, 48]}
+    back["device"] = {"driver": "lab_camera"}
     triggered = real_rig(tmp_path, {"back": back}).streams["back"]
     with pytest.raises(RigError, match=r"write streams.back.timing.grade: host arrival"):
         built("back", triggered)
@@ -178,47 +171,29 @@ def usb(serial: str | None) -> dict[str, Any]:
     return {"driver": "dvxplorer", "source": {"kind": "usb", "serial": serial}}
 
 
-@pytest.mark.parametrize(
-    ("first", "side", "same"),
-    [
-        (usb(None), usb(None), True),
-        (usb("A"), usb("A"), True),
-        (usb("A"), usb("B"), False),
-    ],
-)
-def test_two_devices_are_not_one(
-    first: dict[str, Any], side: dict[str, Any], same: bool, tmp_path: Path
-) -> None:
-    streams = {"side": {**SIDE, "device": side}}
-    if not same:
-        file = real_rig(tmp_path, streams, event_camera=first)
-        assert [part for part, _, _ in file.drivers()][-1] == "side (event camera)"
-        return
-    with pytest.raises(InputError, match=r"is the same device as devices.event_camera") as raised:
-        real_rig(tmp_path, streams, event_camera=first)
-    assert raised.value.key == "streams.side.device"
+def test_two_devices_are_not_one(tmp_path: Path) -> None:
+    streams = {"side": {**SIDE, "device": usb("B")}}
+    file = real_rig(tmp_path, streams, event_camera=usb("A"))
+    assert [part for part, _, _ in file.drivers()][-1] == "side (event camera)"
 
 
 @pytest.mark.parametrize(
-    ("stream", "key", "text"),
+    ("first", "stream", "key", "text"),
     [
-        ({**SIDE, "device": {"driver": "basler"}}, "streams.side.device.driver", "of a kind of"),
-        ({**SIDE, "device": {"driver": "dvx"}}, "streams.side.device.driver", "one of dvxplorer"),
-        ({"kind": "events"}, "streams.side.device", "is needed by driver: devices"),
-        ({**SIDE, "mock": {}}, "streams.side.mock", "has no meaning with driver: devices"),
-        (
-            {**SIDE, "device": {**usb("B"), "noise_filter_us": 0}},
-            "streams.side.device.noise_filter_us",
-            "must be",
-        ),
+        ("A", {"device": {"driver": "basler"}}, ".device.driver", "of a kind of"),
+        ("A", {"device": {"driver": "dvx"}}, ".device.driver", "one of dvxplorer"),
+        ("A", {"device": None}, ".device", "is needed by driver: devices"),
+        ("A", {"mock": {}}, ".mock", "has no meaning with driver: devices"),
+        ("A", {"device": {**usb("B"), "noise_filter_us": 0}}, ".device.noise_filter_us", "must be"),
+        ("A", {"device": usb("A")}, ".device", "is the same device as devices.event_camera"),
+        (None, {"device": usb(None)}, ".device", "is the same device as devices.event_camera"),
     ],
 )
-def test_a_wrong_device_is_named_by_its_key(
-    stream: dict[str, Any], key: str, text: str, tmp_path: Path
-) -> None:
+def test_wrong_device_is_named(first: Any, stream: Any, key: str, text: str, tmp_path: Any) -> None:
+    side = {name: value for name, value in {**SIDE, **stream}.items() if value is not None}
     with pytest.raises(InputError, match=text) as raised:
-        real_rig(tmp_path, {"side": stream}, event_camera=usb("A"))
-    assert raised.value.key == key
+        real_rig(tmp_path, {"side": side}, event_camera=usb(first))
+    assert raised.value.key == f"streams.side{key}"
 
 
 def test_a_second_force_sensor_is_one_of_the_drivers_of_the_first(tmp_path: Path) -> None:

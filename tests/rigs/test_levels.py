@@ -43,7 +43,6 @@ def test_the_full_grid_has_36_slides(rig: RigFile) -> None:
 
 def test_the_default_scene_needs_everything(rig: RigFile) -> None:
     choice = choose_level(rig, plan_of("pilot"))
-    assert choice is not None
     assert choice.level == 3
     assert "two seeds" in choice.reason
     assert "simulated" in choice.reason

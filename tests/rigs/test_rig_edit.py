@@ -30,6 +30,12 @@ def mine(folder: Path, text: str = MOCK) -> Path:
     return path
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A rig file of its own."""
+    return mine(tmp_path)
+
+
 @pytest.mark.parametrize("name", shipped_rigs())
 def test_nothing_changed_is_nothing_changed(name: str) -> None:
     text = shipped_rigs()[name].read_text()
@@ -47,8 +53,7 @@ def test_what_is_written_is_what_is_read(x: float, residual: float) -> None:
     assert [float(v) for v in data["lens"]["distortion"]] == [round(x / 1e6, 6), round(-x, 6)]
 
 
-def test_only_the_entry_changes(tmp_path: Path) -> None:
-    path = mine(tmp_path)
+def test_only_the_entry_changes(path: Path, tmp_path: Path) -> None:
     written = write_entries(path, path, {"calibration.contact_plane": PLANE}, today=DAY)
     before, after = MOCK.splitlines(), path.read_text().splitlines()
     assert [line for line in before if line not in after] == before[10:14]
@@ -59,12 +64,10 @@ def test_only_the_entry_changes(tmp_path: Path) -> None:
     assert written.kept == tmp_path / "lab.before-2026-12-01.yaml"
     assert written.kept.read_text() == MOCK
     again = write_entries(path, path, {}, today=DAY)
-    assert again.kept is not None
     assert again.kept.name == "lab.before-2026-12-01-2.yaml"
 
 
-def test_a_result_that_is_no_rig_file_is_not_written(tmp_path: Path) -> None:
-    path = mine(tmp_path)
+def test_a_result_that_is_no_rig_file_is_not_written(path: Path, tmp_path: Path) -> None:
     line = {**PLANE, "above": ["400 mm", "24 mm", "300.1 mm"]}
     with pytest.raises(InputError, match="almost on one line") as caught:
         write_entries(path, path, {"calibration.contact_plane": line}, today=DAY)
@@ -73,10 +76,7 @@ def test_a_result_that_is_no_rig_file_is_not_written(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
 
 
-def test_a_disk_that_fails_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = mine(tmp_path)
+def test_a_disk_that_fails_leaves_the_old_file(path: Path, monkeypatch: Any) -> None:
     write = rig_edit.write_text
 
     def fails(target: Path, text: str) -> None:
@@ -90,8 +90,7 @@ def test_a_disk_that_fails_leaves_the_old_file(
     assert path.read_text() == MOCK
 
 
-def test_a_file_that_somebody_else_changed_meanwhile_is_kept(tmp_path: Path) -> None:
-    path = mine(tmp_path)
+def test_a_file_that_somebody_else_changed_meanwhile_is_kept(path: Path) -> None:
     _, read = load_rig_file(path)
     path.write_text(MOCK.replace("poll: 200 ms", "poll: 100 ms"))
     with pytest.raises(InputError, match="was changed while measuring"):
@@ -107,8 +106,7 @@ def test_shipped_files_are_never_written_to(tmp_path: Path) -> None:
         assert writable_target(path, tmp_path / "new.yaml") == tmp_path / "new.yaml"
 
 
-def test_targets_that_cannot_be(tmp_path: Path) -> None:
-    path = mine(tmp_path)
+def test_targets_that_cannot_be(path: Path, tmp_path: Path) -> None:
     (tmp_path / "other.yaml").write_text("")
     for out, says in (
         (tmp_path / "other.yaml", "exists: give it as --rig"),
@@ -120,8 +118,7 @@ def test_targets_that_cannot_be(tmp_path: Path) -> None:
     assert writable_target(path, path) == path
 
 
-def test_a_link_stays_a_link(tmp_path: Path) -> None:
-    path = mine(tmp_path)
+def test_a_link_stays_a_link(path: Path, tmp_path: Path) -> None:
     link = tmp_path / "current.yaml"
     link.symlink_to(path)
     write_entries(link, writable_target(link, None), {"sensor": "other"}, today=DAY)

@@ -17,7 +17,7 @@ from sliplab.rigs.devices.basler.frame_time import Stamping
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import read_rig
 from tests.conftest import ROOT
-from tests.rigs.test_rig_file import Change, _both, _set
+from tests.protocols.planning import put, put_all, rows
 
 
 def loopback() -> dict[str, Any]:
@@ -27,94 +27,29 @@ def loopback() -> dict[str, Any]:
     return data
 
 
-def _without(*path: str) -> Change:
-    def change(data: dict[str, Any]) -> None:
-        for part in path[:-1]:
-            data = data[part]
-        del data[path[-1]]
-
-    return change
-
-
-CASES: dict[str, tuple[Change, str, str]] = {
-    "devices on a mock": (_set("driver", to="mock"), "devices", "no meaning with driver: mock"),
-    "a scene on a real rig": (
-        _set("driver", to="devices"),
-        "mock",
-        "no meaning with driver: devices",
-    ),
-    "a loopback without a scene": (_without("mock"), "mock", "is needed by driver: loopback"),
-    "a loopback without drivers": (
-        _without("devices"),
-        "devices",
-        "is needed by driver: loopback",
-    ),
-    "a real rig without drivers": (
-        _both(_set("driver", to="devices"), _without("mock"), _without("devices")),
-        "devices",
-        "is needed by driver: devices",
-    ),
-    "a real rig without a sync box": (
-        _both(_set("driver", to="devices"), _without("mock")),
-        "devices.sync_box.port",
-        "name its serial port",
-    ),
-    "another exposure than the scene's": (
-        _set("devices", "frame_camera", "exposure_us", to=1000),
-        "devices.frame_camera.exposure_us",
-        "must be 2000",
-    ),
-    "an exposure longer than the camera's period": (
-        _set("devices", "frame_camera", "rate_hz", to=1000),
-        "devices.frame_camera.exposure_us",
-        "= 2000: must be at most 1000, the period of rate_hz = 1000",
-    ),
-    "an output that is an input": (
-        _set("devices", "frame_camera", "exposure_line", to="Line1"),
-        "devices.frame_camera.exposure_line",
-        "is already used as an input: trigger_line",
-    ),
-    "ticks on the line of the code": (
-        _set("devices", "frame_camera", "sync_line", to=1),
-        "devices.frame_camera.sync_line",
-        "must differ from trigger_line",
-    ),
-    "frames that no fake times so": (
-        _set("timing", "frames", to="exposure line"),
-        "timing.frames",
-        "must be hardware trigger",
-    ),
-    "tracks in place of pictures": (
-        _set("mock", "frame_camera", "level", to="tracks"),
-        "mock.frame_camera.level",
-        "must be video",
-    ),
-    "an arm that is none": (
-        _set("devices", "arm", "driver", to="kuka"),
-        "devices.arm.driver",
-        "one of ur, abb",
-    ),
-    "a setting of another make": (
-        _set("devices", "arm", "egm_port", to=6510),
-        "devices.arm.egm_port",
-        "known here: driver, host",
-    ),
-    "an arm without limits": (
-        _without("devices", "arm", "limits"),
-        "devices.arm.limits",
-        "is missing",
-    ),
-    "limits the wrong way round": (
-        _set("devices", "arm", "limits", "low_mm", to=[-20, 30, -70]),
-        "devices.arm.limits.low_mm",
-        "y is not below high_mm",
-    ),
-    "a line that no camera has": (
-        _set("devices", "frame_camera", "sync_line", to=9),
-        "devices.frame_camera.sync_line",
-        "less than or equal to 8",
-    ),
-}
+# changes of the loopback | the key that is named | what is said
+CASES = """
+    driver: mock | devices | no meaning with driver: mock
+    driver: devices | mock | no meaning with driver: devices
+    mock: | mock | is needed by driver: loopback
+    devices: | devices | is needed by driver: loopback
+    driver: devices; mock: ; devices: | devices | is needed by driver: devices
+    driver: devices; mock: | devices.sync_box.port | name its serial port
+    devices.frame_camera.exposure_us: 1000 | devices.frame_camera.exposure_us | must be 2000
+    devices.frame_camera.rate_hz: 1000 | devices.frame_camera.exposure_us | = 2000: must be at \
+most 1000, the period of rate_hz = 1000
+    devices.frame_camera.exposure_line: Line1 | devices.frame_camera.exposure_line | is already \
+used as an input: trigger_line
+    devices.frame_camera.sync_line: 1 | devices.frame_camera.sync_line | must differ from \
+trigger_line
+    timing.frames: exposure line | timing.frames | must be hardware trigger
+    mock.frame_camera.level: tracks | mock.frame_camera.level | must be video
+    devices.arm.driver: kuka | devices.arm.driver | one of ur, abb
+    devices.arm.egm_port: 6510 | devices.arm.egm_port | known here: driver, host
+    devices.arm.limits: | devices.arm.limits | is missing
+    devices.arm.limits.low_mm: [-20, 30, -70] | devices.arm.limits.low_mm | y is not below high_mm
+    devices.frame_camera.sync_line: 9 | devices.frame_camera.sync_line | less than or equal to 8
+"""
 
 
 def load(data: dict[str, Any], path: Path) -> Any:
@@ -122,11 +57,10 @@ def load(data: dict[str, Any], path: Path) -> Any:
     return load_rig_file(path)[0]
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_the_message_names_key_and_cure(case: str, tmp_path: Path) -> None:
-    change, key, says = CASES[case]
+@pytest.mark.parametrize(("changes", "key", "says"), rows(CASES))
+def test_the_message_names_key_and_cure(changes: str, key: str, says: str, tmp_path: Path) -> None:
     data = loopback()
-    change(data)
+    put_all(data, changes)
     with pytest.raises(InputError) as caught:
         load(data, tmp_path / "rig.yaml")
     assert caught.value.key.startswith(key)
@@ -166,111 +100,56 @@ def test_a_camera_whose_times_are_worse_than_promised_is_refused(tmp_path: Path)
     _check_grade(file.timing.frames, simulated, "timing.frames")  # knows of no stamps
 
 
-def _arm(**change: Any) -> Change:
-    def apply(data: dict[str, Any]) -> None:
-        for path, value in change.items():
-            part = data["devices"]["arm"]
-            *parents, last = path.split("__")
-            for name in parents:
-                part = part.setdefault(name, {})
-            part[last] = value
-
-    return apply
-
-
-HOSTS = [
-    "192.168.1",
-    "192.168.1.",
-    "10",
-    "192.168..10",
-    "192.168.1.256",
-    "192.168.1.10.5",
-    "1.2.3.04",
-    "192.168.1.x",
-    "192.168.1.10:30004",
-    "0.0.0.0",
-    "255.255.255.255",
-    "224.0.0.1",
-    "ur5-",
-    "-ur5",
-    "ur5..lab",
-    ".",
-    "ur5 lab",
-    "",
-    "\u0661\u0669\u0662.168.1.10",
-]
-MILLIMETRES = "write millimetres"
-UNITS: dict[str, tuple[Change, str, str]] = {
-    "a tool centre in metres": (
-        _arm(tool__tcp_mm=[0, 0, 0.12]),
-        "tool.tcp_mm",
-        f"{MILLIMETRES}, such as [0, 0, 120]",
-    ),
-    "a centre of mass in metres": (
-        _arm(tool__centre_of_mass_mm=[0, 0.01, 0.05]),
-        "tool.centre_of_mass_mm",
-        MILLIMETRES,
-    ),
-    "a turn in radians": (
-        _arm(tool__tcp_rotvec_deg=[0, 3.1416, 0]),
-        "tool.tcp_rotvec_deg",
-        "write degrees",
-    ),
-    "a box in metres": (
-        _arm(limits__low_mm=[-0.4, -0.6, 0], limits__high_mm=[0.4, -0.2, 0.5]),
-        "limits.low_mm",
-        MILLIMETRES,
-    ),
-    "a plate in metres": (
-        _arm(
-            limits__plate={
-                "centre_mm": [0.4, 0, 0.3],
-                "right_mm": [0.4, 0.06, 0.3],
-                "above_mm": [0.4, 0, 0.36],
-            }
-        ),
-        "limits.plate.right_mm",
-        MILLIMETRES,
-    ),
-}
+HOSTS = """192.168.1 | 192.168.1. | 10 | 192.168..10 | 192.168.1.256 | 192.168.1.10.5 | 1.2.3.04
+ | 192.168.1.x | 192.168.1.10:30004 | 0.0.0.0 | 255.255.255.255 | 224.0.0.1 | ur5- | -ur5
+ | ur5..lab | . | ur5 lab | | \u0661\u0669\u0662.168.1.10"""
+PLATE = "{centre_mm: [0.4, 0, 0.3], right_mm: [0.4, 0.06, 0.3], above_mm: [0.4, 0, 0.36]}"
+UNITS = f"""
+    tool.tcp_mm: [0, 0, 0.12] | tool.tcp_mm | write millimetres, such as [0, 0, 120]
+    tool.centre_of_mass_mm: [0, 0.01, 0.05] | tool.centre_of_mass_mm | write millimetres
+    tool.tcp_rotvec_deg: [0, 3.1416, 0] | tool.tcp_rotvec_deg | write degrees
+    limits.low_mm: [-0.4, -0.6, 0]; limits.high_mm: [0.4, -0.2, 0.5] | limits.low_mm | write millim
+    limits.plate: {PLATE} | limits.plate.right_mm | write millimetres
+"""
 
 
-def _real(tmp_path: Path, change: Change) -> Path:
+def _real(tmp_path: Path, place: str, value: Any) -> Path:
     """The UR5's rig file with a change."""
     data = yaml.safe_load((ROOT / "rigs" / "ur5.yaml").read_text())
-    change(data)
+    if place == "changes":
+        put_all(data, value, "devices.arm")
+    else:
+        put(data, place, value)
     path = tmp_path / "rig.yaml"
     path.write_text(yaml.safe_dump(data))
     return path
 
 
-@pytest.mark.parametrize("host", HOSTS)
+@pytest.mark.parametrize("host", [host.strip() for host in HOSTS.split("|")])
 def test_an_address_is_whole(host: str, tmp_path: Path) -> None:
-    path = _real(tmp_path, _arm(host=host))
-    with pytest.raises(InputError) as caught:
-        load_rig_file(path)
-    assert caught.value.key == "devices.arm.host"
-    assert "192.168.1.10" in caught.value.expected
     source = {"kind": "network", "host": host, "events_port": 1, "triggers_port": 2}
-    path = _real(tmp_path, _set("devices", "event_camera", to={"source": source}))
-    with pytest.raises(InputError) as caught:
-        load_rig_file(path)
-    assert caught.value.key == "devices.event_camera.source.host"
+    for place, value, key in (
+        ("devices.arm.host", host, ""),
+        ("devices.event_camera", {"source": source}, ".source.host"),
+    ):
+        with pytest.raises(InputError) as caught:
+            load_rig_file(_real(tmp_path, place, value))
+        assert caught.value.key == place + key
+        if not key:
+            assert "192.168.1.10" in caught.value.expected
 
 
 @pytest.mark.parametrize(
     "host", ["192.168.1.10", "ur5", "ur5.lab.example.org", "localhost", "3com"]
 )
 def test_whole_addresses_are_taken(host: str, tmp_path: Path) -> None:
-    rig, _ = load_rig_file(_real(tmp_path, _arm(host=host)))
-    assert rig.devices is not None
+    rig, _ = load_rig_file(_real(tmp_path, "devices.arm.host", host))
     assert rig.devices.arm.host == host
 
 
-@pytest.mark.parametrize("case", UNITS)
-def test_lengths_in_metres_are_noticed(case: str, tmp_path: Path) -> None:
-    change, key, says = UNITS[case]
-    path = _real(tmp_path, change)
+@pytest.mark.parametrize(("changes", "key", "says"), rows(UNITS))
+def test_lengths_in_metres_are_noticed(changes: str, key: str, says: str, tmp_path: Path) -> None:
+    path = _real(tmp_path, "changes", changes)
     with pytest.raises(InputError) as caught:
         load_rig_file(path)
     assert caught.value.key == f"devices.arm.{key}"
@@ -288,7 +167,6 @@ def test_shipped_rigs_are_in_millimetres(name: str) -> None:
 def test_the_loopback_arm_has_room_for_every_shipped_press() -> None:
     """Its own limits count from the taught plane, and depth zero may be found behind it."""
     rig = load_rig_file(ROOT / "rigs" / "loopback.yaml")[0]
-    assert rig.devices is not None
     limits = rig.devices.arm.limits
     for path in sorted((ROOT / "protocols").glob("*.yaml")):
         plan = load_plan(path)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,6 +14,7 @@ from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, held, lock_names
 from sliplab.storage.trials.lock import Locked
 from tests.conftest import ROOT
+from tests.storage.holders import holder_of
 
 HOLDER = """
 import sys
@@ -41,8 +40,6 @@ def real() -> RigFile:
 
 def with_port(file: RigFile, host: str, port: str) -> RigFile:
     """The same rig with another arm and sync box."""
-    assert file.devices is not None
-    assert file.devices.sync_box is not None
     box = file.devices.sync_box.model_copy(update={"port": port})
     arm = file.devices.arm.model_copy(update={"host": host})
     devices = file.devices.model_copy(update={"arm": arm, "sync_box": box})
@@ -59,19 +56,7 @@ def test_simulated_rigs_need_none(folder: Path) -> None:
 
 
 def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER],
-        cwd=ROOT,
-        text=True,
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    assert holder.stdout is not None
-    assert holder.stdin is not None
-    try:
-        assert holder.stdout.readline() == "held\n"
+    with holder_of(HOLDER, env={**os.environ, "PYTHONPATH": str(ROOT)}) as holder:
         with pytest.raises(Locked) as refused, held(real()):
             pass
         for part in (
@@ -81,13 +66,6 @@ def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) ->
             "for the store /data/study, since 20",
         ):
             assert part in str(refused.value)
-        holder.kill()
-        holder.wait(timeout=60)
-    finally:
-        holder.kill()
-        holder.wait(timeout=60)
-        holder.stdin.close()
-        holder.stdout.close()
     with held(real()):
         pass
 
@@ -113,20 +91,8 @@ def test_a_folder_that_is_none_is_said(folder: Path) -> None:
         held(real()).__enter__()
 
 
-def test_a_link_in_place_of_a_lock_is_not_followed(folder: Path, tmp_path: Path) -> None:
-    with held(real()):
-        pass
-    for path in folder.iterdir():
-        path.unlink()
-        path.symlink_to(tmp_path / "precious")
-    (tmp_path / "precious").write_text("thesis")
-    with pytest.raises(RigError, match="cannot be locked"):
-        held(real()).__enter__()
-    assert (tmp_path / "precious").read_text() == "thesis"
-
-
-@pytest.mark.parametrize("kind", ["hard link", "pipe", "folder"])
-def test_what_another_user_put_in_place_of_a_lock_is_not_written_to(
+@pytest.mark.parametrize("kind", ["link", "hard link", "pipe", "folder"])
+def test_what_is_put_in_place_of_a_lock_is_not_written_to(
     folder: Path, tmp_path: Path, kind: str
 ) -> None:
     (tmp_path / "precious").write_text("thesis")
@@ -134,7 +100,9 @@ def test_what_another_user_put_in_place_of_a_lock_is_not_written_to(
         pass
     for path in folder.iterdir():
         path.unlink()
-        if kind == "hard link":
+        if kind == "link":
+            path.symlink_to(tmp_path / "precious")
+        elif kind == "hard link":
             path.hardlink_to(tmp_path / "precious")
         elif kind == "pipe":
             os.mkfifo(path)

@@ -66,7 +66,6 @@ def test_a_twin_is_a_simulated_rig(tmp_path: Path) -> None:
     rows += "speed_mm_s: {least: 1, most: 2}, parameters: {}}\n"
     file.write_text(f"extends: rehearsal\nname: twin\n{rows}")
     rig, _ = load_rig_file(file)
-    assert rig.twin is not None
     assert rig.twin.trials == 30
     file.write_text(f"extends: ur5\nname: twin\n{rows}")
     with pytest.raises(InputError, match="has no meaning with driver: devices"):

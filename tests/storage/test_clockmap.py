@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from fractions import Fraction
 from math import floor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,9 +40,7 @@ def half_up(value: Fraction) -> int:
     drift=DRIFTS,
     spans=st.lists(SPANS, min_size=1, max_size=20) | st.lists(HOURS, min_size=1, max_size=20),
 )
-def test_every_time_is_the_exact_one_rounded(
-    anchor: int, image: int, drift: int, spans: list[int]
-) -> None:
+def test_a_time_is_the_exact_one_rounded(anchor: int, image: int, drift: int, spans: Any) -> None:
     clock = line(anchor, image, drift)
     times = [max(-(2**63), min(2**63 - 1, anchor + span)) for span in spans]
     expected = [half_up(exact(clock, time)) for time in times]
@@ -52,9 +51,7 @@ def test_every_time_is_the_exact_one_rounded(
 
 
 @given(anchor=TIMES, image=SPANS, drift=DRIFTS, spans=st.lists(NINE_YEARS, min_size=1, max_size=20))
-def test_there_and_back_is_within_a_nanosecond(
-    anchor: int, image: int, drift: int, spans: list[int]
-) -> None:
+def test_there_and_back_in_a_nanosecond(anchor: int, image: int, drift: int, spans: Any) -> None:
     clock = line(anchor, image, drift)
     times = np.array([max(-(2**63), min(2**63 - 1, anchor + span)) for span in spans], np.int64)
     back = clock.to_device(clock.to_reference(times))
@@ -126,9 +123,7 @@ def bent(draw: st.DrawFn) -> ClockMap:
 
 
 @given(clock=bent(), data=st.data())
-def test_a_bent_map_meets_its_knots_keeps_order_and_comes_back(
-    clock: ClockMap, data: st.DataObject
-) -> None:
+def test_a_bent_map_meets_its_knots_keeps_order_and_comes_back(clock: ClockMap, data: Any) -> None:
     assert clock.to_reference(np.array(clock.device_ns)).tolist() == list(clock.reference_ns)
     near = data.draw(st.sampled_from(clock.device_ns))
     times = near + np.arange(-500, 500, dtype=np.int64)
@@ -201,15 +196,12 @@ def test_json_keeps_every_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    "data",
-    [
-        {"device_ns": [0], "reference_ns": [0]},
-        {"device_ns": [0], "reference_ns": [0], "drift": [0], "drift_ppm": [0]},
-        {"device_ns": [0], "reference_ns": [0], "drift": [MAX_DRIFT + 1]},
-        {"device_ns": [2**63], "reference_ns": [0], "drift": [0]},
-    ],
+    "changes",
+    [{"drift": None}, {"drift_ppm": [0]}, {"drift": [MAX_DRIFT + 1]}, {"device_ns": [2**63]}],
 )
-def test_bad_fields_are_refused(data: dict[str, list[int]]) -> None:
+def test_bad_fields_are_refused(changes: dict[str, Any]) -> None:
+    data = {"device_ns": [0], "reference_ns": [0], "drift": [0], **changes}
+    data = {name: values for name, values in data.items() if values is not None}
     with pytest.raises(ValueError, match=r"fields|ClockMap"):
         ClockMap.from_json(data)
 

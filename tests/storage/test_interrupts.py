@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -97,9 +98,7 @@ def test_error_of_uninterrupted_function_is_raised_in_place_of_the_signal() -> N
     assert write([], 0) == "result"
 
 
-def test_third_signal_after_patience_interrupts_a_function_that_hangs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_third_signal_after_patience_interrupts_a_function_that_hangs(monkeypatch: Any) -> None:
     clock = [0.0]
     monkeypatch.setattr("sliplab.storage.interrupts.time.monotonic", lambda: clock[0])
     seen: list[float] = []

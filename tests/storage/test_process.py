@@ -29,7 +29,6 @@ def ended(handle: int, within_s: float) -> bool:
 
 def test_tethered_program_and_its_child_end_with_a_killed_parent() -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
-        assert parent.stdout is not None
         handles = [os.pidfd_open(int(pid)) for pid in parent.stdout.readline().split()]
         try:
             assert not any(ended(handle, 0) for handle in handles)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,9 +81,7 @@ def test_next_write_in_a_folder_sweeps_it(kind: str, tmp_path: Path) -> None:
     assert names(tmp_path) == {"b"}
 
 
-def test_scratch_folder_of_killed_program_is_deleted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scratch_folder_of_killed_program_is_deleted(tmp_path: Path, monkeypatch: Any) -> None:
     killed("scratch", "none", temporary=tmp_path)
     (left,) = tmp_path.iterdir()
     assert names(left) == {"x"}
@@ -140,9 +139,7 @@ def test_sweep_leaves_what_may_be_of_a_living_program(tmp_path: Path) -> None:
     assert names(tmp_path) == {*kept, "b", "y", f".link.{here}.{dead}.tmp"}
 
 
-def test_sweep_counts_the_age_by_the_clock_of_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sweep_counts_the_age_by_the_clock_of_the_folder(tmp_path: Path, monkeypatch: Any) -> None:
     """The clock of a server may be days behind this machine's."""
     (tmp_path / ".a.sliplab-0123abcd.1.tmp").write_text("")
     here = time.time
@@ -151,9 +148,7 @@ def test_sweep_counts_the_age_by_the_clock_of_the_folder(
     assert names(tmp_path) == {".a.sliplab-0123abcd.1.tmp", "b"}
 
 
-def test_sweep_deletes_no_file_of_another_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sweep_deletes_no_file_of_another_user(tmp_path: Path, monkeypatch: Any) -> None:
     killed("file", tmp_path / "a")
     before = names(tmp_path)
     user = os.getuid() + 1

@@ -52,14 +52,8 @@ for work in (rule, Detector(), [Detector]):
 def test_worker_does_not_run_the_script_again(how: str, tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     script = [str(tmp_path / "script.py")] if how == "file" else ["-m", "script"]
-    done = subprocess.run(
-        [sys.executable, *script, str(tmp_path / "log")],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    line = (sys.executable, *script, str(tmp_path / "log"))
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     words = ["3", "in a process", "0", "rule", "Detector", "Detector"]
     assert done.stdout.splitlines() == words

@@ -18,48 +18,18 @@ from tests.conftest import ROOT
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
 TODAY = date(2026, 12, 1)
-PLANE: dict[str, Any] = {
-    "centre": ["400 mm", "0 mm", "300 mm"],
-    "right": ["400 mm", "12 mm", "300 mm"],
-    "above": ["400 mm", "0 mm", "312 mm"],
-    "taught": "2026-11-30",
-}
-WHOLE: dict[str, Any] = {
-    "contact_plane": {**PLANE, "residual": "0.02 mm", "method": "touches"},
-    "depth_zero": {
-        "zero": "0.01 mm",
-        "taught": "2026-11-30",
-        "residual": "0.02 mm",
-        "method": "touches",
-    },
-    "tool_centre_point": {
-        "offset": ["0 mm", "0 mm", "90 mm"],
-        "pivot": ["300 mm", "0 mm", "200 mm"],
-        "poses": 8,
-        "taught": "2026-11-01",
-        "residual": "0.1 mm",
-        "method": "pivoting",
-    },
-    "lens": {
-        "scale_px_per_mm": 20.01,
-        "focal": ["6000 px", "6000 px"],
-        "centre": ["960 px", "600 px"],
-        "distortion": [0, 0, 0, 0, 0],
-        "tilt": "0 deg",
-        "size": ["1920 px", "1200 px"],
-        "views": 8,
-        "measured": "2026-11-01",
-        "residual": "0.1 px",
-        "method": "ChArUco",
-    },
-    "event_crop": {
-        "centre": ["318 px", "241 px"],
-        "size": "360 px",
-        "measured": "2026-11-01",
-        "residual": "1 px",
-        "method": "circle",
-    },
-}
+WHOLE: dict[str, Any] = yaml.safe_load("""
+contact_plane: {centre: [400 mm, 0 mm, 300 mm], right: [400 mm, 12 mm, 300 mm],
+  above: [400 mm, 0 mm, 312 mm], taught: '2026-11-30', residual: 0.02 mm, method: touches}
+depth_zero: {zero: 0.01 mm, taught: '2026-11-30', residual: 0.02 mm, method: touches}
+tool_centre_point: {offset: [0 mm, 0 mm, 90 mm], pivot: [300 mm, 0 mm, 200 mm], poses: 8,
+  taught: '2026-11-01', residual: 0.1 mm, method: pivoting}
+lens: {scale_px_per_mm: 20.01, focal: [6000 px, 6000 px], centre: [960 px, 600 px],
+  distortion: [0, 0, 0, 0, 0], tilt: 0 deg, size: [1920 px, 1200 px], views: 8,
+  measured: '2026-11-01', residual: 0.1 px, method: ChArUco}
+event_crop: {centre: [318 px, 241 px], size: 360 px, measured: '2026-11-01', residual: 1 px,
+  method: circle}
+""")
 
 
 def calibration(**changes: Any) -> Calibration:
@@ -73,12 +43,8 @@ def calibration(**changes: Any) -> Calibration:
 
 
 def faults(found: Calibration, *, simulated: bool = False, scale: float = 20.01) -> list[str]:
-    return [
-        f"{fault.key} = {fault.value}: {fault.expected}: {fault.command}"
-        for fault in find_faults(
-            found, simulated=simulated, needed=COMMANDS, scale_px_per_mm=scale, today=TODAY
-        )
-    ]
+    how = {"simulated": simulated, "needed": COMMANDS, "scale_px_per_mm": scale, "today": TODAY}
+    return [f"{f.key} = {f.value}: {f.expected}: {f.command}" for f in find_faults(found, **how)]
 
 
 def test_a_whole_and_recent_calibration_has_no_faults() -> None:
@@ -101,14 +67,10 @@ def test_an_entry_that_is_missing_or_old_names_its_command(name: str) -> None:
 
 
 def test_the_last_day_still_counts() -> None:
-    at_limit = calibration(
-        contact_plane={"taught": "2026-11-01"}, depth_zero=None, max_age={"depth_zero": None}
-    )
-    assert faults(at_limit) == []
-    beyond = calibration(
-        contact_plane={"taught": "2026-10-31"}, depth_zero=None, max_age={"depth_zero": None}
-    )
-    assert len(faults(beyond)) == 1
+    for day, count in (("2026-11-01", 0), ("2026-10-31", 1)):
+        plane, ages = {"taught": day}, {"depth_zero": None}
+        found = calibration(contact_plane=plane, depth_zero=None, max_age=ages)
+        assert len(faults(found)) == count
 
 
 def test_a_day_to_come_is_refused() -> None:
@@ -118,20 +80,10 @@ def test_a_day_to_come_is_refused() -> None:
 
 
 def test_a_simulated_rig_has_no_age_unless_its_file_says_so() -> None:
-    bare = calibration(
-        contact_plane={"taught": "2020-01-01"},
-        depth_zero=None,
-        tool_centre_point=None,
-        lens=None,
-        event_crop=None,
-    )
+    old = {"contact_plane": {"taught": "2020-01-01"}, "depth_zero": None, "lens": None}
+    bare = calibration(**old, tool_centre_point=None, event_crop=None)
     assert faults(bare, simulated=True) == []
-    reported = calibration(
-        contact_plane={"taught": "2020-01-01"},
-        depth_zero=None,
-        lens=None,
-        max_age={"contact_plane": "30 d", "lens": "90 d"},
-    )
+    reported = calibration(**old, max_age={"contact_plane": "30 d", "lens": "90 d"})
     said = faults(reported, simulated=True)
     assert len(said) == 2
     assert "2020-01-01" in said[0]
@@ -184,9 +136,8 @@ def test_a_rig_begins_with_what_was_found() -> None:
 
 
 def test_a_plane_taught_anew_is_the_same_rig_and_a_new_lens_is_not() -> None:
-    other = MOCK.replace("400.35 mm, 0 mm", "400.31 mm, 0 mm").replace(
-        "taught: 2026-11-21", "taught: 2026-11-25"
-    )
+    other = MOCK.replace("400.35 mm, 0 mm", "400.31 mm, 0 mm")
+    other = other.replace("taught: 2026-11-21", "taught: 2026-11-25")
     assert other != MOCK
     assert same_rig(MOCK, other)
     assert not same_rig(MOCK, MOCK.replace("touch_depth: 0.34", "touch_depth: 0.30"))

@@ -9,6 +9,7 @@ import threading
 import time
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from typing import Any
 
 import pytest
 
@@ -105,9 +106,7 @@ def test_unreferenced_process_ends() -> None:
     child.wait(20.0)
 
 
-def test_a_computer_that_stood_still_is_no_fault_of_the_child(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_computer_that_stood_still_is_no_fault_of_the_child(monkeypatch: Any) -> None:
     process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0, ignore_suspend=True)
     pipe, now_ns = process._calls.pipe, time.monotonic_ns
     late_ns = [0]
@@ -134,9 +133,7 @@ def test_a_computer_that_stood_still_is_no_fault_of_the_child(
     process.close()
 
 
-def test_after_ctrl_c_an_answer_is_still_its_own_calls(
-    process: LibraryProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_ctrl_c_an_answer_is_still_its_own_calls(process: Any, monkeypatch: Any) -> None:
     pipe = process._calls.pipe
 
     class Interrupted:

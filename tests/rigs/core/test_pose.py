@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,9 +36,7 @@ def test_ur_speaks_metres_and_radians() -> None:
 @pytest.mark.parametrize(
     ("axis", "angle"), [((1, 0, 0), 180.0), ((0, 1, 0), 90.0), ((0, 0, 1), 30.0), ((0, 0, 1), 0.0)]
 )
-def test_a_turn_about_an_axis_is_half_its_angle_in_a_quaternion(
-    axis: tuple[int, int, int], angle: float
-) -> None:
+def test_a_turn_about_an_axis_is_half_its_angle_in_a_quaternion(axis: Any, angle: float) -> None:
     half = math.radians(angle) / 2
     want = [math.cos(half), *(math.sin(half) * a for a in axis)]
     rotvec = tuple(angle * a for a in axis)

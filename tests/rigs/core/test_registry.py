@@ -91,9 +91,7 @@ def test_a_driver_of_another_package_is_used_and_imported_only_then(install: Ins
         ({"driver": "ur"}, "event_camera.driver", "is the driver of a kind of arm"),
     ],
 )
-def test_a_message_names_key_value_and_cure(
-    install: Install, camera: dict[str, Any], key: str, says: str
-) -> None:
+def test_a_message_names_key_value_and_cure(install: Any, camera: Any, key: str, says: str) -> None:
     install("lab_camera", CAMERA.format(name="lab"), "lab = lab_camera:DRIVER")
     with pytest.raises(InputError) as caught:
         devices(**camera)
@@ -101,29 +99,22 @@ def test_a_message_names_key_value_and_cure(
     assert says in caught.value.expected
 
 
+IMPORT = "broken of lab_broken 1.2 cannot be imported: "
+NO_MODULE = "ModuleNotFoundError: No module named 'no_such_module_of_a_maker'"
+
+
 @pytest.mark.parametrize(
-    ("code", "point", "says"),
+    ("code", "says"),
     [
-        (
-            "import no_such_module_of_a_maker",
-            "broken = lab_broken:DRIVER",
-            "broken of lab_broken 1.2 cannot be imported: ModuleNotFoundError: "
-            "No module named 'no_such_module_of_a_maker'",
-        ),
-        (
-            "raise RuntimeError('a licence\\nis missing')",
-            "broken = lab_broken:DRIVER",
-            "broken of lab_broken 1.2 cannot be imported: RuntimeError: a licence",
-        ),
-        ("DRIVER = 5", "broken = lab_broken:DRIVER", "lab_broken:DRIVER is a int, not a Driver"),
-        ("", "broken = lab_broken:DRIVER", "has no attribute 'DRIVER'"),
-        (CAMERA.format(name="other"), "broken = lab_broken:DRIVER", "it calls itself 'other'"),
+        ("import no_such_module_of_a_maker", IMPORT + NO_MODULE),
+        ("raise RuntimeError('a licence\\nis missing')", f"{IMPORT}RuntimeError: a licence"),
+        ("DRIVER = 5", "lab_broken:DRIVER is a int, not a Driver"),
+        ("", "has no attribute 'DRIVER'"),
+        (CAMERA.format(name="other"), "it calls itself 'other'"),
     ],
 )
-def test_a_package_that_fails_is_named_in_one_line(
-    install: Install, code: str, point: str, says: str
-) -> None:
-    install("lab_broken", code, point)
+def test_a_package_that_fails_is_named_in_one_line(install: Any, code: str, says: str) -> None:
+    install("lab_broken", code, "broken = lab_broken:DRIVER")
     with pytest.raises(DriverError) as caught:
         find_driver("broken", EventCameraDriver)
     assert says in str(caught.value)

@@ -110,6 +110,12 @@ def run(rig: Rig, plan: Plan, sink: Memory, seed: int = 7) -> Any:
     return rig.run_trial(plan.program(plan.trials[0]), sink, seed, FRAME_PX, 100)
 
 
+@pytest.fixture
+def rig() -> Rig:
+    """The shipped mock rig."""
+    return make_rig()
+
+
 def test_streams_hold_the_recorded_part_in_order() -> None:
     rig, plan, sink = make_rig(), short_plan(), Memory()
     done = run(rig, plan, sink)
@@ -152,9 +158,7 @@ def test_a_trial_depends_on_nothing_that_ran_before() -> None:
         ({"arm": "host time"}, {"box reads"}),
     ],
 )
-def test_what_is_read_besides_is_what_the_timing_needs(
-    timing: dict[str, Any], streams: set[str]
-) -> None:
+def test_what_is_read_besides_is_what_the_timing_needs(timing: Any, streams: set[str]) -> None:
     data = {**RIG, "timing": timing, "mock": {"frame_camera": {"level": "tracks"}}}
     rig = build_rig(validate(RigFile, data, "test"))
     rig.connect()
@@ -228,9 +232,7 @@ def test_a_protective_stop_leaves_the_arm_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
-def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(
-    error: BaseException,
-) -> None:
+def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(error: Any) -> None:
     rig = make_rig()
     notes = watched(rig)
     with pytest.raises(type(error)):
@@ -241,8 +243,7 @@ def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(
     assert rig.arm.state() is ArmState.READY
 
 
-def test_a_stop_request_is_looked_at_in_the_motion() -> None:
-    rig = make_rig()
+def test_a_stop_request_is_looked_at_in_the_motion(rig: Rig) -> None:
     looks = iter([False] * 12)
     rig.should_stop = lambda: next(looks, True)
     with pytest.raises(StopRequested):
@@ -251,15 +252,13 @@ def test_a_stop_request_is_looked_at_in_the_motion() -> None:
     assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm <= -5.0 + 1e-6
 
 
-def test_touching_off_finds_the_surface() -> None:
-    rig = make_rig()
+def test_touching_off_finds_the_surface(rig: Rig) -> None:
     found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 5)]
     assert np.abs(found).max() < 0.06  # the taught plane is the true one; depth steps are 0.2 mm
     assert rig.plate_frame.zero_mm == found[-1]
 
 
-def test_touching_off_finds_a_surface_that_was_taught_wrong() -> None:
-    rig = make_rig()
+def test_touching_off_finds_a_surface_that_was_taught_wrong(rig: Rig) -> None:
     origin, axes = rig.plate_frame.origin - 0.5 * rig.plate_frame.axes[2], rig.plate_frame.axes
     rig.plate_frame = PlateFrame(origin, axes)
     assert rig.touch_off(0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
@@ -296,8 +295,7 @@ def test_depth_zero_is_the_mean_of_as_many_touches_as_asked_for() -> None:
     assert rig.rezero(asked, 2) != found
 
 
-def test_one_touch_is_what_it_was() -> None:
-    rig = make_rig()
+def test_one_touch_is_what_it_was(rig: Rig) -> None:
     found = rig.rezero(Rezero.model_validate(REZERO), 3)
     assert (found.mm, found.sd_mm) == (rig.touch_off(0.5, 1.5, 3), None)
 
@@ -308,8 +306,7 @@ def test_touching_off_in_much_noise_finds_the_surface_nevertheless() -> None:
     assert np.abs([rig.touch_off(0.5, 1.5, seed) for seed in (1037, 1064, 1128)]).max() < 0.1
 
 
-def test_touching_off_goes_no_deeper_than_its_limit() -> None:
-    rig = make_rig()
+def test_touching_off_goes_no_deeper_than_its_limit(rig: Rig) -> None:
     rig.plate_frame = PlateFrame(
         rig.plate_frame.origin - 5.0 * rig.plate_frame.axes[2], rig.plate_frame.axes
     )

@@ -19,6 +19,12 @@ def gone(device: str) -> dict[str, Any]:
     return {"kind": "device_gone", "device": device, "at_s": 0.8}
 
 
+@pytest.fixture
+def rig() -> Any:
+    """The shipped mock rig."""
+    return make_rig()
+
+
 @pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera", "sync_box"])
 def test_whichever_device_goes_the_others_are_stopped_in_order(device: str) -> None:
     rig = make_rig(faults=[gone(device)])
@@ -93,8 +99,7 @@ class Unstoppable:
         raise ArmFault("arm", self.TEXT)
 
 
-def test_closing_says_that_the_arm_was_not_seen_to_stand_and_closes_all() -> None:
-    rig = make_rig()
+def test_closing_says_that_the_arm_was_not_seen_to_stand_and_closes_all(rig: Any) -> None:
     notes = watched(rig)
     rig.arm = Unstoppable(rig.arm)
     ended: list[bool] = []
@@ -114,15 +119,13 @@ def closed_while(error: BaseException, rig: Any) -> None:
         rig.close()
 
 
-def test_closing_after_a_failure_says_both() -> None:
-    rig = make_rig()
+def test_closing_after_a_failure_says_both(rig: Any) -> None:
     rig.arm = Unstoppable(rig.arm)
     with pytest.raises(ArmFault, match=rf"{Unstoppable.TEXT} \(before that: sync box: is gone\)"):
         closed_while(RigError("sync box", "is gone"), rig)
 
 
-def test_closing_says_nothing_twice() -> None:
-    rig = make_rig()
+def test_closing_says_nothing_twice(rig: Any) -> None:
     rig.arm = Unstoppable(rig.arm)
     with pytest.raises(ArmFault, match=Unstoppable.TEXT) as caught:
         run(rig, short_plan(), Memory(fail_after=3, error=OSError("disk full")))
@@ -134,8 +137,7 @@ def test_closing_says_nothing_twice() -> None:
     assert rig.arm.asked > asked  # it was tried again
 
 
-def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped() -> None:
-    rig = make_rig()
+def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped(rig: Any) -> None:
     stop, pressed = rig.arm.stop, iter([True, True])
 
     def interrupted() -> None:
@@ -150,8 +152,7 @@ def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped() -> None:
     assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
 
 
-def test_ctrl_c_while_the_arm_moves_clear_stops_it() -> None:
-    rig = make_rig()
+def test_ctrl_c_while_the_arm_moves_clear_stops_it(rig: Any) -> None:
     start, wait, clearing = rig.arm.start, rig.clock.wait, [False]
 
     def noted(path: Any) -> None:
@@ -179,9 +180,8 @@ def test_ctrl_c_while_the_arm_moves_clear_stops_it() -> None:
     assert rig.arm.state() is ArmState.READY  # it stands, half-way clear
 
 
-def test_an_arm_that_does_not_come_clear_is_told_of() -> None:
+def test_an_arm_that_does_not_come_clear_is_told_of(rig: Any) -> None:
     """It is stopped by somebody on its way out: healthy, and still in contact."""
-    rig = make_rig()
     start, failed = rig.arm.start, [False]
 
     def hindered(path: Any) -> None:
@@ -200,9 +200,8 @@ def test_an_arm_that_does_not_come_clear_is_told_of() -> None:
         run(rig, short_plan(), sink)
 
 
-def test_a_device_with_a_fault_of_its_own_does_not_keep_the_others() -> None:
+def test_a_device_with_a_fault_of_its_own_does_not_keep_the_others(rig: Any) -> None:
     """Not every driver's library raises what the rig's interface allows."""
-    rig = make_rig()
 
     def broken() -> None:
         raise ValueError("a library's own")

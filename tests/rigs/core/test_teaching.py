@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.program import Position
-from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError, Segment
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.core.teaching import Creep, grab_frames, jog_poses, press_in_circles, touch
 from sliplab.rigs.core.touching import RateTouch
 from sliplab.storage.streams import FrameChunk
+from tests.rigs.altered import depths
 from tests.rigs.core.test_rig import after_the_stop, make_rig, watched
 
 QUICK = Creep(clearance_mm=1.5, search_mm=1.0)
@@ -21,20 +22,24 @@ TRACKS = {"frame_camera": {"level": "tracks"}}
 
 
 def find(chunk: FrameChunk) -> Any:
-    assert chunk.markers_px is not None
     return chunk.markers_px.astype(np.float64)
 
 
 def off(rig: Rig, mm: float) -> Rig:
     """The rig with a plane that lies `mm` before the one it has."""
-    rig.plate_frame = PlateFrame(
-        rig.plate_frame.origin - mm * rig.plate_frame.axes[2], rig.plate_frame.axes
-    )
+    origin, axes = rig.plate_frame.origin, rig.plate_frame.axes
+    rig.plate_frame = PlateFrame(origin - mm * axes[2], axes)
     return rig
 
 
 def depth(rig: Rig) -> float:
     return rig.position().depth_mm
+
+
+@pytest.fixture
+def rig() -> Rig:
+    """The shipped mock rig."""
+    return make_rig()
 
 
 @pytest.mark.long
@@ -69,14 +74,7 @@ def test_without_tremor_and_aligned_the_markers_still_tell() -> None:
 
 def test_a_touch_that_never_comes_ends_at_the_hard_limit() -> None:
     rig = off(make_rig(), 5.0)
-    deepest = []
-    pose = rig.arm.pose
-
-    def noted() -> Any:
-        deepest.append(rig.plate_frame.position(pose().xyz_mm).depth_mm)
-        return pose()
-
-    rig.arm.pose = noted  # type: ignore[method-assign]
+    deepest = depths(rig)
     with pytest.raises(RigError, match=r"hard limit of 1 mm .*--search"):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert max(deepest) == pytest.approx(1.0, abs=0.01)
@@ -141,8 +139,7 @@ def test_a_stop_request_stops_the_arm_first(looks: int, way: Any) -> None:
     assert depth(rig) <= -1.5 + 1e-6
 
 
-def test_ctrl_c_stops_the_arm_first() -> None:
-    rig = make_rig()
+def test_ctrl_c_stops_the_arm_first(rig: Rig) -> None:
     notes = watched(rig)
     count = rig.central_events
     looks = iter(range(200))
@@ -185,8 +182,7 @@ def test_markers_that_never_move_end_the_touch_soon_after_the_events() -> None:
         touch(rig, 0.0, 0.0, QUICK, 1, lambda chunk: np.repeat(still, len(chunk), 0))
 
 
-def test_events_that_are_looked_for_elsewhere_are_no_touch() -> None:
-    rig = make_rig()
+def test_events_that_are_looked_for_elsewhere_are_no_touch(rig: Rig) -> None:
     rig.centre_px = (60.0, 60.0)
     with pytest.raises(RigError, match="found no plate"):
         touch(rig, 0.0, 0.0, QUICK, 1)
@@ -201,52 +197,40 @@ def test_a_creep_that_is_none_cannot_be_asked_for(wrong: dict[str, float]) -> No
         Creep(**wrong)
 
 
-def test_the_rate_is_that_of_touching_off() -> None:
+def test_the_rate_is_that_of_touching_off(rig: Rig) -> None:
     """A protocol's `rezero` and `teach zero` find the same surface with the same seed."""
-    rig = make_rig()
     taught = touch(rig, 0.0, 0.0, Creep(clearance_mm=1.5, search_mm=1.5), 7).depth_mm
     assert rig.touch_off(0.5, 1.5, 7) == pytest.approx(taught, abs=0.02)
     assert RateTouch(0).limit == 10
 
 
-def test_a_person_jogs_and_confirms() -> None:
-    rig = make_rig()
+def test_a_person_jogs_and_confirms(rig: Rig) -> None:
     poses = jog_poses(rig, [("", "touched centre"), ("", "touched right"), ("", "touched above")])
     places = [rig.plate_frame.position(pose.xyz_mm) for pose in poses]
     assert [round(p.x_mm) for p in places] == [0, 12, 0]
     assert all(abs(p.depth_mm) < 0.15 for p in places)
 
 
-def test_a_person_who_says_stop_is_heard() -> None:
-    rig = make_rig()
+def test_a_person_who_says_stop_is_heard(rig: Rig) -> None:
     rig.operator.ask = lambda task, prompt, expected: False  # type: ignore[method-assign]
     with pytest.raises(StopRequested):
         jog_poses(rig, [("", "touched centre")])
 
 
-def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose() -> None:
-    rig = make_rig()
+def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose(rig: Rig) -> None:
     rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
-    rig.arm.start([type_segment(rig, -20.0)])
+    rig.arm.start([Segment(rig.plate_frame.pose(Position(0.0, 0.0, -20.0)), 5.0)])
     with pytest.raises(RigError, match="is still moving"):
         jog_poses(rig, [("", "touched centre")])
     fault = {"kind": "arm_protective_stop", "at_s": 0.1, "since": "trial"}
     rig = make_rig(faults=[fault])
-    assert rig.simulation is not None
     rig.simulation.begin_trial(1)
     rig.clock.wait(0.5)
     with pytest.raises(ArmFault, match="protective stop"):
         jog_poses(rig, [("", "elsewhere")])
 
 
-def type_segment(rig: Rig, depth_mm: float) -> Any:
-    from sliplab.rigs.core.capabilities import Segment
-
-    return Segment(rig.plate_frame.pose(Position(0.0, 0.0, depth_mm)), 5.0)
-
-
-def test_looking_gives_frames_and_moves_nothing() -> None:
-    rig = make_rig()
+def test_looking_gives_frames_and_moves_nothing(rig: Rig) -> None:
     rig.frames.set_region(64, 64)
     notes = watched(rig)
     chunk = grab_frames(rig)
@@ -254,8 +238,7 @@ def test_looking_gives_frames_and_moves_nothing() -> None:
     assert "arm.start" not in notes
 
 
-def test_stirring_shows_the_whole_skin() -> None:
-    rig = make_rig()
+def test_stirring_shows_the_whole_skin(rig: Rig) -> None:
     counts = press_in_circles(rig, 2.4, 1.0, 2.0, 1)
     assert counts.shape == (2, 480, 640)
     assert counts.sum(axis=(1, 2)).min() > 10_000
@@ -265,8 +248,7 @@ def test_stirring_shows_the_whole_skin() -> None:
     assert depth(rig) == pytest.approx(-5.0, abs=0.01)
 
 
-def test_a_stop_while_stirring_stops_the_arm() -> None:
-    rig = make_rig()
+def test_a_stop_while_stirring_stops_the_arm(rig: Rig) -> None:
     asked = iter([False] * 30)
     rig.should_stop = lambda: next(asked, True)
     notes = watched(rig)

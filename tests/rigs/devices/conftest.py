@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
-from sliplab.rigs.core.capabilities import Arm, ArmFault, Pose
+from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose
 from sliplab.rigs.core.pose import distance_mm, quaternion
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
@@ -27,6 +27,7 @@ from tests.rigs.waiting import own_address, until
 
 MakeRobot = Callable[..., FakeUr]
 MakeArm = Callable[..., UrArm]
+MakeUr = Callable[..., tuple[UrArm, FakeUr]]
 MakeAbb = Callable[..., tuple[AbbArm, FakeAbb]]
 ABB_PORT, EGM_PORT = 8080, 6510
 LIMIT_S, POLL_S = 60.0, 0.002
@@ -64,6 +65,17 @@ def arm_on() -> Iterator[MakeArm]:
         yield make
 
 
+@pytest.fixture
+def ur_pair(robot_of: MakeRobot, arm_on: MakeArm) -> MakeUr:
+    """Makes a UR fake and the driver on it; both are closed after the test."""
+
+    def make(connected: bool = True, **how: Any) -> tuple[UrArm, FakeUr]:
+        robot = robot_of(**how)
+        return arm_on(robot, connected), robot
+
+    return make
+
+
 def egm_message(number: int, t_s: float | None, pose: Pose) -> egm_pb2.EgmRobot:
     """A datagram of a controller that stands at `pose`; without a time if that is None."""
     message = egm_pb2.EgmRobot()
@@ -93,17 +105,9 @@ def mm_after_kill(program: str, settings: str, robot: Any, limit_s: float) -> fl
 
 def abb_settings(host: str, **more: Any) -> AbbSettings:
     """A tool of 120 mm on an arm whose web services and poses are at the test's address."""
-    return AbbSettings(
-        **{
-            "host": host,
-            "rws_port": ABB_PORT,
-            "egm_bind": host,
-            "egm_port": EGM_PORT,
-            "limits": LIMITS,
-            "tool": {"tcp_mm": (0, 0, 120), "mass_kg": 0.4},
-            **more,
-        }
-    )
+    ports = {"host": host, "rws_port": ABB_PORT, "egm_bind": host, "egm_port": EGM_PORT}
+    tool = {"tcp_mm": (0, 0, 120), "mass_kg": 0.4}
+    return AbbSettings(**{**ports, "limits": LIMITS, "tool": tool, **more})
 
 
 def closed(arm: Arm) -> None:
@@ -113,9 +117,10 @@ def closed(arm: Arm) -> None:
 
 
 def reconnect(arm: Arm) -> None:
-    """Close the arm and connect again, as the next command at a rig would."""
+    """Close the arm and connect again, as the next command at a rig would: it is ready then."""
     closed(arm)
     arm.connect()
+    assert arm.state() is ArmState.READY
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -39,13 +38,7 @@ def joined(chunks: list[Any]) -> dict[str, np.ndarray]:
 
 
 def go(
-    devices: MockDevices,
-    x: float,
-    y: float,
-    depth: float,
-    speed: float,
-    step_s: float,
-    each: Callable[[], None],
+    devices: MockDevices, x: float, y: float, depth: float, speed: float, step_s: float, each: Any
 ) -> None:
     """Move in a straight line to a place on the plate; `each` is called after every step."""
     devices.arm.start([Segment(devices.world.plane.pose(x, y, depth), speed)])
@@ -77,15 +70,13 @@ def slide(
     devices.frames.start()
     devices.events.start()
     devices.sync.start(100.0, CODE)
-    parts: dict[str, list[Any]] = {name: [] for name in ("e", "f", "p", "ep", "ap", "sp")}
+    events, frames, sync = devices.events, devices.frames, devices.sync
+    reads = (events.read, frames.read, arm.read_poses)
+    reads += (events.read_pulses, arm.read_pulses, sync.read_pulses)  # type: ignore[assignment]
+    parts: list[list[Any]] = []
 
     def read() -> None:
-        parts["e"].append(devices.events.read())
-        parts["f"].append(devices.frames.read())
-        parts["p"].append(arm.read_poses())
-        parts["ep"].append(devices.events.read_pulses())
-        parts["ap"].append(arm.read_pulses())
-        parts["sp"].append(devices.sync.read_pulses())
+        parts.append([each() for each in reads])
 
     def run(seconds: float) -> None:
         left = round(seconds * 1e9)
@@ -105,16 +96,8 @@ def slide(
     read()
     clock.wait(0.05)
     read()
-    return Trial(
-        joined(parts["e"]),
-        joined(parts["f"]),
-        joined(parts["p"]),
-        joined(parts["ep"])["t_ns"],
-        joined(parts["ap"])["t_ns"],
-        joined(parts["sp"])["t_ns"],
-        devices.truth(start),
-        start,
-    )
+    found = [joined(list(chunks)) for chunks in zip(*parts, strict=True)]
+    return Trial(*found[:3], *(pulses["t_ns"] for pulses in found[3:]), devices.truth(start), start)
 
 
 def same(a: Trial, b: Trial) -> None:

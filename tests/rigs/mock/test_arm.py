@@ -9,8 +9,13 @@ from sliplab.rigs.mock.devices import build_mock
 from tests.rigs.mock.driving import SMALL
 
 
-def test_the_arm_reports_its_segments_as_they_end() -> None:
-    devices = build_mock(SMALL)
+@pytest.fixture
+def devices() -> Any:
+    """A small simulated rig."""
+    return build_mock(SMALL)
+
+
+def test_the_arm_reports_its_segments_as_they_end(devices: Any) -> None:
     with pytest.raises(ArmFault, match="disconnected"):
         devices.arm.start([])
     devices.arm.connect()
@@ -40,24 +45,21 @@ def test_the_arm_reports_its_segments_as_they_end() -> None:
     assert devices.arm.progress().finished == ()
 
 
-def test_a_tool_that_looks_away_is_refused_near_the_plate() -> None:
-    devices = build_mock(SMALL)
+def test_a_tool_that_looks_away_is_refused_near_the_plate(devices: Any) -> None:
     devices.arm.connect()
     place = devices.world.plane.pose(0, 0, 0)
     with pytest.raises(ArmFault, match="rotated"):
         devices.arm.start([Segment(type(place)(place.xyz_mm, (0.0, 0.0, 0.0)), 5.0)])
 
 
-def test_a_trial_does_not_begin_in_motion() -> None:
-    devices = build_mock(SMALL)
+def test_a_trial_does_not_begin_in_motion(devices: Any) -> None:
     devices.arm.connect()
     devices.arm.start([Segment(devices.world.plane.pose(0, 0, -50), 1.0)])
     with pytest.raises(RigError, match="moving"):
         devices.begin_trial(1)
 
 
-def test_the_operator_mounts_a_mass_and_clears_a_stop() -> None:
-    devices = build_mock(SMALL)
+def test_the_operator_mounts_a_mass_and_clears_a_stop(devices: Any) -> None:
     assert devices.operator.ask("changeover", "Mount the plate.", "0.245 kg")
     assert devices.plate.mass_kg() == 0.245
     assert devices.operator.ask("clean", "Clean the skin.", "")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml, validate
@@ -16,6 +17,7 @@ from sliplab.rigs.mock.path import TOOL, ContactPlane
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
+from tests.protocols.planning import rows
 from tests.rigs.mock.driving import SMALL, Trial, go, gravity, same, slide, with_faults
 
 EFFECTS: list[dict[str, Any]] = [
@@ -41,12 +43,8 @@ def plain(*faults: dict[str, Any]) -> MockDevices:
 
 def slip_mm(trial: Trial) -> np.ndarray:
     """How far the sensor had moved when each tip began to slip; NaN: it did not."""
-    truth = trial.truth
-    since = [
-        math.nan if t is None else (t - truth["reference_ns"]) * 1e-9
-        for t in truth["slip_per_papilla_ns"]
-    ]
-    return SPEED * np.array(since)
+    slips = np.array(trial.truth["slip_per_papilla_ns"], float)  # None becomes NaN
+    return SPEED * (slips - trial.truth["reference_ns"]) * 1e-9
 
 
 def hooke_mm(devices: MockDevices, friction: float = MU) -> np.ndarray:
@@ -121,9 +119,8 @@ def test_a_papilla_torn_from_the_begin_of_every_trial() -> None:
         assert np.count_nonzero(loads) == 18
         assert np.all(np.isnan(torn.frames["markers_px"][:, 9]))
         others = [i for i in range(19) if i != 9]
-        assert np.array_equal(
-            torn.frames["markers_px"][:, others], whole.frames["markers_px"][:, others]
-        )
+        markers = [trial.frames["markers_px"][:, others] for trial in (torn, whole)]
+        assert np.array_equal(*markers)
         for key in ("per_papilla_ns", "slip_per_papilla_ns"):
             assert torn.truth[key][9] is None
             assert [torn.truth[key][i] for i in others] == [whole.truth[key][i] for i in others]
@@ -255,38 +252,29 @@ def test_a_short_move_never_gets_to_its_speed() -> None:
 # -- how they are written ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("faults", "camera", "key", "said"),
-    [
-        (({"kind": "papilla_sticky"},), {}, "[0].papilla", "is missing"),
-        (({"kind": "papilla_sticky", "papilla": 19},), {}, "[0].papilla", "from 0 (the centre)"),
-        (({"kind": "papilla_sticky", "papilla": 1, "factor": 0},), {}, "[0].factor", "than 0"),
-        (({"kind": "papilla_sticky", "papilla": 1, "at_s": 1},), {}, "[0].at_s", "unknown key"),
-        (({"kind": "plate_spot", "radius_mm": 1},), {}, "[0].centre_mm", "is missing"),
-        (
-            ({"kind": "plate_spot", "centre_mm": [0, 0], "radius_mm": 0},),
-            {},
-            "[0].radius_mm",
-            "than 0",
-        ),
-        (({"kind": "mains_light", "share": 0.6},), {}, "[0].share", "0.5"),
-        (({"kind": "mains_light", "hz": 0},), {}, "[0].hz", "10"),
-        (
-            ({"kind": "mains_light"}, {"kind": "mains_light", "trial": 3}),
-            {},
-            "[1].kind",
-            "once only for a trial",
-        ),
-        (({"kind": "mains_light"},), {"cutoff_hz": 200}, "[0].kind", "cutoff_hz = 0"),
-        (({"kind": "arm_ramp", "mm_s2": 0},), {}, "[0].mm_s2", "0.01"),
-        (({"kind": "arm_ramp"}, {"kind": "arm_ramp"}), {}, "[1].kind", "once only for a trial"),
-    ],
-)
+# faults | settings of the event camera | its key | what is said
+WRONG = """
+    kind: papilla_sticky | | [0].papilla | is missing
+    kind: papilla_sticky, papilla: 19 | | [0].papilla | from 0 (the centre)
+    kind: papilla_sticky, papilla: 1, factor: 0 | | [0].factor | than 0
+    kind: papilla_sticky, papilla: 1, at_s: 1 | | [0].at_s | unknown key
+    kind: plate_spot, radius_mm: 1 | | [0].centre_mm | is missing
+    kind: plate_spot, centre_mm: [0, 0], radius_mm: 0 | | [0].radius_mm | than 0
+    kind: mains_light, share: 0.6 | | [0].share | 0.5
+    kind: mains_light, hz: 0 | | [0].hz | 10
+    kind: mains_light}, {kind: mains_light, trial: 3 | | [1].kind | once only for a trial
+    kind: mains_light | cutoff_hz: 200 | [0].kind | cutoff_hz = 0
+    kind: arm_ramp, mm_s2: 0 | | [0].mm_s2 | 0.01
+    kind: arm_ramp}, {kind: arm_ramp | | [1].kind | once only for a trial
+"""
+
+
+@pytest.mark.parametrize(("faults", "camera", "key", "said"), rows(WRONG))
 def test_an_impossible_effect_is_said_as_any_wrong_input(
-    faults: tuple[dict[str, Any], ...], camera: dict[str, Any], key: str, said: str
+    faults: str, camera: str, key: str, said: str
 ) -> None:
     data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
-    data["mock"] |= {"faults": list(faults), "event_camera": camera}
+    data["mock"] |= yaml.safe_load(f"{{faults: [{{{faults}}}], event_camera: {{{camera}}}}}")
     with pytest.raises(InputError) as caught:
         validate(RigFile, data, "mock.yaml")
     assert caught.value.key == f"mock.faults{key}"
@@ -294,9 +282,8 @@ def test_an_impossible_effect_is_said_as_any_wrong_input(
 
 
 def test_effects_of_different_trials_may_differ() -> None:
-    lights = [
-        {"kind": "mains_light", "trial": n, "share": 0.05 * n, "since": "trial"} for n in (1, 2)
-    ]
+    light = {"kind": "mains_light", "since": "trial"}
+    lights = [{**light, "trial": n, "share": 0.05 * n} for n in (1, 2)]
     devices = with_faults(*lights, {"kind": "arm_ramp"})
     assert devices.world.faults.flicker() is None
     for n in (1, 2):

@@ -3,42 +3,51 @@
 from __future__ import annotations
 
 import errno
+import functools
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+import yaml
 
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.fault_settings import KINDS
+from sliplab.rigs.mock.fault_settings import KINDS, AnyFault
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
+from tests.protocols.planning import rows
 from tests.rigs.mock.driving import SMALL, Trial, go, gravity, same, slide, with_faults
 
-MOMENTS: list[dict[str, Any]] = [
-    {"kind": "frames_lost", "count": 3},
-    {"kind": "frame_late", "count": 2, "seconds": 0.13},
-    {"kind": "event_gap", "seconds": 0.1},
-    {"kind": "event_stall", "seconds": 60.0},
-    {"kind": "event_burst", "seconds": 0.02, "million_per_s": 5},
-    {"kind": "clock_drift", "device": "arm", "ppm": 500},
-    {"kind": "clock_drift", "device": "sync_box", "ppm": -500},
-    {"kind": "clock_jump", "device": "event_camera", "seconds": -0.25},
-    {"kind": "clock_jump", "device": "sync_box", "seconds": 0.5},
-    {"kind": "clock_restart", "device": "arm"},
-    {"kind": "clock_restart", "device": "event_camera"},
-    {"kind": "clock_restart", "device": "frame_camera"},
-    {"kind": "pulses_lost", "count": 4, "device": "sync_box"},
-    {"kind": "pulses_duplicated", "count": 4, "device": "arm", "seconds": 0.0137},
-    {"kind": "pulses_late", "count": 4, "device": "event_camera", "seconds": 0.031},
-    {"kind": "papilla_torn", "papilla": 9},
-    {"kind": "marker_occluded", "papilla": 0, "seconds": 0.2},
-    {"kind": "arm_off_path", "mm": 0.5, "seconds": 0.4},
-    {"kind": "arm_protective_stop"},
-]
+MOMENTS = """
+    kind: frames_lost, count: 3
+    kind: frame_late, count: 2, seconds: 0.13
+    kind: event_gap, seconds: 0.1
+    kind: event_stall, seconds: 60.0
+    kind: event_burst, seconds: 0.02, million_per_s: 5
+    kind: clock_drift, device: arm, ppm: 500
+    kind: clock_drift, device: sync_box, ppm: -500
+    kind: clock_jump, device: event_camera, seconds: -0.25
+    kind: clock_jump, device: sync_box, seconds: 0.5
+    kind: clock_restart, device: arm
+    kind: clock_restart, device: event_camera
+    kind: clock_restart, device: frame_camera
+    kind: pulses_lost, count: 4, device: sync_box
+    kind: pulses_duplicated, count: 4, device: arm, seconds: 0.0137
+    kind: pulses_late, count: 4, device: event_camera, seconds: 0.031
+    kind: papilla_torn, papilla: 9
+    kind: marker_occluded, papilla: 0, seconds: 0.2
+    kind: arm_off_path, mm: 0.5, seconds: 0.4
+    kind: arm_protective_stop
+"""
+
+
+def fault_of(text: str) -> dict[str, Any]:
+    """A fault as it stands in a rig file."""
+    found: dict[str, Any] = yaml.safe_load(f"{{{text}}}")
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +55,9 @@ def sound() -> Trial:
     return slide(build_mock(SMALL), seed=11)
 
 
-@pytest.mark.parametrize("fault", MOMENTS, ids=lambda f: f"{f['kind']} {f.get('device', '')}")
-def test_a_fault_is_the_same_in_any_pieces(fault: dict[str, Any], sound: Trial) -> None:
-    devices = with_faults({**fault, "at_s": 0.7213})
+@pytest.mark.parametrize("fault", MOMENTS.strip().splitlines())
+def test_a_fault_is_the_same_in_any_pieces(fault: str, sound: Trial) -> None:
+    devices = with_faults({**fault_of(fault), "at_s": 0.7213})
     whole = slide(devices, seed=11)
     devices.operator.ask("protective_stop", "Clear it.", "")
     same(slide(devices, seed=11, chunk_s=0.0331), whole)
@@ -80,9 +89,7 @@ def test_a_protective_stop_holds_the_arm_until_a_person_clears_it() -> None:
     ("since", "at_mm", "place"),
     [("recording", 1.2345, (1.2345, 2.6)), ("trial", 3.1, (0.0, 1.1)), ("trial", 5.0, (0.4, 2.6))],
 )
-def test_a_protective_stop_at_a_point_of_the_way(
-    since: str, at_mm: float, place: tuple[float, float], chunk_s: float
-) -> None:
+def test_a_stop_at_a_point_of_the_way(since: str, at_mm: float, place: Any, chunk_s: float) -> None:
     devices = with_faults({"kind": "arm_protective_stop", "since": since, "at_mm": at_mm})
     if place[1] < 2.6:  # while it presses, so that it cannot slide
         with pytest.raises(ArmFault):
@@ -95,9 +102,7 @@ def test_a_protective_stop_at_a_point_of_the_way(
 
 
 @pytest.mark.parametrize(("direction", "turned"), [(None, 90.0), (0.0, 0.0), (-30.0, -30.0)])
-def test_an_arm_off_its_path_says_so_in_its_poses(
-    direction: float | None, turned: float, sound: Trial
-) -> None:
+def test_an_arm_off_its_path_says_so(direction: Any, turned: float, sound: Trial) -> None:
     fault = {"kind": "arm_off_path", "mm": 0.8, "seconds": 1.0, "at_s": 0.9}
     devices = with_faults(fault | ({} if direction is None else {"direction_deg": direction}))
     off = slide(devices, seed=11)
@@ -131,51 +136,28 @@ def test_a_stuck_plate_does_not_fall() -> None:
 # -- devices that go -----------------------------------------------------------------------
 
 
+CALLS = {
+    "arm": "state pose now_ns progress read_poses read_pulses stop close connect start:[]",
+    "event_camera": "start read read_pulses stop close",
+    "frame_camera": "start read stop close set_region:64,64 read_clock",
+    "sync_box": "read_pulses read_exposures read_clock stop close start:100.0,1",
+}
+
+
 def calls(devices: MockDevices, device: str) -> list[Any]:
-    return {
-        "arm": [
-            devices.arm.state,
-            devices.arm.pose,
-            devices.arm.now_ns,
-            devices.arm.progress,
-            devices.arm.read_poses,
-            devices.arm.read_pulses,
-            devices.arm.stop,
-            devices.arm.close,
-            devices.arm.connect,
-            lambda: devices.arm.start([]),
-        ],
-        "event_camera": [
-            devices.events.start,
-            devices.events.read,
-            devices.events.read_pulses,
-            devices.events.stop,
-            devices.events.close,
-        ],
-        "frame_camera": [
-            devices.frames.start,
-            devices.frames.read,
-            devices.frames.stop,
-            devices.frames.close,
-            lambda: devices.frames.set_region(64, 64),
-            devices.frames.read_clock,
-        ],
-        "sync_box": [
-            devices.sync.read_pulses,
-            devices.sync.read_exposures,
-            devices.sync.read_clock,
-            devices.sync.stop,
-            devices.sync.close,
-            lambda: devices.sync.start(100.0, 1),
-        ],
-    }[device]
+    names = {"event_camera": "events", "frame_camera": "frames", "sync_box": "sync"}
+    found: Any = getattr(devices, names.get(device, device))
+    made = (call.partition(":") for call in CALLS[device].split())
+    return [
+        functools.partial(getattr(found, name), *yaml.safe_load(f"[{words}]"))
+        for name, _, words in made
+    ]
 
 
-@pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera", "sync_box"])
+@pytest.mark.parametrize("device", CALLS)
 def test_a_device_that_is_gone_fails_every_call_and_no_other(device: str) -> None:
-    devices = with_faults(
-        {"kind": "device_gone", "device": device, "since": "trial", "at_s": 1.0, "seconds": 2.0}
-    )
+    fault = fault_of("kind: device_gone, since: trial, at_s: 1.0, seconds: 2.0")
+    devices = with_faults({**fault, "device": device})
     devices.arm.connect()
     devices.begin_trial(1)
     devices.clock.wait(1.0)
@@ -184,7 +166,7 @@ def test_a_device_that_is_gone_fails_every_call_and_no_other(device: str) -> Non
         with pytest.raises(RigError, match=f"{words}: does not answer") as caught:
             call()
         assert isinstance(caught.value, ArmFault) == (device == "arm")
-    for other in {"arm", "event_camera", "frame_camera", "sync_box"} - {device}:
+    for other in CALLS.keys() - {device}:
         for call in calls(devices, other):
             call()
     devices.clock.wait(2.0)
@@ -193,9 +175,8 @@ def test_a_device_that_is_gone_fails_every_call_and_no_other(device: str) -> Non
 
 
 def test_an_arm_without_its_cable_stands_still() -> None:
-    devices = with_faults(
-        {"kind": "device_gone", "device": "arm", "since": "trial", "at_s": 1.0, "seconds": 0.5}
-    )
+    fault = fault_of("kind: device_gone, device: arm, since: trial, at_s: 1.0, seconds: 0.5")
+    devices = with_faults(fault)
     devices.arm.connect()
     devices.begin_trial(1)
     with pytest.raises(ArmFault, match="does not answer"):
@@ -206,9 +187,7 @@ def test_an_arm_without_its_cable_stands_still() -> None:
 
 
 def test_a_box_without_power_does_not_tick() -> None:
-    devices = with_faults(
-        {"kind": "device_gone", "device": "sync_box", "at_s": 1.0, "seconds": 0.5}
-    )
+    devices = with_faults(fault_of("kind: device_gone, device: sync_box, at_s: 1.0, seconds: 0.5"))
     devices.begin_trial(1)
     devices.frames.start()
     devices.sync.start(100.0, 1)
@@ -252,42 +231,34 @@ def test_faults_belong_to_their_trial() -> None:
     assert len(third.frames["number"]) == len(first.frames["number"])
 
 
-@pytest.mark.parametrize(
-    ("fault", "key", "said"),
-    [
-        ({"kind": "frames_lots"}, "mock.faults[1].kind", "must be one of"),
-        ({"count": 3}, "mock.faults[1].kind", "must be one of"),
-        ({"kind": "frames_lost", "seconds": 3}, "mock.faults[1].seconds", "known here: trial"),
-        ({"kind": "frames_lost", "cuont": 3}, "mock.faults[1].cuont", "did you mean 'count'"),
-        ({"kind": "pulses_late", "device": "frame_camera"}, "mock.faults[1].device", "'sync_box'"),
-        ({"kind": "clock_drift", "device": "arm"}, "mock.faults[1].ppm", "is missing"),
-        ({"kind": "clock_restart", "device": "sync_box"}, "mock.faults[1].device", "'arm'"),
-        ({"kind": "event_gap", "seconds": 0}, "mock.faults[1].seconds", "greater than 0"),
-        ({"kind": "papilla_torn", "papilla": 19}, "mock.faults[1].papilla", "from 0 (the centre)"),
-        ({"kind": "marker_occluded"}, "mock.faults[1]", "needs either a papilla"),
-        (
-            {"kind": "arm_protective_stop", "at_s": 1, "at_mm": 2},
-            "mock.faults[1]",
-            "needs a time (at_s) or a point (at_mm)",
-        ),
-        ({"kind": "plate_stuck", "at_s": 1}, "mock.faults[1].at_s", "unknown key"),
-    ],
-)
-def test_a_wrong_fault_is_said_as_any_wrong_input(fault: Any, key: str, said: str) -> None:
+WRONG = """
+    kind: frames_lots | .kind | must be one of
+    count: 3 | .kind | must be one of
+    kind: frames_lost, seconds: 3 | .seconds | known here: trial
+    kind: frames_lost, cuont: 3 | .cuont | did you mean 'count'
+    kind: pulses_late, device: frame_camera | .device | 'sync_box'
+    kind: clock_drift, device: arm | .ppm | is missing
+    kind: clock_restart, device: sync_box | .device | 'arm'
+    kind: event_gap, seconds: 0 | .seconds | greater than 0
+    kind: papilla_torn, papilla: 19 | .papilla | from 0 (the centre)
+    kind: marker_occluded | | needs either a papilla
+    kind: arm_protective_stop, at_s: 1, at_mm: 2 | | needs a time (at_s) or a point (at_mm)
+    kind: plate_stuck, at_s: 1 | .at_s | unknown key
+"""
+
+
+@pytest.mark.parametrize(("fault", "key", "said"), rows(WRONG))
+def test_a_wrong_fault_is_said_as_any_wrong_input(fault: str, key: str, said: str) -> None:
     data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
-    data["mock"]["faults"] = [{"kind": "event_gap"}, fault]
+    data["mock"]["faults"] = [{"kind": "event_gap"}, fault_of(fault)]
     with pytest.raises(InputError) as caught:
         validate(RigFile, data, "mock.yaml")
     assert caught.value.file == "mock.yaml"
-    assert caught.value.key == key
+    assert caught.value.key == f"mock.faults[1]{key}"
     assert said in caught.value.expected
 
 
 def test_every_kind_is_documented_with_its_parameters() -> None:
-    from typing import get_args
-
-    from sliplab.rigs.mock.fault_settings import AnyFault
-
     text = Path(ROOT / "docs" / "faults.md").read_text().split("## Outcome of each fault")[0]
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     assert set(rows) == set(KINDS)

@@ -13,7 +13,7 @@ from sliplab.analysis.force import step_ns
 from sliplab.protocols.timing import Delay
 from sliplab.protocols.yaml_file import validate
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.core.capabilities import ForceSensor, RigError
+from sliplab.rigs.core.capabilities import ForceSensor, RigError, Segment
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.force import MockForceSensor
@@ -26,24 +26,15 @@ from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.writer import TrialWriter
 from tests.rigs.core.test_rig import FRAME_PX, RIG, Memory, run, short_plan
 
-QUIET = {
-    "noise_n": 0.0,
-    "noise_nm": 0.0,
-    "drift_n_per_min": 0.0,
-    "drift_nm_per_min": 0.0,
-    "cross_talk_share": 0.0,
-    "bias": "never",
-}
+QUIET: dict[str, Any] = dict.fromkeys(("noise_n", "noise_nm", "drift_n_per_min"), 0.0)
+QUIET |= {"drift_nm_per_min": 0.0, "cross_talk_share": 0.0, "bias": "never"}
 PERIOD_NS = 1_000_000
 
 
 def force_rig(*, force: dict[str, Any] | None, **mock: Any) -> Rig:
     """The mock rig with tracks in place of pictures, with a force sensor or without."""
-    data = {
-        **RIG,
-        "mock": {**RIG["mock"], "frame_camera": {"level": "tracks"}, "force": force, **mock},
-    }
-    rig = build_rig(validate(RigFile, data, "test"))
+    mock = {**RIG["mock"], "frame_camera": {"level": "tracks"}, "force": force, **mock}
+    rig = build_rig(validate(RigFile, {**RIG, "mock": mock}, "test"))
     rig.connect()
     return rig
 
@@ -109,7 +100,7 @@ def test_without_faults_it_shows_the_sum_of_the_tips() -> None:
     go_to(devices, 2.4)
     loads = world.keep_loads()
     sensor.start()
-    slide_by(devices, 3.0)
+    move(devices, 3.0, 2.4, 2.0)
     found = sensor.read()
     times = sensor.clock.to_device(found.t_ns)
     track = world.physics.track.at(times)
@@ -128,20 +119,13 @@ def test_without_faults_it_shows_the_sum_of_the_tips() -> None:
 
 def go_to(devices: Any, depth_mm: float) -> None:
     """Press at the plate's centre."""
-    from sliplab.rigs.core.capabilities import Segment
-
     devices.arm.connect()
-    for depth in (-2.0, depth_mm):
-        devices.arm.start([Segment(devices.world.plane.pose(0.0, 0.0, depth), 20.0)])
-        while not devices.arm.progress().done:
-            devices.clock.wait(0.05)
-    devices.clock.wait(0.1)
+    move(devices, 0.0, -2.0, 20.0)
+    move(devices, 0.0, depth_mm, 20.0)
 
 
-def slide_by(devices: Any, x_mm: float) -> None:
-    from sliplab.rigs.core.capabilities import Segment
-
-    devices.arm.start([Segment(devices.world.plane.pose(x_mm, 0.0, 2.4), 2.0)])
+def move(devices: Any, x_mm: float, depth_mm: float, speed_mm_s: float) -> None:
+    devices.arm.start([Segment(devices.world.plane.pose(x_mm, 0.0, depth_mm), speed_mm_s)])
     while not devices.arm.progress().done:
         devices.clock.wait(0.05)
     devices.clock.wait(0.1)
@@ -220,7 +204,6 @@ def test_drawn_cross_talk_belongs_to_the_seed_and_keeps_its_share() -> None:
 def test_zero_takes_drift_and_load_away() -> None:
     rig = force_rig(force={**QUIET, "drift_n_per_min": 5.0, "bias": "trial"})
     force = rig.force
-    assert force is not None
     assert force.zeroing == "trial"
     devices = build_mock(MockSettings(force={**QUIET, "bias": "trial"}))
     go_to(devices, 2.4)
@@ -256,7 +239,6 @@ def test_its_delay_is_held_against_the_timing() -> None:
 
 def test_the_rig_that_ships_has_it() -> None:
     file, _ = load_rig_file(Path("mock-force"))
-    assert file.timing.force is not None
     assert file.timing.force.grade == "host time"
     assert file.scene.force is not None
     plain, _ = load_rig_file(Path("mock"))
@@ -282,7 +264,6 @@ def torn_rig(seed: int, delay: Delay | None = None) -> Rig:
     scene = MockSettings.model_validate(file.scene.model_dump() | changes)
     timing = file.timing
     if delay is not None:
-        assert timing.force is not None
         force = timing.force.model_copy(update={"delay": delay})
         timing = timing.model_copy(update={"force": force})
     rig = build_rig(file.model_copy(update={"mock": scene, "timing": timing}))
@@ -338,7 +319,6 @@ def steps_within(
         found = Taken(rigs[seed % 2], folder / str(seed), seed)
         off = abs(found.force_step_ns - found.event_step_ns)
         steps += off <= found.stated_ns
-        assert found.truth is not None
         pairs = np.array(found.truth["clocks"]["force"])
         force = found.sync.devices["force"]
         error = np.abs(np.asarray(force.map.to_reference(pairs[:, 0])) - pairs[:, 1])

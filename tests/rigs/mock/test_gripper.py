@@ -18,7 +18,6 @@ GRIP = {"force_n": [1.0, 50.0]}
 def with_gripper(**more: Any) -> MockDevices:
     data = {**SMALL.model_dump(), "gripper": GRIP, **more}
     devices = build_mock(MockSettings.model_validate(data))
-    assert devices.gripper is not None
     devices.arm.connect()
     devices.gripper.connect()
     return devices
@@ -40,7 +39,6 @@ def normal_n(devices: MockDevices) -> float:
 
 def peak_n(devices: MockDevices, limit_n: float, by_mm: float = 2.0, speed: float = 150.0) -> float:
     """Close the fingers and return the largest normal force on the way."""
-    assert devices.gripper is not None
     kept = devices.world.keep_wrench("test")
     devices.gripper.move(40.0 - by_mm, speed, limit_n)
     devices.clock.wait(1.0)
@@ -56,8 +54,7 @@ def test_fingers_stall_at_their_force_and_never_pass_it(depth_mm: float, speed: 
     limit_n = pressed(devices, depth_mm) + 1.0
     most = peak_n(devices, limit_n, speed=speed)
     assert limit_n - 0.3 < most < limit_n
-    state = devices.gripper and devices.gripper.state()
-    assert state
+    state = devices.gripper.state()
     assert state.stalled
     assert 38.0 < state.opening_mm < 40.0
     devices.clock.wait(5.0)
@@ -69,7 +66,6 @@ def test_fingers_that_begin_beyond_their_force_do_not_move() -> None:
     devices = with_gripper()
     force_n = pressed(devices, 3.0)
     assert peak_n(devices, force_n - 1.0) == pytest.approx(force_n, abs=0.01)
-    assert devices.gripper is not None
     assert devices.gripper.state().opening_mm == pytest.approx(40.0, abs=1e-6)
 
 
@@ -82,9 +78,8 @@ def test_what_fingers_close_is_depth() -> None:
     for devices in (by_arm, by_fingers):
         devices.clock.wait(10.0)
         devices.world.advance()
-    np.testing.assert_allclose(
-        by_fingers.world.physics.tips.normal, by_arm.world.physics.tips.normal, rtol=1e-3
-    )
+    normals = (devices.world.physics.tips.normal for devices in (by_fingers, by_arm))
+    np.testing.assert_allclose(*normals, rtol=1e-3)
 
 
 def test_how_often_the_state_is_read_changes_nothing() -> None:
@@ -92,7 +87,6 @@ def test_how_often_the_state_is_read_changes_nothing() -> None:
     for step_s in (0.001, 0.05):
         devices = with_gripper()
         pressed(devices, 3.0)
-        assert devices.gripper is not None
         devices.gripper.move(38.0, 50.0, normal_n(devices) + 0.5)
         for _ in range(round(0.2 / step_s)):
             devices.clock.wait(step_s)
@@ -116,7 +110,6 @@ def fallen_mm(grip_mm: float) -> float:
     devices.clock.wait(1.0)
     devices.arm.start([Segment(devices.world.plane.pose(0, 0, 2.3), 1.0)])
     devices.clock.wait(0.4)
-    assert devices.gripper is not None
     if grip_mm:
         devices.gripper.move(40.0 - grip_mm, 150.0, 50.0)
     devices.clock.wait(2.0)
@@ -158,6 +151,5 @@ def test_a_gripper_without_power_does_not_answer() -> None:
     devices = with_gripper(faults=[fault])
     devices.begin_trial(1)
     devices.clock.wait(0.1)
-    assert devices.gripper is not None
     with pytest.raises(RigError, match="gripper: does not answer"):
         devices.gripper.move(30.0, 50.0, 5.0)

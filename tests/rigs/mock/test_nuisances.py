@@ -67,7 +67,6 @@ def test_a_brush_passes_over_each_papilla_once_and_along_its_way() -> None:
     layout = np.array([[0.0, 0.0], [3.0, -6.0], [0.0, 6.0]])
     t_ns = np.arange(0, 4 * SECOND, 2_000_000, dtype=np.int64)
     force = brushing(book(brush), layout, 1, t_ns)
-    assert force is not None
     assert np.abs(force[:, :, 0]).max() < 1e-15  # upwards only
     assert not force[t_ns < SECOND].any()
     assert force[:, :, 1].max(axis=0) == pytest.approx(0.05, rel=1e-3)

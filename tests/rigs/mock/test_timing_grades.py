@@ -73,13 +73,8 @@ def test_its_rate_is_its_own() -> None:
 
 def test_a_clock_that_drifts_at_once_does_not_expose_before_the_start() -> None:
     for ppm in (10_000, -10_000):
-        fault = {
-            "kind": "clock_drift",
-            "device": "frame_camera",
-            "ppm": ppm,
-            "since": "trial",
-            "at_s": 0.0,
-        }
+        fault = {"kind": "clock_drift", "device": "frame_camera", "since": "trial", "at_s": 0.0}
+        fault["ppm"] = ppm
         devices = rig({"frames": "exposure line"}, fault)
         devices.clock.wait(20.0)
         found = record(devices, 1.0)
@@ -103,9 +98,8 @@ def test_edges_and_frame_stamps_are_the_same_instants() -> None:
 
 
 def test_a_lost_frame_was_exposed_all_the_same() -> None:
-    lost = record(
-        rig({"frames": "exposure line"}, {"kind": "frames_lost", "at_s": 1.0, "count": 4})
-    )
+    fault = {"kind": "frames_lost", "at_s": 1.0, "count": 4}
+    lost = record(rig({"frames": "exposure line"}, fault))
     plain = record(rig({"frames": "exposure line"}))
     assert np.array_equal(lost.exposures, plain.exposures)
     assert len(lost.frames["number"]) == len(plain.frames["number"]) - 4
@@ -161,16 +155,10 @@ def test_by_arrival_a_frame_has_the_hosts_time_only() -> None:
 
 
 def test_late_messages_hold_up_the_next_ones() -> None:
+    timing = {"frames": "host arrival", "arm": "host time"}
+    camera, arm = ({"arrival_jitter_us": us} for us in (60_000, 15_000))
     for chunk_s in (0.5, 0.011):
-        found = record(
-            rig(
-                {"frames": "host arrival", "arm": "host time"},
-                camera={"arrival_jitter_us": 60_000},
-                arm={"arrival_jitter_us": 15_000},
-            ),
-            1.0,
-            chunk_s,
-        )
+        found = record(rig(timing, camera=camera, arm=arm), 1.0, chunk_s)
         for stream in (found.frames, found.poses):
             assert np.all(np.diff(stream["host_ns"]) >= 0)
             assert np.any(np.diff(stream["host_ns"]) == 0)

@@ -10,6 +10,9 @@ from sliplab.rigs.scene.springs import Springs, Tips, make_springs, new_tips, tr
 
 MU = 0.85
 H = 1e-3
+RICH = {"static_excess": 0.03, "strengthening": 0.01, "relaxation_share": 0.2}
+QUIET = {"noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0}
+QUIET |= {"refractory_us": 0.0, "readout_hz": 0.0}
 
 
 def ideal_skin() -> Skin:
@@ -22,6 +25,11 @@ def springs_of(skin: Skin, level: int = 3, mu: float = MU, **options) -> Springs
     return make_springs(skin, friction_knots(skin, mu, 0.0, 0.5, 1), level, **options)
 
 
+def rough(skin: Skin, variation: float, seed: int, level: int = 3, **options) -> Springs:
+    """Springs with friction that varies along the way."""
+    return make_springs(skin, friction_knots(skin, MU, variation, 0.5, seed), level, **options)
+
+
 def times(steps: int, h: float) -> np.ndarray:
     """Row times of `steps` steps of `h` seconds, ns."""
     return np.rint(np.arange(steps + 1) * (h * 1e9)).astype(np.int64)
@@ -30,24 +38,14 @@ def times(steps: int, h: float) -> np.ndarray:
 def run(
     springs: Springs, tips: Tips, sensor: np.ndarray, h: float = H, t_ns: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track and load (steps, n, 3) of `tips` under `sensor` (steps, 2 to 5 columns)."""
+    """Track and load (steps, n, 3) of `tips` under `sensor` (steps, 2 to 6 columns)."""
     n, steps = len(springs.gap), len(sensor)
-    full = np.zeros((steps, 5))
+    full = np.zeros((steps, max(sensor.shape[1], 5)))
     full[:, : sensor.shape[1]] = sensor
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     rows = times(steps, h) if t_ns is None else t_ns
-    advance(
-        springs.table,
-        springs.friction,
-        springs.law,
-        tips.state,
-        rows,
-        full,
-        np.zeros(steps + 1),
-        track,
-        load,
-        springs.spots,
-    )
+    law = springs.table, springs.friction, springs.law
+    advance(*law, tips.state, rows, full, np.zeros(steps + 1), track, load, springs.spots)
     return track, load.reshape(steps, n, 3)
 
 
@@ -66,30 +64,14 @@ def fall(
     """Track of a released plate under `sensor` (depth alone, or x, y, depth), and steps taken."""
     steps, n = len(sensor), len(springs.gap)
     full = np.zeros((steps, 5))
-    if sensor.ndim == 1:
-        full[:, 2] = sensor
-    else:
-        full[:, : sensor.shape[1]] = sensor
+    full[:, [2] if sensor.ndim == 1 else range(sensor.shape[1])] = sensor.reshape(steps, -1)
     pull = np.broadcast_to(mass * 9.81 if weight is None else weight, steps).astype(float)
     pull = np.concatenate([[2 * pull[0] - pull[min(1, steps - 1)]], pull])
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
     rows = times(steps, h) if t_ns is None else t_ns
-    done, _ = advance_free(
-        springs.table,
-        springs.friction,
-        springs.law,
-        tips.state,
-        rows,
-        full,
-        motion,
-        mass,
-        pull,
-        stiction,
-        -25.0,
-        track,
-        load,
-        springs.spots,
-    )
+    law = springs.table, springs.friction, springs.law
+    plate = motion, mass, pull, stiction, -25.0
+    done, _ = advance_free(*law, tips.state, rows, full, *plate, track, load, springs.spots)
     return track[:done], done
 
 

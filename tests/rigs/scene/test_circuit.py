@@ -14,16 +14,9 @@ import pytest
 from sliplab.rigs.scene.circuit import ON, SEEN
 from sliplab.rigs.scene.edges import CUT
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
+from tests.rigs.scene.steps import QUIET as IDEAL
 
-QUIET = {
-    "noise_hz": 0.0,
-    "hot_pixels": 0,
-    "threshold_sigma": 0.0,
-    "refractory_us": 0.0,
-    "readout_hz": 0.0,
-    "width": 96,
-    "height": 96,
-}
+QUIET = {**IDEAL, "width": 96, "height": 96}
 ONE = np.zeros((1, 2))
 MIDDLE = 47.5
 RADIUS_PX = 14.0 * 1.2
@@ -206,10 +199,8 @@ def test_a_reference_that_leaks_moves_the_next_signal_events() -> None:
 @pytest.mark.parametrize("leak_share", [0.25, 1.0])
 def test_pixels_at_rest_leak_at_their_rate(leak_share: float) -> None:
     """Of n pixels at rest each fires once in 1 / rate, wherever it stood at the begin."""
-    optics = EventOptics(
-        **{**QUIET, "noise_hz": 2.0, "leak_share": leak_share, "leak": "reference"}
-    )
-    sensor = MarkerSensor(optics, ONE, 1)
+    leaking = {"noise_hz": 2.0, "leak_share": leak_share, "leak": "reference"}
+    sensor = MarkerSensor(EventOptics(**{**QUIET, **leaking}), ONE, 1)
     t_ns = np.arange(0, 4001, 32, dtype=np.int64) * 1_000_000
     loads = np.zeros((len(t_ns), 3))
     sensor.reset(loads[0], 5)
@@ -256,15 +247,8 @@ def test_a_slow_pixel_fires_later_and_a_dark_one_is_slower() -> None:
 
 @pytest.mark.parametrize("cuts", [[32], [64, 128, 160, 320, 512], list(range(32, 640, 32))])
 def test_chunks_do_not_matter_to_cells(cuts: list[int]) -> None:
-    changes = {
-        "leak": "reference",
-        "noise_hz": 1.0,
-        "cutoff_hz": 30.0,
-        "threshold_off_sigma": 0.05,
-        "threshold_sigma": 0.03,
-        "readout_hz": 5000.0,
-        "refractory_us": 300.0,
-    }
+    changes = {"leak": "reference", "noise_hz": 1.0, "cutoff_hz": 30.0, "threshold_sigma": 0.03}
+    changes |= {"threshold_off_sigma": 0.05, "readout_hz": 5000.0, "refractory_us": 300.0}
     sensor, whole = sensed(there_and_back, 640, **changes)
     t_ns = np.arange(0, 641, 2, dtype=np.int64) * 1_000_000
     loads = loads_on(there_and_back, t_ns * 1e-9)

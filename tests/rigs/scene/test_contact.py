@@ -2,22 +2,25 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.scene.friction import friction_knots, grip_at
+from sliplab.rigs.scene.friction import grip_at
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
-from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK, make_springs, new_tips
+from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK, new_tips
 from tests.rigs.scene.steps import (
     MU,
+    RICH,
     at,
     ideal_skin,
     line,
     places,
     pressed,
+    rough,
     run,
     slid,
     springs_of,
@@ -59,27 +62,14 @@ def test_slip_starts_at_mu_n_over_k_on_a_straight_path_whatever_the_step() -> No
 @LEVELS
 @pytest.mark.parametrize("depth", [2.4, 2.8, 3.4])
 @pytest.mark.parametrize("direction", range(0, 360, 45))
-def test_slip_runs_from_the_outer_layer_to_the_centre(
-    depth: float, direction: int, level: int
-) -> None:
+def test_slip_runs_from_the_outer_layer_inwards(depth: float, direction: int, level: int) -> None:
     geometry = SkinGeometry(height_scatter_mm=0.08, position_scatter_mm=0.05, friction_scatter=0.05)
     skin = make_skin(geometry, seed=3)
-    springs = make_springs(
-        skin,
-        friction_knots(skin, MU, 0.05, 0.5, seed=9),
-        level,
-        static_excess=0.03,
-        relaxation_share=0.2,
-        strengthening=0.01,
-    )
+    springs = rough(skin, 0.05, 9, level, **RICH)
     tips = pressed(springs, depth)
     angle = math.radians(direction)
-    track, _ = run(
-        springs,
-        tips,
-        line((0, 0, depth), (15 * math.cos(angle), 15 * math.sin(angle), depth), 500),
-        h=0.03,
-    )
+    end = (15 * math.cos(angle), 15 * math.sin(angle), depth)
+    track, _ = run(springs, tips, line((0, 0, depth), end, 500), h=0.03)
     first = np.argmax(slid(track) > 1e-9, axis=0)
     outer, middle, centre = (first[skin.ring == ring] for ring in (2, 1, 0))
     assert np.all(slid(track)[-1] > 0)
@@ -137,15 +127,9 @@ def test_static_friction_drops_by_its_excess() -> None:
 @LEVELS
 def test_huge_stiffness_and_long_steps_stay_finite_and_inside_the_cone(level: int) -> None:
     skin = ideal_skin()
-    stiff = springs_of(
-        replace(
-            skin,
-            normal_n_per_mm=1e9 * skin.normal_n_per_mm,
-            bending_n_per_mm=1e9 * skin.bending_n_per_mm,
-            compliance_mm_per_n=1e-9 * skin.compliance_mm_per_n,
-        ),
-        level,
-    )
+    hard = {name: 1e9 * getattr(skin, name) for name in ("normal_n_per_mm", "bending_n_per_mm")}
+    soft = 1e-9 * skin.compliance_mm_per_n
+    stiff = springs_of(replace(skin, compliance_mm_per_n=soft, **hard), level)
     tips = new_tips(19)
     run(stiff, tips, at(0, 0, 2.8, 3), h=0.01)
     track, load = run(stiff, tips, line((0, 0, 2.8), (15, 4, 2.8), 1500), h=0.01)
@@ -220,19 +204,8 @@ def test_leaving_and_touching_again_resets_the_slider(level: int) -> None:
 
 def test_chunks_do_not_matter() -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08), seed=2)
-    springs = make_springs(
-        skin,
-        friction_knots(skin, MU, 0.05, 0.5, 4),
-        static_excess=0.03,
-        relaxation_share=0.2,
-        strengthening=0.01,
-    )
-    path = np.vstack(
-        [
-            line((0, 0, 0), (0, 0, 2.6), 300),
-            line((0, 0, 2.6), (4, 2, 2.6), 700),
-        ]
-    )
+    springs = rough(skin, 0.05, 4, **RICH)
+    path = np.vstack([line((0, 0, 0), (0, 0, 2.6), 300), line((0, 0, 2.6), (4, 2, 2.6), 700)])
     whole, parts = new_tips(19), new_tips(19)
     track, _ = run(springs, whole, path)
     rows = times(1000, 1e-3)
@@ -241,21 +214,14 @@ def test_chunks_do_not_matter() -> None:
     assert np.array_equal(whole.state, parts.state, equal_nan=True)
 
 
+WAYPOINT = st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-1, 3.6))
+
+
 @settings(max_examples=40, deadline=None)
-@example(
-    seed=0,
-    waypoints=[(0.0, 1.0, 1.0), (1.0, 0.0, 0.0)],
-    share=0.2,
-    level=3,
-    variation=0.1,
-    excess=0.0,
-    h=1e-3,
-)
+@example(0, [(0.0, 1.0, 1.0), (1.0, 0.0, 0.0)], 0.2, 3, 0.1, 0.0, 1e-3)
 @given(
     seed=st.integers(0, 1000),
-    waypoints=st.lists(
-        st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-1, 3.6)), min_size=1, max_size=5
-    ),
+    waypoints=st.lists(WAYPOINT, min_size=1, max_size=5),
     share=st.sampled_from([0.0, 0.2]),
     level=st.sampled_from([1, 2, 3]),
     variation=st.sampled_from([0.0, 0.1]),
@@ -263,17 +229,10 @@ def test_chunks_do_not_matter() -> None:
     h=st.sampled_from([1e-3, 1e-2]),
 )
 def test_every_force_stays_inside_its_cone(
-    seed: int,
-    waypoints: list[tuple[float, float, float]],
-    share: float,
-    level: int,
-    variation: float,
-    excess: float,
-    h: float,
+    seed: int, waypoints: Any, share: float, level: int, variation: float, excess: float, h: float
 ) -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08, friction_scatter=0.05), seed)
-    knots = friction_knots(skin, MU, variation, 0.5, seed)
-    springs = make_springs(skin, knots, level, static_excess=excess, relaxation_share=share)
+    springs = rough(skin, variation, seed, level, static_excess=excess, relaxation_share=share)
     tips, last = new_tips(19), (0.0, 0.0, -1.0)
     for waypoint in waypoints:
         track, load = run(springs, tips, line(last, waypoint, 60), h)
@@ -282,7 +241,5 @@ def test_every_force_stays_inside_its_cone(
         assert np.all(np.isfinite(load))
         size = np.hypot(load[..., 0], load[..., 1])
         way = slid(track)
-        grip = np.array(
-            [[grip_at(springs.friction, i, way[k, i])[0] for i in range(19)] for k in range(60)]
-        )
-        assert np.all(size <= grip * load[..., 2] * (1 + excess) * (1 + 1e-12))
+        grip = [[grip_at(springs.friction, i, way[k, i])[0] for i in range(19)] for k in range(60)]
+        assert np.all(size <= np.array(grip) * load[..., 2] * (1 + excess) * (1 + 1e-12))

@@ -11,14 +11,8 @@ from scipy.optimize import brentq
 from sliplab.rigs.scene.edges import CUT
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
 from sliplab.rigs.scene.marker_path import excursion, fit_blocks, inner_weights, slope_weights
+from tests.rigs.scene.steps import QUIET
 
-QUIET = {
-    "noise_hz": 0.0,
-    "hot_pixels": 0,
-    "threshold_sigma": 0.0,
-    "refractory_us": 0.0,
-    "readout_hz": 0.0,
-}
 OPTICS = EventOptics(**QUIET)
 ONE = np.zeros((1, 2))
 RADIUS_PX = OPTICS.px_per_mm * OPTICS.radius_mm
@@ -177,9 +171,8 @@ def test_a_block_follows_a_polynomial_that_it_can_hold(rows: int) -> None:
     """On uneven rows: lines through two, parabolas through three, cubics through more."""
     rng = np.random.default_rng(rows)
     t = np.concatenate([[0.0], np.cumsum(rng.choice([1.0, 2.0, 4.0], rows - 1))])
-    polynomial = np.polynomial.Polynomial(
-        rng.standard_normal(min(rows, 4)) / 4.0 ** np.arange(min(rows, 4))
-    )
+    order = min(rows, 4)
+    polynomial = np.polynomial.Polynomial(rng.standard_normal(order) / 4.0 ** np.arange(order))
     curve = fitted(t, polynomial(t))
     for k in range(rows - 1):
         for s in (0.0, 0.3, 0.5, 1.0):

@@ -1,26 +1,20 @@
 """Event times against closed forms, and what must not depend on how a trial is cut up."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.scene.edges import CUT, level_at, rim_of
+from sliplab.rigs.scene.edges import level_at, rim_of
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
 from sliplab.rigs.scene.rim_pixels import no_lists
+from tests.rigs.scene.steps import QUIET
+from tests.rigs.scene.test_event_paths import crossings
 
 STEP_NS = 1_000_000
 ONE = np.zeros((1, 2))
-QUIET = {
-    "noise_hz": 0.0,
-    "hot_pixels": 0,
-    "threshold_sigma": 0.0,
-    "refractory_us": 0.0,
-    "readout_hz": 0.0,
-}
 
 
 def loads_for(centre_px: np.ndarray, optics: EventOptics, growth_px: np.ndarray | None = None):
@@ -48,38 +42,6 @@ def sense(sensor: MarkerSensor, loads: np.ndarray, first_step: int = 0, seed: in
     return sensor.sense(loads, times(len(loads), first_step))
 
 
-def expected_crossings(
-    optics: EventOptics, x: int, y: int, v: tuple[float, float], t_end: float
-) -> list[tuple[float, int]]:
-    """Times (s) and polarities at one pixel, by fine bisection of its own log intensity."""
-    cx, cy = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
-    radius = optics.px_per_mm * optics.radius_mm
-
-    def level(t: float) -> float:
-        away = math.hypot(x - cx - v[0] * t, y - cy - v[1] * t) - radius
-        share = 1 / (1 + math.exp(min(away / optics.edge_px, 600.0)))
-        tail = 1 / (1 + math.exp(CUT))
-        if abs(away) >= CUT * optics.edge_px:
-            return 0.0 if away > 0 else optics.contrast
-        return optics.contrast * (share - tail) / (1 - 2 * tail)
-
-    found, reference, t, dt = [], level(0.0), 0.0, t_end / 4000
-    while t < t_end:
-        for sign in (1, -1):
-            target = reference + sign * optics.threshold
-            if sign * (level(t + dt) - target) >= 0:
-                low, high = t, t + dt
-                for _ in range(60):
-                    mid = 0.5 * (low + high)
-                    low, high = (low, mid) if sign * (level(mid) - target) >= 0 else (mid, high)
-                found.append((high, int(sign > 0)))
-                reference = target
-                t -= dt  # this interval again: there may be more
-                break
-        t += dt
-    return found
-
-
 def test_the_profile_and_its_inverse() -> None:
     for level in np.linspace(0.01, 2.07, 50):
         assert level_at(rim_of(level, 2.08, 0.8), 2.08, 0.8) == pytest.approx(level, rel=1e-12)
@@ -102,7 +64,7 @@ def test_a_disc_that_moves_straight_fires_at_the_closed_form_times(v: tuple[floa
     total = 0
     for px, py in pixels[:: max(len(pixels) // 40, 1)]:
         here = (x == px) & (y == py)
-        expected = expected_crossings(optics, px, py, v, steps * 1e-3)
+        expected = crossings(lambda t: (v[0] * t, v[1] * t, 0.0), px, py, steps * 1e-3, 1.25e-4)
         assert p[here].tolist() == [sign for _, sign in expected]
         assert t_ns[here] == pytest.approx([t * 1e9 for t, _ in expected], abs=1000)
         total += len(expected)
@@ -116,13 +78,10 @@ def test_a_growing_disc_fires_where_its_rim_is() -> None:
     t_ns, x, y, p = sense(MarkerSensor(optics, ONE, 1), loads)
     assert len(t_ns) > 1000
     assert np.all(p == 1)
-    away = np.hypot(x - 319.5, y - 239.5) - 16.8 - t_ns * 1e-9 * 10.0
-    level = np.array([level_at(d, optics.contrast, optics.edge_px) for d in away])
-    start = np.array(
-        [
-            level_at(d, optics.contrast, optics.edge_px)
-            for d in np.hypot(x - 319.5, y - 239.5) - 16.8
-        ]
+    away = np.hypot(x - 319.5, y - 239.5) - 16.8
+    start, level = (
+        np.array([level_at(d, optics.contrast, optics.edge_px) for d in away - grown_px])
+        for grown_px in (0.0, t_ns * 1e-9 * 10.0)
     )
     share = (level - start) / optics.threshold
     assert np.abs(share - np.rint(share)).max() < 1e-4
@@ -145,12 +104,8 @@ def test_a_pixel_tangent_to_the_rim_has_both_crossings_or_none() -> None:
     rim = rim_of(optics.threshold, optics.contrast, optics.edge_px)
     for offset in (-1e-9, 0.0, 1e-9, 1e-4):
         above = 0.5 * (optics.height - 1) - 100 - (16.8 + rim) + offset
-        path = np.column_stack(
-            [
-                np.linspace(-60, 60, 241),
-                np.full(241, above - 0.5 * (optics.height - 1)),
-            ]
-        )
+        row = above - 0.5 * (optics.height - 1)
+        path = np.column_stack([np.linspace(-60, 60, 241), np.full(241, row)])
         t_ns, x, y, p = sense(MarkerSensor(optics, ONE, 1), loads_for(path, optics))
         here = (y == round(above + 16.8 + rim)) & (x == 320)
         assert sorted(p[here].tolist()) in ([], [0, 1])

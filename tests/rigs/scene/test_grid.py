@@ -1,6 +1,7 @@
 """The whole kinematic grid by contact alone: what every lab's first figure shows."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,9 +23,8 @@ def runs() -> tuple[np.ndarray, np.ndarray]:
     settings = MockSettings(seed=1)
     skin = skin_of(settings)
     rows, motion = [], []
-    for seed, (depth, speed, direction, _) in enumerate(
-        itertools.product(DEPTHS, SPEEDS, DIRECTIONS, range(3))
-    ):
+    grid = itertools.product(DEPTHS, SPEEDS, DIRECTIONS, range(3))
+    for seed, (depth, speed, direction, _) in enumerate(grid):
         springs = springs_of(settings, skin, seed)
         run = run_slide(springs, depth, speed, direction, step_mm=0.25)
         rows.append(run.slipped_s)
@@ -74,9 +74,7 @@ def test_deeper_and_slower_is_later(grid: np.ndarray) -> None:
         assert np.all(np.diff(onset, axis=1) < 0)
 
 
-def test_markers_move_most_while_loading_and_little_in_gross_slip(
-    runs: tuple[np.ndarray, np.ndarray],
-) -> None:
+def test_markers_move_most_while_loading_and_little_in_gross_slip(runs: Any) -> None:
     """The story of the event rate: a sharp rise before the first slip, falling through the
     incipient phase as papillae let go one after another, low but not silent in gross slip."""
     loading, early, middle, late, gross = runs[1].T
@@ -90,12 +88,8 @@ def test_markers_move_most_while_loading_and_little_in_gross_slip(
 
 def test_an_even_scene_is_silent_in_gross_slip() -> None:
     """Without friction that varies, nothing tells gross slip from holding still."""
-    settings = MockSettings.model_validate(
-        {
-            "seed": 1,
-            "scene": {"friction": {"path_variation": 0.0, "static_excess": 0.0}},
-        }
-    )
+    friction = {"path_variation": 0.0, "static_excess": 0.0}
+    settings = MockSettings.model_validate({"seed": 1, "scene": {"friction": friction}})
     run = run_slide(springs_of(settings, skin_of(settings), 1), 2.8, 1.0, step_mm=0.25)
     motion = _motion(run, settings.event_camera.shift_mm_per_n)
     assert motion[4] < 1e-3 * motion[0]

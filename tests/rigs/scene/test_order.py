@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sliplab.rigs.scene.friction import friction_knots
-from sliplab.rigs.scene.springs import make_springs
 from tests.rigs.scene.reference import Leg, follow, papilla, rows_of, straight_legs
-from tests.rigs.scene.steps import MU, ideal_skin, places, pressed, run
+from tests.rigs.scene.steps import MU, ideal_skin, places, pressed, rough, run
 
 SWITCHES: dict[str, dict[str, float]] = {
     "none": {},
@@ -58,7 +57,7 @@ def errors(
     depth, i, variation = scene.get("depth", 1.2), int(scene.get("tip", 0)), scene.get("rough", 0)
     skin = ideal_skin()
     knots = friction_knots(skin, MU, variation, 0.5, 3)
-    springs = make_springs(skin, knots, level, **SWITCHES[switch])
+    springs = rough(skin, variation, 3, level, **SWITCHES[switch])
     begin = pressed(springs, depth)
     at_s, _ = rows_of(legs, depth, h)
     true = follow(papilla(springs, begin, knots, i, depth), legs, at_s)
@@ -87,23 +86,15 @@ def floor_of_turns(switch: str) -> float:
     return JUMP_N if switch == "much static" else FLOOR_N
 
 
+TURNS = {"none": 60, "relaxation": 90, "no static": 90, "static": 110, "much static": 90}
+FURTHER = [("no static", 30, 1.0), ("all", 150, 4.0), ("strengthening", 180, 3.0)]
+
+
 @pytest.mark.parametrize(
-    ("level", "switch", "angle_deg", "speed"),
-    [
-        (2, "none", 60, 1.0),
-        (3, "relaxation", 90, 1.0),
-        (3, "no static", 90, 1.0),
-        (3, "no static", 30, 1.0),
-        (3, "all", 150, 4.0),
-        (3, "static", 110, 1.0),
-        (3, "strengthening", 180, 3.0),
-        (3, "much static", 90, 1.0),
-    ],
+    ("switch", "angle_deg", "speed"), [*((*turn, 1.0) for turn in TURNS.items()), *FURTHER]
 )
-def test_a_turn_is_of_second_order_in_the_step(
-    level: int, switch: str, angle_deg: float, speed: float
-) -> None:
-    parts = (1, 4, 16)
+def test_a_turn_is_of_second_order_in_the_step(switch: str, angle_deg: float, speed: float) -> None:
+    parts, level = (1, 4, 16), 2 if switch == "none" else 3
     misses, slips, true = errors(level, switch, turn(angle_deg, speed), 8e-3, parts)
     assert slips == [true] * len(parts)
     assert_second_order(misses, parts, 5e-4, switch, floor_of_turns(switch))
@@ -137,9 +128,7 @@ def test_turns_at_every_level_speed_and_switch(
 
 @pytest.mark.parametrize("speed", [1e3, 1e6, 1e9])
 def test_no_speed_is_too_high(speed: float) -> None:
-    springs = make_springs(
-        ideal_skin(), friction_knots(ideal_skin(), MU, 0.05, 0.5, 3), 3, **SWITCHES["all"]
-    )
+    springs = rough(ideal_skin(), 0.05, 3, **SWITCHES["all"])
     way = np.arange(1, 101)[:, None] * [speed * 2e-3, 0.0, 0.0] + [0.0, 0.0, 2.8]
     track, load = run(springs, pressed(springs), way, h=2e-3)
     assert np.all(np.isfinite(load))

@@ -54,6 +54,10 @@ class Look:
     def rows(self) -> int:
         return int(self.first[-1])
 
+    @property
+    def path(self) -> tuple[np.ndarray, ...]:
+        return self.segments, self.first, self.since, self.until, self.inverse, self.curve
+
     def place(self, k: int, tau: float) -> np.ndarray:
         """Column, row and radius `tau` ns after the begin of step k."""
         c = self.curve[:, k].reshape(3, 4)
@@ -74,11 +78,8 @@ def look(seed: int, px: float, smooth: float) -> Look:
     t = np.arange(total + 1) * float(NS)
     first = np.arange(4) * STEPS
     inverse, weights, inner = np.empty(total + 1), np.empty((4, 2 * total)), np.empty((3, total))
-    curve, segments, spread = (
-        np.empty((12, total + 1)),
-        np.empty(total, SEGMENT),
-        np.empty((4, total)),
-    )
+    curve, segments = np.empty((12, total + 1)), np.empty(total, SEGMENT)
+    spread = np.empty((4, total))
     for block in range(3):
         slope_weights(t, first[block], first[block + 1], block, inverse, weights)
     inner_weights(first, 3, weights, inner)
@@ -86,19 +87,9 @@ def look(seed: int, px: float, smooth: float) -> Look:
     since = np.tile(np.arange(STEPS) * float(NS), 3)
     amount = 0
     for block in range(3):
-        amount = cut_block(
-            first[block],
-            first[block + 1],
-            block,
-            t[first[block]],
-            CUT * EDGE,
-            since,
-            since + NS,
-            curve,
-            spread,
-            segments,
-            amount,
-        )
+        begin, end = first[block : block + 2]
+        room = since, since + NS, curve, spread, segments
+        amount = cut_block(begin, end, block, t[begin], CUT * EDGE, *room, amount)
     threshold = 0.2 + 0.03 * rng.uniform(-3, 3, (HEIGHT, WIDTH))
     state = dark_pixels(threshold, CONTRAST, EDGE)
     disc = path[:, :, 0]
@@ -113,28 +104,9 @@ def side_by_side(a: Look, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     pack_steps(a.rows, a.since, a.inverse, a.curve, steps)
     gaps, out = np.empty(len(pixels)), np.empty(400_000, np.int64)
     scratch = [np.empty(STRIDE * count) for count in (PIXEL_FIELDS, FIRE_FIELDS, WAIT_FIELDS)]
-    n = events_of_pixels(
-        pixels,
-        len(pixels),
-        a.segments,
-        a.first,
-        a.since,
-        a.until,
-        a.inverse,
-        a.curve,
-        steps,
-        tree,
-        a.threshold,
-        CONTRAST,
-        EDGE,
-        0,
-        np.empty((160, 3)),
-        *scratch,
-        state,
-        gaps,
-        out,
-        0,
-    )
+    sensor = a.threshold, CONTRAST, EDGE, 0, np.empty((160, 3))
+    room = *scratch, state, gaps, out, 0
+    n = events_of_pixels(pixels, len(pixels), *a.path, steps, tree, *sensor, *room)
     return np.sort(out[:n]), gaps
 
 
@@ -143,19 +115,7 @@ def one_by_one(a: Look, state: np.ndarray) -> np.ndarray:
     tree, stack, out = np.empty((4 * a.rows, 7)), np.empty((160, 3)), np.empty(400_000, int)
     for block in range(3):
         bound_rates(a.curve, a.first[block], a.first[block + 1], 4 * a.first[block], tree)
-    n = search_all(
-        a.segments,
-        a.first,
-        a.since,
-        a.until,
-        a.inverse,
-        a.curve,
-        tree,
-        a.threshold,
-        state,
-        stack,
-        out,
-    )
+    n = search_all(*a.path, tree, a.threshold, state, stack, out)
     return np.sort(out[:n])
 
 
@@ -172,31 +132,10 @@ def search_all(  # type: ignore[no-untyped-def]
                 begin = int(first[segment.block])
                 gap = np.hypot(x - segment.x0, y - segment.y0) - segment.r0
                 head = int(segment.zero) << 25 | x << 13 | y << 1
-                on, off, last_one, level, n = events_of_segment(
-                    float(x),
-                    float(y),
-                    on,
-                    off,
-                    last_one,
-                    level,
-                    threshold[y, x],
-                    gap,
-                    segment,
-                    4 * begin,
-                    begin,
-                    begin + STEPS,
-                    since,
-                    until,
-                    inverse,
-                    curve,
-                    tree,
-                    CONTRAST,
-                    EDGE,
-                    head,
-                    stack,
-                    out,
-                    n,
-                )
+                pixel = float(x), float(y), on, off, last_one, level, threshold[y, x], gap
+                steps = 4 * begin, begin, begin + STEPS, since, until, inverse, curve, tree
+                sensor = CONTRAST, EDGE, head, stack, out, n
+                on, off, last_one, level, n = events_of_segment(*pixel, segment, *steps, *sensor)
             kept = state[y, x]
             kept[0], kept[1], kept[2], kept[3] = on, off, last_one, level
     return n
@@ -275,8 +214,5 @@ def roots_of(a: Look, x: int, y: int) -> list[tuple[float, int]]:
                     now = brentq(gap, now, end, args=(k, target), xtol=1e-3, rtol=1e-14)
                 found.append((k * NS + now, int(comes)))
                 level += step if comes else -step
-                on, off = (
-                    rim_of(level + step, CONTRAST, EDGE),
-                    rim_of(level - step, CONTRAST, EDGE),
-                )
+                on, off = (rim_of(level + sign * step, CONTRAST, EDGE) for sign in (1, -1))
     return found

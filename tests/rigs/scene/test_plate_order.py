@@ -128,7 +128,6 @@ def narrowest_s() -> float:
     left = departure(away, sigma, 10)
     assert left is not None
     found = change_point(frame_ns, away, sigma, left, 2_000_000)
-    assert found is not None
     return (found.high_ns - found.low_ns) * 1e-9
 
 

@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sliplab.rigs.scene.friction import friction_knots
-from sliplab.rigs.scene.springs import Springs, make_springs
+from sliplab.rigs.scene.springs import Springs
 from tests.rigs.scene.steps import (
     MU,
+    RICH,
     at,
     fall,
     ideal_skin,
     line,
     places,
     pressed,
+    rough,
     run,
     springs_of,
 )
@@ -76,13 +77,7 @@ def test_a_tip_that_crosses_a_spot_lags_less_on_it_by_the_factor() -> None:
 @pytest.mark.parametrize("factor", [0.3, 2.5])
 def test_shorter_steps_change_a_crossing_by_a_step_at_most(factor: float) -> None:
     skin = ideal_skin()
-    springs = make_springs(
-        skin,
-        friction_knots(skin, MU, 0.05, 0.5, 1),
-        static_excess=0.03,
-        strengthening=0.01,
-        relaxation_share=0.2,
-    )
+    springs = rough(skin, 0.05, 1, **RICH)
     springs = spotted(springs, (7.0, 1.0, 3.0, factor), (-9.0, -2.0, 2.0, factor))
     fine, _ = slide(springs, 6.0, 5e-4)
     coarse, _ = slide(springs, 6.0, 4e-3)
@@ -96,9 +91,8 @@ def test_shorter_steps_change_a_crossing_by_a_step_at_most(factor: float) -> Non
 
 def test_a_plate_that_is_one_spot_has_other_friction() -> None:
     skin, factor = ideal_skin(), 0.6
-    options = {"static_excess": 0.03, "strengthening": 0.01, "relaxation_share": 0.2}
-    spot = spotted(springs_of(skin, 3, **options), (0.0, 0.0, 100.0, factor))
-    other = springs_of(skin, 3, mu=factor * MU, **options)
+    spot = spotted(springs_of(skin, 3, **RICH), (0.0, 0.0, 100.0, factor))
+    other = springs_of(skin, 3, mu=factor * MU, **RICH)
     track, load = slide(spot, 5.0)
     expected, expected_load = slide(other, 5.0)
     assert places(track) == pytest.approx(places(expected), abs=1e-9)
@@ -128,7 +122,7 @@ def test_a_falling_plate_takes_its_spots_with_it() -> None:
 @pytest.mark.parametrize("cut", [1, 777, 1500])
 def test_chunks_do_not_matter(cut: int) -> None:
     skin = ideal_skin()
-    springs = make_springs(skin, friction_knots(skin, MU, 0.05, 0.5, 1), static_excess=0.03)
+    springs = rough(skin, 0.05, 1, static_excess=0.03)
     springs = spotted(springs, (7.0, 1.0, 3.0, 0.5), (8.0, 0.0, 2.0, 1.5))
     way = np.concatenate([at(0, 0, DEPTH, 100), line((0, 0, DEPTH), (6, 1, DEPTH), 2900)])
     whole, load = run(springs, pressed(springs, DEPTH), way)

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.scene.friction import friction_knots
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
-from sliplab.rigs.scene.springs import SLIDING, Springs, make_springs, new_tips
-from tests.rigs.scene.steps import MU, ideal_skin, line, pressed, run, springs_of
+from sliplab.rigs.scene.springs import SLIDING, Springs, new_tips
+from tests.rigs.scene.steps import MU, RICH, ideal_skin, line, pressed, rough, run, springs_of
 
 LEVELS = pytest.mark.parametrize("level", [1, 2, 3])
 
@@ -67,9 +66,11 @@ def test_the_drag_of_a_growing_cone_is_exact_too() -> None:
     rho1 = MU * springs.normal[0] * 3.2 / springs.tangential[0]
     run(springs, tips, line((15, 0, 2.8), (15 + 2 * math.cos(turn), 2 * math.sin(turn), 3.2), 1))
     mpmath.mp.dps = 30
-    theta = mpmath.odefun(
-        lambda s, y: [-mpmath.sin(y[0]) / (rho0 + (rho1 - rho0) * s / 2)], 0, [mpmath.mpf(turn)]
-    )(2)[0]
+
+    def rate(s, y):
+        return [-mpmath.sin(y[0]) / (rho0 + (rho1 - rho0) * s / 2)]
+
+    theta = mpmath.odefun(rate, 0, [mpmath.mpf(turn)])(2)[0]
     angle = math.atan2(tips.force[0, 1], tips.force[0, 0])
     assert angle == pytest.approx(turn - float(theta), abs=1e-12)
     assert np.hypot(*tips.force[0]) == pytest.approx(MU * tips.normal[0], rel=1e-13)
@@ -109,13 +110,7 @@ def test_projection_is_of_first_order_on_a_turn() -> None:
 def test_a_hair_of_a_difference_stays_one_where_the_direction_turned() -> None:
     # a search for the slip that stops too early feeds back through the speed of the next step
     skin = ideal_skin()
-    springs = make_springs(
-        skin,
-        friction_knots(skin, MU, 0.05, 0.5, 1),
-        static_excess=0.03,
-        strengthening=0.01,
-        relaxation_share=0.2,
-    )
+    springs = rough(skin, 0.05, 1, **RICH)
     forces, paths = [], []
     for hair in (0.0, 1e-12):
         tips = pressed(springs)
@@ -125,12 +120,6 @@ def test_a_hair_of_a_difference_stays_one_where_the_direction_turned() -> None:
         paths.append(tips.path.copy())
     assert forces[0] == pytest.approx(forces[1], abs=1e-10)
     assert paths[0] == pytest.approx(paths[1], abs=1e-10)
-
-
-def rich_springs(level: int) -> Springs:
-    return springs_of(
-        ideal_skin(), level, relaxation_share=0.2, static_excess=0.03, strengthening=0.01
-    )
 
 
 def driven(springs: Springs, map_of) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +138,7 @@ def driven(springs: Springs, map_of) -> tuple[np.ndarray, np.ndarray]:
 def test_turning_or_mirroring_the_scene_does_so_to_the_result(
     level: int, turns: int, mirror: bool
 ) -> None:
-    springs = rich_springs(level)
+    springs = springs_of(ideal_skin(), level, **RICH)
     spin = np.exp(1j * math.pi / 3 * turns)
 
     def moved(z):
@@ -163,22 +152,22 @@ def test_turning_or_mirroring_the_scene_does_so_to_the_result(
     assert other_force[partner] == pytest.approx(moved(force), abs=1e-9)
 
 
+WAYPOINT = st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(0.5, 3.4))
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 500),
     level=st.sampled_from([1, 2]),
     exact=st.booleans(),
-    waypoints=st.lists(
-        st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(0.5, 3.4)), min_size=2, max_size=5
-    ),
+    waypoints=st.lists(WAYPOINT, min_size=2, max_size=5),
     steps=st.sampled_from([5, 40, 200]),
 )
 def test_friction_never_creates_energy(
     seed: int, level: int, exact: bool, waypoints: list[tuple[float, float, float]], steps: int
 ) -> None:
     skin = make_skin(SkinGeometry(height_scatter_mm=0.08, friction_scatter=0.05), seed)
-    knots = friction_knots(skin, MU, 0.05, 0.5, seed)
-    springs = make_springs(skin, knots, level, exact_turns=exact)
+    springs = rough(skin, 0.05, seed, level, exact_turns=exact)
     tips, last = new_tips(19), (0.0, 0.0, 0.0)
     for waypoint in waypoints:
         way = line(last, waypoint, steps)

@@ -5,28 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from sliplab.rigs.scene.contact import advance
-from sliplab.rigs.scene.springs import SLIDING, STUCK, Springs, Tips, new_tips, track_width
-from tests.rigs.scene.steps import MU, ideal_skin, line, pressed, run, slid, springs_of, times
-
-
-def turn(springs: Springs, tips: Tips, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Track and load under a sensor of six columns, 1 ms a step."""
-    n, steps = len(springs.gap), len(sensor)
-    track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
-    advance(
-        springs.table,
-        springs.friction,
-        springs.law,
-        tips.state,
-        times(steps, 1e-3),
-        sensor,
-        np.zeros(steps + 1),
-        track,
-        load,
-        springs.spots,
-    )
-    return track, load.reshape(steps, n, 3)
+from sliplab.rigs.scene.springs import SLIDING, STUCK, new_tips
+from tests.rigs.scene.steps import MU, ideal_skin, line, pressed, run, slid, springs_of
 
 
 def angles(end_deg: float, steps: int, start_deg: float = 0.0, depth: float = 2.8) -> np.ndarray:
@@ -50,7 +30,7 @@ def test_an_angle_of_zero_is_no_angle_to_the_bit(level: int) -> None:
     six = np.zeros((len(path), 6))
     six[:, :3] = path
     expected = run(springs, plain, path)
-    for found, known in zip(turn(springs, turned, six), expected, strict=True):
+    for found, known in zip(run(springs, turned, six), expected, strict=True):
         assert np.array_equal(found, known, equal_nan=True)
     assert np.array_equal(plain.state, turned.state, equal_nan=True)
 
@@ -63,7 +43,7 @@ def test_a_tip_sticks_until_its_chord_is_mu_n_over_k(way: int) -> None:
     tips = pressed(springs)
     limit = MU * tips.normal / skin.tangential_n_per_mm
     steps = 4000
-    track, load = turn(springs, tips, angles(40.0 * way, steps))
+    track, load = run(springs, tips, angles(40.0 * way, steps))
     off = r > 0
     slips_at = 2.0 * np.degrees(np.arcsin(limit[off] / (2.0 * r[off])))
     assert slips_at.max() < 40.0
@@ -82,7 +62,7 @@ def test_a_tip_that_slides_on_follows_a_smaller_circle() -> None:
     tips = pressed(springs)
     spring = MU * tips.normal / skin.tangential_n_per_mm
     n = len(r)
-    track, _ = turn(springs, tips, angles(170.0, 8000))
+    track, _ = run(springs, tips, angles(170.0, 8000))
     there = np.hypot(*track[-1, : 2 * n].reshape(n, 2).T)
     outer = r > 6.0
     expected = np.sqrt(r[outer] ** 2 - spring[outer] ** 2)
@@ -95,7 +75,7 @@ def test_a_way_slid_is_the_arc_and_no_chord() -> None:
     for steps in (90, 180, 1440):
         springs = springs_of(ideal_skin(), level=1)
         tips = pressed(springs)
-        found.append(slid(turn(springs, tips, angles(90.0, steps))[0])[-1])
+        found.append(slid(run(springs, tips, angles(90.0, steps))[0])[-1])
     assert found[0] == pytest.approx(found[2], rel=3e-3, abs=1e-3)
     assert np.abs(found[1] - found[2]).max() < np.abs(found[0] - found[2]).max() + 1e-9
 
@@ -111,10 +91,10 @@ def test_a_skin_that_stands_turned_slides_as_the_turned_world_does(level: int) -
     press = np.zeros((200, 6))
     press[:, 2] = np.linspace(2.8 / 200, 2.8, 200)
     press[:, 5] = math.pi / 2
-    turn(springs, turned, press)
+    run(springs, turned, press)
     slide = np.zeros((900, 6))
     slide[:, 0], slide[:, 2], slide[:, 5] = np.arange(1, 901) / 100, 2.8, math.pi / 2
-    found, _ = turn(springs, turned, slide)
+    found, _ = run(springs, turned, slide)
     x, y = known[:, 0 : 2 * n : 2], known[:, 1 : 2 * n : 2]
     assert found[:, 0 : 2 * n : 2] == pytest.approx(-y, abs=1e-9)
     assert found[:, 1 : 2 * n : 2] == pytest.approx(x, abs=1e-9)

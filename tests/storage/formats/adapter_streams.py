@@ -16,19 +16,11 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.recording import Recording
 from tests.storage.formats.adapters import bring
 
-EVENTS: dict[str, Any] = {
-    "format": "csv",
-    "columns": {"t": 0, "x": 1, "y": 2, "p": 3},
-    "unit": "us",
-    "size_px": [8, 6],
-}
-BASE: dict[str, Any] = {
-    "adapter": 1,
-    "name": "streams",
-    "experiment": "kinematic",
-    "trials": {"files": "{who}/events.csv", "id": "{who}"},
-    "streams": {"events": EVENTS},
-}
+EVENTS: dict[str, Any] = {"format": "csv", "columns": {"t": 0, "x": 1, "y": 2, "p": 3}}
+EVENTS |= {"unit": "us", "size_px": [8, 6]}
+BASE: dict[str, Any] = {"adapter": 1, "name": "streams", "experiment": "kinematic"}
+BASE |= {"trials": {"files": "{who}/events.csv", "id": "{who}"}, "streams": {"events": EVENTS}}
+ONSETS = {"file": "marks.csv", "match": {"who": "{id}"}, "incipient": "first", "gross": "full"}
 FRAMES: dict[str, Any] = {
     "images": {"files": "{who}/img/*.png"},
     "numpy": {"files": "{who}/frames.npy"},

@@ -18,68 +18,45 @@ from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 
-COUNTS: dict[str, Any] = {
-    "adapter": 1,
-    "name": "touch",
-    "experiment": "classes",
-    "trials": {"files": "**/{part:train|test}/*{object:number}*.npy", "id": "{part}-{stem}"},
-    "streams": {
-        "events": {"format": "counts", "axes": ["taxel", "polarity", "step"], "step_ms": 20}
-    },
-    "labels": {"class": "{object}"},
-    "split": {"given": "part"},
-}
-SLIDES: dict[str, Any] = {
-    "adapter": 1,
-    "name": "slides",
-    "experiment": "kinematic",
-    "trials": {"files": "rec/{person}_{speed:number}_{number:number}/events.csv", "id": "{folder}"},
-    "fields": {"side": {"from": "{number}", "values": {"0": "left", "1": "right"}}},
-    "factors": {"speed": {"field": "speed", "unit": "mm/s"}, "side": {"field": "side"}},
-    "streams": {
-        "events": {
-            "format": "csv",
-            "columns": {"t": "time", "x": "x", "y": "y", "p": "polarity"},
-            "unit": "s",
-            "size_px": [16, 12],
-        },
-        "frames": {
-            "files": "rec/{folder}/img/*.png",
-            "format": "images",
-            "times": {"files": "rec/{folder}/img/t.npy", "unit": "ms"},
-            "clock": {"offset_ms": 5, "uncertainty_ms": 0.5},
-        },
-        "poses": {
-            "files": "rec/{folder}/arm.csv",
-            "format": "csv",
-            "unit": "ms",
-            "length": "m",
-            "columns": {"t": 0, "x": 1, "y": 2, "z": 3},
-        },
-        "wrenches": {
-            "force": {
-                "files": "rec/{folder}/force.npz",
-                "format": "numpy",
-                "unit": "us",
-                "columns": {"t": "t", "fx": "x", "fy": "y", "fz": "z"},
-                "clock": {"uncertainty_ms": 1},
-            }
-        },
-    },
-    "labels": {
-        "onsets": {
-            "file": "onsets.csv",
-            "match": {"trial": "{id}"},
-            "incipient": "first",
-            "gross": "full",
-            "unit": "ms",
-            "clock": "frames",
-            "uncertainty_ms": 2,
-        }
-    },
-    "motion": {"start": 0.1, "end": 0.9, "unit": "s"},
-    "split": {"together": "person"},
-}
+COUNTS: dict[str, Any] = yaml.safe_load("""
+adapter: 1
+name: touch
+experiment: classes
+trials: {files: '**/{part:train|test}/*{object:number}*.npy', id: '{part}-{stem}'}
+streams: {events: {format: counts, axes: [taxel, polarity, step], step_ms: 20}}
+labels: {class: '{object}'}
+split: {given: part}
+""")
+SLIDES: dict[str, Any] = yaml.safe_load(
+    """
+adapter: 1
+name: slides
+experiment: kinematic
+trials: {files: 'rec/{person}_{speed:number}_{number:number}/events.csv', id: '{folder}'}
+fields: {side: {from: '{number}', values: {'0': left, '1': right}}}
+factors: {speed: {field: speed, unit: mm/s}, side: {field: side}}
+streams:
+  events: {format: csv, columns: {t: time, x: x, y: y, p: polarity}, unit: s, size_px: [16, 12]}
+  frames:
+    files: rec/{folder}/img/*.png
+    format: images
+    times: {files: 'rec/{folder}/img/t.npy', unit: ms}
+    clock: {offset_ms: 5, uncertainty_ms: 0.5}
+  poses:
+    {files: 'rec/{folder}/arm.csv', format: csv, unit: ms, length: m,
+     columns: {t: 0, x: 1, y: 2, z: 3}}
+  wrenches:
+    force:
+      {files: 'rec/{folder}/force.npz', format: numpy, unit: us,
+       columns: {t: t, fx: x, fy: y, fz: z}, clock: {uncertainty_ms: 1}}
+labels:
+  onsets:
+    {file: onsets.csv, match: {trial: '{id}'}, incipient: first, gross: full, unit: ms,
+     clock: frames, uncertainty_ms: 2}
+motion: {start: 0.1, end: 0.9, unit: s}
+split: {together: person}
+"""
+)
 
 
 def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = None) -> Campaign:

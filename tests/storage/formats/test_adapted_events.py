@@ -58,11 +58,8 @@ def test_events_of_a_known_format_are_those_of_the_file(name: str, tmp_path: Pat
     folder = tmp_path / "set" / "s7"
     folder.mkdir(parents=True)
     write(folder / file)
-    made = {
-        **BASE,
-        "trials": {"files": f"s{{number:number}}/{file}", "id": "trial-{number}"},
-        "streams": {"events": {"format": form}},
-    }
+    made = {**BASE, "streams": {"events": {"format": form}}}
+    made["trials"] = {"files": f"s{{number:number}}/{file}", "id": "trial-{number}"}
     whole = all_events()
     for path in (tmp_path / "set", zipped(tmp_path / "set")):
         campaign = bring(made, path, tmp_path / f"store{path.suffix}")
@@ -73,10 +70,8 @@ def test_events_of_a_known_format_are_those_of_the_file(name: str, tmp_path: Pat
         record = recording.record
         assert record.geometry.event_px == size
         assert ("sensor size" in record.imported.unknown) == (size is None)
-        assert record.imported.span_ns == (
-            int(whole.t_us[0]) * 1000,
-            (int(whole.t_us[-1]) + 1) * 1000,
-        )
+        span_us = int(whole.t_us[0]), int(whole.t_us[-1]) + 1
+        assert record.imported.span_ns == (span_us[0] * 1000, span_us[1] * 1000)
         assert record.imported.fields == {"number": "7"}
         with recording.open() as reader:
             pulses = reader.pulses("event_pulses")
@@ -86,11 +81,8 @@ def test_events_of_a_known_format_are_those_of_the_file(name: str, tmp_path: Pat
 def test_frames_in_the_file_of_the_events_come_with_them(tmp_path: Path) -> None:
     (tmp_path / "set").mkdir()
     write_aedat4(tmp_path / "set" / "a.aedat4")
-    made = {
-        **BASE,
-        "trials": {"files": "{who}.aedat4"},
-        "streams": {"events": {"format": "aedat4"}},
-    }
+    made = {**BASE, "trials": {"files": "{who}.aedat4"}}
+    made["streams"] = {"events": {"format": "aedat4"}}
     recording = bring(made, tmp_path / "set", tmp_path / "store").recording("a")
     assert recording.record.counts.frames == 3
     assert recording.frame_px[:2] == (8, 6)
@@ -102,21 +94,13 @@ def test_frames_in_the_file_of_the_events_come_with_them(tmp_path: Path) -> None
 def test_the_labs_pickles_are_one_trial_of_two_files(tmp_path: Path) -> None:
     (tmp_path / "set").mkdir()
     lab_pickles(tmp_path / "set", "d3_s0.5", SMALL[::-1], by_columns=True)
-    made = {
-        **BASE,
-        "trials": {"files": "{what}_events_on.pickle", "id": "{what}"},
-        "streams": {"events": {"format": "lab-pickles", "files": "{what}_events_*.pickle"}},
-    }
+    made = {**BASE, "trials": {"files": "{what}_events_on.pickle", "id": "{what}"}}
+    made["streams"] = {"events": {"format": "lab-pickles", "files": "{what}_events_*.pickle"}}
+    there = [(0, 0, 0, 125), (3, 5, 0, 11_250), (3, 5, 1, 10_000), (3, 5, 1, 12_500)]
     for path in (tmp_path / "set", zipped(tmp_path / "set")):
         events = bring(made, path, tmp_path / f"store{path.suffix}").recording("d3_s0.5").events()
         found = sorted(zip(*(column.tolist() for column in vars(events).values()), strict=True))
-        assert found == [
-            (0, 0, 0, 125),
-            (3, 5, 0, 11_250),
-            (3, 5, 1, 10_000),
-            (3, 5, 1, 12_500),
-            (7, 5, 1, 11_000),
-        ]
+        assert found == [*there, (7, 5, 1, 11_000)]
     (tmp_path / "set" / "d3_s0.5_events_off.pickle").write_bytes(b"\x80\x04.")
     for path in (tmp_path / "set", zipped(tmp_path / "set")):
         with pytest.raises(InputError, match=f"{path}/d3_s0.5_events_off.pickle: "):
@@ -126,9 +110,7 @@ def test_the_labs_pickles_are_one_trial_of_two_files(tmp_path: Path) -> None:
 ROWS = [(0, 7, 5, 1), (3, 0, 0, -1), (3, 1, 4, 0), (999_999, 2, 3, 1)]
 
 
-def _text(
-    separator: str, heading: str | None, *, end: str = "\n", mark: str = "", quoted: bool = False
-) -> bytes:
+def _text(separator: str, heading: Any, end: str = "\n", mark: str = "", quoted: int = 0) -> bytes:
     file = io.StringIO()
     quoting = csv.QUOTE_NONNUMERIC if quoted else csv.QUOTE_MINIMAL
     writer = csv.writer(file, delimiter=separator, lineterminator=end, quoting=quoting)
@@ -141,36 +123,21 @@ def _text(
 NAMED = {"t": "time", "x": "col", "y": "row", "p": "pol"}
 BY_INDEX = {"t": 1, "x": 2, "y": 3, "p": 0}
 HEADING = "pol|time|col|row"
+HEADED = {"headed": (HEADING, NAMED), "by index": (HEADING, BY_INDEX), "bare": (None, BY_INDEX)}
+SPACED = b"".join(b"  %4d %8d   %2d %2d\n" % (p, t, x, y) for t, x, y, p in ROWS)
+OWN, OTHER = "pol, -1 or 1", "pol; -1 or 1"
 TEXTS: dict[str, tuple[bytes, dict[str, Any]]] = {
     **{
-        f"{what} {said}": (_text(separator, heading), columns)
-        for what, separator in (
-            ("commas", ","),
-            ("semicolons", ";"),
-            ("tabs", "\t"),
-            ("spaces", " "),
-        )
-        for said, heading, columns in (
-            ("headed", HEADING, NAMED),
-            ("headed by index", HEADING, BY_INDEX),
-            ("bare", None, BY_INDEX),
-        )
+        f"{separator!r} {how}": (_text(separator, heading), columns)
+        for separator in ",;\t "
+        for how, (heading, columns) in HEADED.items()
     },
     "Windows' ends and a mark": (_text(",", HEADING, end="\r\n", mark="\ufeff"), NAMED),
     "a mark and no heading": (_text(",", None, mark="\ufeff"), BY_INDEX),
-    "a separator in a name": (
-        _text(",", "pol, -1 or 1|time|col|row"),
-        {**NAMED, "p": "pol, -1 or 1"},
-    ),
-    "another one in a name": (
-        _text(",", "pol; -1 or 1|time|col|row", quoted=True),
-        {**NAMED, "p": "pol; -1 or 1"},
-    ),
+    "a separator in a name": (_text(",", f"{OWN}|time|col|row"), {**NAMED, "p": OWN}),
+    "another": (_text(",", f"{OTHER}|time|col|row", quoted=1), {**NAMED, "p": OTHER}),
     "spaces in rows": (_text(",", HEADING).replace(b",", b" , "), NAMED),
-    "many spaces": (
-        b"".join(b"  %4d %8d   %2d %2d\n" % (p, t, x, y) for t, x, y, p in ROWS),
-        BY_INDEX,
-    ),
+    "many spaces": (SPACED, BY_INDEX),
     "no end": (_text(",", None).rstrip(), BY_INDEX),
 }
 
@@ -178,15 +145,8 @@ TEXTS: dict[str, tuple[bytes, dict[str, Any]]] = {
 def check_rows(recording: Recording, rows: list[tuple[int, int, int, int]]) -> None:
     """Check that events are rows of time, column, row and polarity."""
     events = recording.events()
-    found = list(
-        zip(
-            events.t_us.tolist(),
-            events.x.tolist(),
-            events.y.tolist(),
-            events.p.tolist(),
-            strict=True,
-        )
-    )
+    columns = (events.t_us, events.x, events.y, events.p)
+    found = list(zip(*(column.tolist() for column in columns), strict=True))
     assert found == [(t, x, y, int(p > 0)) for t, x, y, p in rows]
 
 
@@ -208,16 +168,11 @@ def _columns() -> dict[str, Any]:
     return {name: rows[name] for name in rows.dtype.names}
 
 
+IN_ORDER = {"t": 0, "x": 1, "y": 2, "p": 3}
 ARRAYS: dict[str, tuple[Callable[[Path], None], dict[str, Any]]] = {
     "structured": (lambda path: np.save(path, _structured()), NAMED),
-    "whole numbers": (
-        lambda path: np.save(path, np.array(ROWS, np.int32)),
-        {"t": 0, "x": 1, "y": 2, "p": 3},
-    ),
-    "columns first": (
-        lambda path: np.save(path, np.asfortranarray(np.array(ROWS, float))),
-        {"t": 0, "x": 1, "y": 2, "p": 3},
-    ),
+    "whole numbers": (lambda path: np.save(path, np.array(ROWS, np.int32)), IN_ORDER),
+    "columns first": (lambda path: np.save(path, np.array(ROWS, float, order="F")), IN_ORDER),
     "an archive": (lambda path: np.savez(path, **_columns()), NAMED),
     "a packed archive": (lambda path: np.savez_compressed(path, **_columns()), NAMED),
 }
@@ -298,9 +253,7 @@ def test_a_table_that_cannot_be_right_is_refused(text: str, message: str, tmp_pa
 def test_arrays_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     made = adapter(trials={"files": "{who}/events.np{kind}", "id": "{who}"})
-    made["streams"] = {
-        "events": {**EVENTS, "format": "numpy", "columns": {"t": 0, "x": 1, "y": 2, "p": 3}}
-    }
+    made["streams"] = {"events": {**EVENTS, "format": "numpy", "columns": IN_ORDER}}
     for wrong, message in (
         (np.zeros(3), r"array of shape \(3,\); a table has rows and columns"),
         (np.zeros((2, 3)), "has no column 3; there are 0, 1, 2"),

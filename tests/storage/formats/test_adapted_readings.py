@@ -19,23 +19,11 @@ from tests.command_line import here, sliplab
 from tests.storage.formats.adapters import bring
 
 TABLE = {"files": "{kind}/trial{n}.csv", "format": "csv", "unit": "s"}
-PRESSURES: dict[str, Any] = {
-    "adapter": 1,
-    "name": "pressures",
-    "experiment": "classes",
-    "trials": {"files": "{kind}/trial{n:number}.csv"},
-    "streams": {
-        "scalars": {
-            f"sensor{k}": {
-                **TABLE,
-                "columns": {"t": "Time (s)", "value": f"S{k}"},
-                "quantity_unit": "kPa",
-            }
-            for k in (1, 2)
-        }
-    },
-    "labels": {"class": "{kind}"},
-}
+VALUES = {**TABLE, "quantity_unit": "kPa"}
+SENSORS = {f"sensor{k}": {**VALUES, "columns": {"t": "Time (s)", "value": f"S{k}"}} for k in (1, 2)}
+PRESSURES: dict[str, Any] = {"adapter": 1, "name": "pressures", "experiment": "classes"}
+PRESSURES |= {"trials": {"files": "{kind}/trial{n:number}.csv"}, "labels": {"class": "{kind}"}}
+PRESSURES["streams"] = {"scalars": SENSORS}
 
 
 def _data(folder: Path) -> None:
@@ -63,10 +51,8 @@ def test_readings_alone_are_a_trial(campaign: Campaign) -> None:
     assert readings.t_ns.tolist() == [round(0.127 * k * 1000) * 10**6 for k in range(30)]
     assert found.clocks.reference == "sensor1"
     span = (0, 3_683_001_000)
-    assert found.record.imported is not None
     assert (found.record.imported.span_ns, recorded_span(found)) == (span, span)
     given = found.record.imported.given
-    assert given is not None
     assert [(each.name, each.start_ns, each.end_ns) for each in given.spans] == [("hold", *span)]
     assert found.record.recorded_s == pytest.approx(3.683, abs=1e-5)
 
@@ -99,15 +85,8 @@ def test_a_table_without_rows_costs_its_trial_only(tmp_path: Path) -> None:
     _data(tmp_path / "set")
     (tmp_path / "set" / "slip" / "trial2.csv").write_text("Time (s),S1,S2\n")
     (tmp_path / "a.yaml").write_text(json.dumps(PRESSURES))
-    done = here(
-        "import",
-        "--adapter",
-        tmp_path / "a.yaml",
-        tmp_path / "set",
-        "--store",
-        tmp_path / "s",
-        "--json",
-    )
+    line = ("import", "--adapter", tmp_path / "a.yaml", tmp_path / "set")
+    done = here(*line, "--store", tmp_path / "s", "--json")
     assert done.returncode == 1, done.stderr
     result = json.loads(done.stdout)
     assert len(result["imported"]) == 7
@@ -144,12 +123,9 @@ def test_frames_alone_are_exported(tmp_path: Path) -> None:
     (tmp_path / "set").mkdir()
     levels = np.arange(4, dtype=np.uint8)[:, None, None] * np.ones((1, 6, 8), np.uint8)
     np.save(tmp_path / "set" / "a.npy", levels)
-    made: dict[str, Any] = {
-        **PRESSURES,
-        "trials": {"files": "{n}.npy"},
-        "labels": {},
-        "streams": {"frames": {"files": "{n}.npy", "format": "numpy", "rate_hz": 100}},
-    }
+    frames = {"files": "{n}.npy", "format": "numpy", "rate_hz": 100}
+    made = {**PRESSURES, "trials": {"files": "{n}.npy"}, "labels": {}}
+    made["streams"] = {"frames": frames}
     campaign = bring(made, tmp_path / "set", tmp_path / "store")
     done = export_trials([campaign.recording("a")], tmp_path / "out", "aedat4", "pressures")
     assert (done["events"], done["frames"]) == (0, 4)
@@ -160,12 +136,8 @@ def test_view_shows_imported_trials_of_any_kind(campaign: Campaign, tmp_path: Pa
     from tests.storage.formats.files import lab_hdf5
 
     lab_hdf5(tmp_path / "plain.h5")
-    assert (
-        here(
-            "import", tmp_path / "plain.h5", "--store", tmp_path / "plain", "--name", "x"
-        ).returncode
-        == 0
-    )
+    done = here("import", tmp_path / "plain.h5", "--store", tmp_path / "plain", "--name", "x")
+    assert done.returncode == 0
     for store, trial, said in (
         (tmp_path / "store", "slip-trial1", '"sensor1_scalar": 30'),
         (tmp_path / "plain", "plain", '"events": 50'),

@@ -21,6 +21,7 @@ from sliplab.storage.formats.foreign import Skipped
 from tests.storage.formats.adapter_streams import (
     BASE,
     FRAMES,
+    ONSETS,
     adapter,
     folder_of,
     imported,
@@ -55,18 +56,15 @@ def at_rate(count: int, rate: str) -> tuple[dict[str, Any], list[int]]:
 FURTHER = pytest.mark.long
 
 
+FIRST = {("video", "csv"), ("images", "npy"), ("numpy", "rate")}
+
+
 @pytest.mark.parametrize(
     ("form", "timing"),
     [
-        ("video", "csv"),
-        ("images", "npy"),
-        ("numpy", "rate"),
-        pytest.param("video", "rate", marks=FURTHER),
-        pytest.param("video", "npy", marks=FURTHER),
-        pytest.param("images", "csv", marks=FURTHER),
-        pytest.param("images", "rate", marks=FURTHER),
-        pytest.param("numpy", "csv", marks=FURTHER),
-        pytest.param("numpy", "npy", marks=FURTHER),
+        pytest.param(form, timing, marks=() if (form, timing) in FIRST else FURTHER)
+        for form in ("video", "images", "numpy")
+        for timing in ("csv", "npy", "rate")
     ],
 )
 def test_frames_and_their_times_are_those_of_the_files(
@@ -89,22 +87,16 @@ def test_frames_and_their_times_are_those_of_the_files(
 
 @pytest.mark.parametrize("form", FRAMES)
 @pytest.mark.parametrize(
-    ("times", "message"),
-    [
-        (30, "holds 35 frames, and 30 times of frames"),
-        (40, "holds 35 frames, and 40 times of frames"),
-        pytest.param(64, "holds 35 frames, and 64 times of frames", marks=FURTHER),
-        pytest.param(0, "holds 35 frames, and 0 times of frames", marks=FURTHER),
-    ],
+    "times", [30, 40, pytest.param(64, marks=FURTHER), pytest.param(0, marks=FURTHER)]
 )
-def test_another_number_of_times_than_frames_is_refused(
-    form: str, times: int, message: str, tmp_path: Path
+def test_other_counts_of_times_than_frames_are_refused(
+    form: str, times: int, tmp_path: Path
 ) -> None:
     folder = folder_of(tmp_path)
     write_frames(folder, form, some_frames())
     timed, _ = write_times(folder, "npy", times)
     made = adapter({"frames": {**FRAMES[form], "format": form, **timed}})
-    refused(made, tmp_path, f"streams.frames: {message}")
+    refused(made, tmp_path, f"streams.frames: holds 35 frames, and {times} times of frames")
 
 
 def test_frames_that_are_none_are_refused_with_their_file(tmp_path: Path) -> None:
@@ -159,23 +151,11 @@ def test_a_recording_of_frames_only_lies_on_their_clock(tmp_path: Path) -> None:
         write_frames(folder, "numpy", images)
         np.save(folder / "times.npy", np.array([2.5, 2.75, 3.0, 4.0]))
     (tmp_path / "set" / "marks.csv").write_text("who,first,full\nann,0.25,1.5\nbob,2,\n")
-    onsets = {
-        "file": "marks.csv",
-        "match": {"who": "{id}"},
-        "incipient": "first",
-        "gross": "full",
-        "unit": "s",
-        "clock": "start",
-        "uncertainty_ms": 3,
-    }
+    onsets = ONSETS | {"unit": "s", "clock": "start", "uncertainty_ms": 3}
     timed = {"files": "{who}/times.npy", "unit": "s"}
     streams = {"frames": {**FRAMES["numpy"], "format": "numpy", "times": timed}}
-    made = {
-        **BASE,
-        "trials": {"files": "{who}/frames.npy", "id": "{who}"},
-        "streams": streams,
-        "labels": {"onsets": onsets},
-    }
+    made = {**BASE, "streams": streams, "labels": {"onsets": onsets}}
+    made["trials"] = {"files": "{who}/frames.npy", "id": "{who}"}
     with pytest.raises(InputError, match=r"row 3, first = 2: lies outside of .* trial bob"):
         imported(made, tmp_path)
     (tmp_path / "set" / "marks.csv").write_text("who,first,full\nann,0.25,1.5\nbob,1.5,\n")
@@ -225,59 +205,23 @@ def test_each_stream_has_its_clock_to_the_nanosecond_after_an_hour(
         writer.writerow(["rz", "t", "x", "y", "z", "rx", "ry"])
         for t, place, turn in zip(stamps, xyz.tolist(), turned.tolist(), strict=True):
             writer.writerow([turn[2], t, *place, *turn[:2]])
-    rows = np.zeros(
-        4,
-        [
-            ("when", "<i8"),
-            ("f", "<f8", 3),
-            ("fx", "<f8"),
-            ("fy", "<f8"),
-            ("fz", "<f8"),
-            ("tx", "<f8"),
-            ("ty", "<f8"),
-            ("tz", "<f8"),
-        ],
-    )
+    axes = [f"{kind}{axis}" for kind in "ft" for axis in "xyz"]
+    rows = np.zeros(4, [("when", "<i8"), ("f", "<f8", 3), *((name, "<f8") for name in axes)])
     rows["when"] = stamps
     for index, axis in enumerate("xyz"):
         rows[f"f{axis}"], rows[f"t{axis}"] = force[:, index], torque[:, index]
     np.save(folder / "force.npy", rows)
     np.save(folder / "heat.npy", np.stack([np.arange(4.0), heat], axis=1))
     clock = {"offset_ms": float(offset_ms), "drift_ppm": float(drift_ppm)}
-    made = adapter(
-        {
-            "poses": {
-                "files": "{who}/arm.csv",
-                "format": "csv",
-                "unit": "ns",
-                "length": "m",
-                "angle": "rad",
-                "columns": {key: key for key in ("t", "x", "y", "z", "rx", "ry", "rz")},
-                "clock": {**clock, "uncertainty_ms": 0.25},
-            },
-            "wrenches": {
-                "force": {
-                    "files": "{who}/force.npy",
-                    "format": "numpy",
-                    "unit": "ns",
-                    "clock": clock,
-                    "columns": {
-                        "t": "when",
-                        **{k: k for k in ("fx", "fy", "fz", "tx", "ty", "tz")},
-                    },
-                }
-            },
-            "scalars": {
-                "heat": {
-                    "files": "{who}/heat.npy",
-                    "format": "numpy",
-                    "unit": "s",
-                    "quantity_unit": "degC",
-                    "columns": {"t": 0, "value": 1},
-                }
-            },
-        }
-    )
+    poses = {"files": "{who}/arm.csv", "format": "csv", "unit": "ns", "length": "m", "angle": "rad"}
+    poses["columns"] = {key: key for key in ("t", "x", "y", "z", "rx", "ry", "rz")}
+    felt = {"files": "{who}/force.npy", "format": "numpy", "unit": "ns", "clock": clock}
+    felt["columns"] = {"t": "when", **{name: name for name in axes}}
+    warm = {"files": "{who}/heat.npy", "format": "numpy", "unit": "s", "quantity_unit": "degC"}
+    warm["columns"] = {"t": 0, "value": 1}
+    poses["clock"] = {**clock, "uncertainty_ms": 0.25}
+    streams = {"poses": poses, "wrenches": {"force": felt}, "scalars": {"heat": warm}}
+    made = adapter(streams)
     recording = imported(made, tmp_path)
     with recording.open() as reader:
         poses, wrench, scalar = reader.poses(), reader.wrenches("force"), reader.scalars("heat")
@@ -292,13 +236,10 @@ def test_each_stream_has_its_clock_to_the_nanosecond_after_an_hour(
     for device in ("arm", "force"):
         found = recording.clock(device).to_reference(np.array(stamps))
         assert found.tolist() == [on_line(stamp, offset_ms, drift_ppm) for stamp in stamps]
-    known = recording.record.clocks.devices()
-    assert [known[name].grade for name in ("arm", "force", "heat")] == ["given"] * 2 + ["unknown"]
-    assert [known[name].uncertainty_ns for name in ("arm", "force", "heat")] == [
-        250_000,
-        None,
-        None,
-    ]
+    devices = recording.record.clocks.devices()
+    known = [devices[name] for name in ("arm", "force", "heat")]
+    assert [clock.grade for clock in known] == ["given", "given", "unknown"]
+    assert [clock.uncertainty_ns for clock in known] == [250_000, None, None]
     assert recording.record.imported.unknown == ("clock of heat",)
     assert recording.clock("heat").to_reference(HOUR_NS) == HOUR_NS
 
@@ -306,19 +247,9 @@ def test_each_stream_has_its_clock_to_the_nanosecond_after_an_hour(
 def test_angles_in_degrees_and_places_in_mm_stay_as_they_are(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     (folder / "arm.csv").write_text("0 1.5 -2 0.1 90 0 -45.25\n0.5 1 2 3 0 0 0\n")
-    made = adapter(
-        {
-            "poses": {
-                "files": "{who}/arm.csv",
-                "format": "csv",
-                "unit": "s",
-                "angle": "deg",
-                "columns": dict(zip(("t", "x", "y", "z", "rx", "ry", "rz"), range(7), strict=True)),
-                "clock": {},
-            }
-        }
-    )
-    recording = imported(made, tmp_path)
+    columns = dict(zip(("t", "x", "y", "z", "rx", "ry", "rz"), range(7), strict=True))
+    made = {"files": "{who}/arm.csv", "format": "csv", "unit": "s", "angle": "deg", "clock": {}}
+    recording = imported(adapter({"poses": {**made, "columns": columns}}), tmp_path)
     with recording.open() as reader:
         poses = reader.poses()
     assert poses.t_ns.tolist() == [0, 500_000_000]
@@ -346,18 +277,9 @@ def test_a_label_on_the_frames_clock_after_an_hour_lies_where_its_drift_puts_it(
     frames |= {} if clock is None else {"clock": clock}
     rows = ["who,first,full", "ann,3600000000000,3600000000007", "bob,3600000000000,"]
     (tmp_path / "set" / "marks.csv").write_text("\n".join(rows) + "\n")
-    onsets = {
-        "file": "marks.csv",
-        "match": {"who": "{id}"},
-        "incipient": "first",
-        "gross": "full",
-        "unit": "ns",
-        "clock": "frames",
-        "uncertainty_ms": 2,
-    }
-    campaign = bring(
-        adapter({"frames": frames}, labels={"onsets": onsets}), tmp_path / "set", tmp_path / "store"
-    )
+    onsets = ONSETS | {"unit": "ns", "clock": "frames", "uncertainty_ms": 2}
+    made = adapter({"frames": frames}, labels={"onsets": onsets})
+    campaign = bring(made, tmp_path / "set", tmp_path / "store")
     offset, drift = ("-12.5", "100") if clock else ("0", "0")
     first, full = (on_line(HOUR_NS + more, offset, drift) for more in (0, 7))
     given = campaign.recording("ann").record.imported.given
@@ -367,15 +289,8 @@ def test_a_label_on_the_frames_clock_after_an_hour_lies_where_its_drift_puts_it(
     assert (given.incipient_ns, given.uncertainty_ns) == (first, uncertainty_ns)
 
 
-SPANS: dict[str, Any] = {
-    "file": "marks.csv",
-    "match": {"trial": "{who}"},
-    "start": "a",
-    "end": "b",
-    "class": "what",
-    "unit": "ms",
-    "names": {"pause": "", "rub": "slide"},
-}
+SPANS: dict[str, Any] = {"file": "marks.csv", "match": {"trial": "{who}"}, "start": "a", "end": "b"}
+SPANS |= {"class": "what", "unit": "ms", "names": {"pause": "", "rub": "slide"}}
 
 
 def test_a_second_import_takes_the_labels_of_new_trials_from_the_table_of_all(
@@ -384,14 +299,8 @@ def test_a_second_import_takes_the_labels_of_new_trials_from_the_table_of_all(
     made = adapter(experiment="classes", labels={"spans": SPANS})
     for who in ("ann", "bob"):
         folder_of(tmp_path, who)
-    rows = [
-        "trial,a,b,what",
-        "ann,0,100,rub",
-        "ann,100,250,pause",
-        "ann,250,500,tap",
-        "cid,1,2,tap",
-        "bob,10,20,pause",
-    ]
+    rows = ["trial,a,b,what", "ann,0,100,rub", "ann,100,250,pause", "ann,250,500,tap"]
+    rows += ["cid,1,2,tap", "bob,10,20,pause"]
     marks = tmp_path / "set" / "marks.csv"
     marks.write_text("\n".join(rows) + "\n")
     first = bring(made, tmp_path / "set", tmp_path / "store")
@@ -414,12 +323,9 @@ def test_a_second_import_takes_the_labels_of_new_trials_from_the_table_of_all(
     given = again.recording("cid").record.imported.given
     assert [(s.start_ns, s.end_ns, s.name) for s in given.spans] == [(250_000, 10**9, "slide")]
     changed = {**SPANS, "names": {}}
+    other = adapter(experiment="classes", labels={"spans": changed})
     with pytest.raises(InputError, match="labels: differs from the adapter of campaign 'streams'"):
-        bring(
-            adapter(experiment="classes", labels={"spans": changed}),
-            tmp_path / "set",
-            tmp_path / "store",
-        )
+        bring(other, tmp_path / "set", tmp_path / "store")
 
 
 @pytest.mark.parametrize(
@@ -449,27 +355,13 @@ def test_onsets_and_motion_on_another_clock_come_to_the_time_line(
     (folder / "events.csv").write_text("500000,1,2,1\n2000000,7,5,0\n")
     write_frames(folder, "numpy", some_frames(2))
     (tmp_path / "set" / "t.jsonl").write_text('{"trial": "ann", "a": 0.7000000001, "b": 0.9}\n')
-    onsets = {
-        "file": "t.jsonl",
-        "match": {"trial": "{id}"},
-        "incipient": "a",
-        "gross": "b",
-        "unit": "s",
-        "clock": clock,
-        "uncertainty_ms": 1,
-    }
-    frames = {
-        **FRAMES["numpy"],
-        "format": "numpy",
-        "times": {"files": "{who}/t.npy", "unit": "s"},
-        "clock": {"offset_ms": 7.5, "uncertainty_ms": 0.25},
-    }
+    onsets = {"file": "t.jsonl", "match": {"trial": "{id}"}, "incipient": "a", "gross": "b"}
+    onsets |= {"unit": "s", "clock": clock, "uncertainty_ms": 1}
+    frames = {**FRAMES["numpy"], "format": "numpy", "times": {"files": "{who}/t.npy", "unit": "s"}}
+    frames["clock"] = {"offset_ms": 7.5, "uncertainty_ms": 0.25}
     np.save(folder / "t.npy", np.array([0.6, 0.7]))
-    made = adapter(
-        {"frames": frames},
-        labels={"onsets": onsets},
-        motion={"start": 0.6, "end": "0.95", "unit": "s", "clock": clock},
-    )
+    motion = {"start": 0.6, "end": "0.95", "unit": "s", "clock": clock}
+    made = adapter({"frames": frames}, labels={"onsets": onsets}, motion=motion)
     recording = imported(made, tmp_path)
     given = recording.record.imported.given
     assert given.incipient_ns == 700_000_000 + moved_ns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,9 +41,8 @@ def test_a_zip_gives_what_its_folder_gives(tmp_path: Path) -> None:
         with a.open() as first, b.open() as second:
             for column in ("events/t", "events/x", "poses/xyz", "frames/t"):
                 np.testing.assert_array_equal(first.column(column), second.column(column))
-            np.testing.assert_array_equal(
-                first.wrenches("force").force_n, second.wrenches("force").force_n
-            )
+            forces = [reader.wrenches("force").force_n for reader in (first, second)]
+            np.testing.assert_array_equal(*forces)
 
 
 def _zip_of_one(tmp_path: Path) -> Path:
@@ -94,17 +94,13 @@ def test_a_zip_that_unpacks_to_more_than_the_limit_is_refused(
     assert len(bring(BASE, path, tmp_path / "store").recording("ann").events()) == 5000
 
 
-def test_an_archive_of_arrays_beyond_the_limit_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_archive_of_arrays_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
     folder = folder_of(tmp_path)
     np.savez_compressed(folder / "events.npz", t=np.zeros(200_000), x=np.zeros(200_000))
     monkeypatch.setattr(tables, "MOST_BYTES", 3 << 20)
     made = adapter(trials={"files": "{who}/events.npz", "id": "{who}"})
-    columns = {"t": "t", "x": "x"}
-    made["streams"] = {
-        "events": {**EVENTS, "format": "numpy", "columns": columns, "size_px": [8, 1]}
-    }
+    table = {"format": "numpy", "columns": {"t": "t", "x": "x"}, "size_px": [8, 1]}
+    made["streams"] = {"events": {**EVENTS, **table}}
     refused(made, tmp_path, "events.npz: streams.events: holds more than 3 MiB")
     monkeypatch.setattr(tables, "MOST_BYTES", 4 << 20)
     assert len(imported(made, tmp_path).events()) == 200_000

@@ -72,11 +72,8 @@ def test_the_labs_names_with_and_without_ending(
     assert found.trial_id == stem
     events = found.events()
     assert events.t_us.tolist() == [10_000, 11_000, 12_000]
-    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [
-        [3, 7, 3],
-        [5, 0, 5],
-        [1, 0, 1],
-    ]
+    assert (events.x.tolist(), events.y.tolist()) == ([3, 7, 3], [5, 0, 5])
+    assert events.p.tolist() == [1, 0, 1]
     assert found.record.geometry.event_px == SIZE
     assert "OFF events" not in found.record.imported.unknown
     if stem.startswith("d2"):
@@ -147,6 +144,12 @@ def _stream(path: Path, resolution: Any, x: list[int], y: list[int]) -> None:
         file.attrs["sensor_resolution"] = resolution
 
 
+def _dsec(path: Path, count: int) -> None:
+    with h5py.File(path, "w") as file:
+        for name in "xypt":
+            file[f"events/{name}"] = np.arange(count)
+
+
 @pytest.mark.parametrize(
     ("resolution", "x", "y", "size"),
     [
@@ -180,110 +183,53 @@ def _raw(path: Path, header: str = "% evt 2.0\n", words: tuple[int, ...] = ()) -
     path.write_bytes(header.encode() + struct.pack(f"<{len(words)}I", *words))
 
 
-def _empty_dsec(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        for name in "xypt":
-            file[f"events/{name}"] = np.zeros(0, np.int64)
-
-
-def _text(path: Path) -> None:
-    path.write_text("not events")
-
-
-NAME = "d2_s1.0_dir_right_r0_events_on"
-BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "an empty aedat4": ("a.aedat4", lambda path: _aedat4(path, _events([])), "contains no events"),
-    "an empty dsec": ("a.h5", _empty_dsec, "contains no events"),
-    "empty pickles": (NAME, lambda path: _pickled(path, lab_cells(SIZE, {})), "contains no events"),
-    "aedat4 outside of its camera": (
-        "a.aedat4",
-        lambda path: _aedat4(path, _events([3, 64])),
-        r"a\.aedat4: events: 1 up to column 64 and row 32, outside of the 64 x 48 pixels",
-    ),
-    "a stream outside of its camera": (
-        "a.h5",
-        lambda path: _stream(path, [64, 48], [3, 64], [3, 64]),
-        r"a\.h5: events: 1 up to column 64 and row 64, outside of the 64 x 48 pixels",
-    ),
-    "an older aedat": (
-        "a.aedat4",
-        lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(50)),
-        r"a\.aedat4: is an AEDAT 3\.1 file; read is AEDAT 4\.0, to which iniVation's DV converts",
-    ),
-    "text by the lab's name": (NAME, _text, f"{NAME}: byte 0: is no whole pickle"),
-    "an empty file by the lab's name": (NAME, lambda path: path.touch(), "the file is empty"),
-    "a pickle cut short": (
-        NAME,
-        lambda path: path.write_bytes(pickle.dumps(lab_cells(SIZE, {}))[:-1]),
-        r"byte \d+: is no whole pickle: it ends after \d+ bytes .* as a copy cut short; .*dump",
-    ),
-    "npy cut short": (
-        "a_on.npy",
-        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2)))[:-3]),
-        r"a_on\.npy: is truncated",
-    ),
-    "npy of 8 TB": (
-        "a_on.npy",
-        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"8, 2), ", b"8, 9**9)")),
-        r"a_on\.npy: has a damaged numpy header",
-    ),
-    "npy whose header does not end": (
-        "a_on.npy",
-        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"2), }", b"2 , }")),
-        r"a_on\.npy: has a damaged numpy header",
-    ),
-    "npy of 20 million bytes": (
-        "a_on.npy",
-        lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
-        r"a_on\.npy: holds 20160000 times, as many in every pixel",
-    ),
-    "npy with another pickle in it": (
-        "a_on.npy",
-        lambda path: path.write_bytes(
-            _npy(lab_cells(SIZE, {})).split(b"\n")[0] + b"\n" + pickle.dumps([1])
-        ),
-        r"a_on\.npy: contains data other than the array \(8, 6\)",
-    ),
-    "npy of counts": (
-        "a_on.npy",
-        lambda path: _saved(path, np.zeros((39, 2, 250))),
-        r"shape \(39, 2, 250\); the lab's",
-    ),
-    "a pickle of another camera": (
-        NAME,
-        lambda path: _pickled(path, lab_cells((5, 5), {})),
-        r"shape \(5, 5\); the lab's files hold",
-    ),
-}
-
-
 def _npy(cells: Any) -> bytes:
     file = io.BytesIO()
     np.save(file, cells, allow_pickle=True)
     return file.getvalue()
 
 
-@pytest.mark.parametrize("name", BAD)
+NAME = "d2_s1.0_dir_right_r0_events_on"
+NOTHING, PAIRS = lab_cells(SIZE, {}), _npy(np.zeros((6, 8, 2)))
+OTHER = _npy(NOTHING).split(b"\n")[0] + b"\n" + pickle.dumps([1])
+WHOLE = r"byte \d+: is no whole pickle: it ends after \d+ bytes .* as a copy cut short; .*dump"
+BEYOND = r"a\.\w+: events: 1 up to column 64 and row {}, outside of the 64 x 48 pixels"
+# the file, its bytes or how it is written, and what is said of it
+BAD: list[tuple[str, bytes | Callable[[Path], object], str]] = [
+    ("a.aedat4", lambda path: _aedat4(path, _events([])), "contains no events"),
+    ("a.h5", lambda path: _dsec(path, 0), "contains no events"),
+    (NAME, pickle.dumps(NOTHING), "contains no events"),
+    ("a.aedat4", lambda path: _aedat4(path, _events([3, 64])), BEYOND.format(32)),
+    ("a.h5", lambda path: _stream(path, [64, 48], [3, 64], [3, 64]), BEYOND.format(64)),
+    (NAME, b"not events", f"{NAME}: byte 0: is no whole pickle"),
+    (NAME, b"", "the file is empty"),
+    (NAME, pickle.dumps(NOTHING)[:-1], WHOLE),
+    ("a_on.npy", PAIRS[:-3], r"a_on\.npy: is truncated"),
+    ("a_on.npy", PAIRS.replace(b"8, 2), ", b"8, 9**9)"), r"a_on\.npy: has a damaged numpy header"),
+    ("a_on.npy", PAIRS.replace(b"2), }", b"2 , }"), r"a_on\.npy: has a damaged numpy header"),
+    (
+        "a_on.npy",
+        lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
+        r"a_on\.npy: holds 20160000 times, as many in every pixel",
+    ),
+    ("a_on.npy", OTHER, r"a_on\.npy: contains data other than the array \(8, 6\)"),
+    ("a_on.npy", _npy(np.zeros((39, 2, 250))), r"shape \(39, 2, 250\); the lab's"),
+    (NAME, pickle.dumps(lab_cells((5, 5), {})), r"shape \(5, 5\); the lab's files hold"),
+    ("a.raw", f"% evt 2.0\n% {'x' * 47}\n".encode(), "contains no events"),
+    ("a.raw", b"% date today\n", "gives no format: a .raw file"),
+    ("a.dat", b"not events", "gives no format"),
+]
+
+
+@pytest.mark.parametrize(("file", "data", "says"), BAD)
 @pytest.mark.usefixtures("small")
-def test_a_bad_file_is_named_with_what_would_be_right(tmp_path: Path, name: str) -> None:
-    file, write, says = BAD[name]
-    write(tmp_path / file)
-    with pytest.raises(InputError, match=says) as caught:
-        _import(tmp_path / "store", tmp_path / file)
-    assert caught.value.message.count(file) == 1
-    assert Store.open(tmp_path / "store").campaigns() == []
-
-
-@pytest.mark.parametrize(
-    ("file", "write", "says"),
-    [
-        ("a.raw", lambda path: _raw(path, f"% evt 2.0\n% {'x' * 47}\n"), "contains no events"),
-        ("a.raw", lambda path: _raw(path, "% date today\n"), "gives no format: a .raw file"),
-        ("a.dat", _text, "gives no format"),
-    ],
-)
-def test_a_bad_file_of_prophesees(tmp_path: Path, file: str, write: Any, says: str) -> None:
-    write(tmp_path / file)
+def test_a_bad_file_is_named_with_what_would_be_right(
+    tmp_path: Path, file: str, data: Any, says: str
+) -> None:
+    if isinstance(data, bytes):
+        (tmp_path / file).write_bytes(data)
+    else:
+        data(tmp_path / file)
     with pytest.raises(InputError, match=says) as caught:
         _import(tmp_path / "store", tmp_path / file)
     assert caught.value.message.count(file) == 1
@@ -306,9 +252,7 @@ EVT2 = (0x80000001, 1 << 28 | 2 << 22 | 5 << 11 | 7, 3 << 22 | 1500 << 11 | 1400
 @pytest.mark.parametrize(
     ("header", "size"), [("", None), ("% format EVT2;width=1600;height=1500\n", [1600, 1500])]
 )
-def test_a_size_that_no_header_gives_is_unknown(
-    tmp_path: Path, header: str, size: list[int] | None
-) -> None:
+def test_a_size_that_no_header_gives_is_unknown(tmp_path: Path, header: str, size: Any) -> None:
     _raw(tmp_path / "a", f"% evt 2.0\n{header}", EVT2)
     (found,) = _import(tmp_path / "store", tmp_path / "a")
     assert found.record.geometry.event_px == (None if size is None else tuple(size))
@@ -322,9 +266,7 @@ def _mixed(folder: Path) -> None:
     folder.mkdir()
     _aedat4(folder / "b.aedat4", _events([3, 4]))
     lab_hdf5(folder / "a.h5")
-    with h5py.File(folder / "d.hdf5", "w") as file:
-        for name in "xypt":
-            file[f"events/{name}"] = np.arange(2)
+    _dsec(folder / "d.hdf5", 2)
     _pickled(folder / "c_events_on", lab_cells(SIZE, {(3, 5): [10, 12]}))
     (folder / "notes.txt").write_text("a note")
     (folder / "video_on").write_text("a note")
@@ -337,20 +279,13 @@ def test_a_folder_of_several_formats_is_sorted(tmp_path: Path) -> None:
     folder = tmp_path / "theirs"
     _mixed(folder)
     found = _import(tmp_path / "store", folder)
-    origins = [(one.trial_id, one.record.imported) for one in found]
-    assert [(name, about.format) for name, about in origins if about is not None] == [
-        ("a", "lab-hdf5"),
-        ("b", "aedat4"),
-        ("c", "lab-pickles"),
-        ("d", "dsec"),
-    ]
+    origins = {one.trial_id: one.record.imported.format for one in found}
+    assert origins == {"a": "lab-hdf5", "b": "aedat4", "c": "lab-pickles", "d": "dsec"}
     assert [len(one.events()) for one in found] == [50, 2, 2, 2]
     skipped = {item.file: item.reason for item in skipped_in(folder, kind_of(folder))}
     assert list(skipped) == ["link.h5", "more", "notes.txt", "video_on"]
-    assert [skipped["link.h5"], skipped["more"]] == [
-        "is a link",
-        "is a folder; import it by itself",
-    ]
+    assert skipped["link.h5"] == "is a link"
+    assert skipped["more"] == "is a folder; import it by itself"
     assert skipped["notes.txt"].startswith("is of no known format (aedat4, dsec, ")
     others = {item.file: item.reason for item in skipped_in(folder, "aedat4")}
     assert others["a.h5"] == "is no aedat4 file"
@@ -403,15 +338,8 @@ def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path)
     folder.mkdir()
     _aedat4(folder / "a.aedat4", _events([3, 4]))
     lab_hdf5(folder / "b.h5")
-    item = {
-        "trial": "t",
-        "file": "a.aedat4",
-        "condition": {},
-        "events": 2,
-        "frames": 0,
-        "triggers": 0,
-        "repetition": 0,
-    }
+    item = {"trial": "t", "file": "a.aedat4", "condition": {}, "events": 2}
+    item |= dict.fromkeys(("frames", "triggers", "repetition"), 0)
     manifest = {"sliplab_export": 1, "simulated": True, "trials": [item]}
     (folder / EXPORT_MANIFEST).write_text(json.dumps(manifest))
     assert kind_of(folder) == MIXED

@@ -6,6 +6,7 @@ import random
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -45,8 +46,6 @@ class Outcome:
 
     @property
     def lost(self) -> Lost | None:
-        assert self.found is not None
-        assert self.found.record.imported is not None
         return self.found.record.imported.lost
 
 
@@ -95,7 +94,6 @@ def _try(folder: Path, name: str, data: bytes) -> tuple[Outcome, Outcome]:
         assert isinstance(plain.error, DamagedFile)
         assert f"; --salvage imports {_counted(saved)} events up to " in plain.error.message
         lost = saved.lost
-        assert lost is not None
         assert 0 <= lost.at_byte <= len(data)
         assert 0 <= lost.unread_bytes <= len(data)
         assert lost.reason
@@ -103,7 +101,6 @@ def _try(folder: Path, name: str, data: bytes) -> tuple[Outcome, Outcome]:
 
 
 def _counted(outcome: Outcome) -> str:
-    assert outcome.found is not None
     return f"{outcome.found.record.counts.events:,}"
 
 
@@ -144,9 +141,7 @@ def _cut(folder: Path, name: str, data: bytes, at: int) -> int:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_cut_short_gives_a_prefix(
-    tmp_path: Path, name: str, seed: int, whole: dict[str, bytes]
-) -> None:
+def test_a_file_cut_short_gives_a_prefix(tmp_path: Path, name: str, seed: int, whole: Any) -> None:
     rng = random.Random(seed)
     data = whole[name]
     places = sorted(rng.randrange(len(data)) for _ in range(4 if seed == 1 else 24))
@@ -158,22 +153,10 @@ def test_a_file_cut_short_gives_a_prefix(
     assert counts == sorted(counts), "a longer file holds less"
 
 
-@pytest.mark.parametrize(
-    ("name", "share"),
-    [
-        ("aedat4", 0.9),
-        ("dsec", 0.5),
-        ("dsec newest", 0.5),
-        ("mcap", 0.8),
-        ("es", 0.9),
-        ("evt2", 0.94),
-        ("evt3", 0.94),
-        ("dat", 0.94),
-    ],
-)
-def test_most_of_a_file_that_lost_its_end_is_salvaged(
-    tmp_path: Path, name: str, share: float, whole: dict[str, bytes]
-) -> None:
+@pytest.mark.parametrize("name", sorted(FILES.keys() - {"dsec checked", "contiguous", "lab"}))
+def test_most_of_a_file_without_its_end_is_salvaged(tmp_path: Path, name: str, whole: Any) -> None:
+    shares = {"dsec": 0.5, "dsec newest": 0.5, "mcap": 0.8, "aedat4": 0.9, "es": 0.9}
+    share = shares.get(name, 0.94)
     at = int(len(whole[name]) * 0.95) | 1
     assert _cut(tmp_path, name, whole[name], at) >= share * COUNT
 
@@ -214,10 +197,8 @@ def test_the_table_at_the_end_of_aedat4_counts_what_is_lost(tmp_path: Path) -> N
     data[at + 8 : at + 8 + size] = bytes(size)
     path.write_bytes(data)
     outcome = _import(tmp_path / "store", path, salvage=True)
-    assert outcome.found is not None
     assert _is_prefix(outcome.found) == 17 * PACKET
     lost = outcome.lost
-    assert lost is not None
     assert (lost.at_byte, lost.unread_bytes) == (at, len(data) - at)
     assert (lost.events, lost.frames) == (13 * PACKET, 1)
     assert outcome.found.record.counts.frames == 2
@@ -252,11 +233,9 @@ def test_an_event_outside_of_the_camera_is_no_damage(tmp_path: Path) -> None:
         for low in range(0, COUNT, PACKET):
             file.events(0, part_of(whole, low, low + PACKET))
     for outcome in _try(tmp_path, "aedat4", path.read_bytes()):
-        assert outcome.found is not None
         expected = np.delete(whole.t_us, wrong)
         np.testing.assert_array_equal(outcome.found.events().t_us, expected)
         imported = outcome.found.record.imported
-        assert imported is not None
         assert imported.dropped == {"events outside of the sensor": 1}
 
 
@@ -271,7 +250,6 @@ def test_a_damaged_chunk_counts_its_events(tmp_path: Path) -> None:
     outcome = _import(tmp_path / "store", path, salvage=True)
     assert outcome.found is not None
     assert _is_prefix(outcome.found) == 11 * PACKET
-    assert outcome.lost is not None
     assert outcome.lost.events == 19 * PACKET
     assert outcome.lost.at_byte <= info.byte_offset
 
@@ -283,14 +261,11 @@ def test_the_statistics_of_mcap_count_the_frames_that_are_lost(tmp_path: Path) -
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     outcome = _import(tmp_path / "store", path, salvage=True)
-    assert outcome.found is not None
     assert 0 < _is_prefix(outcome.found) < COUNT
-    assert outcome.lost is not None
     assert outcome.lost.frames == 3 - outcome.found.record.counts.frames
     assert outcome.lost.events is None
     path.write_bytes(data[:-1])
     cut = _import(tmp_path / "cut", path, salvage=True)
-    assert cut.lost is not None
     assert cut.lost.frames is None
 
 
@@ -307,14 +282,12 @@ def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
     assert text.startswith("a.aedat4: is not whole: it is cut short")
     assert f"{lost['unread_bytes']:,} bytes were not read" in text
     (recording,) = store.campaign("theirs").recordings()
-    assert recording.record.imported is not None
     assert [f"a.aedat4: {one}" for one in recording.record.imported.warnings] == [text]
     assert salvaged(store) == ["theirs/a"]
     assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]
     assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]  # from the index
-    again = import_trials(
-        store, "theirs", trials_in(path, "aedat4", salvage=True), path, "aedat4", salvage=True
-    )
+    found = trials_in(path, "aedat4", salvage=True)
+    again = import_trials(store, "theirs", found, path, "aedat4", salvage=True)
     assert again["there"] == ["a"]
 
 

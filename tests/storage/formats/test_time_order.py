@@ -12,39 +12,32 @@ ROWS = np.arange(2000, dtype=np.int64) * 10
 LATE = 10**12
 TIES = ROWS // 30
 
+
+def twice(rows: np.ndarray, first: int, times: int = 1) -> np.ndarray:
+    """Rows of which those from `first` to 900 come again."""
+    return np.concatenate([rows[:900], *[rows[first:900]] * times, rows[900:]])
+
+
+def without(first: int, end: int, count: int) -> list[int]:
+    """Rows that stay: all but some."""
+    return [*range(first), *range(end, count)]
+
+
 CASES = {
     "rows of the run before, at the start": (np.r_[ROWS[:20] + LATE, ROWS], slice(20, None)),
     "rows of the run before, within the times": (np.r_[ROWS[:20] + 777, ROWS], slice(20, None)),
-    "one late row": (np.r_[ROWS[:500], LATE, ROWS[500:]], [*range(500), *range(501, 2001)]),
-    "one early row": (np.r_[ROWS[:500], 0, ROWS[500:]], [*range(500), *range(501, 2001)]),
+    "one late row": (np.r_[ROWS[:500], LATE, ROWS[500:]], without(500, 501, 2001)),
+    "one early row": (np.r_[ROWS[:500], 0, ROWS[500:]], without(500, 501, 2001)),
     "a late row at the start": (np.r_[LATE, ROWS], slice(1, None)),
     "an early row at the end": (np.r_[ROWS, 5], slice(0, -1)),
-    "a packet of other times": (
-        np.r_[ROWS[:900], ROWS[:100] + LATE, ROWS[900:]],
-        [*range(900), *range(1000, 2100)],
-    ),
-    "a packet of earlier times": (
-        np.r_[ROWS[:900] + LATE, ROWS[:100], ROWS[900:] + LATE],
-        [*range(900), *range(1000, 2100)],
-    ),
+    "other times": (np.r_[ROWS[:900], ROWS[:100] + LATE, ROWS[900:]], without(900, 1000, 2100)),
+    "earlier": (np.r_[ROWS[:900] + LATE, ROWS[:100], ROWS[900:] + LATE], without(900, 1000, 2100)),
     "a restart in the first half": (np.r_[ROWS[:900], ROWS], slice(900, None)),
     "a restart in the second half": (np.r_[ROWS, ROWS[:900]], slice(0, 2000)),
-    "a packet twice": (
-        np.r_[ROWS[:900], ROWS[700:900], ROWS[900:]],
-        [*range(900), *range(1100, 2200)],
-    ),
-    "a packet three times": (
-        np.r_[ROWS[:900], ROWS[700:900], ROWS[700:900], ROWS[900:]],
-        [*range(900), *range(1300, 2400)],
-    ),
-    "a packet again later": (
-        np.r_[ROWS[:900], ROWS[300:500], ROWS[900:]],
-        [*range(900), *range(1100, 2200)],
-    ),
-    "a packet of equal times twice": (
-        np.r_[TIES[:900], TIES[701:900], TIES[900:]],
-        [*range(900), *range(1099, 2199)],
-    ),
+    "a packet twice": (twice(ROWS, 700), without(900, 1100, 2200)),
+    "a packet three times": (twice(ROWS, 700, 2), without(900, 1300, 2400)),
+    "again later": (np.r_[ROWS[:900], ROWS[300:500], ROWS[900:]], without(900, 1100, 2200)),
+    "a packet of equal times twice": (twice(TIES, 701), without(900, 1099, 2199)),
     "two restarts": (np.r_[ROWS[:500], ROWS, ROWS[:900]], slice(500, 2500)),
 }
 

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import pytest
@@ -161,9 +162,7 @@ def test_a_pull_that_was_cut_goes_on(
     assert tree(back.folder, "campaigns") == tree(store.folder, "campaigns")
 
 
-def test_a_damaged_object_is_named_and_sent_anew(
-    store: Store, remote: Remote, tmp_path: Path
-) -> None:
+def test_a_damaged_object_is_named_and_sent_anew(store: Store, remote: Any, tmp_path: Path) -> None:
     push(store, remote)
     manifest = trial_manifest(the(store), TRIALS[1])
     objects = tmp_path / "shared" / objects_folder("c")
@@ -214,10 +213,8 @@ def test_a_trial_that_is_wanted_again_goes_and_comes_back(
     assert push(store, remote).replaced == 1
     assert pull(remote, tmp_path / "back").replaced == 1
     assert tree(tmp_path / "back/campaigns/c", "trials") == tree(the(store).folder, "trials")
-    causes = {
-        item["cause"].split(":")[0] for item in the(Store.open(tmp_path / "back")).quarantined()
-    }
-    assert causes == {"withdrawn", "replaced"}
+    aside = the(Store.open(tmp_path / "back")).quarantined()
+    assert {item["cause"].split(":")[0] for item in aside} == {"withdrawn", "replaced"}
 
 
 def test_two_stores_do_not_mix(store: Store, remote: Remote, tmp_path: Path) -> None:
@@ -284,9 +281,7 @@ def test_a_manifest_leads_nowhere_else(
     assert not list((tmp_path / "back").rglob("x*"))
 
 
-def test_names_and_objects_of_others_are_refused(
-    store: Store, remote: Remote, tmp_path: Path
-) -> None:
+def test_names_and_objects_of_others_are_refused(store: Store, remote: Any, tmp_path: Path) -> None:
     push(store, remote)
     trials = tmp_path / "shared/campaigns/c/trials"
     shutil.copy(trials / f"{TRIALS[0]}.json", trials / "other=1mm.json")  # of something else
@@ -300,13 +295,8 @@ def test_names_and_objects_of_others_are_refused(
     done = pull(remote, tmp_path / "back")
     assert done.pulled == 1
     reported = " ".join(done.problems)
-    for part in (
-        "belongs to another trial or campaign",
-        "'a b'",
-        "'c d'",
-        "no checksum of data.h5",
-        "is incomplete",
-    ):
+    named = ("belongs to another trial or campaign", "'a b'", "'c d'")
+    for part in (*named, "no checksum of data.h5", "is incomplete"):
         assert part in reported
     assert len(verify_remote(remote)[1]) == len(done.problems)
 
@@ -314,10 +304,8 @@ def test_names_and_objects_of_others_are_refused(
 @settings(max_examples=150)
 @given(st.data())
 def test_a_mutated_manifest_is_refused(data: st.DataObject) -> None:
-    files = {
-        name: Checksum("a" * 64, 3)
-        for name in ("data.h5", "record.json", "checksums.json", "provenance.json")
-    }
+    names = ("data.h5", "record.json", "checksums.json", "provenance.json")
+    files = dict.fromkeys(names, Checksum("a" * 64, 3))
     whole = Manifest("trials", "c", "t", files, "take").dump()
     assert parse(whole, "trials", "c", "t", "here").files == files
     at = data.draw(st.integers(0, len(whole) - 1))
@@ -368,9 +356,7 @@ def test_a_mirror_fetches_what_is_read(
     assert not (the(again_there).folder / "trials" / TRIALS[2] / "data.h5").exists()
 
 
-def test_versions_and_places_that_cannot_be_used(
-    store: Store, remote: Remote, tmp_path: Path
-) -> None:
+def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_path: Path) -> None:
     with pytest.raises(RemoteMissing, match="does not contain a pushed store"):
         pull(remote, tmp_path / "back")
     assert not (tmp_path / "back").exists()
@@ -381,13 +367,8 @@ def test_versions_and_places_that_cannot_be_used(
     write_json(store.folder / "store.json", {"format": 1})
     with pytest.raises(StoreError, match="sliplab migrate"):
         push(store, remote)
-    for url in (
-        "lab",
-        "s3://me:hunter2@b/x",
-        "s3://b/x?token=hunter2",
-        "zip::s3://b/x",
-        "file:///a/../b",
-    ):
+    secret = ("s3://me:hunter2@b/x", "s3://b/x?token=hunter2")
+    for url in ("lab", *secret, "zip::s3://b/x", "file:///a/../b"):
         with pytest.raises(InputError) as wrong:
             Remote(url)
         assert "hunter2" not in wrong.value.message

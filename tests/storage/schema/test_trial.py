@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sliplab.storage.files import json_text
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.trial import Clocks, TrialRecord
+from tests.protocols.planning import put_all, rows
 from tests.storage.trial_files import record
 
 PATH = Path("record.json")
@@ -29,48 +28,24 @@ def test_what_is_read_is_written_again_to_the_byte() -> None:
     assert json_text(TrialRecord.parse(data, PATH).to_json()) == json_text(data)
 
 
-FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "text for a count": (
-        lambda r: r["counts"].update(events="12"),
-        "record.json: counts.events = 12: must be a whole number",
-    ),
-    "true for a number": (
-        lambda r: r.update(recorded_s=True),
-        "record.json: recorded_s = true: must be a number",
-    ),
-    "no number": (
-        lambda r: r.update(recorded_s=float("inf")),
-        "must be a finite number",
-    ),
-    "no quality": (lambda r: r.pop("quality"), "record.json: quality: is missing"),
-    "a gate without a figure": (
-        lambda r: r["quality"]["gates"].update(g={"passed": True, "value": [1]}),
-        "quality.gates.g.value = [1]: must be a number",
-    ),
-    "a level without a number": (
-        lambda r: r["condition"].update(depth="deep mm"),
-        "condition.depth = deep mm: must be a number with its unit",
-    ),
-    "half a nanosecond": (
-        lambda r: r["clocks"]["arm"]["map"].update(drift=[0.5]),
-        "must be a clock map",
-    ),
-    "beyond 64 bits": (
-        lambda r: r["counts"].update(events=2**63),
-        "must fit 64 bits",
-    ),
-    "a list for a mapping": (
-        lambda r: r.update(counts=[]),
-        "counts = []: must be a mapping",
-    ),
-}
+# what is put where (nothing: dropped) | what is said
+FAULTS = """
+    counts.events: '12' | record.json: counts.events = 12: must be a whole number
+    recorded_s: true | record.json: recorded_s = true: must be a number
+    recorded_s: .inf | must be a finite number
+    quality: | record.json: quality: is missing
+    quality.gates.g: {passed: true, value: [1]} | quality.gates.g.value = [1]: must be a number
+    condition.depth: deep mm | condition.depth = deep mm: must be a number with its unit
+    clocks.arm.map.drift: [0.5] | must be a clock map
+    counts.events: 9223372036854775808 | must fit 64 bits
+    counts: [] | counts = []: must be a mapping
+"""
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_names_file_key_value_and_what_would_be_right(name: str) -> None:
+@pytest.mark.parametrize(("change", "words"), rows(FAULTS))
+def test_a_fault_names_file_key_value_and_what_would_be_right(change: str, words: str) -> None:
     data = json.loads(json.dumps(record("t").to_json()))
-    change, words = FAULTS[name]
-    change(data)
+    put_all(data, change)
     with pytest.raises(DocumentError) as fault:
         TrialRecord.parse(data, PATH)
     assert words in str(fault.value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,9 +13,9 @@ from sliplab.storage import process
 from sliplab.storage.files import read_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import SKIPPED, again, skip, skipped
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
-from tests.storage.trial_files import campaign, commit, fail
+from tests.storage.trial_files import commit, fail
 
 
 def test_requests_keep_who_when_why_and_their_order(tmp_path: Path) -> None:
@@ -60,8 +61,7 @@ def test_what_is_no_request_is_passed_over(tmp_path: Path) -> None:
 BY = {"who": "anna", "when": "2026-01-02T03:04:05+00:00", "why": "skin was dirty"}
 
 
-def test_a_committed_trial_that_is_wanted_again_is_kept_aside(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_a_committed_trial_that_is_wanted_again_is_kept_aside(where: Any, tmp_path: Path) -> None:
     sums = read_json(commit(where, "t") / "checksums.json")
     assert again(where, ["t"], BY) == {"t": "moved to quarantine/t.1; will be taken again"}
     assert where.committed() == set()
@@ -75,8 +75,7 @@ def test_a_committed_trial_that_is_wanted_again_is_kept_aside(tmp_path: Path) ->
     assert verify(Store.open(tmp_path / "s")) == []
 
 
-def test_failed_attempts_are_forgiven_once_and_stay(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_failed_attempts_are_forgiven_once_and_stay(where: Campaign) -> None:
     for attempt in range(2):
         fail(where, "t", attempt)
     assert again(where, ["t"], BY) == {
@@ -87,8 +86,7 @@ def test_failed_attempts_are_forgiven_once_and_stay(tmp_path: Path) -> None:
     assert all(item["forgiven"] == BY for item in where.quarantined())
 
 
-def test_skipping_and_thinking_better_of_it(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_skipping_and_thinking_better_of_it(where: Campaign) -> None:
     commit(where, "t")
     did = skip(where, ["t", "u", "v"], BY)
     assert did == {"t": "is committed: left as it is", "u": "set aside", "v": "set aside"}

@@ -21,21 +21,12 @@ from tests.conftest import ROOT
 from tests.storage.trials.foreign_hdf5 import LOOKS, SHAPES, changed, committed, look
 
 PACKED: list[dict[str, Any]] = [
-    {},
-    {"compression": "gzip"},
+    *({}, {"fletcher32": True}, {"shuffle": True}, {"scaleoffset": 0}),
+    *({"compression": "gzip"}, {"compression": "lzf"}),
     {"compression": "gzip", "shuffle": True, "fletcher32": True},
-    {"fletcher32": True},
-    {"shuffle": True},
-    {"compression": "lzf"},
-    {"scaleoffset": 0},
-    dict(hdf5plugin.Zstd()),
-    dict(hdf5plugin.LZ4()),
-    dict(hdf5plugin.Blosc()),
-    dict(hdf5plugin.Blosc2()),
-    dict(hdf5plugin.BZip2()),
-    dict(hdf5plugin.Bitshuffle()),
-    dict(hdf5plugin.Bitshuffle(cname="zstd")),
-    dict(hdf5plugin.Bitshuffle(cname="none")),
+    *map(dict, (hdf5plugin.Zstd(), hdf5plugin.LZ4(), hdf5plugin.Blosc(), hdf5plugin.Blosc2())),
+    *(dict(hdf5plugin.BZip2()), dict(hdf5plugin.Bitshuffle())),
+    *(dict(hdf5plugin.Bitshuffle(cname=name)) for name in ("zstd", "none")),
 ]
 Found = dict[str, tuple[list[str], list[str]]]
 

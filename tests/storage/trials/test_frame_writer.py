@@ -78,9 +78,7 @@ def test_a_slow_disk_is_waited_for_only_when_memory_is_full(
     assert np.array_equal(np.fromfile(tmp_path / "raw", np.uint8), frames(3).ravel())
 
 
-def test_a_disk_that_stands_still_is_an_error_in_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_stands_still_is_an_error_in_the_end(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(spooling, "QUEUE_BYTES", 10)
     monkeypatch.setattr(spooling, "WAIT_S", 0.05)
     spool = Spool(tmp_path / "raw")

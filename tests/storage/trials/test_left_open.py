@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
@@ -43,7 +44,6 @@ def held(path: Path, mode: str, how: str) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-c", HOLD, str(path), mode, how]
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as program:
         try:
-            assert program.stdout is not None
             assert program.stdout.readline() == "open\n"
             yield program
         finally:
@@ -99,9 +99,7 @@ def test_left_open_and_changed_is_damage(where: Campaign) -> None:
     assert quarantine_damaged(store_of(where), problems) == ["t"]
 
 
-def test_left_open_where_nothing_can_be_written_says_so(
-    where: Campaign, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_left_open_where_nothing_can_be_written_says_so(where: Campaign, monkeypatch: Any) -> None:
     leave_open(data_of(where))
 
     def refused(*_: object) -> None:
@@ -113,9 +111,7 @@ def test_left_open_where_nothing_can_be_written_says_so(
 
 
 @pytest.mark.parametrize(("mode", "how"), MODES)
-def test_trial_is_read_while_another_program_has_it_open(
-    mode: str, how: str, where: Campaign
-) -> None:
+def test_trial_is_read_while_another_program_has_it_open(mode: str, how: str, where: Any) -> None:
     with held(data_of(where), mode, how) as program:
         assert len(where.recording("t").events()) == 1000
         assert verify(store_of(where)) == []
@@ -171,9 +167,7 @@ def test_committed_files_are_read_only_and_can_be_moved(where: Campaign, tmp_pat
     shutil.rmtree(tmp_path / "copy")
 
 
-def test_commit_on_a_file_system_without_modes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commit_on_a_file_system_without_modes(tmp_path: Path, monkeypatch: Any) -> None:
     def refused(*_: object, **__: object) -> None:
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 

@@ -7,10 +7,9 @@ import fcntl
 import json
 import os
 import signal
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +23,7 @@ from sliplab.storage.trials.lock import STORE_LOCK, Locked, NoLocks, exclusive
 from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
+from tests.storage.holders import holder_of
 
 REFUSED = [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL]
 SILENT = 0
@@ -52,9 +52,7 @@ def test_a_file_system_without_locks_is_refused(
 
 
 @pytest.mark.parametrize("number", [SILENT, errno.ENOLCK])
-def test_a_collection_there_takes_no_trial(
-    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_collection_there_takes_no_trial(number: int, tmp_path: Path, monkeypatch: Any) -> None:
     """Two of them would run into each other: the first is refused like the second."""
     without_locks(monkeypatch, number)
     store = tmp_path / "s"
@@ -74,9 +72,7 @@ def test_a_collection_there_takes_no_trial(
 
 
 @pytest.mark.parametrize("number", [SILENT, *REFUSED])
-def test_a_rig_is_not_driven_without_a_lock(
-    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rig_is_not_driven_without_a_lock(number: int, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setenv(ENVIRONMENT, str(tmp_path / "locks"))
     without_locks(monkeypatch, number)
     file, _ = load_rig_file(Path("ur5"))
@@ -137,9 +133,7 @@ def test_locks_that_other_machines_do_not_see(
         pass
 
 
-def test_a_store_on_such_a_share_says_whose_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_on_such_a_share_says_whose_it_is(tmp_path: Path, monkeypatch: Any) -> None:
     store = Store.create(tmp_path / "s")
     monkeypatch.setattr(lock, "_alone", lambda _: "fuse.sshfs")
     (store.folder / STORE_LOCK).write_text(json.dumps({"pid": 12, "host": "nas", "boot": "b"}))
@@ -160,25 +154,13 @@ with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
 
 def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, path],
-        cwd=ROOT,
-        text=True,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    assert holder.stdout is not None
-    assert holder.stdin is not None
-    try:
-        assert holder.stdout.readline() == "held\n"
+    with holder_of(HOLDER, path) as holder:
         with pytest.raises(Locked) as refused, exclusive(path, "the rig"):
             pass
         who = refused.value.holder
         assert who["pid"] == holder.pid
-        assert (
-            f"the rig is in use by another program (pid {holder.pid} of {process.user_name()} on "
-            in str(refused)
-        )
+        said = f"is in use by another program (pid {holder.pid} of {process.user_name()} on "
+        assert f"the rig {said}" in str(refused)
         assert "for the store somewhere, since 20" in str(refused.value)
         assert process.is_here(who)
         # another start with this number is another process, and gets no signal
@@ -187,11 +169,6 @@ def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Pat
         assert holder.poll() is None
         assert process.send(who, signal.SIGKILL)
         assert holder.wait(timeout=60) == -signal.SIGKILL
-    finally:
-        holder.kill()
-        holder.wait(timeout=60)
-        holder.stdin.close()
-        holder.stdout.close()
     assert not process.is_here(who)
     assert not process.send(who, signal.SIGTERM)
     with exclusive(path, "the rig"):

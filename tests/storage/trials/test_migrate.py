@@ -24,30 +24,32 @@ def old(folder: Path) -> Store:
     return Store.open(folder)
 
 
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store as version 1 left it."""
+    return old(tmp_path / "s")
+
+
 def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_an_older_store_is_read_as_it_is(tmp_path: Path) -> None:
-    store = old(tmp_path / "s")
+def test_an_older_store_is_read_as_it_is(store: Store, tmp_path: Path) -> None:
     before = files(tmp_path)
     assert verify(store) == []
     assert len(store.campaign("c").recording("t").events()) == 1000
     assert files(tmp_path) == before
 
 
-def test_it_migrates_forward_with_a_copy_kept(tmp_path: Path) -> None:
-    store = old(tmp_path / "s")
+def test_it_migrates_forward_with_a_copy_kept(store: Store) -> None:
     before = files(store.folder)
     assert migrate(store) == list(range(1, FORMAT))
     assert store.format == FORMAT
     assert verify(store) == []
     copies = files(kept(store, 1))
     assert copies == {name: before[name] for name in copies}
-    assert copies.keys() == {
-        "store.json",
-        *(f"campaigns/c/{n}" for n in ("campaign.json", "protocol.yaml", "rig.yaml")),
-    }
+    names = ("campaign.json", "protocol.yaml", "rig.yaml")
+    assert copies.keys() == {"store.json", *(f"campaigns/c/{name}" for name in names)}
     after = files(store.folder)
     assert all(after[name] == before[name] for name in before if "/trials/" in name)
     assert migrate(store) == []
@@ -81,8 +83,7 @@ def test_an_interrupted_migration_is_begun_again(
     assert all(data == before[name] for name, data in files(kept(store, 1)).items())
 
 
-def test_formats_follow_each_other(tmp_path: Path) -> None:
-    store = old(tmp_path / "s")
+def test_formats_follow_each_other(store: Store) -> None:
     seen: list[int] = []
     steps = {n: lambda _, n=n: seen.append(n) for n in (1, 2, 3)}
     assert migrate(store, steps) == [1, 2, 3]
@@ -91,8 +92,7 @@ def test_formats_follow_each_other(tmp_path: Path) -> None:
     assert set(STEPS) == set(range(1, FORMAT))
 
 
-def test_a_newer_store_is_refused_by_name(tmp_path: Path) -> None:
-    store = old(tmp_path / "s")
+def test_a_newer_store_is_refused_by_name(store: Store) -> None:
     write_json(store.folder / "store.json", {"format": FORMAT + 1})
     with pytest.raises(StoreError, match=r"written by a newer version .* update it"):
         Store.open(store.folder)
@@ -105,15 +105,13 @@ def test_a_newer_store_is_refused_by_name(tmp_path: Path) -> None:
         Store.open(store.folder)
 
 
-def test_a_newer_trial_is_refused_by_name(tmp_path: Path) -> None:
-    store = old(tmp_path / "s")
+def test_a_newer_trial_is_refused_by_name(store: Store) -> None:
     campaign_ = store.campaign("c")
     commit(campaign_, "n", format=99)
     with pytest.raises(StoreError, match=r"record.json: format = 99: was written by a newer"):
         _ = campaign_.recording("n").record
-    assert [p.what for p in verify(store) if p.trial == "n"] == [
-        "was written by a newer version (format 99)"
-    ]
+    found = [p.what for p in verify(store) if p.trial == "n"]
+    assert found == ["was written by a newer version (format 99)"]
     folder = commit(campaign_, "m")
     (folder / "data.h5").chmod(0o644)
     with h5py.File(folder / "data.h5", "r+") as file:
@@ -123,8 +121,7 @@ def test_a_newer_trial_is_refused_by_name(tmp_path: Path) -> None:
         campaign_.recording("m").open()
 
 
-def test_a_migration_names_what_it_cannot_bring_forward(tmp_path: Path) -> None:
-    store = old(tmp_path / "s")
+def test_a_migration_names_what_it_cannot_bring_forward(store: Store) -> None:
     (store.campaign("c").folder / "rig.yaml").unlink()
     with pytest.raises(StoreError, match=r"rig.yaml: is missing: restore it .* nothing was"):
         migrate(store)

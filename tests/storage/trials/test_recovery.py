@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,19 +29,20 @@ def torn(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:20])
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda folder: None,
-        lambda folder: (folder / "checksums.json").unlink(),
-        lambda folder: torn(folder / "checksums.json"),
-    ],
-    ids=["before the rename", "before the checksums", "in the checksums"],
-)
-def test_killed_commit_is_completed(tmp_path: Path, damage: Callable[[Path], None]) -> None:
-    where = campaign(tmp_path / "s")
+def damage(folder: Path, how: str) -> None:
+    """Delete, tear or add files, as in ``-record.json ~data.h5 +x.json``."""
+    for word in how.split():
+        path = folder / word[1:]
+        if word[0] == "+":
+            path.write_text("{}")
+        else:
+            {"-": Path.unlink, "~": torn}[word[0]](path)
+
+
+@pytest.mark.parametrize("how", ["", "-checksums.json", "~checksums.json"])
+def test_killed_commit_is_completed(where: Campaign, tmp_path: Path, how: str) -> None:
     whole = commit(where, "u")
-    damage(killed(where))
+    damage(killed(where), how)
     (problem,) = verify(Store.open(tmp_path / "s"))
     assert problem.kind == "unfinished"
     assert problem.path.endswith("incoming/t")
@@ -52,38 +54,27 @@ def test_killed_commit_is_completed(tmp_path: Path, damage: Callable[[Path], Non
         assert (where.folder / "trials" / "t" / name).read_bytes() == (whole / name).read_bytes()
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda folder: (folder / "record.json").unlink(),
-        lambda folder: torn(folder / "record.json"),
-        lambda folder: torn(folder / "data.h5"),
-        lambda folder: [torn(folder / "data.h5"), (folder / "checksums.json").unlink()],
-        lambda folder: [(folder / "frames.mkv").unlink(), (folder / "checksums.json").unlink()],
-        lambda folder: (folder / "provenance.json").unlink(),
-        lambda folder: (folder / "elsewhere.json").write_text("{}"),
-        lambda folder: (folder / "frames.raw").write_text("x"),
-    ],
-)
-def test_incomplete_trial_is_quarantined(tmp_path: Path, damage: Callable[[Path], None]) -> None:
-    where = campaign(tmp_path / "s")
-    damage(killed(where))
+INCOMPLETE = """-record.json; ~record.json; ~data.h5; ~data.h5 -checksums.json
+-frames.mkv -checksums.json; -provenance.json; +elsewhere.json; +frames.raw"""
+
+
+@pytest.mark.parametrize("how", re.split(r"; |\n", INCOMPLETE))
+def test_incomplete_trial_is_quarantined(where: Campaign, how: str) -> None:
+    damage(killed(where), how)
     assert recover(where) == []
     assert where.sweep() == 1
     assert where.committed() == set()
     assert [item["cause"] for item in where.quarantined()] == ["interrupted"]
 
 
-def test_trial_of_another_name_or_of_a_failed_gate_is_not_committed(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_trial_of_another_name_or_of_a_failed_gate_is_not_committed(where: Campaign) -> None:
     killed(where, "t", quality={"passed": False, "gates": {}})
     killed(where, "u")
     shutil.move(where.folder / "incoming" / "u", where.folder / "incoming" / "v")
     assert recover(where) == []
 
 
-def test_failed_attempt_killed_before_its_rename_keeps_its_cause(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_failed_attempt_killed_before_its_rename_keeps_its_cause(where: Campaign) -> None:
     fail(where, "t", 0)
     os.rename(where.folder / "quarantine" / "t.1", where.folder / "incoming" / "t")
     assert recover(where) == []
@@ -102,8 +93,7 @@ def test_trial_killed_on_its_way_to_quarantine_is_unfinished_and_moved(tmp_path:
     assert verify(Store.open(tmp_path / "s")) == []
 
 
-def test_committed_trial_is_not_replaced(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_committed_trial_is_not_replaced(where: Campaign) -> None:
     killed(where)
     commit(where, "u")
     os.rename(where.folder / "trials" / "u", where.folder / "trials" / "t")
@@ -112,9 +102,7 @@ def test_committed_trial_is_not_replaced(tmp_path: Path) -> None:
     assert (where.folder / "trials" / "t" / "record.json").read_bytes() == before
 
 
-def test_data_are_flushed_before_the_record_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_are_flushed_before_the_record_is_written(tmp_path: Path, monkeypatch: Any) -> None:
     """A record on the disk says that the data are, too."""
     order: list[str] = []
     real = os.fsync

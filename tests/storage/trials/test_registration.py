@@ -31,35 +31,37 @@ from sliplab.storage.trials.verify import DAMAGED, UNFINISHED, verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
 
+PROTOCOL = {"name": "c", "file_sha256": "f" * 64, "text": "protocol: 1\n", "enabled": []}
+PROTOCOL |= {"collection_hash": "c" * 64, "analysis_hash": "a" * 64}
 CONTENT: dict[str, Any] = {
-    "protocol": {
-        "name": "c",
-        "file_sha256": "f" * 64,
-        "text": "protocol: 1\n",
-        "enabled": [],
-        "collection_hash": "c" * 64,
-        "analysis_hash": "a" * 64,
-    },
+    "protocol": PROTOCOL,
     "analysis": {"windows": {"length_ms": 30}},
     "stopping": {"error": 0.05, "claims": []},
-    "judging_model": None,
-    "planned": 3,
-    "rig": None,
-    "versions": {"numpy": "2.0"},
     "taken": {"committed": 0, "attempts": 0},
     "registered": "2026-01-02T03:04:05+00:00",
 }
-
-
+CONTENT |= {"judging_model": None, "planned": 3, "rig": None, "versions": {"numpy": "2.0"}}
 HEADS = {
     ".tsr": bytes.fromhex("30820100 3003 020100"),  # a response begins with its status
     ".ots": b"\x00OpenTimestamps\x00\x00Proof\x00",
 }
 
 
+@pytest.fixture
+def where(tmp_path: Path) -> Campaign:
+    """A campaign."""
+    return campaign(tmp_path / "store")
+
+
 def registered(where: Campaign, count: int = 1) -> list[Path]:
     """Register a campaign some times."""
     return [add_registration(where, CONTENT) for _ in range(count)]
+
+
+@pytest.fixture
+def path(where: Campaign) -> Path:
+    """A registration."""
+    return registered(where)[0]
 
 
 def problems(where: Campaign) -> dict[str, str]:
@@ -75,8 +77,7 @@ def test_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     assert Registration.load(one).after == "before the first trial"
 
 
-def test_later_registration_is_numbered_and_chained(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
+def test_later_registration_is_numbered_and_chained(where: Campaign, tmp_path: Path) -> None:
     first, second, third = registered(where, 3)
     assert [path.name for path in (first, second, third)] == ["0001.json", "0002.json", "0003.json"]
     assert [it.previous for _, it in registrations(where)] == [None, sha256(first), sha256(second)]
@@ -84,8 +85,7 @@ def test_later_registration_is_numbered_and_chained(tmp_path: Path) -> None:
     assert verify(Store.open(tmp_path / "store")) == []
 
 
-def test_taken_number_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    where = campaign(tmp_path / "store")
+def test_taken_number_is_never_overwritten(where: Any, monkeypatch: Any) -> None:
     (first,) = registered(where)
     before = first.read_bytes()
     module = "sliplab.storage.trials.registration"
@@ -112,8 +112,9 @@ def test_registered_campaign_without_trials_is_whole(tmp_path: Path) -> None:
         (lambda data: "", "0002.json", "is not JSON"),
     ],
 )
-def test_changed_content_is_named(tmp_path: Path, change: Any, name: str, what: str) -> None:
-    where = campaign(tmp_path / "store")
+def test_changed_file_is_named(
+    where: Any, tmp_path: Any, change: Any, name: str, what: str
+) -> None:
     _, second = registered(where, 2)
     text = change(json.loads(second.read_bytes()))
     os.chmod(second, 0o644)
@@ -123,17 +124,13 @@ def test_changed_content_is_named(tmp_path: Path, change: Any, name: str, what: 
     assert (Path(found.path).name, found.kind, found.campaign) == (name, DAMAGED, "c")
 
 
-def test_other_spaces_are_named(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
-    (path,) = registered(where)
+def test_other_spaces_are_named(path: Path, where: Campaign) -> None:
     os.chmod(path, 0o644)
     path.write_text(json.dumps(json.loads(path.read_bytes())))
     assert "not as it was written" in problems(where)["0001.json"]
 
 
-def test_every_cut_or_changed_byte_is_named(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
-    (path,) = registered(where)
+def test_every_cut_or_changed_byte_is_named(path: Path, where: Campaign) -> None:
     os.chmod(path, 0o644)
     whole = path.read_bytes()
     for at in range(0, len(whole), 7):
@@ -142,8 +139,7 @@ def test_every_cut_or_changed_byte_is_named(tmp_path: Path) -> None:
             assert "0001.json" in problems(where), damaged
 
 
-def test_missing_registration_is_named(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
+def test_missing_registration_is_named(where: Campaign) -> None:
     first, second, third = registered(where, 3)
     second.unlink()
     assert "missing or changed" in problems(where)["0003.json"]
@@ -157,8 +153,7 @@ def test_missing_registration_is_named(tmp_path: Path) -> None:
     assert "missing or changed" in problems(where)["0001.json"]
 
 
-def test_damaged_earlier_registration_refuses_another_one(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
+def test_damaged_earlier_registration_refuses_another_one(where: Campaign) -> None:
     (first,) = registered(where)
     os.chmod(first, 0o644)
     first.write_text("{}")
@@ -167,9 +162,7 @@ def test_damaged_earlier_registration_refuses_another_one(tmp_path: Path) -> Non
     assert registration_files(where) == [first]
 
 
-def test_temporary_and_foreign_files_are_named(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
-    (path,) = registered(where)
+def test_temporary_and_foreign_files_are_named(path: Path, where: Campaign, tmp_path: Path) -> None:
     (path.parent / "notes.txt").write_text("")
     (path.parent / f".0002.json.{2**22 + 1}.tmp").write_text("")
     found = {Path(it.path).name: it.kind for it in verify(Store.open(tmp_path / "store"))}
@@ -179,8 +172,7 @@ def test_temporary_and_foreign_files_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", [".tsr", ".ots"])
-def test_stamp_goes_to_the_registration_that_it_is_of(tmp_path: Path, ending: str) -> None:
-    where = campaign(tmp_path / "store")
+def test_stamp_goes_to_the_registration_it_is_of(where: Any, tmp_path: Path, ending: str) -> None:
     files = registered(where, 2)
     stamp = tmp_path / f"answer{ending}"
     stamp.write_bytes(HEADS[ending] + bytes.fromhex(sha256(files[0])) + b" by an authority")
@@ -198,17 +190,15 @@ def test_stamp_goes_to_the_registration_that_it_is_of(tmp_path: Path, ending: st
         attach_stamp(files, stamp)
 
 
-def test_nothing_is_registered_after_a_damaged_registration(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
-    (path,) = registered(where)
+def test_nothing_is_registered_after_a_damaged_registration(path: Path, where: Campaign) -> None:
     path.chmod(0o644)
     path.write_text(path.read_text().replace('"planned": 3', '"planned": 4'))
     with pytest.raises(StoreError, match="does not match its checksum; restore it from a copy"):
         registered(where)
 
 
-def test_second_authority_does_not_overwrite_the_first(tmp_path: Path) -> None:
-    files = registered(campaign(tmp_path / "store"))
+def test_second_authority_does_not_overwrite_the_first(where: Campaign, tmp_path: Path) -> None:
+    files = registered(where)
     digest = bytes.fromhex(sha256(files[0]))
     for ending in (".tsr", ".ots"):
         (tmp_path / f"one{ending}").write_bytes(HEADS[ending] + digest + b"1")
@@ -220,8 +210,8 @@ def test_second_authority_does_not_overwrite_the_first(tmp_path: Path) -> None:
     assert [path.read_bytes()[-1:] for path in stamps(files[0])] == [b"1", b"2"]
 
 
-def test_stamp_of_another_kind_or_missing_is_refused(tmp_path: Path) -> None:
-    files = registered(campaign(tmp_path / "store"))
+def test_stamp_of_another_kind_or_missing_is_refused(where: Campaign, tmp_path: Path) -> None:
+    files = registered(where)
     with pytest.raises(InputError, match=r"must end in \.tsr or \.ots"):
         attach_stamp(files, tmp_path / "stamp.sig")
     with pytest.raises(InputError, match="cannot be read"):
@@ -230,18 +220,14 @@ def test_stamp_of_another_kind_or_missing_is_refused(tmp_path: Path) -> None:
         attach_stamp(files, Path(os.fspath(tmp_path)).with_suffix(".tsr"))
 
 
-def test_changed_stamp_and_stamp_without_registration_are_named(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
-    (path,) = registered(where)
+def test_changed_stamp_and_stamp_without_registration_are_named(path: Any, where: Campaign) -> None:
     path.with_name("0001.json.tsr").write_bytes(b"of another file")
     path.with_name("0007.json.ots").write_bytes(b"")
     assert "SHA-256" in problems(where)["0001.json.tsr"]
     assert problems(where)["0007.json.ots"] == "is of no registration"
 
 
-def test_push_and_pull_take_registrations_along(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
-    (path,) = registered(where)
+def test_push_and_pull_take_registrations_along(path: Any, where: Campaign, tmp_path: Path) -> None:
     path.with_name("0001.json.tsr").write_bytes(bytes.fromhex(sha256(path)))
     commit(where, "a")
     remote = Remote(f"file://{tmp_path / 'shared'}")
@@ -256,8 +242,7 @@ def test_push_and_pull_take_registrations_along(tmp_path: Path) -> None:
     assert verify(Store.open(tmp_path / "copy")) == []
 
 
-def test_pull_leaves_another_registration_as_it_is(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
+def test_pull_leaves_another_registration_as_it_is(where: Campaign, tmp_path: Path) -> None:
     commit(where, "a")
     remote = Remote(f"file://{tmp_path / 'shared'}")
     push(Store.open(tmp_path / "store"), remote)
@@ -272,15 +257,12 @@ def test_pull_leaves_another_registration_as_it_is(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_copies_are_the_files_and_their_stamps(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "store")
+def test_copies_are_the_files_and_their_stamps(where: Campaign, tmp_path: Path) -> None:
     copy_registrations(where, tmp_path / "none")
     assert not (tmp_path / "none").exists()
     (path,) = registered(where)
     path.with_name("0001.json.ots").write_bytes(bytes.fromhex(sha256(path)))
     write_json(path.with_name("notes.json"), {})
     copy_registrations(where, tmp_path / "out" / "c")
-    assert sorted(it.name for it in (tmp_path / "out" / "c").iterdir()) == [
-        "0001.json",
-        "0001.json.ots",
-    ]
+    names = sorted(it.name for it in (tmp_path / "out" / "c").iterdir())
+    assert names == ["0001.json", "0001.json.ots"]

@@ -84,9 +84,7 @@ def test_of_many_who_decide_at_once_each_is_kept_or_told(store: Store) -> None:
         ("maybe", {}, "must be one of accept, adjust, reject, reopen"),
     ],
 )
-def test_what_cannot_be_is_not_kept(
-    store: Store, verdict: str, more: dict[str, Any], problem: str
-) -> None:
+def test_what_cannot_be_is_not_kept(store: Store, verdict: str, more: Any, problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         decide(store, 0, verdict, **more)
     assert review.history(store, "c", "t") == []

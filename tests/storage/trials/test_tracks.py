@@ -76,7 +76,6 @@ def test_a_plate_that_comes_late_or_goes_leaves_gaps_and_no_shift(tmp_path: Path
     chunks = [tracks(5, False), tracks(4, True, 5), tracks(3, False, 9), tracks(2, True, 12)]
     recording = Recording(take(where, "t", chunks))
     plate = recording.tracks().plate_px
-    assert plate is not None
     assert np.isfinite(plate[:, 0]).tolist() == [False] * 5 + [True] * 4 + [False] * 3 + [True] * 2
     assert np.array_equal(plate[5:9], chunks[1].plate_px)
     assert verify(Store.open(tmp_path / "s")) == []
@@ -93,8 +92,7 @@ def test_the_same_tracks_are_the_same_bytes_and_units_are_said(tmp_path: Path) -
             assert file[name].attrs["unit"].startswith("px")
 
 
-def test_the_catalogue_says_what_there_is(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_the_catalogue_says_what_there_is(where: Campaign, tmp_path: Path) -> None:
     commit(where, "a")
     take(where, "b", [tracks(20, False)])
     table = catalogue(Store.open(tmp_path / "s"))
@@ -102,8 +100,7 @@ def test_the_catalogue_says_what_there_is(tmp_path: Path) -> None:
     assert list(table["frames"]) == [12, 20]
 
 
-def test_what_is_not_there_is_said(tmp_path: Path) -> None:
-    where = campaign(tmp_path / "s")
+def test_what_is_not_there_is_said(where: Campaign) -> None:
     with pytest.raises(ValueError, match="contains no tracks"):
         Recording(commit(where, "a")).tracks()
 

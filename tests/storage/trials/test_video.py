@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -60,9 +61,7 @@ def test_the_number_of_threads_shows_nowhere_in_the_file(count: int, tmp_path: P
     assert np.array_equal(np.stack(found), images)
 
 
-def test_an_encoder_that_fails_says_so_and_blocks_nobody(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_encoder_that_fails_says_so_and_blocks_nobody(tmp_path: Path, monkeypatch: Any) -> None:
     class Broken:
         """Stands for the codec's frames: the third one cannot be made."""
 
@@ -75,9 +74,8 @@ def test_an_encoder_that_fails_says_so_and_blocks_nobody(
                 raise ValueError("out of ink")
             return av.VideoFrame.from_numpy_buffer(image, format=format)
 
-    monkeypatch.setattr(
-        "sliplab.storage.trials.video.av", SimpleNamespace(**{**vars(av), "VideoFrame": Broken})
-    )
+    codec = SimpleNamespace(**{**vars(av), "VideoFrame": Broken})
+    monkeypatch.setattr("sliplab.storage.trials.video.av", codec)
     writer = VideoWriter(tmp_path / "v.mkv", *FRAME, 100)
     # fewer than the queues hold: nothing waits, and closing tells what happened
     writer.write(frames(20).images[:2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
@@ -39,7 +40,6 @@ def test_the_module_is_loaded_into_a_task_whose_end_stops_the_arm() -> None:
 
 def test_the_stand_in_has_the_cycle_of_the_module_and_beats_fit_into_every_limit() -> None:
     found = re.search(r"CONST num cycle_s:=([0-9.]+);", MODULE)
-    assert found is not None
     assert float(found[1]) == WATCH_S
     shortest = AbbSettings.model_json_schema()["properties"]["watchdog_s"]["anyOf"][0]["minimum"]
     assert shortest > BEAT_S + WATCH_S
@@ -62,9 +62,7 @@ class Signals:
 
 
 @pytest.mark.parametrize("ahead", [*AHEAD, float("nan")])
-def test_echo_of_a_task_that_has_ended_is_no_echo(
-    ahead: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_echo_of_a_task_that_has_ended_is_no_echo(ahead: float, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.abb.watchdog.ECHO_S", 0.02)
     settings = AbbSettings.model_validate(
         {"host": "127.0.0.1", "limits": {"low_mm": [0, 0, 0], "high_mm": [9, 9, 9]}}

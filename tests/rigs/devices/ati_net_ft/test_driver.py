@@ -34,13 +34,17 @@ def make() -> Iterator[Make]:
     with ExitStack() as stack:
 
         def build(
-            connected: bool = True, wire: dict[str, Any] | None = None, **settings: Any
+            connected: bool = True, wire: Any = None, rows: int | None = None, **settings: Any
         ) -> tuple[AtiNetFt, FakeNetFt]:
+            """Started, and read from until there are so many rows, if that is a number."""
             fake = stack.enter_context(FakeNetFt(own_address(), **(wire or {})))
             sensor = AtiNetFt(settings_for(fake, **settings))
             stack.callback(sensor.close)
             if connected:
                 sensor.connect()
+            if rows is not None:
+                sensor.start()
+                gather(sensor, rows)
             return sensor, fake
 
         yield build
@@ -213,18 +217,14 @@ def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
 
 
 def test_what_is_no_record_is_counted(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.inject(Kind.MALFORMED, 2)
     gather(sensor, 20)
     assert (sensor.counts.malformed, sensor.counts.lost) == (2, 2)
 
 
 def test_silence_is_a_fault(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.inject(Kind.SILENCE)
     assert "nothing came for 0.3 s" in fault_of(sensor, SILENCE_S)
     with pytest.raises(RigError, match="nothing came"):
@@ -235,26 +235,20 @@ def test_silence_is_a_fault(make: Make) -> None:
 
 
 def test_a_sensor_without_power_is_a_fault(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.close()
     assert "force sensor: " in fault_of(sensor, SILENCE_S)
     sensor.close()
 
 
 def test_a_saturated_sensor_is_a_fault(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     fake.inject(Kind.SATURATED)
     assert "0xC0000000: force or torque out of range" in fault_of(sensor, 0.5)
 
 
 def test_a_sensor_that_begins_anew_is_a_fault(make: Make) -> None:
-    sensor, fake = make(wire={"ticks": 10**6})
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(wire={"ticks": 10**6}, rows=5)
     fake.inject(Kind.RESTART)
     assert "it restarted" in fault_of(sensor, 0.5)
 
@@ -285,9 +279,7 @@ def test_a_saturated_sensor_does_not_connect(make: Make) -> None:
 
 
 def test_closing_ends_the_stream_and_may_be_repeated(make: Make) -> None:
-    sensor, fake = make()
-    sensor.start()
-    gather(sensor, 5)
+    sensor, fake = make(rows=5)
     sensor.close()
     sensor.close()
     until(lambda: not fake.streaming, 2.0)
@@ -360,8 +352,13 @@ def record(number: int, ticks: int, newtons: float = 0.0) -> bytes:
     return found.tobytes()
 
 
-def test_one_record_far_ahead_is_dropped_and_the_next_ones_are_read() -> None:
-    wire = Wire()
+@pytest.fixture
+def wire() -> Wire:
+    """A driver that is given datagrams."""
+    return Wire()
+
+
+def test_one_record_far_ahead_is_dropped_and_the_next_ones_are_read(wire: Wire) -> None:
     wire.hear_all(range(600))
     wire.hear(record(600 + 2**30, 7 * 600 + 2**30))
     wire.hear_all(range(601, 2156), newtons=50.0)
@@ -383,10 +380,7 @@ def test_one_record_far_ahead_is_dropped_and_the_next_ones_are_read() -> None:
     ],
     ids=["short", "long", "the same", "older ones", "far ahead"],
 )
-def test_records_that_cannot_be_used_are_silence(
-    useless: Callable[[int], bytes], said: str
-) -> None:
-    wire = Wire()
+def test_records_that_cannot_be_used_are_silence(wire: Wire, useless: Any, said: str) -> None:
     wire.hear_all(range(90))
     for number in range(90, 589):
         wire.hear(useless(number))
@@ -396,16 +390,14 @@ def test_records_that_cannot_be_used_are_silence(
         wire.sensor.read()
 
 
-def test_first_record_far_ahead_ends_in_a_fault() -> None:
-    wire = Wire()
+def test_first_record_far_ahead_ends_in_a_fault(wire: Wire) -> None:
     wire.hear(record(2**30, 2**30))
     wire.hear_all(range(500))
     with pytest.raises(RigError, match="none of 500 datagrams"):
         wire.sensor.read()
 
 
-def test_records_that_waited_in_a_buffer_are_not_ahead() -> None:
-    wire = Wire()
+def test_records_that_waited_in_a_buffer_are_not_ahead(wire: Wire) -> None:
     wire.hear_all(range(100))
     wire.now_ns += 3_000_000_000  # of these 3 s the first records fitted into the buffer
     for number in range(100, 600):
@@ -416,23 +408,20 @@ def test_records_that_waited_in_a_buffer_are_not_ahead() -> None:
     assert (wire.sensor.counts.ahead, wire.sensor.counts.lost) == (0, 2500)
 
 
-def test_doubles_do_not_make_lost_records_good() -> None:
-    wire = Wire()
+def test_doubles_do_not_make_lost_records_good(wire: Wire) -> None:
     wire.hear_all([1, 2, 6, 3, 3, 2, 2, 1, 1, 7])
     counts = wire.sensor.counts
     assert (counts.lost, counts.late) == (2, 6)
 
 
 @pytest.mark.parametrize(("first", "lost"), [(2**32 - 3, 0), (2**32 - 2, 3)])
-def test_counters_wrap_at_32_bits(first: int, lost: int) -> None:
-    wire = Wire()
+def test_counters_wrap_at_32_bits(wire: Wire, first: int, lost: int) -> None:
     wire.hear_all([first + n + (lost if n > 2 else 0) for n in range(6)])
     assert (wire.sensor.counts.received, wire.sensor.counts.lost) == (6, lost)
     assert len(wire.sensor.read()) == 6
 
 
-def test_numbers_of_another_request_are_neither_lost_nor_late() -> None:
-    wire = Wire()
+def test_numbers_of_another_request_are_neither_lost_nor_late(wire: Wire) -> None:
     for ticks, number in enumerate([500, 501, 1, 2, 2**31, 4], 1):
         wire.hear(record(number, 7 * ticks))
     counts = wire.sensor.counts

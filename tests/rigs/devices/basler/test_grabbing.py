@@ -19,17 +19,10 @@ from sliplab.rigs.devices.basler.grabbing import NO_ID, Grab, GrabSettings
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
 Until = Callable[[Callable[[], bool]], None]
-CHUNKS = GrabSettings(
-    stamping=Stamping("chunk", "hardware trigger"),
-    mid_exposure_ns=1000,
-    first_id=0,
-    period_ns=10_000_000,
-    late_ns=100_000_000,
-    sync_bit=2,
-    queue=100,
-    first_ns=0,
-    stall_ns=0,
-)
+LIMITS: dict[str, Any] = {"period_ns": 10_000_000, "late_ns": 100_000_000, "queue": 100}
+LIMITS |= {"mid_exposure_ns": 1000, "first_id": 0, "sync_bit": 2, "first_ns": 0, "stall_ns": 0}
+CHUNKS = GrabSettings(stamping=Stamping("chunk", "hardware trigger"), **LIMITS)
+EXPOSED = Stamping("exposure end event", "exposure line")
 
 
 class Result:
@@ -84,14 +77,9 @@ def changed(**changes: Any) -> GrabSettings:
 
 
 def test_chunks_give_time_and_level_of_the_sync_line(until: Until) -> None:
-    level = SimpleNamespace(Value=0b0100)
-    other = SimpleNamespace(Value=0b1011)
-    stamp = SimpleNamespace(Value=5_000_000)
-    device = Device(
-        Result(0, ChunkTimestamp=stamp, ChunkLineStatusAll=level),
-        Result(1, ChunkLineStatusAll=other),
-    )
-    with grabbing(device) as grab:
+    level, other, stamp = (SimpleNamespace(Value=value) for value in (0b0100, 0b1011, 5_000_000))
+    first = Result(0, ChunkTimestamp=stamp, ChunkLineStatusAll=level)
+    with grabbing(Device(first, Result(1, ChunkLineStatusAll=other))) as grab:
         until(lambda: grab.counts.grabbed == 2)
         first, second = grab.take()
         assert (first.number, first.t_ns, first.sync) == (0, 5_001_000, 1)
@@ -107,11 +95,9 @@ def test_a_frame_out_of_order_or_twice_is_counted_and_kept_back(until: Until) ->
 
 
 def test_without_block_ids_what_pylon_overwrote_is_counted(until: Until) -> None:
-    device = Device(
-        Result(0, BlockID=NO_ID, ImageNumber=1),
-        Result(0, BlockID=NO_ID, ImageNumber=2, NumberOfSkippedImages=3),
-    )
-    with grabbing(device) as grab:
+    first = Result(0, BlockID=NO_ID, ImageNumber=1)
+    second = Result(0, BlockID=NO_ID, ImageNumber=2, NumberOfSkippedImages=3)
+    with grabbing(Device(first, second)) as grab:
         until(lambda: grab.counts.grabbed == 2)
         assert grab.counts.skipped == 3
 
@@ -128,13 +114,8 @@ def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on(until: Unti
         assert grab.counts.late == 1
 
 
-GIGE = changed(
-    stamping=Stamping("grab result", "device time stamps"),
-    first_id=1,
-    late_ns=10**12,
-    sync_bit=None,
-    queue=10**6,
-)
+STAMPED = Stamping("grab result", "device time stamps")
+GIGE = changed(stamping=STAMPED, first_id=1, late_ns=10**12, sync_bit=None, queue=10**6)
 
 
 class Gige(Device):
@@ -212,7 +193,7 @@ def test_block_id_far_ahead_is_dropped(until: Until) -> None:
 
 
 def test_exposure_ends_are_found_by_block_ids_that_wrap(until: Until) -> None:
-    settings = changed(**vars(GIGE) | {"stamping": Stamping("exposure end event", "exposure line")})
+    settings = changed(**vars(GIGE) | {"stamping": EXPOSED})
     ends = {block: 10_000_000 * at for at, block in enumerate((65_534, 65_535, 1, 2), 1)}
     device = Gige(())
     device.results = [Result(block) for block in ends]
@@ -249,13 +230,9 @@ def test_a_promised_stamp_that_is_missing_ends_the_run(until: Until) -> None:
         assert "has no time stamp" in str(grab.fault)
 
 
-def test_an_exposure_end_that_comes_late_is_waited_for_and_one_that_never_comes_given_up(
-    until: Until,
-) -> None:
+def test_a_late_exposure_end_is_waited_for_and_one_that_never_comes_given_up(until: Until) -> None:
     ends: dict[int, int] = {1: 9_000}
-    settings = changed(
-        stamping=Stamping("exposure end event", "exposure line"), sync_bit=None, late_ns=10**12
-    )
+    settings = changed(stamping=EXPOSED, sync_bit=None, late_ns=10**12)
     device = Device(Result(0), Result(1))
     with grabbing(device, settings, ends) as grab:
         until(lambda: grab.counts.grabbed == 1)
@@ -269,7 +246,7 @@ def test_an_exposure_end_that_comes_late_is_waited_for_and_one_that_never_comes_
 
 
 def test_a_frame_that_still_waits_for_its_time_at_the_end_is_counted(until: Until) -> None:
-    settings = changed(stamping=Stamping("exposure end event", "exposure line"), sync_bit=None)
+    settings = changed(stamping=EXPOSED, sync_bit=None)
     device = Device(Result(0))
     with grabbing(device, settings) as grab:
         until(lambda: not device.results)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+import yaml
 from pydantic import ValidationError
 
 from sliplab.rigs.core.capabilities import RigError
@@ -19,39 +20,18 @@ from sliplab.rigs.devices.basler.settings import BaslerSettings
 from tests.rigs.devices.basler.test_fake_live import FakeScene
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
-LEFT: dict[str, Any] = {
-    "PixelFormat": "Mono12",
-    "Gain": 6.0,
-    "GainAuto": "Continuous",
-    "BlackLevel": 12.0,
-    "Gamma": 0.5,
-    "DigitalShift": 2,
-    "BinningHorizontal": 2,
-    "BinningVertical": 2,
-    "ReverseX": True,
-    "ReverseY": True,
-    "ExposureAuto": "Continuous",
-    "ExposureMode": "TriggerWidth",
-    "AcquisitionMode": "SingleFrame",
-    "TriggerActivation": "FallingEdge",
-    "LineInverter": True,
-}
+LEFT: dict[str, Any] = yaml.safe_load(
+    "{PixelFormat: Mono12, Gain: 6.0, GainAuto: Continuous, BlackLevel: 12.0, Gamma: 0.5, "
+    "DigitalShift: 2, BinningHorizontal: 2, BinningVertical: 2, ReverseX: true, ReverseY: true, "
+    "ExposureAuto: Continuous, ExposureMode: TriggerWidth, AcquisitionMode: SingleFrame, "
+    "TriggerActivation: FallingEdge, LineInverter: true}"
+)
 """Settings that pylon Viewer changes, away from the maker's."""
-OURS: dict[str, Any] = {
-    "PixelFormat": "Mono8",
-    "Gain": 0.0,
-    "GainAuto": "Off",
-    "BlackLevel": 0.0,
-    "Gamma": 1.0,
-    "DigitalShift": 0,
-    "BinningHorizontal": 1,
-    "BinningVertical": 1,
-    "ReverseX": False,
-    "ReverseY": False,
-    "ExposureAuto": "Off",
-    "ExposureMode": "Timed",
-    "AcquisitionMode": "Continuous",
-}
+OURS: dict[str, Any] = yaml.safe_load(
+    "{PixelFormat: Mono8, Gain: 0.0, GainAuto: 'Off', BlackLevel: 0.0, Gamma: 1.0, "
+    "DigitalShift: 0, BinningHorizontal: 1, BinningVertical: 1, ReverseX: false, ReverseY: false, "
+    "ExposureAuto: 'Off', ExposureMode: Timed, AcquisitionMode: Continuous}"
+)
 MID_NS = 1_000_000
 HARDWARE: dict[str, Any] = {"trigger": "hardware", "trigger_line": "Line1", "sync_line": 2}
 
@@ -169,29 +149,24 @@ def test_a_stand_in_refuses_another_trigger_than_that_of_a_frame() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (
-            {"trigger": "hardware", "trigger_line": "Line9"},
-            "trigger_line = Line9: this camera is triggered by Line1, Line2, Line3",
-        ),
-        (HARDWARE | {"sync_line": 8}, "sync_line = 8: this camera has Line1, Line2, Line3"),
-        (
-            HARDWARE | {"exposure_line": "Out1"},
-            "exposure_line = Out1: outputs of this camera are Line1, Line2, Line3",
-        ),
-        (HARDWARE | {"user_set": "UserSet3"}, "user_set = UserSet3: this camera has Default"),
+        ({"trigger_line": "Line9"}, "this camera is triggered by Line1, Line2, Line3"),
+        ({"sync_line": 8}, "this camera has Line1, Line2, Line3"),
+        ({"exposure_line": "Out1"}, "outputs of this camera are Line1, Line2, Line3"),
+        ({"user_set": "UserSet3"}, "this camera has Default"),
     ],
 )
 def test_what_the_camera_does_not_have_is_named(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(RigError, match=message), opened(emulated(), **settings):
+    ((key, value),) = settings.items()
+    said = f"{key} = {value}: {message}"
+    with pytest.raises(RigError, match=said), opened(emulated(), **HARDWARE | settings):
         pass
 
 
 def test_a_rate_that_the_camera_cannot_keep_is_refused_at_the_start() -> None:
     with opened(live(), **HARDWARE, rate_hz=200) as camera:
         camera.set_region(64, 48)
-        with pytest.raises(
-            RigError, match=r"rate_hz = 200: with exposure_us = 2000, .* at most 160\.0 frames/s"
-        ):
+        said = r"rate_hz = 200: with exposure_us = 2000, .* at most 160\.0 frames/s"
+        with pytest.raises(RigError, match=said):
             camera.start()
 
 
@@ -226,8 +201,7 @@ def test_of_several_cameras_one_must_be_named() -> None:
         "from sliplab.rigs.devices.basler.driver import find_device_info; "
         "print(find_device_info('0815-0001').GetSerialNumber()); find_device_info(None)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
+    line = (sys.executable, "-c", code)
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=False)
     assert done.stdout == "0815-0001\n"
     assert "found several: 0815-0000, 0815-0001; select one by serial" in done.stderr

@@ -54,8 +54,6 @@ def library_bytes(kind: str, count: int) -> bytes:
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         with socket.create_connection(("127.0.0.1", port), 10.0) as link:
             link.settimeout(10.0)

@@ -145,7 +145,6 @@ def test_ctrl_c_ends_an_opening_at_once() -> None:
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as process:
-            assert process.stdout is not None
             assert process.stdout.readline() == "opening\n"
             end = time.monotonic() + event_process.OPEN_S
             while len(port._links) < 2:  # the library connects, and hangs

@@ -8,6 +8,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,6 +62,12 @@ def pulses_of(box: SerialSyncBox, enough: int) -> np.ndarray:
     return gather(lambda: box.read_pulses().t_ns, lambda found: len(found) >= enough)
 
 
+def running(box: SerialSyncBox, rate_hz: float, pulses: int) -> None:
+    """Start a train, and wait for some pulses."""
+    box.start(rate_hz, SEED)
+    pulses_of(box, pulses)
+
+
 def fault_of(call: Callable[[], object], bound_s: float) -> str:
     """The text of the fault in which `call`, again and again, ends within a bound."""
     begin = time.monotonic()
@@ -92,8 +99,7 @@ def test_its_pulses_are_the_codes(box: SerialSyncBox, code: Code, rate_hz: float
 
 
 def test_nothing_comes_after_the_stop(box: SerialSyncBox) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 5)
+    running(box, 200.0, 5)
     box.stop()
     box.read_pulses()
     clock = box.read_clock().device_ns[0]
@@ -103,8 +109,7 @@ def test_nothing_comes_after_the_stop(box: SerialSyncBox) -> None:
 
 
 def test_a_new_start_begins_anew(box: SerialSyncBox) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 5)
+    running(box, 200.0, 5)
     box.start(100.0, SEED, "regular")
     assert pulses_of(box, 2)[:2].tolist() == [0, 160_000_000]
 
@@ -146,11 +151,8 @@ def test_the_clock_may_be_anybodys() -> None:
 # -- faults ------------------------------------------------------------------------------------
 
 
-def test_a_reset_is_told_at_once_and_the_next_start_works(
-    wire: FakeSyncBox, box: SerialSyncBox
-) -> None:
-    box.start(100.0, SEED)
-    pulses_of(box, 3)
+def test_a_reset_is_told_at_once_and_the_next_start_works(wire: FakeSyncBox, box: Any) -> None:
+    running(box, 100.0, 3)
     wire.reset()
     assert "restarted" in fault_of(box.read_pulses, 0.2)
     with pytest.raises(SyncBoxFault, match="restarted"):
@@ -177,8 +179,7 @@ def test_a_clock_that_falls_back_is_a_reset(wire: FakeSyncBox, box: SerialSyncBo
 
 
 def test_silence_ends_a_train(wire: FakeSyncBox, box: SerialSyncBox) -> None:
-    box.start(100.0, SEED)
-    pulses_of(box, 3)
+    running(box, 100.0, 3)
     wire.silence()
     assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S)
     wire.silence(False)
@@ -186,13 +187,9 @@ def test_silence_ends_a_train(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     assert pulses_of(box, 1)[0] == 0
 
 
-def test_a_host_that_was_busy_has_not_heard_a_silence(
-    wire: FakeSyncBox, box: SerialSyncBox
-) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 3)
+def test_a_host_that_was_busy_has_not_heard_a_silence(wire: FakeSyncBox, box: Any) -> None:
+    running(box, 200.0, 3)
     port = box._port
-    assert port is not None
     with port.news:  # the reading thread can take nothing meanwhile
         threading.Event().wait(0.08 + SILENCE_S + 0.3)
         box._check(port)
@@ -208,9 +205,7 @@ def test_no_answer_is_a_fault(wire: FakeSyncBox, box: SerialSyncBox, ask: str) -
     assert "start the trial again" in text
 
 
-def test_a_late_answer_is_not_taken_for_that_of_the_next_try(
-    wire: FakeSyncBox, box: SerialSyncBox
-) -> None:
+def test_a_late_answer_is_not_taken_for_that_of_the_next_try(wire: FakeSyncBox, box: Any) -> None:
     box.connect()
     first = box.read_clock()
     wire.answer_late()
@@ -225,8 +220,7 @@ def test_one_garbled_answer_is_asked_for_again(wire: FakeSyncBox, box: SerialSyn
     wire.corrupt(1)
     assert len(box.read_clock()) == 1
     wire.corrupt(1)
-    box.start(100.0, SEED)
-    pulses_of(box, 3)
+    running(box, 100.0, 3)
     wire.corrupt(3)
     assert len(box.read_clock()) == 1
 
@@ -251,8 +245,7 @@ def test_a_garbled_answer_to_go_loses_no_pulse(wire: FakeSyncBox, box: SerialSyn
 
 
 def test_garbled_reports_are_missing_and_counted(wire: FakeSyncBox, box: SerialSyncBox) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 3)
+    running(box, 200.0, 3)
     wire.corrupt(40)
     pulses_of(box, 10)
     box.stop()
@@ -262,8 +255,7 @@ def test_garbled_reports_are_missing_and_counted(wire: FakeSyncBox, box: SerialS
 
 
 def test_dropped_reports_are_counted(wire: FakeSyncBox, box: SerialSyncBox) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 3)
+    running(box, 200.0, 3)
     wire.drop(40)
     pulses_of(box, 20)
     box.stop()
@@ -284,9 +276,7 @@ def test_reports_missing_at_the_end_are_counted(wire: FakeSyncBox, box: SerialSy
     assert box.losses.pulses >= 5
 
 
-def test_what_nobody_reads_is_counted_and_not_kept(
-    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_nobody_reads_is_counted_and_not_kept(wire: Any, box: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.driver.MOST_WAITING", 5)
     box.start(1000.0, SEED)
     end = time.monotonic() + 5.0
@@ -299,9 +289,7 @@ def test_what_nobody_reads_is_counted_and_not_kept(
     assert box.losses.pulses == 0
 
 
-def test_what_the_box_refuses_is_said(
-    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_box_refuses_is_said(wire: FakeSyncBox, box: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.fake.MOST_HZ", 50.0)
     with pytest.raises(SyncBoxFault, match="refuses ARM: rate must be"):
         box.start(100.0, SEED)
@@ -345,9 +333,7 @@ def test_nobody_answers(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     assert "no answer on" in fault_of(box.connect, 1.0 + ANSWER_S)
 
 
-def test_another_device_answers(
-    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_device_answers(wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: Any) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.fake.NAME", "sliplab-sync-box 99")
     with pytest.raises(SyncBoxFault, match="sliplab-sync-box 99"):
         box.connect()
@@ -357,9 +343,7 @@ def test_another_device_answers(
     ("rate_hz", "seed", "word"),
     [(0.5, 1, "rate"), (1001.0, 1, "rate"), (100.0001, 1, "steps of 0.001"), (100.0, 0, "seed")],
 )
-def test_a_train_that_cannot_be_sent(
-    box: SerialSyncBox, rate_hz: float, seed: int, word: str
-) -> None:
+def test_a_train_that_cannot_be_sent(box: Any, rate_hz: float, seed: int, word: str) -> None:
     with pytest.raises(RigError, match=word):
         box.start(rate_hz, seed)
 
@@ -415,8 +399,7 @@ def test_a_foreign_device_that_chatters_without_end_is_no_sync_box(what: str) ->
 def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
     wire: FakeSyncBox, box: SerialSyncBox
 ) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 5)
+    running(box, 200.0, 5)
     wire._say = lambda body: os.write(wire._master, b"no line at all\n") and None  # type: ignore[method-assign]
     assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S)
     assert box.losses.lines > 10
@@ -444,8 +427,7 @@ def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
 def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
     wire: FakeSyncBox, box: SerialSyncBox, line: str
 ) -> None:
-    box.start(200.0, SEED)
-    pulses_of(box, 3)
+    running(box, 200.0, 3)
     wire._say(line)
     before = len(box.read_exposures())
     exposures = gather(lambda: box.read_exposures().t_ns, lambda found: len(found) >= 20)
@@ -458,9 +440,7 @@ def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
 
 
 @pytest.mark.parametrize("us", ["999999999", "99999999999999", "99999999999999999999"])
-def test_a_garbled_exposure_far_ahead_costs_one(
-    wire: FakeSyncBox, box: SerialSyncBox, us: str
-) -> None:
+def test_a_garbled_exposure_far_ahead_costs_one(wire: FakeSyncBox, box: Any, us: str) -> None:
     """Believed, it would come after all that follow, and none of them could be."""
     say = wire._say
 
@@ -482,15 +462,13 @@ def test_a_clock_that_falls_back_in_a_train_ends_it(box: SerialSyncBox) -> None:
     with FakeSyncBox(lambda: time.monotonic_ns() - shift[0]) as wire:
         box = SerialSyncBox(settings(wire))
         threading.Event().wait(0.3)
-        box.start(200.0, SEED)
-        pulses_of(box, 5)
+        running(box, 200.0, 5)
         box.read_clock()
         shift[0] = 250_000_000
         assert "jumped back by 0.2" in fault_of(box.read_clock, 0.1)
         assert "restarted" in fault_of(box.read_pulses, 0.1)
         shift[0] = 0
-        box.start(200.0, SEED)
-        pulses_of(box, 5)
+        running(box, 200.0, 5)
         shift[0] = 4_294_967_296_000  # nobody reads the clock: no tick is due any more
         assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S)
         box.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +25,7 @@ from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.devices import ur
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.storage.streams import PoseChunk
-from tests.rigs.devices.conftest import MakeArm, MakeRobot, ur_settings
+from tests.rigs.devices.conftest import MakeArm, MakeRobot, MakeUr, ur_settings
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -77,9 +78,7 @@ def test_a_slide_at_1_6_mm_s_is_straight_and_at_its_speed(
     check_slide(robot_of, arm_on, 1.6, rate)
 
 
-def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(robot_of: Any, arm_on: MakeArm) -> None:
     check_slide(robot_of, arm_on, 0.6, rate=5.0)  # 25 s of controller time
 
 
@@ -99,9 +98,7 @@ def check_slide(robot_of: MakeRobot, arm_on: MakeArm, speed: float, rate: float)
     assert chunk.xyz_mm[-1] == pytest.approx(at(15.0).xyz_mm, abs=1e-6)
 
 
-def test_a_path_of_segments_is_followed_from_rest_to_rest(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_path_of_segments_is_followed_from_rest_to_rest(robot_of: Any, arm_on: MakeArm) -> None:
     arm = arm_on(robot_of(rate=5.0))
     spans = follow(
         arm, Segment(at(10.0), 20.0), Segment(at(10.0, 297.0), 5.0), Segment(at(0.0), 40.0)
@@ -115,9 +112,7 @@ def test_a_path_of_segments_is_followed_from_rest_to_rest(
     assert arm.state() is ArmState.READY
 
 
-def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(robot_of: Any, arm_on: Any) -> None:
     robot = robot_of()
     tool = {"tcp_mm": (0, 0, 120), "tcp_rotvec_deg": (0, 0, 90), "mass_kg": 0.4}
     arm = arm_on(robot, tool=tool)
@@ -130,9 +125,7 @@ def test_it_is_an_arm_with_its_tool_payload_and_watchdog_set(
     assert abs(arm.now_ns() / 1e9 - robot.clock.now_s()) < 0.5
 
 
-def test_sync_pulses_are_rising_edges_in_controller_time(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_sync_pulses_are_rising_edges_in_controller_time(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of(digital_inputs=lambda t_s: int(t_s * 10) % 2 << 3)  # 5 Hz on input 3
     arm = arm_on(robot, sync_input=3)
     arm.read_pulses()
@@ -144,11 +137,8 @@ def test_sync_pulses_are_rising_edges_in_controller_time(
     assert np.all(pulses % 200_000_000 >= 100_000_000 - 8_000_000)
 
 
-def test_a_stop_in_a_slide_stands_still_soon_and_says_so(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+def test_a_stop_in_a_slide_stands_still_soon_and_says_so(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair()
     arm.start([Segment(at(15.0), 1.6), Segment(at(0.0), 1.6)])
     until(lambda: robot.pose().xyz_mm[1] > 1.0, 5.0)
     began = time.monotonic()
@@ -181,11 +171,8 @@ def test_a_stop_goes_on_as_far_as_it_says(robot_of: MakeRobot, arm_on: MakeArm) 
     assert min(gone) < 40.0 * (arm.stopping_s(40.0) + 0.01)
 
 
-def test_no_move_follows_a_stop_however_short_the_segments(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+def test_no_move_follows_a_stop_however_short_the_segments(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair()
     for attempt in range(3):
         path = [Segment(at(attempt + 0.1 * step), 20.0) for step in range(1, 60)]
         arm.start(path)
@@ -196,9 +183,8 @@ def test_no_move_follows_a_stop_however_short_the_segments(
         assert robot.pose() == where
 
 
-def test_what_the_guard_forbids_is_never_sent(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of(joints_deg=(0, -90, 90, -90, -90, 0))
-    arm = arm_on(robot)
+def test_what_the_guard_forbids_is_never_sent(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(joints_deg=(0, -90, 90, -90, -90, 0))
     with pytest.raises(WorkspaceError, match=r"y in the base frame 101 mm .* 100 mm"):
         arm.start([Segment(at(101.0), 1.0)])
     with pytest.raises(SpeedError, match=r"51 mm/s .* 50 mm/s"):
@@ -221,9 +207,8 @@ def test_a_wrist_near_its_singularity_is_not_moved(robot_of: MakeRobot, arm_on: 
         arm.start([Segment(at(1.0), 1.0)])
 
 
-def test_a_slowed_speed_slider_is_noticed(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+def test_a_slowed_speed_slider_is_noticed(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair()
     robot.program.speed_fraction = 0.5
     until(lambda: _refuses(arm, "slider is at 50%"), 2.0)
     assert robot.pose() == HOME
@@ -253,9 +238,8 @@ def test_two_robots_have_two_addresses(robot_of: MakeRobot, arm_on: MakeArm) -> 
     assert other.pose() == HOME
 
 
-def test_a_closed_arm_can_be_connected_again(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+def test_a_closed_arm_can_be_connected_again(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair()
     arm.close()
     assert arm.state() is ArmState.DISCONNECTED
     assert not robot.program.program_running
@@ -272,11 +256,8 @@ def test_an_address_where_nothing_listens_is_a_fault() -> None:
     arm.close()
 
 
-def test_a_move_that_somebody_ends_at_the_pendant_is_not_finished(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
-    robot = robot_of(faults=[Fault(Kind.PROGRAM_END, Stage.MOVING, after_mm=1.0)])
-    arm = arm_on(robot)
+def test_a_move_that_somebody_ends_at_the_pendant_is_not_finished(ur_pair: MakeUr) -> None:
+    arm, _ = ur_pair(faults=[Fault(Kind.PROGRAM_END, Stage.MOVING, after_mm=1.0)])
     arm.start([Segment(at(15.0), 5.0)])
     until(lambda: arm.progress().done, 5.0)
     assert arm.progress().finished == ()

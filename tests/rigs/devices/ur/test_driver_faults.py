@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -29,7 +30,7 @@ from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.fake_program import Safety
 from sliplab.rigs.devices.ur.rtde import HEADER, SETUP_INPUTS
 from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
-from tests.rigs.devices.conftest import MakeArm, MakeRobot, reconnect, ur_settings
+from tests.rigs.devices.conftest import MakeArm, MakeRobot, MakeUr, reconnect, ur_settings
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -38,6 +39,13 @@ BUSY_S = 3.0
 """Allowance for a busy machine in addition to a timeout, s."""
 TARGET = Pose((400.0, 15.0, 300.0), HOME.rotvec_deg)
 SLIDE = [Segment(TARGET, 1.6)]
+
+
+def sliding(arm: UrArm, robot: Any) -> tuple[Any, Any]:
+    """Start a slide, and wait until the arm moves."""
+    arm.start(SLIDE)
+    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+    return arm, robot
 
 
 def fails(action: Callable[[], object], within_s: float, match: str) -> float:
@@ -61,11 +69,8 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> float:
         (Kind.POWER_OFF, ArmState.NOT_RUNNING),
     ],
 )
-def test_a_stop_while_sliding_ends_the_path(
-    robot_of: MakeRobot, arm_on: MakeArm, kind: Kind, state: ArmState
-) -> None:
-    robot = robot_of(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
-    arm = arm_on(robot)
+def test_a_stop_while_sliding_ends_the_path(ur_pair: MakeUr, kind: Kind, state: ArmState) -> None:
+    arm, robot = ur_pair(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
     arm.start(SLIDE)
     until(lambda: arm.progress().done, 5.0)
     assert arm.state() is state
@@ -79,11 +84,8 @@ def test_a_stop_while_sliding_ends_the_path(
         arm.start(SLIDE)
 
 
-def test_connecting_again_unlocks_nothing_and_needs_a_person_first(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
-    robot = robot_of(faults=[Fault(Kind.PROTECTIVE_STOP, Stage.MOVING, after_mm=1.0)])
-    arm = arm_on(robot)
+def test_connecting_again_unlocks_nothing_and_needs_a_person_first(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(faults=[Fault(Kind.PROTECTIVE_STOP, Stage.MOVING, after_mm=1.0)])
     arm.start(SLIDE)
     until(lambda: arm.progress().done, 5.0)
     with pytest.raises(ArmFault, match="unlock the stop at the pendant"):
@@ -92,7 +94,6 @@ def test_connecting_again_unlocks_nothing_and_needs_a_person_first(
     robot.unlock()
     where = robot.pose()
     reconnect(arm)
-    assert arm.state() is ArmState.READY
     assert distance_mm(robot.pose(), where) < 1e-6  # the interrupted move did not go on
     arm.start([Segment(TARGET, 40.0)])
     until(lambda: arm.progress().done, 5.0)
@@ -100,9 +101,8 @@ def test_connecting_again_unlocks_nothing_and_needs_a_person_first(
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
-def test_a_link_lost_while_sliding(robot_of: MakeRobot, arm_on: MakeArm, kind: Kind) -> None:
-    robot = robot_of(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
-    arm = arm_on(robot)
+def test_a_link_lost_while_sliding(ur_pair: MakeUr, kind: Kind) -> None:
+    arm, robot = ur_pair(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] >= 1.0, 5.0)
     until(lambda: arm.state() is ArmState.DISCONNECTED, driver.SILENCE_S + BUSY_S)
@@ -112,14 +112,12 @@ def test_a_link_lost_while_sliding(robot_of: MakeRobot, arm_on: MakeArm, kind: K
     where = robot.pose()
     robot.restore_link()
     reconnect(arm)
-    assert arm.state() is ArmState.READY
     assert distance_mm(robot.pose(), where) < 1e-6  # the client did not send the move again
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
-def test_a_link_lost_while_idle(robot_of: MakeRobot, arm_on: MakeArm, kind: Kind) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+def test_a_link_lost_while_idle(ur_pair: MakeUr, kind: Kind) -> None:
+    arm, robot = ur_pair()
     robot.inject(kind)
     until(lambda: arm.state() is ArmState.DISCONNECTED, driver.SILENCE_S + BUSY_S)
     fails(lambda: arm.start(SLIDE), driver.PORT_S, "does not answer")
@@ -127,7 +125,6 @@ def test_a_link_lost_while_idle(robot_of: MakeRobot, arm_on: MakeArm, kind: Kind
     robot.restore_link()
     until(lambda: not robot.program.program_running, 1 / ur_control.WATCHDOG_HZ + BUSY_S)
     reconnect(arm)
-    assert arm.state() is ArmState.READY
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
@@ -140,8 +137,7 @@ def test_a_link_lost_while_idle(robot_of: MakeRobot, arm_on: MakeArm, kind: Kind
     ],
 )
 def test_a_link_lost_while_connecting_or_uploading(
-    robot_of: MakeRobot,
-    arm_on: MakeArm,
+    ur_pair: MakeUr,
     monkeypatch: pytest.MonkeyPatch,
     kind: Kind,
     stage: Stage,
@@ -149,8 +145,7 @@ def test_a_link_lost_while_connecting_or_uploading(
 ) -> None:
     """The client would wait for ever in most of these; the child's bound is cut short here."""
     monkeypatch.setattr(ur_control, "START_S", 2.0)
-    robot = robot_of(faults=[Fault(kind, stage)])
-    arm = arm_on(robot, connected=False)
+    arm, robot = ur_pair(connected=False, faults=[Fault(kind, stage)])
     fails(arm.connect, min(within_s, 2.0) + 2 * driver.PORT_S, "its power|did not give control")
     assert arm.state() is ArmState.DISCONNECTED
     robot.restore_link()
@@ -159,32 +154,21 @@ def test_a_link_lost_while_connecting_or_uploading(
         fails(arm.connect, driver.ANSWER_S, "a program is already running on it")
         robot.inject(Kind.PROGRAM_END)
     reconnect(arm)
-    assert arm.state() is ArmState.READY
 
 
-def test_a_controller_that_takes_commands_and_never_answers(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_controller_that_takes_commands_and_never_answers(ur_pair: MakeUr) -> None:
     """Its stream flows and its program says that it runs, but nothing happens any more."""
-    robot = robot_of()
-    arm = arm_on(robot)
+    arm, robot = ur_pair()
     robot.hang_program(True)
     took = fails(lambda: arm.start(SLIDE), driver.COMMAND_S + 2 * driver.PORT_S, "lost its control")
     assert took >= driver.COMMAND_S
     assert not robot.program.program_running  # it was asked to stop by the dashboard
     robot.hang_program(False)
     reconnect(arm)
-    assert arm.state() is ArmState.READY
 
 
-def test_a_dead_control_client_leaves_two_ways_to_stop(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
-    arm.start(SLIDE)
-    until(lambda: robot.pose().xyz_mm[1] > 0.3, 5.0)
-    assert arm._control is not None
+def test_a_dead_control_client_leaves_two_ways_to_stop(ur_pair: MakeUr) -> None:
+    arm, robot = sliding(*ur_pair())
     arm._control.kill()
     began = time.monotonic()
     arm.stop()
@@ -192,10 +176,9 @@ def test_a_dead_control_client_leaves_two_ways_to_stop(
     assert not robot.moving()
 
 
-def test_remote_control_off_is_a_state_of_its_own(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
+def test_remote_control_off_is_a_state_of_its_own(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(connected=False)
     robot.set_remote(False)
-    arm = arm_on(robot, connected=False)
     fails(arm.connect, driver.ANSWER_S, "remote control off; switch the pendant")
     robot.set_remote(True)
     arm.connect()
@@ -206,17 +189,14 @@ def test_remote_control_off_is_a_state_of_its_own(robot_of: MakeRobot, arm_on: M
     arm.start(SLIDE)
 
 
-def test_a_stopped_arm_is_not_taken_control_of(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
+def test_a_stopped_arm_is_not_taken_control_of(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(connected=False)
     robot.inject(Kind.PROTECTIVE_STOP)
-    arm = arm_on(robot, connected=False)
     fails(arm.connect, driver.ANSWER_S, "unlock the stop at the pendant")
     assert robot.program.uploads == 0
 
 
-def test_a_second_client_is_refused_and_the_first_slides_on(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_second_client_is_refused_and_the_first_slides_on(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     first = arm_on(robot)
     first.start([Segment(TARGET, 10.0)])
@@ -238,9 +218,7 @@ def test_registers_that_are_taken_are_told(robot_of: MakeRobot) -> None:
         fails(arm.connect, ur_control.START_S, "another client has control of it.*EtherNet/IP")
 
 
-def test_a_bad_call_is_an_error_and_the_client_lives_on(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_bad_call_is_an_error_and_the_client_lives_on(robot_of: Any, arm_on: MakeArm) -> None:
     robot = robot_of()
     arm_on(robot, connected=False)
     control = ControlProcess(robot.host, 125)
@@ -255,9 +233,7 @@ def test_a_bad_call_is_an_error_and_the_client_lives_on(
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_somebody_elses_program_is_not_taken_over(
-    robot_of: MakeRobot, arm_on: MakeArm, paused: bool
-) -> None:
+def test_somebody_elses_program_is_not_taken_over(robot_of: Any, arm_on: Any, paused: bool) -> None:
     """A paused one waits to be resumed; the control client would end it without a word."""
     robot = robot_of()
     ur_ports.send_script(robot.host, "def palletise():\n  sleep(1000)\nend\n", 1.0)
@@ -272,23 +248,17 @@ def test_somebody_elses_program_is_not_taken_over(
     assert robot.program.uploads == 0
 
 
-def test_an_arm_without_power_is_said_to_have_none(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
+def test_an_arm_without_power_is_said_to_have_none(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(connected=False)
     robot.inject(Kind.POWER_OFF)
-    arm = arm_on(robot, connected=False)
     fails(arm.connect, driver.ANSWER_S, r"not switched on \(power off\)")
     robot.restore()
     arm.connect()
     assert arm.state() is ArmState.READY
 
 
-def test_a_slider_that_is_moved_while_sliding_ends_the_path(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
-    arm.start(SLIDE)
-    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+def test_a_slider_that_is_moved_while_sliding_ends_the_path(ur_pair: MakeUr) -> None:
+    arm, robot = sliding(*ur_pair())
     robot.set_slider(0.5)
     until(lambda: arm._run.done, 2.0)
     fails(arm.progress, 0.0, "slider is at 50%, so the move was too slow")
@@ -297,12 +267,9 @@ def test_a_slider_that_is_moved_while_sliding_ends_the_path(
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_controller_clock_that_falls_back_ends_the_stream(
-    robot_of: MakeRobot, arm_on: MakeArm, moving: bool
-) -> None:
+def test_a_controller_clock_that_falls_back_ends_the_stream(ur_pair: MakeUr, moving: bool) -> None:
     """A segment that began before and ended after would have a negative length."""
-    robot = robot_of()
-    arm = arm_on(robot)
+    arm, robot = ur_pair()
     if moving:
         arm.start(SLIDE)
         until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
@@ -315,23 +282,18 @@ def test_a_controller_clock_that_falls_back_ends_the_stream(
     fails(lambda: arm.start(SLIDE), driver.PORT_S, "clock jumped back by 4.9")
     until(lambda: not robot.program.program_running, 1 / ur_control.WATCHDOG_HZ + BUSY_S)
     reconnect(arm)
-    assert arm.state() is ArmState.READY
 
 
-def test_a_stream_of_nonsense_is_a_lost_one(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
-    arm.start(SLIDE)
-    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+def test_a_stream_of_nonsense_is_a_lost_one(ur_pair: MakeUr) -> None:
+    arm, robot = sliding(*ur_pair())
     robot.program.joints_deg[2] = float("nan")
     until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
     fails(arm.stop, 2 * driver.PORT_S + 2 * driver.STILL_S, "cannot be confirmed at rest")
     assert not robot.moving()
 
 
-def test_packets_that_are_missing_are_counted(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+def test_packets_that_are_missing_are_counted(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair()
     assert arm.describe()["poses_missing"] == 0
     robot.inject(Kind.PACKETS_LOST)
     until(lambda: arm.describe()["poses_missing"] > 0, 2.0)
@@ -340,11 +302,10 @@ def test_packets_that_are_missing_are_counted(robot_of: MakeRobot, arm_on: MakeA
 
 
 def test_a_link_lost_as_the_move_begins_is_no_arm_at_rest(
-    robot_of: MakeRobot, arm_on: MakeArm, monkeypatch: pytest.MonkeyPatch
+    ur_pair: MakeUr, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last packet still shows the arm at rest, and yet it moves."""
-    robot = robot_of()
-    arm = arm_on(robot)
+    arm, robot = ur_pair()
     monkeypatch.setattr(arm, "_take", lambda packet: None)  # none of those after the start comes
     arm.start(SLIDE)
     robot.inject(Kind.LINK_CUT)
@@ -358,21 +319,17 @@ def test_a_link_lost_as_the_move_begins_is_no_arm_at_rest(
     assert not robot.moving()
 
 
-def test_a_stop_after_close_still_stops(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
-    arm.start(SLIDE)
-    until(lambda: robot.pose().xyz_mm[1] > 0.3, 5.0)
+def test_a_stop_after_close_still_stops(ur_pair: MakeUr) -> None:
+    arm, robot = sliding(*ur_pair())
     arm.close()
     arm.stop()
     assert not robot.moving()
 
 
 def test_a_follower_that_fails_says_why_and_stops_the_arm(
-    robot_of: MakeRobot, arm_on: MakeArm, monkeypatch: pytest.MonkeyPatch
+    ur_pair: MakeUr, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot = robot_of()
-    arm = arm_on(robot)
+    arm, robot = ur_pair()
 
     def broken(pose: Pose) -> bool:
         raise TypeError("of whatever kind")
@@ -423,7 +380,6 @@ def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> 
     program = subprocess.Popen(
         [sys.executable, "-c", DRIVES, settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
-    assert program.stdout is not None
     assert program.stdin is not None
     with program.stdout, program.stdin:
         client = int(program.stdout.readline())

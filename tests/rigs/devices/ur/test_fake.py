@@ -40,13 +40,8 @@ def robot() -> Iterator[FakeUr]:
 
 def client(robot: FakeUr, script: str) -> dict[str, object]:
     """Run a script that uses the real client, and return its output."""
-    done = subprocess.run(
-        [sys.executable, "-c", HEAD + script + "\nprint('SAID', json.dumps(said))", robot.host],
-        capture_output=True,
-        text=True,
-        timeout=CLIENT_S,
-        check=False,
-    )
+    line = (sys.executable, "-c", HEAD + script + "\nprint('SAID', json.dumps(said))", robot.host)
+    done = subprocess.run(line, capture_output=True, text=True, timeout=CLIENT_S, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("SAID ")]
     assert lines, done.stderr
     found: dict[str, object] = json.loads(lines[-1][5:])
@@ -54,9 +49,7 @@ def client(robot: FakeUr, script: str) -> dict[str, object]:
 
 
 def test_the_real_client_moves_stops_and_sets_things(robot: FakeUr) -> None:
-    found = client(
-        robot,
-        """
+    script = """
 receive = RTDEReceiveInterface(host)
 control = RTDEControlInterface(host)
 said["mode"] = receive.getRobotMode()
@@ -71,8 +64,8 @@ control.stopL(5.0, True)
 said["set"] = [control.setTcp([0, 0, 0.1, 0, 0, 0]), control.setPayload(0.5, [0, 0, 0])]
 said["near"] = control.isPoseWithinSafetyLimits(home)
 said["far"] = control.isPoseWithinSafetyLimits([2.0, 0, 0, 0, 0, 0])
-""",
-    )
+"""
+    found = client(robot, script)
     assert found["mode"] == 7
     assert (found["moved"], found["taken"], found["set"]) == (True, True, [True, True])
     assert found["z"] == pytest.approx(0.295, abs=1e-4)
@@ -82,30 +75,26 @@ said["far"] = control.isPoseWithinSafetyLimits([2.0, 0, 0, 0, 0, 0])
 
 
 def test_registers_belong_to_the_first_client(robot: FakeUr) -> None:
-    found = client(
-        robot,
-        """
+    script = """
 first = RTDEControlInterface(host)
 try:
     RTDEControlInterface(host)
 except RuntimeError as error:
     said["refused"] = str(error)
 said["first"] = first.moveL(home, 0.1, 1.0)
-""",
-    )
+"""
+    found = client(robot, script)
     assert "already in use" in str(found["refused"])
     assert found["first"] is True
 
 
 def test_a_protective_stop_lasts_until_somebody_unlocks_it(robot: FakeUr) -> None:
-    found = client(
-        robot,
-        """
+    script = """
 control = RTDEControlInterface(host)
 said["triggered"] = control.triggerProtectiveStop()
 said["refused"] = control.moveL(home, 0.1, 1.0)
-""",
-    )
+"""
+    found = client(robot, script)
     assert found["refused"] is False
     assert ur_ports.dashboard(robot.host, "safetystatus", 1.0) == "Safetystatus: PROTECTIVE_STOP"
     said = ur_ports.dashboard(robot.host, "unlock protective stop", 1.0)
@@ -114,17 +103,15 @@ said["refused"] = control.moveL(home, 0.1, 1.0)
 
 
 def test_the_watchdog_ends_the_program_of_a_client_that_went_silent(robot: FakeUr) -> None:
-    client(
-        robot,
-        """
+    script = """
 import os
 control = RTDEControlInterface(host)
 control.setWatchdog(5.0)
 control.moveL([0.4, 0.05, 0.3, 3.141592653589793, 0.0, 0.0], 0.001, 0.5, True)
 print("SAID {}", flush=True)
 os._exit(0)  # as if it had been killed
-""",
-    )
+"""
+    client(robot, script)
     until(lambda: not robot.moving(), 2.0)
     assert not robot.program.program_running
     assert robot.pose().xyz_mm[1] < 5.0
@@ -171,17 +158,15 @@ def _answers(host: str) -> bool:
 
 @pytest.mark.parametrize("call", ["speedL([0.01, 0, 0, 0, 0, 0], 0.1, 0.1)", "forceModeStop()"])
 def test_a_command_that_is_not_simulated_fails(robot: FakeUr, call: str) -> None:
-    found = client(
-        robot,
-        f"""
+    script = f"""
 control = RTDEControlInterface(host)
 control.{call}
 late = time.monotonic() + 5.0
 while control.isProgramRunning() and time.monotonic() < late:
     pass
 said["runs"] = control.isProgramRunning()
-""",
-    )
+"""
+    found = client(robot, script)
     assert found["runs"] is False
     assert robot.program.refused
     assert robot.pose() == HOME

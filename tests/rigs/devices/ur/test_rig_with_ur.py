@@ -89,9 +89,7 @@ def test_a_rig_presses_with_a_real_driver(robot_of: MakeRobot, arm_on: MakeArm) 
     assert arm.state() is ArmState.DISCONNECTED
 
 
-def test_a_rig_hears_of_a_protective_stop_and_retracts_nothing(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_a_rig_hears_of_a_protective_stop_and_retracts_nothing(robot_of: Any, arm_on: Any) -> None:
     robot = robot_of(faults=[Fault(Kind.PROTECTIVE_STOP, Stage.MOVING, after_mm=3.0)])
     arm = arm_on(robot, connected=False, limits=LIMITS)
     rig = rig_on(arm)

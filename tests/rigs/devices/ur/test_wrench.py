@@ -15,7 +15,7 @@ from sliplab.rigs.devices.ur.rtde import OUTPUTS
 from sliplab.rigs.devices.ur.settings import UrWrenchSettings
 from sliplab.rigs.devices.ur.wrench import UrWrench
 from sliplab.storage.streams import WrenchChunk
-from tests.rigs.devices.conftest import MakeArm, MakeRobot
+from tests.rigs.devices.conftest import MakeUr
 from tests.rigs.waiting import until
 
 pytestmark = pytest.mark.realtime
@@ -33,13 +33,11 @@ def gather(sensor: UrWrench, rows: int) -> WrenchChunk:
     return WrenchChunk(*(np.concatenate([getattr(p, field) for p in parts]) for field in fields))
 
 
-def test_it_reads_the_wrench_with_the_arms_times(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
+def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(connected=False)
     robot.program.tool_load = lambda t_s: (math.sin(t_s), -2.0, 5.0, 0.1, 0.2, 0.3)
-    arm = arm_on(robot, connected=False)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
     assert isinstance(sensor, ForceSensor)
-    assert isinstance(sensor, UrWrench)
     assert sensor.grade == "arm clock"
     arm.connect()
     sensor.connect()
@@ -55,28 +53,22 @@ def test_it_reads_the_wrench_with_the_arms_times(robot_of: MakeRobot, arm_on: Ma
     assert np.allclose(found.torque_nm, [0.1, 0.2, 0.3])
 
 
-def test_the_plates_reaction_is_the_force_on_the_plate(
-    robot_of: MakeRobot, arm_on: MakeArm
-) -> None:
+def test_the_plates_reaction_is_the_force_on_the_plate(ur_pair: MakeUr) -> None:
     frame = PlateFrame.taught([(400, 0, 300), (400, 60, 300), (400, 0, 360)])
     pushed = frame.axes.T @ np.array([0.5, 0.0, 3.0])  # on the plate, in the base
-    robot = robot_of()
+    arm, robot = ur_pair(connected=False)
     robot.program.tool_load = lambda t_s: (*(-pushed).tolist(), 0.0, 0.0, 0.0)
-    arm = arm_on(robot, connected=False)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
-    assert isinstance(sensor, UrWrench)
     arm.connect()
     sensor.start()
     on_plate = np.array(frame.force_matrix(sensor.mounting)) @ gather(sensor, 3).force_n[-1]
     assert on_plate == pytest.approx([0.5, 0.0, 3.0], abs=1e-9)
 
 
-def test_zero_takes_the_load_away(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
+def test_zero_takes_the_load_away(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(connected=False)
     robot.program.tool_load = lambda t_s: (0.0, 0.0, 5.0, 0.0, 0.0, 0.0)
-    arm = arm_on(robot, connected=False)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(bias="session"), arm)
-    assert isinstance(sensor, UrWrench)
     arm.connect()
     sensor.connect()
     sensor.start()
@@ -84,11 +76,9 @@ def test_zero_takes_the_load_away(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     assert robot.program.refused == []
 
 
-def test_a_lost_link_is_a_fault(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm = arm_on(robot, connected=False)
+def test_a_lost_link_is_a_fault(ur_pair: MakeUr) -> None:
+    arm, robot = ur_pair(connected=False)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
-    assert isinstance(sensor, UrWrench)
     with pytest.raises(RigError, match="the arm that measures it is not connected"):
         sensor.connect()
     arm.connect()
@@ -106,9 +96,8 @@ def test_a_lost_link_is_a_fault(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     until(lost, 5.0)
 
 
-def test_an_arm_without_it_is_asked_for_nothing_more(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    robot = robot_of()
-    arm_on(robot)
+def test_an_arm_without_it_is_asked_for_nothing_more(ur_pair: MakeUr) -> None:
+    _, robot = ur_pair()
     assert list(OUTPUTS) in [client._names for client in robot._clients]
 
 
