@@ -116,7 +116,7 @@ def check_export(request: ExportRequest) -> Export:
 
 
 def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
-    """Return a store, a campaign of it, and the trials that are asked for."""
+    """Return a store, a campaign of it, and the requested trials."""
     from sliplab.storage.remote.mirror import open_store
 
     folder, part = Path(request.place), request.part

@@ -30,7 +30,7 @@ def _template(text: str) -> str:
 
 def _field_name(text: str) -> str:
     if text in BUILT_IN:
-        raise ValueError(f"is a field that every trial has; choose a name beside {BUILT_IN}")
+        raise ValueError(f"is a field that every trial has; choose a name other than {BUILT_IN}")
     return text
 
 
@@ -332,7 +332,9 @@ class AdaptedStreams(StrictModel):
             )
         if self.events is None and self.frames is not None and self.frames.clock is not None:
             raise KeyedError(
-                ".frames.clock", None, "is for streams beside events; without them its own counts"
+                ".frames.clock",
+                None,
+                "is for streams other than events; without them its own counts",
             )
         if both := set(self.wrenches) & set(self.scalars):
             raise KeyedError(f".scalars.{min(both)}", None, "is the name of a wrench, too")
@@ -406,7 +408,7 @@ class Labels(StrictModel):
         ways = {"class": self.whole, "onsets": self.onsets, "spans": self.spans}
         given = [key for key, value in ways.items() if value is not None]
         if len(given) > 1:
-            raise KeyedError(f".{given[1]}", None, f"stands beside '{given[0]}'; give one of them")
+            raise KeyedError(f".{given[1]}", None, f"is given with '{given[0]}'; give one of them")
         return self
 
 

@@ -119,7 +119,7 @@ def _named(raw: object) -> Level:
     if isinstance(raw, str):
         if not _NAME.fullmatch(raw):
             raise ValueError(
-                "must be a number (the unit stands once, in 'unit') or a text of letters, digits, "
+                "must be a number (its unit is given in 'unit') or a text of letters, digits, "
                 "'_', '-' and '.', 32 characters at most"
             )
         return raw

@@ -271,7 +271,7 @@ class Plan:
         for name, factor in self.protocol.collection.context.items():
             if factor.changeover == "none" and len(self.enabled[name]) > 1:
                 found.append(
-                    f"collection.context.{name}: has {len(self.enabled[name])} levels and nobody "
+                    f"collection.context.{name}: has {len(self.enabled[name])} levels and no one "
                     "is asked to change it; write changeover: person if somebody does"
                 )
         return [*found, *block_warnings(self.protocol.collection, self.enabled)]

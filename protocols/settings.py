@@ -66,7 +66,7 @@ class Windows(StrictModel):
                     raise KeyedError(
                         f"analysis.windows.{name}",
                         value,
-                        f"must be left out beside taxels = {self.taxels}: taxels have no crop",
+                        f"must be left out with taxels = {self.taxels}: taxels have no crop",
                     )
         elif self.crop_px % self.pool_px:
             raise KeyedError("analysis.windows.pool_px", self.pool_px, "must divide crop_px")

@@ -107,7 +107,7 @@ class _Stream(StrictModel):
             text = f"must be at most timing.drift_ppm = {timing.drift_ppm:g}"
             raise KeyedError(".mock.clock_ppm", ppm, text)
         if timing.grade == "arm clock":
-            text = "must be host time: the simulated sensor has a clock of its own"
+            text = "must be host time: the simulated sensor has its own clock"
             raise KeyedError(".timing.grade", timing.grade, text)
         by_delay = timing.grade in {"host arrival", "host time"}
         if by_delay and not isinstance(mock, FurtherEventCamera):

@@ -477,7 +477,7 @@ def fit_numbered(
         raise ClockRefused(
             "ambiguous",
             f"the device counted {int(numbers[-1]) + 1} exposures and the box stamped "
-            f"{int(counted[-1]) + 1}, so it cannot be told which is which: start the box before "
+            f"{int(counted[-1]) + 1}, so it is unknown which is which: start the box before "
             "the camera, stop it later, and check the exposure line",
         )
     _, i, j = np.intersect1d(numbers, counted, return_indices=True)

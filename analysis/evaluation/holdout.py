@@ -41,7 +41,7 @@ class Holdout:
         if not self.item.info.get("simulated"):
             raise StoreError(
                 f"{store.folder}: its slides are real; a campaign of another skin has to be "
-                "collected with another protocol seed, into a store of its own"
+                "collected with another protocol seed, into a separate store"
             )
         evaluated = evaluation_of(store)
         self.detection = evaluated.detection[self.item.name]

@@ -120,7 +120,7 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
             path,
             "",
             None,
-            f"{reason}; a state_dict needs a description beside it, such as "
+            f"{reason}; a state_dict needs a description next to it, such as "
             f"{path.with_suffix('.yaml').name} (docs/models.md)",
         ) from None
     fitted.check_slip(path, "an evaluation of slip")

@@ -301,7 +301,7 @@ def _near_lost(onsets: Onsets, lost_ns: I64) -> Doubts:
 
     def of(onset: int | None) -> str | None:
         near = onset is not None and bool((np.abs(lost_ns - onset) < NEAR_LOST_NS).any())
-        return "events were lost beside it" if near else None
+        return "events were lost close to it" if near else None
 
     return Doubts(of(onsets.incipient_ns), of(onsets.gross_ns))
 

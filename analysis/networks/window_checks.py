@@ -188,7 +188,7 @@ def check_chance(found: Chance) -> None:
         raise CheckFailed(
             f"a network that learned from shuffled labels is right in {found.shuffled} of the test "
             f"windows; their mean lies in {found.low:.3f}..{found.high:.3f}, chance is a third: "
-            "something beside the training labels tells it the answer"
+            "something other than the training labels gives it the answer"
         )
     if not found.true > max(found.high, chance):
         raise CheckFailed(

@@ -322,8 +322,8 @@ def _uncertain(device: str, gate: Gate) -> str:
 
 def _unvouched(gate: Gate) -> str:
     if gate.value is None or isinstance(gate.value, str) or gate.value < 0:
-        return "nobody knows which part of the recording the pulses vouch for"
+        return "it is unknown which part of the recording the pulses cover"
     return (
-        f"the recording goes on for {gate.value:.2f} s beyond the pulses on which a clock "
+        f"the recording continues for {gate.value:.2f} s beyond the pulses on which a clock "
         f"stands, {gate.limit:g} s are allowed"
     )

@@ -156,7 +156,7 @@ def collect(
         console.say(
             "nothing to do: all available trials are collected"
             if not result["left_out"]
-            else "nothing to do: the campaign ended by its claims; --no-stopping goes on"
+            else "nothing to do: the campaign ended by its claims; --no-stopping continues"
         )
     if not as_json:
         from sliplab.flows.planning.campaign_trials import print_excluded

@@ -51,9 +51,7 @@ def import_(
     ] = False,
     salvage: Annotated[
         bool,
-        typer.Option(
-            "--salvage", help="Import what stands whole before the damage in a damaged file."
-        ),
+        typer.Option("--salvage", help="Import the undamaged beginning of a damaged file."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -67,7 +65,7 @@ def import_(
     if adapter is not None:
         for option, given in (("KIND", path is not None), ("--simulated", simulated)):
             if given:
-                raise InputError(option, "", None, "cannot be given beside --adapter")
+                raise InputError(option, "", None, "cannot be given with --adapter")
         from sliplab.flows.cli.adapted import import_by_adapter
 
         import_by_adapter(

@@ -110,7 +110,7 @@ def write(request: ExportRequest, as_json: bool) -> None:
 
 
 def former(name: str, request: ExportRequest, as_json: bool) -> None:
-    """Run an export that was a command of its own, with a hint at its new form."""
+    """Run an export by its former command, with a hint at its new form."""
     console.say(
         f"`{name}` is an old name; write: sliplab export {request.place} --as {request.form} "
         f"--output {request.output}"

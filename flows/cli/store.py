@@ -322,7 +322,7 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
             "",
             url,
             "must not be given with a URL: `sliplab push --check` from a "
-            "whole store sends anew what is damaged there",
+            "whole store replaces what is damaged there",
         )
     with console.bar(f"verify {url} (trials)", 0) as bar:
 

@@ -314,5 +314,5 @@ def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:
     else:
         outcome = requests.ask(store, kind, who=who, why=wanted.why, limit_s=wanted.wait_s)
     if outcome.answer is None:
-        return f"{kind}: not yet; request {outcome.request.number} stands"
+        return f"{kind}: not yet; request {outcome.request.number} is still open"
     return f"{kind}: done, request {outcome.request.number}: {outcome.answer['did']}"

@@ -78,7 +78,7 @@ async def watch(page: PageServer | None, store: Path, server: str, stopped: asyn
             lost = True
             console.say(
                 f"warning: Prefect's server {'ended' if ended else 'does not answer'}; what runs "
-                "goes on, and its end is reported when the server answers again"
+                "continues, and its end is reported when the server answers again"
             )
         if page is not None and (ended or misses % MISSES == 0):
             await page.renew()

@@ -188,7 +188,7 @@ def program() -> str:
     sibling = Path(sys.executable).with_name("rerun")
     found = str(sibling) if sibling.exists() else shutil.which("rerun")
     if found is None:
-        raise StoreError("Rerun's program `rerun` cannot be found beside its library")
+        raise StoreError("Rerun's program `rerun` cannot be found next to its library")
     return found
 
 

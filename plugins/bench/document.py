@@ -81,7 +81,7 @@ class BenchDetector(Part):
 
 
 class KeptDetector(Document):
-    """What is kept of a detector, so that a run resumes."""
+    """Stored result of a detector, so that a run resumes."""
 
     row: BenchDetector
     hours: dict[str, Number]

@@ -112,7 +112,7 @@ class ClaimWatch:
                 raise CampaignStopped(
                     f"campaign {self._campaign.name}: the figures of {trial} that its claims need "
                     f"could not be made: {type(error).__name__}: {error}. `sliplab skip` leaves it "
-                    "out, --no-stopping goes on without looking at the claims"
+                    "out, --no-stopping continues without looking at the claims"
                 ) from error
             self._kept.write(trial, work.key, made)
         return TrialFigures.model_validate(self._kept.read(trial))

@@ -151,7 +151,7 @@ def _limits(bench: ArmBench) -> None:
             raise Seen(f"start took a path {what}")
 
 
-@RULES.add("one path at a time", "start raises a RigError while the arm moves; the path goes on")
+@RULES.add("one path at a time", "start raises a RigError while the arm moves; the path continues")
 def _one_path(bench: ArmBench) -> None:
     bench.connect()
     back, path = bench.to(-SHORT_MM), bench.to(4 * SHORT_MM)

@@ -40,7 +40,7 @@ def _declaration(bench: GripperBench) -> None:
 @RULES.add(
     "move of the fingers",
     "a move returns at once, is reported as moving from then on, and ends at most a step wider "
-    "than it was asked for, never tighter",
+    "than requested, never tighter",
 )
 def _move(bench: GripperBench) -> None:
     bench.connect()
@@ -51,19 +51,19 @@ def _move(bench: GripperBench) -> None:
     if time.monotonic() - began > CLOSED_MM / slow / 2:
         raise Seen("move returned when the fingers were half way or further")
     if not bench.state().moving:
-        raise Seen("state said that nothing moved right after the move")
+        raise Seen("state reported no motion right after the move")
     if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
-        raise Seen(f"state still said moving after {bench.bounds.call_s:g} s")
+        raise Seen(f"state still reported motion after {bench.bounds.call_s:g} s")
     reached, true_mm = bench.state().opening_mm, bench.fingers.target_mm
     if not wanted - EPS_MM <= true_mm <= wanted + bench.range.step_mm + EPS_MM:
-        raise Seen(f"asked for {wanted:g} mm, the fingers went to {true_mm:g} mm")
+        raise Seen(f"requested {wanted:g} mm, the fingers went to {true_mm:g} mm")
     if abs(reached - true_mm) > bench.range.step_mm + EPS_MM:
-        raise Seen(f"state said {reached:g} mm, and the fingers stood at {true_mm:g} mm")
+        raise Seen(f"state reported {reached:g} mm, and the fingers were at {true_mm:g} mm")
 
 
 @RULES.add(
     "values of a move",
-    "fingers go to the opening that was asked for, in mm, at the speed in mm/s, within 10 %, and "
+    "fingers go to the requested opening, in mm, at the speed in mm/s, within 10 %, and "
     "with the force in N or up to 10 % less; they open as well as they close",
 )
 def _values(bench: GripperBench) -> None:
@@ -76,20 +76,20 @@ def _values(bench: GripperBench) -> None:
         from_mm, began_ns = bench.true_mm(time.monotonic_ns())[0], time.monotonic_ns()
         bench.move(wanted, speed, force)
         if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
-            raise Seen(f"state still said moving after {bench.bounds.call_s:g} s")
+            raise Seen(f"state still reported motion after {bench.bounds.call_s:g} s")
         if bench.moving():
-            raise Seen("state said that nothing moved while the fingers moved")
+            raise Seen("state reported no motion while the fingers moved")
         (to_mm,) = bench.true_mm(time.monotonic_ns())
         if not wanted - EPS_MM <= to_mm <= wanted + bench.range.step_mm + EPS_MM:
-            raise Seen(f"asked for {wanted:g} mm from {from_mm:g} mm, the fingers are at {to_mm:g}")
+            raise Seen(f"requested {wanted:g} mm from {from_mm:g} mm, the fingers are at {to_mm:g}")
         reached = _speed_mm_s(bench, began_ns, from_mm, to_mm)
         if not abs(reached - speed) <= SHARE * speed:
-            raise Seen(f"asked for {speed:g} mm/s, the fingers went at {reached:.1f} mm/s")
+            raise Seen(f"requested {speed:g} mm/s, the fingers went at {reached:.1f} mm/s")
         sent_n = bench.fingers.last_force_n
         if not (1.0 - SHARE) * force <= sent_n <= force + EPS_MM:
-            raise Seen(f"asked for {force:g} N, the gripper was sent {sent_n:g} N")
+            raise Seen(f"requested {force:g} N, the gripper was sent {sent_n:g} N")
         if bench.state().stalled:
-            raise Seen("state said stalled, though no object was there")
+            raise Seen("state reported a stall, though no object was there")
 
 
 @RULES.add(
@@ -163,7 +163,7 @@ def _stop(bench: GripperBench) -> None:
         bench.call("stop", bench.device.stop)
     (stopped_mm,) = bench.true_mm(time.monotonic_ns())
     if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
-        raise Seen("state said moving after the stop")
+        raise Seen("state reported motion after the stop")
     if not bench.until(lambda: not bench.fingers.moving(time.monotonic_ns()), bench.bounds.call_s):
         raise Seen("the fingers moved on")
     if abs(bench.fingers.target_mm - (bench.opening_mm - CLOSED_MM)) < 1.0:
@@ -184,10 +184,10 @@ def _stall(bench: GripperBench) -> None:
         return state.stalled and not state.moving
 
     if not bench.until(stalled, bench.bounds.news_s):
-        raise Seen(f"state said {bench.state()}")
+        raise Seen(f"state reported {bench.state()}")
     bench.move(bench.opening_mm)
     if bench.state().stalled:
-        raise Seen("state said stalled in the next move")
+        raise Seen("state reported a stall in the next move")
 
 
 @RULES.add("fault of the gripper", "a fault that the gripper reports is a RigError of `state`")
@@ -265,8 +265,8 @@ def _speed_mm_s(bench: GripperBench, began_ns: int, from_mm: float, to_mm: float
 
 def _check_state(bench: GripperBench, state: GripperState, begun_ns: int, ended_ns: int) -> None:
     if not state.moving or state.stalled:
-        raise Seen(f"while the fingers moved it said {state}")
+        raise Seen(f"while the fingers moved it reported {state}")
     true = bench.true_mm(begun_ns - round(LAG_S * 1e9), begun_ns, ended_ns)
     step = bench.range.step_mm + EPS_MM
     if not min(true) - step <= state.opening_mm <= max(true) + step:
-        raise Seen(f"state said {state.opening_mm:g} mm, the fingers were at {true[-1]:.2f} mm")
+        raise Seen(f"state reported {state.opening_mm:g} mm, the fingers were at {true[-1]:.2f} mm")

@@ -197,7 +197,7 @@ def _calls(bench: ArmBench) -> None:
 
 
 @RULES.add(
-    "clock", "now_ns is the clock of the poses, in ns: it goes on as the controller's clock does"
+    "clock", "now_ns is the clock of the poses, in ns: it runs as the controller's clock does"
 )
 def _clock(bench: ArmBench) -> None:
     bench.connect()

@@ -48,7 +48,7 @@ packages = ["$name"]
 README = Template("""\
 # $name
 
-A driver for SlipLab. It runs as it stands, on a fake of a device that does not exist.
+A driver for SlipLab. It runs unchanged, on a fake of a device that does not exist.
 
 ```sh
 pip install -e .[dev]

@@ -405,7 +405,7 @@ def _sync_level(bench: FrameBench) -> None:
 
 @FRAME_RULES.add(
     "clock of a camera",
-    "read_clock raises a RigError, or returns a clock in ns that goes on as the host's does, read "
+    "read_clock raises a RigError, or returns a clock in ns that runs as the host's does, read "
     "between the host's times before and after",
 )
 def _camera_clock(bench: FrameBench) -> None:

@@ -53,7 +53,7 @@ def _late(bench: SyncBench) -> None:
 
 
 @RULES.add(
-    "trains", "the box sends the train of every code that it was asked for: its rate, seed and bits"
+    "trains", "the box sends the train of every code that was requested: its rate, seed and bits"
 )
 def _trains(bench: SyncBench) -> None:
     bench.connect()
@@ -69,7 +69,7 @@ def _trains(bench: SyncBench) -> None:
         asked = bench.RATE_HZ, bench.seed, bench.CODE
         if (train.rate_hz, train.seed, train.code) != asked:
             raise Seen(
-                f"asked for {asked[0]:g} Hz, seed {asked[1]} and code {asked[2]}, the box sent "
+                f"requested {asked[0]:g} Hz, seed {asked[1]} and code {asked[2]}, the box sent "
                 f"{train.rate_hz:g} Hz, seed {train.seed} and code {train.code}"
             )
         bench.gather()

@@ -30,7 +30,7 @@ _TRIAL_COLUMNS = {
     "recorded_s": "length of the recording, s",
     "events": "number of events",
     "frames": "number of frames of the first frame camera",
-    "frame_source": "what was kept of the frames: video, tracks (places of markers) or none",
+    "frame_source": "what was stored of the frames: video, tracks (places of markers) or none",
     "sync_uncertainty_us": "uncertainty of event times on the trial's time line, us",
     "passed": "true if all gates of the protocol were passed",
 }

@@ -50,7 +50,7 @@ def read_samples(path: Path, count: int) -> list[dict[str, float]]:
         with np.load(path) as arrays:
             keys, values = arrays["keys"].tolist(), arrays["values"]
     except FileNotFoundError:
-        text = "no such file: `sliplab calibrate scene` writes it beside the twin; fit it again"
+        text = "no such file: `sliplab calibrate scene` writes it next to the twin; fit it again"
         raise InputError(path, "", None, text) from None
     except (OSError, ValueError, KeyError) as error:
         raise InputError(path, "", None, f"cannot be read: {error}") from None

@@ -67,10 +67,10 @@ class StreamBuffer:
                 raise ValueError(f"its clock fell back after {last}")
             waiting = self._parts.setdefault(stream, [])
             if len(waiting) == MOST_PARTS:
-                raise ValueError(f"nobody read it: {MOST_PARTS} packets are waiting")
+                raise ValueError(f"it was not read: {MOST_PARTS} packets are waiting")
             held = self._bytes.get(stream, 0) + nbytes
             if self._most_mb is not None and held > 1e6 * self._most_mb:
-                raise ValueError(f"nobody read it: {self._most_mb:g} MB are full")
+                raise ValueError(f"it was not read: {self._most_mb:g} MB are full")
             waiting.append(part)
             self._bytes[stream] = held
             if stream in self._last and int(times[-1]) == last:

@@ -62,7 +62,7 @@ class History:
         """
         times = self._t_ns[: self._length]
         if not self._length or first_ns < times[0]:
-            raise IndexError(f"the time {first_ns} ns lies before the kept history")
+            raise IndexError(f"the time {first_ns} ns lies before the stored history")
         first = int(np.searchsorted(times, first_ns, side="right")) - 1
         last = int(np.searchsorted(times, last_ns, side="left")) + 1
         return times[first:last], self._rows[first : min(last, self._length)]

@@ -87,7 +87,7 @@ def plate_course(world: World, since_true_ns: int) -> PlateCourse:
     end_ns = world.advance()
     forces = world.physics.more_wrenches.get(COURSE)
     if forces is None:
-        raise RigError("plate", "its course is not kept: call watch_plate first")
+        raise RigError("plate", "its course is not stored: call watch_plate first")
     t_ns = np.arange(max(since_true_ns, forces.begin_ns), end_ns + 1, _COURSE_NS, dtype=np.int64)
     return {
         "t_ms": ((t_ns - since_true_ns) / 1e6).tolist(),
@@ -112,7 +112,7 @@ def _counted_from(
     """Return the onsets after a true time, with displacements from then; see `truth_of`."""
     history = world.physics.track
     if reference_true_ns < history.begin_ns:
-        raise RigError("simulation", "the trial is too long: its start is no longer kept")
+        raise RigError("simulation", "the trial is too long: its start is no longer stored")
     start = history.at(np.array([reference_true_ns], np.int64))[0]
     t_ns, rows = history.between(reference_true_ns, history.end_ns)
     t_ns = t_ns.copy()

@@ -98,7 +98,7 @@ class DataFolder:
             if any(part.startswith(".") or part == "__MACOSX" for part in parts):
                 self.skipped.append(Skipped(item.filename, "is hidden, or leads out of the zip"))
             elif "" in parts or "\\" in item.filename or item.filename in self._items:
-                self.skipped.append(Skipped(item.filename, "has no name of its own in the zip"))
+                self.skipped.append(Skipped(item.filename, "has no separate name in the zip"))
             else:
                 self._items[item.filename] = item
         return list(self._items)

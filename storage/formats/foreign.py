@@ -284,7 +284,7 @@ def before_damage(
         worse = fault if isinstance(fault, Damage) else error
         raise Damage(str(worse), error.file) from None
     if not len(times):
-        raise Damage(f"{error}; no event stands before that", error.file)
+        raise Damage(f"{error}; there is no event before that", error.file)
     packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
     offer = f"--salvage imports {len(times):,} events up to {times[-1]} us{packets}"
     raise Damage(f"{error}; {offer}", error.file)

@@ -502,7 +502,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
     content.check_majority(EVENTS_KIND, done)
     content.check_order(EVENTS_KIND, content.rows[EVENTS_KIND], done)
     if first_us is None and trial.lost is not None:
-        raise Damage(f"{trial.lost.reason}; no event stands before that")
+        raise Damage(f"{trial.lost.reason}; there is no event before that")
     _fill_triggers(writer, trial, content)
     times = None
     if trial.frames is not None:

@@ -155,7 +155,7 @@ def test_what_cannot_be_judged_is_refused(store: Store, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"lab\.pt: 5\.weight = \[16, 600\]: .* layers\[5\]"):
         judge_model(store, campaigns, path)
     path.unlink()
-    with pytest.raises(InputError, match=r"needs a description beside it, such as lab\.yaml"):
+    with pytest.raises(InputError, match=r"needs a description next to it, such as lab\.yaml"):
         judge_model(store, campaigns, tmp_path / "lab.pt")
     layers = [*OURS[:3], {**OURS[3], "lowest": -1.0}, *OURS[4:]]
     with pytest.raises(InputError, match=r"--engine = fast: .*no lowest potential; use sinabs"):

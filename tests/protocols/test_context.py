@@ -114,7 +114,7 @@ def test_a_serial_number_is_text(tmp_path: Path) -> None:
 def test_levels_that_nobody_changes_are_noted(tmp_path: Path) -> None:
     data = with_context(skin={"values": ["a", "b"]}, operator={"values": ["anna"]})
     (note,) = plan_of(data, tmp_path).warnings()
-    assert note.startswith("collection.context.skin: has 2 levels and nobody is asked")
+    assert note.startswith("collection.context.skin: has 2 levels and no one is asked")
 
 
 WRONG = """

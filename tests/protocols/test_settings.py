@@ -55,8 +55,8 @@ def test_taxels_are_channels_of_one_cell() -> None:
 @pytest.mark.parametrize(
     ("data", "key", "right"),
     [
-        ({"taxels": 39, "crop_px": 200}, "crop_px", "must be left out beside taxels = 39"),
-        ({"taxels": 39, "pool_px": 1}, "pool_px", "must be left out beside taxels = 39"),
+        ({"taxels": 39, "crop_px": 200}, "crop_px", "must be left out with taxels = 39"),
+        ({"taxels": 39, "pool_px": 1}, "pool_px", "must be left out with taxels = 39"),
         ({"taxels": 39, "length_ms": 5, "step_ms": 2}, "step_ms", "must divide length_ms"),
         ({"crop_px": 30}, "pool_px", "must divide crop_px"),
     ],

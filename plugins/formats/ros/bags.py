@@ -198,7 +198,7 @@ def _sqlite(path: Path, *, whole: bool = True) -> Source:
                 yield found[0]
 
     warnings = [
-        f"lies beside {path.name}{ending}, in which its recorder left messages that are not in it "
+        f"lies next to {path.name}{ending}, in which its recorder left messages that are not in it "
         f"yet: open it once with `sqlite3 {path.name} vacuum`, and import it again"
         for ending in ("-wal", "-journal")
         if _size(path.with_name(path.name + ending))

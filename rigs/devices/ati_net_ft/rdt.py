@@ -37,7 +37,7 @@ BITS = {
     0: "internal temperature out of range",
     1: "supply voltage out of range",
     2: "broken gauge",
-    5: "an error that has no bit of its own",
+    5: "an error without a bit",
     7: "calibration not accessible",
     27: "gauge out of range",
     28: "simulated error",
