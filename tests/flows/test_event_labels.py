@@ -92,7 +92,6 @@ def errors_ms(recording: Recording, found: EventOnsets) -> dict[str, float]:
     for kind in KINDS:
         if getattr(found.paper_doubts, kind) is None and found.paper_doubts.incipient is None:
             at = getattr(found.paper, f"{kind}_ns")
-            assert at is not None
             known[kind] = (at - truth[f"{kind}_ns"]) / 1e6
     return known
 
@@ -106,7 +105,6 @@ def test_onsets_are_within_their_interval_and_close_to_those_from_frames(
         truth = recording.simulation_truth() or {}
         for kind, error in errors_ms(recording, found).items():
             interval = found.intervals[KINDS.index(kind)]
-            assert interval is not None
             assert interval.low_ns <= truth[f"{kind}_ns"] <= interval.high_ns
             assert abs(error) < 100.0
             seen = getattr(frames.paper, f"{kind}_ns")
@@ -197,7 +195,6 @@ def test_without_events_everything_is_in_doubt(slides: list[Recording]) -> None:
         return EventChunk.empty()
 
     found = by_events(WithOtherEvents(slides[0], none))
-    assert found.paper_doubts.incipient is not None
     assert "not found" in found.paper_doubts.incipient
     assert found.paper.incipient_ns is None
 
@@ -208,9 +205,7 @@ def test_the_document_says_that_it_is_from_events(tmp_path: Path) -> None:
     found = label_recording(recording, Labelling())
     document = TrialLabel.model_validate(found.document().to_json())
     assert document.source == "events"
-    assert document.intervals is not None
     low, high = document.intervals.incipient_ns or (0, 0)
-    assert document.incipient_ns is not None
     assert low <= document.incipient_ns <= high
     assert document.change_point is not None
     arrays = found.as_arrays()

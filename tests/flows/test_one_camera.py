@@ -94,7 +94,6 @@ def test_a_study_with_one_camera_runs_to_its_report(
     assert {"train", "evaluate", "holdout"} <= states.keys()
 
     summary = read_one_camera(store)
-    assert summary is not None
     assert (summary.simulated, summary.one_camera) == (True, camera)
     assert summary.quality.committed == 5
     assert summary.labels is not None
@@ -111,26 +110,20 @@ def test_a_study_with_one_camera_runs_to_its_report(
         assert (errors.incipient.n, errors.gross.n) == (3, 3)
         assert max(errors.incipient.max_abs or 0.0, errors.gross.max_abs or 0.0) < 100
         assert "the plate moves by itself" in page
-        assert summary.kinematic is not None
         assert summary.kinematic.accuracy.n > 50
         assert summary.kinematic.latency_ms.incipient.n >= 0
-        assert summary.gravity is not None
         assert summary.gravity.accounted.without_onsets == 2
         assert summary.kinematic.work is not None
         assert "Window accuracy" in page or "window accuracy" in page
         assert (store.folder / "report" / "figures" / "confusion.svg").exists()
         for rate in (summary.event_rates or {}).values():
-            assert rate.hold is not None
-            assert rate.motion is not None
             assert rate.motion > rate.hold > 0
         assert "Onsets of slip are read from the events of the" in page
         assert (store.folder / "report" / "figures" / "event-rates.svg").exists()
     else:
         assert left_out == []
         assert summary.classifier is not None
-        assert summary.kinematic is not None
         assert summary.kinematic.samples.test > 50
-        assert summary.kinematic.accuracy.strict is not None
         assert summary.kinematic.accuracy.strict > 0.8
         assert summary.kinematic.work is None
         assert len(summary.trials) == 3
@@ -145,7 +138,6 @@ def test_a_study_with_one_camera_runs_to_its_report(
         assert "no clock lies between them" in page
         assert (store.folder / "report" / "figures" / "confusion.svg").exists()
         assert summary.labels.error_ms.incipient.n == 5
-        assert summary.labels.error_ms.incipient.max_abs is not None
         assert summary.labels.error_ms.incipient.max_abs < 25
         assert "Top: frames a second." in page
     assert "spiking network and its detectors" in page or camera == "events"
@@ -231,7 +223,6 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     label(store, campaigns)
     report(store, campaigns)
     summary = read_one_camera(store)
-    assert summary is not None
     found = summary.references["tiny"]
     assert len(found.trials) >= 3
     assert all(trial.hold_events_per_s is None for trial in found.trials)

@@ -71,7 +71,6 @@ def test_labels_of_tracks_are_checked_with_video(
     assert check_required(run_request)
     assert check_labels(run_request, 2)["done"] == 2
     found = read_check(Store.open(run_request.store))
-    assert found is not None
     assert (found.trials, found.simulated) == (2, True)
     incipient = found.model_dump(mode="json")["rules_ms"]["paper"]["incipient"]
     assert incipient["n"] == 2

@@ -88,7 +88,6 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
     found = evaluation_of(two)
     assert {rule.margin for rule in found.detection.values()} == {margin}
     kept = kept_counts(two, found.key)
-    assert kept is not None
     expected = metrics.accuracy(kept["counts"], kept["y"], margin).margin
     assert found.windows.accuracy.margin == expected
     (seed,) = found.windows.seeds.each

@@ -98,7 +98,6 @@ def test_equal_onsets_give_equal_rows() -> None:
     assert figures.median == 150.0
     assert ours.median_incipient_ms is not None
     low, high = ours.median_incipient_ms
-    assert low is not None
     assert -20 <= low < 10
     assert high is None, "no upper bound"
 
@@ -192,7 +191,6 @@ def test_doubted_and_absent_onsets_are_lacking(
 ) -> None:
     truth(monkeypatch, None)
     points = label().change_point
-    assert points is not None
     doubted = points.model_copy(update={"doubts": OnsetDoubts(gross="it creeps")})
     both = label().model_copy(update={"change_point": doubted})
     assert set(references_of(recording, both)) == {"paper"}

@@ -83,7 +83,6 @@ HARD = [{}, {"noise_hz": 0.1}, {"hot": 500}, {"contrast": 1.0}]
 @pytest.mark.parametrize("case", HARD, ids=str)
 def test_discs_are_found_wherever_they_are_and_however_large(case: dict[str, float]) -> None:
     discs = found(without_hot_pixels(events(**case), SIZE))
-    assert discs is not None
     assert discs.found.all()
     assert np.abs(discs.xy - rests()).max() < 1.0
     # 1.2 mm, and 0.4 mm/N under 0.3 N, at 14 px/mm
@@ -113,7 +112,6 @@ def test_a_disc_that_is_not_there_is_not_found() -> None:
     seen = events()
     torn = np.hypot(*(np.stack([seen.x, seen.y], 1) - rests()[4]).T) > 40
     discs = found(kept(seen, torn))
-    assert discs is not None
     assert discs.found.tolist() == [True] * 4 + [False] + [True] * 2
     tracks = track(kept(seen, torn))
     assert np.isnan(tracks.xy[:, 4]).all()

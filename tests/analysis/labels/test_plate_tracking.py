@@ -155,7 +155,6 @@ def test_a_video_in_one_pass() -> None:
         markers.append(at)
         frames.append(noisy(stick(frame.astype(np.uint8), plates[-1], 0.05), rng))
     tracks = track_video(iter(frames), layout, with_plate=True)
-    assert tracks.plate is not None
     assert tracks.plate.ok.all()
     assert tracks.markers.ok.all()
     assert np.abs(tracks.plate.xy - plates).max() < 0.2

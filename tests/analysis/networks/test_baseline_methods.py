@@ -89,7 +89,6 @@ def test_training_leaves_torchs_random_state_alone() -> None:
 def test_boosting_learns_and_repeats() -> None:
     votes, said = boosted(TRAIN, VALIDATION, TEST.windows, 15)
     strict = accuracy(votes, TEST.y).strict
-    assert strict is not None
     assert strict > 0.9
     assert 0 < said["rounds"] <= 15
     np.testing.assert_array_equal(votes, boosted(TRAIN, VALIDATION, TEST.windows, 15)[0])

@@ -131,7 +131,6 @@ def test_real_data_name_no_true_onset() -> None:
 def test_an_older_evaluation_has_rows_of_networks_and_none_of_detectors() -> None:
     own = figures(1020, references={**LABEL, **TRUE})
     section = onset_section(summary(own, {"smoothing": {}}))
-    assert section is not None
     assert section.allowed is None
     assert {row[0] for row in section.table.rows} == {
         "this store's network and rule",

@@ -20,7 +20,6 @@ from tests.flows.older import older_store
 def deviations(store: Store) -> dict[str, tuple[str, str]]:
     """Registered and found by name, but for versions: the store is an older one's."""
     section = registration_section(store, collected(store))
-    assert section is not None
     (campaign,) = section.campaigns
     assert campaign.after == "after 4 trials"
     return {
@@ -102,7 +101,6 @@ def test_changed_or_missing_registration_proves_nothing(store: Store, deleted: b
         path.chmod(0o644)
         path.write_text(path.read_text().replace("2026", "2025"))
     section = registration_section(store, collected(store))
-    assert section is not None
     (shown,) = section.campaigns
     assert shown.after == "but its registrations are damaged, missing or changed"
     assert shown.deviations.rows[0][0] == "damaged registration"

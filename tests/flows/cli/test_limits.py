@@ -238,7 +238,6 @@ def test_a_library_that_crashes_for_want_of_memory_ends_in_one_line() -> None:
 
 def test_a_program_with_limited_memory_can_be_stopped() -> None:
     with limited("wait") as process:
-        assert process.stdout is not None
         child = int(process.stdout.readline())
         assert child != process.pid
         process.send_signal(signal.SIGINT)
@@ -247,7 +246,6 @@ def test_a_program_with_limited_memory_can_be_stopped() -> None:
 
 def test_a_child_ends_with_its_killed_parent() -> None:
     with limited("wait") as process:
-        assert process.stdout is not None
         watched = os.pidfd_open(int(process.stdout.readline()))
         try:
             process.kill()
@@ -271,7 +269,6 @@ def test_threads_that_cannot_be_started_are_said_before_a_library_asks_for_them(
     monkeypatch.setattr(threading.Thread, "start", refuse_the_second)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     said = too_few_threads()
-    assert said is not None
     assert said.startswith("no more processes or threads can be started")
     (thread,) = begun
     assert not thread.is_alive()

@@ -69,7 +69,6 @@ def test_the_record_counts_and_times_the_forces(taken: Recording) -> None:
     assert gate.passed
     assert gate.grade == "host time"
     assert 0.001 < float(gate.value or 0) < 0.004
-    assert record.timing is not None
     assert record.timing.rig.force is not None
     truth = np.array((record.simulation_truth or {})["clocks"]["force"])
     error = np.abs(np.asarray(clock.map.to_reference(truth[:, 0])) - truth[:, 1])
@@ -280,8 +279,6 @@ def test_the_label_has_onsets_by_force(labelled: Store) -> None:
         truth = recording.simulation_truth() or {}
         assert label.rule == "paper"
         force = label.by_rule("force")
-        assert force.incipient_ns is not None
-        assert force.gross_ns is not None
         assert abs(force.incipient_ns - truth["incipient_ns"]) < 30_000_000
         assert force.incipient_ns < force.gross_ns < truth["gross_ns"]
 
@@ -291,7 +288,6 @@ def test_the_force_may_rule(labelled: Store) -> None:
     recording = item.trials[0][1]
     settings = item.settings.labelling.model_copy(update={"rule": "force"})
     label, _ = label_results(recording, settings)
-    assert label.force is not None
     assert (label.incipient_ns, label.gross_ns) == (
         label.force.incipient_ns,
         label.force.gross_ns,
@@ -302,7 +298,6 @@ def test_the_force_may_rule(labelled: Store) -> None:
 def test_the_report_shows_the_forces(labelled: Store) -> None:
     items = [Collected(campaign) for campaign in labelled.campaigns()]
     section = force_section(labelled, items, None, simulated=True)
-    assert section is not None
     assert section.trials == 2
     assert 0.5 < section.friction < 1.0
     page = render_page("report.html", [section], simulated=True, campaigns=["tiny"], headline=[])

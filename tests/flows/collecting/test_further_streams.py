@@ -522,7 +522,6 @@ def test_readings_do_not_depend_on_how_often_they_are_read() -> None:
         file, _ = load_rig_file(ROOT / "rigs" / "mock_two_cameras.yaml")
         rig = build_rig(file)
         rig.connect()
-        assert rig.simulation is not None
         rig.simulation.begin_trial(3)
         side, _, warm = (further.device for further in rig.further)
         for device in (side, warm):
@@ -572,7 +571,6 @@ def test_the_estimate_counts_further_cameras(tmp_path: Path) -> None:
     one, all_of_them = (trial_bytes(work.rig_file, work.plan, trial) for work in (alone, more))
     known, seconds = alone.rig_file.estimates, alone.plan.seconds(trial, recorded_only=True)
     first_px = alone.rig_file.frame_px(alone.plan)
-    assert first_px is not None
     events = one - known.fixed_bytes - known.bytes_per_tracked_frame * seconds * 100
     back = known.bytes_per_frame * 160 * 160 / (first_px[0] * first_px[1]) * seconds * 100
     free = known.bytes_per_tracked_frame * seconds * 60

@@ -80,7 +80,6 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
         if len(waits) == 3:
             control.ask(store, "resume", who="ben")
 
-    assert work.supervisor is not None
     work.supervisor.wait, work.supervisor.on_pause = wait, pauses.append
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
@@ -100,7 +99,6 @@ def test_a_pause_that_nobody_ends_ends_the_stretch(
 ) -> None:
     monkeypatch.setattr(supervising, "PAUSE_LIMIT_S", 2.0)
     work, campaign, store = supervised(tmp_path / "a")
-    assert work.supervisor is not None
     work.supervisor.wait = lambda seconds: None
     with pytest.raises(CampaignStopped, match=r"pause by anna.*nobody resumed it: `sliplab resume"):
         after_first(work, lambda: control.ask(store, "pause", who="anna"))
@@ -124,7 +122,6 @@ def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path
     press, touch_off = work.rig.press, work.rig.touch_off
     work.rig.press = lambda *given: (done.append("warm up"), press(*given))[1]  # type: ignore[method-assign]
     work.rig.touch_off = lambda *given: (done.append("zero"), touch_off(*given))[1]  # type: ignore[method-assign]
-    assert work.supervisor is not None
     work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
     assert done == ["warm up", "zero"] * 2
@@ -140,7 +137,6 @@ def test_a_stop_that_came_by_file_is_heeded_at_the_next_boundary(tmp_path: Path)
     assert campaign.quarantined() == []
     (request,) = control.requests(store)
     answer = control.answered(store, request)
-    assert answer is not None
     assert answer["did"]["stopped"]
 
 
@@ -170,7 +166,6 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert outcomes == [(first, "committed"), (second, "skipped"), (third, "committed")]
     (request, _) = control.requests(store)
     answer = control.answered(store, request)
-    assert answer is not None
     assert answer["did"]["trials"] == {
         second: "set aside",
         first: "is committed: left as it is",
@@ -180,7 +175,6 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert skipped(campaign)[second]["request"] == 1
     (kept,) = campaign.quarantined()
     assert (kept["cause"], kept["asked"]["who"]) == ("again: dust", "ben")
-    assert work.supervisor is not None
     again = work.supervisor.more()
     assert [trial.id for trial in again] == [first]
     work.take(again)

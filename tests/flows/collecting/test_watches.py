@@ -70,7 +70,6 @@ def test_what_a_trial_needs_comes_from_the_plan_then_from_the_trials(tmp_path: P
     spooling = run_request.rig.model_copy(update={"frame_camera": camera})
     raw = DiskWatch(RunRequest(**{**vars(run_request), "rig": spooling}), campaign)
     frame = run_request.rig.frame_px(run_request.plan)
-    assert frame is not None
     seconds = run_request.plan.seconds(second, recorded_only=True)
     assert raw.needs(second) - disk.needs(second) == frame[0] * frame[1] * 100 * seconds
 

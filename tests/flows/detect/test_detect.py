@@ -256,5 +256,4 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
     assert result["reflex"]["stopped_mm"][2] < 3.4
     assert stands_clear(rigs[0])
     plate = rigs[0].plate
-    assert plate is not None
     assert plate.mass_kg() == 0.165

@@ -58,7 +58,6 @@ class Drawn(NullSink):
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Raise what is due."""
-        assert self.began_ns is not None
         passed_s = (self._devices.clock.now_ns() - self.began_ns) / 1e9
         if passed_s < self._due_s:
             return
@@ -115,7 +114,6 @@ def reflex(
 ) -> Reflex:
     """Draw a reflex within the rig's ranges; what is over the depth is for the rig to cut off."""
     gripper = FILE.gripper_range
-    assert gripper is not None
     press = kind == "press"
     return Reflex(
         kind,
@@ -178,7 +176,6 @@ def check_limits(
     sensor = world.path.commanded(t_ns, SENSOR)[:, :3]  # a fault moves the tool besides
     speed = np.linalg.norm(np.diff(sensor, axis=0), axis=1) * 1e3
     assert speed.max(initial=0.0) <= ARM_MM_S * (1 + 1e-6), number
-    assert world.fingers is not None
     opening = world.fingers.opening_mm(t_ns)
     closing = -np.diff(opening) * 1e3
     assert closing.max(initial=0.0) <= finger_mm_s * (1 + 1e-6), number

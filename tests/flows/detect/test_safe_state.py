@@ -319,7 +319,6 @@ def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(
     rig = rigs[0]
     rig.connect()
     rig.begin_trial(order.plan.program(order.trial).home, 1)  # type: ignore[union-attr, arg-type]
-    assert rig.gripper is not None
     assert rig.gripper.state().opening_mm == pytest.approx(40.0)
 
 
@@ -364,7 +363,6 @@ def test_a_loopback_rig_needs_the_fingers_that_its_gripper_moves(tmp_path: Path)
         with pytest.raises(InputError, match=r"mock.gripper.opening_mm.* must be 40: the fake of"):
             load_rig_file(write(tmp_path / "rig.yaml", change))
     allowed = load_rig_file(shipped)[0].gripper_range
-    assert allowed is not None
     assert allowed.force_n == (20.0, 235.0)
 
 

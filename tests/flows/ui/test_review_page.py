@@ -51,7 +51,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         env={**os.environ, "PYTHONWARNINGS": "default"},
     )
     try:
-        assert process.stdout is not None
         reported = json.loads(process.stdout.readline())
         with launched() as browser:
             yield Served(made, reported, process, browser)
@@ -238,13 +237,11 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
     assert tab.page.title() == "SlipLab review"
 
     made = review.last(served.made.store, NAME, one)
-    assert made is not None
     assert (made.verdict, made.who, made.label) == ("adjust", "anna", served.made.keys[one])
     assert (made.old.incipient_ns, made.old.gross_ns) == (known["incipient_ns"], known["gross_ns"])
     assert made.new.incipient_ns == round(float(reported.removesuffix(" s")) * 1e9)
     assert made.new.gross_ns == known["gross_ns"]  # not moved: to the nanosecond
     made = review.last(served.made.store, NAME, two)
-    assert made is not None
     assert (made.verdict, made.new) == ("reject", review.Onsets())
 
 
