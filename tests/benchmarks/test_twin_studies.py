@@ -152,10 +152,9 @@ def test_times_count_from_the_onset_that_is_asked_for() -> None:
         Decided(found, {"paper": paper}, 30 * ms),
     ]
     rows: Any = [(SimpleNamespace(trial=name, experiment="kinematic"), None) for name in "ab"]
+    trials = [("tiny", "a"), ("tiny", "b")]
     samples: Any = SimpleNamespace(
-        y=np.array([0, 1, 2, 2]),
-        trial=np.array([0, 0, 0, 1]),
-        trials=[("tiny", "a"), ("tiny", "b")],
+        y=np.array([0, 1, 2, 2]), trial=np.array([0, 0, 0, 1]), trials=trials
     )
     judged = [Judged(np.array([[9, 0, 0], [0, 9, 0], [0, 9, 0], [0, 0, 9]]), samples, rows)]
     by_paper, by_point = (Outcome.of(judged, [decided], onset) for onset in ONSETS)
