@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,18 @@ def deviations(store: Store) -> dict[str, tuple[str, str]]:
     }
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with an evaluation, registered as it is."""
-    found = Store.open(older_store(tmp_path / "store"))
+    found = Store.open(older_store(tmp_path_factory.mktemp("registered") / "store"))
     register(found.campaign("small").protocol_file, found.folder, campaign="small")
-    return found
+    return found.folder
+
+
+@pytest.fixture
+def store(registered: Path, tmp_path: Path) -> Store:
+    """A copy of it, to be changed at will."""
+    return Store.open(shutil.copytree(registered, tmp_path / "store"))
 
 
 def evaluated(store: Store, **changes: Any) -> None:
