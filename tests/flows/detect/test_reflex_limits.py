@@ -14,15 +14,9 @@ import pytest
 
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program
 from sliplab.rigs.build import simulated_rig
+from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.reacting import (
-    Reaction,
-    Reflex,
-    SafeState,
-    SenseLost,
-    SlipDetected,
-    run_watched,
-)
+from sliplab.rigs.core.reacting import Reaction, Reflex, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.path import SENSOR
 from sliplab.rigs.mock.settings import MockSettings
@@ -149,7 +143,7 @@ def one_trial(number: int) -> str:
         rig.connect()
         made = run_watched(rig, program(rng, deepest_mm), watcher, number, 100, wanted, safe)
         ended = "no reflex" if made is None else wanted.kind
-    except SafeState as lost:
+    except reacting.SafeState as lost:
         made, ended = lost.reaction, "safe state"
         assert made.command_ms + made.actuator_ms <= SAFE_MS, number
         assert not devices.world.path.moving(devices.world.now_ns), number
