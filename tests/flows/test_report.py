@@ -17,23 +17,14 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.report import campaign
+from sliplab.analysis.report import campaign, outcomes
 from sliplab.analysis.report.against import Change, compare
-from sliplab.analysis.report.outcomes import (
-    MOST_FAILURES,
-    OUTCOMES,
-    Conditions,
-    account,
-    failure_section,
-    trial_intervals,
-    trial_outcome,
-)
+from sliplab.analysis.report.outcomes import MOST_FAILURES, account, failure_section, trial_outcome
 from sliplab.analysis.report.page import render_section, write_figures
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
-from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import read_summary, report
-from sliplab.flows.study import Outcome
 from sliplab.plugins.studies.generalise.section import RESULT as GENERALISATION
 from sliplab.plugins.studies.generalise.section import skin_section
 from sliplab.plugins.studies.results import RESULTS
@@ -47,7 +38,7 @@ from sliplab.storage.trials.store import Store, StoreError
 from tests.analysis.report.test_plugin_sections import install
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
-from tests.flows.conftest import write
+from tests.flows.conftest import Ran, write
 from tests.protocols.test_plugin import installed
 
 __all__ = ["installed"]  # a fixture
@@ -61,7 +52,7 @@ UNITLESS = re.compile(
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, with its report."""
     folder = tmp_path_factory.mktemp("report") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -91,7 +82,7 @@ def test_every_trial_is_counted_once(store: Store) -> None:
         found = getattr(summary, experiment)
         accounts, lead = found.accounted, found.lead_ms
         assert accounts.planned == planned
-        assert sum(accounts.of(name) for name in OUTCOMES) == planned
+        assert sum(accounts.of(name) for name in outcomes.OUTCOMES) == planned
         for name in ("detected_first", "missed", "false_early", "late"):
             assert accounts.of(name) == getattr(lead, name)
     assert [row.campaign for row in summary.trials].count("tiny") == 2
@@ -152,7 +143,9 @@ def test_what_became_of_a_trial() -> None:
         assert found.late_gross_ms == values.get("late_gross_ms")
     none = trial_outcome(changed(judged(), latency=None, gross_ns=None))
     assert (none.outcome, none.gross, none.lead_ms) == ("without_onsets", "without_onsets", None)
-    found = trial_intervals([trial_outcome(judged()), trial_outcome(judged(lead_ms=1000.0)), none])
+    found = outcomes.trial_intervals(
+        [trial_outcome(judged()), trial_outcome(judged(lead_ms=1000.0)), none]
+    )
     assert found.lead_ms.n == 2
     half = 12.7062047 * 50  # Student's t of two trials
     assert found.lead_ms.mean == pytest.approx([950 - half, 950 + half])
@@ -161,13 +154,13 @@ def test_what_became_of_a_trial() -> None:
 def test_trials_stand_under_their_conditions(store: Store) -> None:
     campaigns = collected(store)
     rows = evaluation_of(store).trials
-    found = Conditions(campaigns, rows, "gravity")
+    found = outcomes.Conditions(campaigns, rows, "gravity")
     cells = found.cells(list(found.factors))
     assert sum(map(len, cells.values())) == 2
     for name, trials in cells.items():
         levels = dict(zip(found.factors, name.split(", "), strict=True))
         assert trials == found.at(**levels)
-    both = Conditions(campaigns, rows, "kinematic")
+    both = outcomes.Conditions(campaigns, rows, "kinematic")
     assert both.varied() == ["direction"]
     assert both.breaks(["direction"]) == []
     assert len(both.at(direction="240 deg")) == 1
