@@ -86,13 +86,8 @@ def test_what_adds_up_evidence_beats_the_average_here(compared: DetectorComparis
 
 
 def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparison) -> None:
-    other = compare(
-        Parts(parts().train, parts().validation, [trial(900, 10)]),
-        WINDOWS,
-        SETTINGS,
-        10,
-        WINDOWS.steps,
-    )
+    one = Parts(parts().train, parts().validation, [trial(900, 10)])
+    other = compare(one, WINDOWS, SETTINGS, 10, WINDOWS.steps)
     for mine, theirs in zip(compared.detectors, other.detectors, strict=True):
         for a, b in zip(mine.rates, theirs.rates, strict=True):
             assert (a.levels, a.choice, a.validation) == (b.levels, b.choice, b.validation)
@@ -107,13 +102,8 @@ def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> 
         return {"paper": OnsetReference(slip), "true": OnsetReference(earlier)}
 
     of = parts()
-    found = compare(
-        Parts(seen(of.train), seen(of.validation), seen(of.test)),
-        WINDOWS,
-        SETTINGS,
-        10,
-        WINDOWS.steps,
-    )
+    judged = Parts(seen(of.train), seen(of.validation), seen(of.test))
+    found = compare(judged, WINDOWS, SETTINGS, 10, WINDOWS.steps)
     for mine, theirs in zip(found.detectors, compared.detectors, strict=True):
         assert mine.curve == theirs.curve
         for a, b in zip(mine.rates, theirs.rates, strict=True):

@@ -184,16 +184,14 @@ def test_trials_without_a_value_are_left_out_of_a_difference() -> None:
 
 
 def test_too_few_trials_have_no_interval() -> None:
-    assert interval([]) is None
-    assert interval([3.0]) is None
-    assert interval([3.0, 3.0, 3.0]) is None
-    assert interval(LATE[:5], "median") is None
-    assert interval(LATE[:71], "p95") is None
-    assert difference(LATE[:11], LATE, "median") is None
-    assert difference(LATE[:71], LATE, "p95") is None
+    for values in ([], [3.0], [3.0, 3.0, 3.0]):
+        assert interval(values) is None
+    for few, statistic in ((5, "median"), (71, "p95")):
+        assert interval(LATE[:few], statistic) is None
+    for few, statistic in ((11, "median"), (71, "p95")):
+        assert difference(LATE[:few], LATE, statistic) is None
     assert share_difference(([1.0], [2.0]), ([1.0], [2.0])) is None
-    assert share_interval([1.0], [2.0]) is None
-    assert share_interval([], []) is None
+    assert share_interval([1.0], [2.0]) is share_interval([], []) is None
     for bad in ([1.0, np.inf], [1.0, np.nan]):
         with pytest.raises(ValueError, match="finite"):
             interval(bad)
