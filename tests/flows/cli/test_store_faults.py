@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,19 @@ def sliplab(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) 
     return run
 
 
-@pytest.fixture
-def whole(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a protocol, a rig file, and a store with two trials."""
-    work, _ = session(tmp_path, slides(2), frame_camera=TRACKS)
+    folder = tmp_path_factory.mktemp("taken") / "lab"
+    work, _ = session(folder, slides(2), frame_camera=TRACKS)
     take_all(work)
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def whole(taken: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be damaged at will."""
+    return shutil.copytree(taken, tmp_path / "lab")
 
 
 def trials(folder: Path) -> list[Path]:
