@@ -21,6 +21,7 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
+from tests.flows.programs import ended
 
 PLAN = (ROOT / "protocols" / "pilot.yaml",)
 
@@ -45,13 +46,7 @@ main()
     ],
 )
 def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", STARTED, which, str(limit), "plan", *PLAN, "--json"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    done = ended([sys.executable, "-c", STARTED, which, limit, "plan", *PLAN, "--json"])
     error = json.loads(done.stdout)["error"]
     assert (done.returncode, error["exit_code"]) == (1, 1)
     assert error["message"].startswith(message)
@@ -181,13 +176,7 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
     how: str, said: str, tmp_path: Path
 ) -> None:
     """HDF5 crashed it at its exit: collect ended with a segmentation fault, not with exit 1."""
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, tmp_path / "data.h5", how],
-        cwd=ROOT,
-        text=True,
-        capture_output=True,
-        timeout=120,
-    )
+    done = ended([sys.executable, "-c", FULL, tmp_path / "data.h5", how])
     assert (done.returncode, done.stdout) == (0, f"{said}\n"), done.stderr
 
 
