@@ -38,6 +38,7 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
+from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import session, short, take_all
 from tests.flows.conftest import tiny, tiny_gravity
 from tests.flows.ui.test_view import Read
@@ -54,8 +55,8 @@ def felt(
 
 
 def gated(**gates: Any) -> dict[str, Any]:
-    """Three slides with these gates in place of the protocol's."""
-    data = short()
+    """A slide with these gates in place of the protocol's."""
+    data = slides(1)
     data["collection"]["gates"] = gates
     return data
 
@@ -67,15 +68,15 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     work, campaign = felt(folder, gated(normal_force="5 N", hold_force="1 N"))
     take_all(work)
     assert verify(Store.open(folder / "a" / "store")) == []
-    assert len(campaign.committed()) == 3
-    return sorted(campaign.recordings(), key=lambda r: str(r.record.condition["direction"]))[0]
+    (recording,) = campaign.recordings()
+    return recording
 
 
 @pytest.fixture(scope="module")
 def unfelt(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
     """The same of a rig without a sensor."""
     folder = tmp_path_factory.mktemp("unfelt")
-    work, campaign = session(folder / "a", short(), frame_camera=TRACKS)
+    work, campaign = session(folder / "a", slides(1), frame_camera=TRACKS)
     take_all(work)
     return campaign
 
@@ -208,11 +209,11 @@ def test_a_rig_without_a_sensor_says_nothing_of_forces(unfelt: Campaign) -> None
 
 def test_a_clock_that_jumps_back_is_refused_and_the_trial_taken_again(tmp_path: Path) -> None:
     jump = {"kind": "clock_jump", "device": "force_sensor", "seconds": -2.0}
-    work, campaign = felt(tmp_path, short(), faults=[{**jump, "at_s": 0.5, "trial": 2}])
+    work, campaign = felt(tmp_path, slides(1), faults=[{**jump, "at_s": 0.5, "trial": 1}])
     take_all(work)
     (failed,) = campaign.quarantined()
     assert "sync_uncertainty_force_s: its clock fell back" in failed["cause"]
-    assert len(campaign.committed()) == 3
+    assert len(campaign.committed()) == 1
 
 
 def test_figures_are_of_the_right_stretches() -> None:
@@ -383,7 +384,7 @@ def test_a_press_that_meets_its_deepest_place_first_is_an_error(tmp_path: Path) 
 
 
 def test_a_limit_of_force_stops_the_arm_on_its_way(tmp_path: Path) -> None:
-    work, campaign = felt(tmp_path, short())
+    work, campaign = felt(tmp_path, slides(1))
     work.rig.force_limit_n = 1.0
     clear: list[float] = []
     stop = work.rig.arm.stop

@@ -37,6 +37,7 @@ from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import answer, here
 from tests.conftest import ROOT
+from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import checksums, short, take_all
 from tests.flows.collecting.test_session import session as plain_session
 from tests.flows.conftest import write
@@ -262,11 +263,11 @@ def test_the_public_interface_puts_them_on_one_time_line(taken: Recording) -> No
 
 
 def test_the_first_cameras_are_as_on_a_rig_without_them(tmp_path: Path) -> None:
-    alone, campaign = plain_session(tmp_path / "a", short(), frame_camera=TRACKS)
+    alone, campaign = plain_session(tmp_path / "a", slides(1), frame_camera=TRACKS)
     take_all(alone)
     # an identical rig, its two further cameras on the wire
-    both, more = session(tmp_path / "b", {"side": SIDE, "back": BACK})
-    both.take(pending_trials(both.plan, more)[:1])
+    both, more = session(tmp_path / "b", {"side": SIDE, "back": BACK}, data=slides(1))
+    take_all(both)
     (with_them,) = more.recordings()
     without = campaign.recording(with_them.trial_id)
     one, other = ((r.folder / "data.h5").read_bytes() for r in (with_them, without))
@@ -277,18 +278,18 @@ def test_the_first_cameras_are_as_on_a_rig_without_them(tmp_path: Path) -> None:
 
 
 def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
-    streams = {"side": SIDE, "warm": WARM}
-    whole, campaign = session(tmp_path / "a", streams)
+    streams, data = {"side": SIDE, "warm": WARM}, slides(2)
+    whole, campaign = session(tmp_path / "a", streams, data=data)
     take_all(whole)
     expected = checksums(campaign)
-    part, pieces = session(tmp_path / "b", streams)
+    part, pieces = session(tmp_path / "b", streams, data=data)
     part.take(pending_trials(part.plan, pieces)[:1])
     # killed in the second trial: its files stay behind, and go to quarantine
     trial = pending_trials(part.plan, pieces)[0]
     writer = pieces.begin(trial.id, None, 100)
     writer.add_stream("side", whole.rig.further[0].device.read())
     assert (writer.folder / "stream-side.h5").exists()
-    again, pieces = session(tmp_path / "b", streams)
+    again, pieces = session(tmp_path / "b", streams, data=data)
     take_all(again)
     assert checksums(pieces) == expected
     assert any(path.name.startswith(trial.id) for path in (pieces.folder / "quarantine").iterdir())
@@ -312,8 +313,8 @@ def record_calls(rig: Rig, called: list[str]) -> None:
 @pytest.mark.parametrize("name", ["side", "back", "wrist", "warm"])
 def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path) -> None:
     streams = {"side": SIDE, "back": BACK, "wrist": WRIST, "warm": WARM}
-    fault = {"kind": "stream_gone", "stream": name, "trial": 2, "at_s": 0.3}
-    work, campaign = session(tmp_path / "a", streams, faults=[fault])
+    fault = {"kind": "stream_gone", "stream": name, "trial": 1, "at_s": 0.3}
+    work, campaign = session(tmp_path / "a", streams, data=slides(1), faults=[fault])
     called: list[str] = []
     record_calls(work.rig, called)
     text = rf"{name} \(further device\): does not answer \(simulated fault\)"
@@ -328,9 +329,9 @@ def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path)
     others = [call for call in called if call.startswith("close")]
     assert others[0] == "close arm"
     assert set(others[-2:]) <= {f"close {stream}" for stream in streams}
-    repaired, campaign = session(tmp_path / "a", streams)
+    repaired, campaign = session(tmp_path / "a", streams, data=slides(1))
     take_all(repaired)
-    assert len(campaign.committed()) == 3
+    assert len(campaign.committed()) == 1
 
 
 def test_a_camera_that_falls_silent_fails_a_gate(tmp_path: Path) -> None:
