@@ -42,18 +42,9 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     campaigns = collected(store)
     label(store, campaigns)
     rejected, recording = list(campaigns[0].of_split("test"))[-1]
-    decide(
-        store,
-        "first",
-        rejected.id,
-        "reject",
-        label=Labels(store).key(campaigns[0], recording),
-        old=Onsets(),
-        new=Onsets(),
-        seen=0,
-        who="a person",
-        why="the skin was dirty",
-    )
+    key = Labels(store).key(campaigns[0], recording)
+    known = {"label": key, "old": Onsets(), "new": Onsets(), "seen": 0, "who": "a person"}
+    decide(store, "first", rejected.id, "reject", **known, why="the skin was dirty")
     train(store, campaigns, reviewed=True)
     return store
 
